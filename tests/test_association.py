@@ -19,6 +19,8 @@ from asm_gym.memory.association import (
     existing,
     hidden_units,
     log_variance,
+    normalised_errors,
+    spans,
     synapses,
     unbounded,
 )
@@ -45,9 +47,8 @@ from asm_gym.memory.linear import (
     learn_linear,
     moments,
 )
-from asm_gym.memory.traces import Network, direct_synapses, hebbian_change, initial_weights
+from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import MemoryConfig, NeuralASM, make_monitor
-from asm_gym.scaling import ScaledRows
 from asm_gym.spec import Channel, StreamSpec
 from tests.problems import CHANGES, energy, some_association
 from tests.streams import frozen, sine_episodes, sine_spec
@@ -87,12 +88,8 @@ def test_log_variance_stays_within_its_limits_and_those_of_nominal_contexts():
 def test_the_network_normalises_errors_of_association_by_their_expected_spread():
     rng = np.random.default_rng(0)
     association = some_association(rng, 13, 6, 5)
-    network = Network(initial_weights(8, 5, 2, rng), association, 20, 1.0, 1.0)
-    u, x, inputs = (rng.normal(size=(2, n)).astype(np.float32) for n in (3, 5, 13))
-    seen = np.ones_like(x)
-    seen[1, 3] = 0
-    whole = seen.min(axis=1, keepdims=True)
-    found, units = network.associate(ScaledRows(x, seen, u, inputs, inputs[:, CHANGES], whole, np.ones((2, 7), bool)))
+    inputs, whole = rng.normal(size=(2, 13)).astype(np.float32), np.array([[1.0], [0.0]], np.float32)
+    found, units = normalised_errors(inputs, inputs[:, CHANGES].copy(), whole, *association, spans(association.U))
     V, U, D, W_S, b_S, _, remainder = association
     f = np.tanh(inputs @ V.T)
     error = (inputs[:, CHANGES] - f @ U.T - inputs @ D.T) / remainder

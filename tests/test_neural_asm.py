@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from asm_gym.episode import Episode
+from asm_gym.memory.association import normalised_errors
 from asm_gym.monitors import Monitor, NeuralASM, make_monitor
 from asm_gym.spec import Channel, StreamSpec
 from tests.memories import SMALL, learned_bytes, sine_memory
@@ -155,7 +156,8 @@ def test_errors_count_little_until_it_is_known_how_the_arm_moved(asm):
     model, state = asm.model, asm.model.start(1)
     rows = sine_episodes(1, seed=3)[0].stream[40:44].astype(np.float64)  # in mid-motion
     for row, counts in zip(rows, (0.0, 0.1, 1.0, 1.0), strict=True):
-        error, _ = model.network.associate(model.senses_.read(row[None], *state.history.past(row[None])))
+        read, net = model.senses_.read(row[None], *state.history.past(row[None])), model.network
+        error, _ = normalised_errors(read.inputs, read.changes, read.whole, *net.association, net.spans)
         state, output = model.predict(state, row[None])
         np.testing.assert_allclose(output.errors, counts * error, rtol=1e-6)
         assert np.abs(error).max() > 0.1 or counts == 0.0

@@ -33,6 +33,7 @@ from asm_gym.memory.traces import (
     TracesLearner,
     advance,
     at_rest,
+    carry,
     direct,
     direct_synapses,
     fit_gains,
@@ -313,14 +314,13 @@ def test_offline_recall_without_a_state_is_the_power_of_its_matrix():
     np.testing.assert_allclose(recalled.traces, state, rtol=2e-3, atol=1e-4)
 
 
-def test_carrying_on_is_the_part_of_following_that_a_monitor_needs():
+def test_the_compiled_row_carries_on_what_the_network_follows():
     net, (senses, commands) = network(), some_rows(3, 3, S, A)
     for seen in (np.ones((3, S), np.float32), np.array([[1, 0, 1, 1]] * 3, np.float32)):
-        step = net.follow(net.at_rest(3), commands[0], senses[0], seen)
-        expected, traces = net.carry_on(net.at_rest(3), commands[0], senses[0], seen)
+        row = net.at_rest(3), commands[0], senses[0], seen
+        step, (expected, traces) = net.follow(*row), carry(*row, *net.weights, *net.inference, True)
         np.testing.assert_allclose(expected, np.tanh(step.mu), atol=1e-6)
         np.testing.assert_array_equal(traces, step.traces)
-        np.testing.assert_allclose(net.predict(net.at_rest(3), commands[0]), step.expected, atol=1e-6)
 
 
 def test_online_recall_of_a_row_does_not_know_its_senses():

@@ -4,10 +4,8 @@
     mahalanobis    ‖M ε‖²                       M whitens the errors of nominal steps
     moving_mean    mean over 5 steps of ε_i²    summed over i
     largest        max_i |ε_i|
-    per_dimension  max_i |ε_i| / q_i            q_i: |ε_i| exceeds it in one of a thousand nominal rows
 
-Sources: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest;
-Munn et al. 2026 (arXiv 2602.01515) for the calibration of each dimension.
+Sources: Xu et al. 2025 (RSS) for the moving mean; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 31, for the largest.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ from asm_gym.validation import check_number
 Floats = NDArray[np.float64]
 
 WINDOW = 5  # rows of the moving mean
-SELDOM, TINY = 1e-3, 1e-6  # share of nominal rows above q_i, and the least q_i
 
 
 class Squares:
@@ -101,17 +98,3 @@ class Largest(Squares):
     def parts(self, output: ModelOutput) -> Floats:
         sizes = np.abs(np.asarray(output.errors, np.float64))
         return np.where(np.arange(sizes.shape[1]) == sizes.argmax(axis=1)[:, None], sizes, 0.0)
-
-
-class PerDimension(Largest):
-    """The largest error relative to a quantile of its own in held-out nominal rows."""
-
-    name = "per_dimension"
-    arrays = ("seldom",)
-
-    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
-        errors = np.abs(np.concatenate([r.errors for r in nominal.outputs(nominal.held_out)]))
-        return self.restore({"seldom": np.maximum(np.quantile(errors, 1.0 - SELDOM, axis=0), TINY).astype(np.float64)})
-
-    def parts(self, output: ModelOutput) -> Floats:
-        return super().parts(output._replace(errors=np.asarray(output.errors) / self.learned_["seldom"]))

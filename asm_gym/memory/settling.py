@@ -62,10 +62,6 @@ class SettlingNetwork(TemporalNetwork):
     def at_rest(self, batch: int) -> NDArray[np.float32]:
         return np.zeros((batch, self.hidden_size), np.float32)
 
-    def predict(self, c: Array, u: Array) -> Array:
-        mu, action = self._expected(c, u)
-        return np.hstack([self._sense(mu), action])
-
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         w, precision = self.weights, self.sensory_precision * seen
         mu, action = self._expected(c, u)

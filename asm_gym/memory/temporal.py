@@ -14,10 +14,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association, association_shapes, normalised_errors, spans
+from asm_gym.memory.association import Association, association_shapes, spans
 from asm_gym.memory.energy import Array, Scalar
 from asm_gym.memory.learning import Schedule, Tick, Trajectory
-from asm_gym.scaling import ScaledRows
 
 
 class Step(NamedTuple):
@@ -65,11 +64,6 @@ class TemporalNetwork(ABC):
         other.iterations = iterations
         return other
 
-    def associate(self, reading: ScaledRows) -> tuple[Array, Array]:
-        """Return the normalised errors (B, X), 0 for rows with missing values, and f(h) (B, M) of association."""
-        error, units = normalised_errors(reading.inputs, reading.changes, reading.whole, *self.association, self.spans)
-        return error, units
-
     @property
     def inference(self) -> tuple[Scalar, Scalar, Scalar, int]:
         """Π_z, Π_x, the curvature, and iterations."""
@@ -88,10 +82,6 @@ class TemporalNetwork(ABC):
     @abstractmethod
     def at_rest(self, batch: int) -> NDArray[np.float32]:
         """Return c_0 (B, I), before the first row."""
-
-    @abstractmethod
-    def predict(self, c: Array, u: Array) -> Array:
-        """Return [x̂_t, â_t] (B, S + A) before a row is read; arguments as in ``follow``."""
 
     @abstractmethod
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:

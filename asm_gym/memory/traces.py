@@ -158,10 +158,6 @@ class Network(TemporalNetwork):
     def at_rest(self, batch: int) -> NDArray[np.float32]:
         return at_rest(batch, self.weights.W_F.shape[0] + 1)
 
-    def predict(self, c: Array, u: Array) -> Array:
-        found: Array = direct(c, u, self.weights.W_D) + sense(expect(c, self.weights.W_C), self.weights.W_F)
-        return found
-
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         w = self.weights
         mu, past = expect(c, w.W_C), direct(c, u, w.W_D)
