@@ -12,9 +12,6 @@ from asm_gym.episode import Episode
 from asm_gym.memory import association_learning
 from asm_gym.memory.adaptation import followed, specialise
 from asm_gym.memory.association import (
-    LARGEST,
-    SMALLEST,
-    Association,
     complete,
     existing,
     hidden_units,
@@ -25,12 +22,9 @@ from asm_gym.memory.association import (
     unbounded,
 )
 from asm_gym.memory.association_learning import (
-    ALL_TICKS,
     FEEDBACK,
     PRECISION_BATCH,
     PRECISION_BATCHES,
-    ROWS_PER_INPUT,
-    THIRDS,
     TRANSPORTED,
     association_change,
     crossfit,
@@ -38,18 +32,14 @@ from asm_gym.memory.association_learning import (
     learn_precision,
     thirds,
     trust,
-    usual_span,
 )
 from asm_gym.memory.linear import (
-    FEW_PENALTY,
     conditional,
-    learn_from_past,
     learn_linear,
     moments,
 )
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import MemoryConfig, NeuralASM, make_monitor
-from asm_gym.spec import Channel, StreamSpec
 from tests.problems import CHANGES, energy, some_association
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -70,21 +60,6 @@ def test_precision_recovers_noise_that_depends_on_context(rows, monkeypatch):
     assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
 
 
-def test_log_variance_stays_within_its_limits_and_those_of_nominal_contexts():
-    f = np.ones((2, 3), np.float32)
-    for sign, bound in ((1, LARGEST), (-1, SMALLEST)):
-        W_S = np.full((2, 3), sign * 100, np.float32)
-        assert np.all(log_variance(f, W_S, np.zeros(2, np.float32), unbounded(2)) == bound)
-    f = np.tanh(np.random.default_rng(0).normal(size=(20_000, 3))).astype(np.float32)
-    W_S, b_S = np.array([[1.0, 0, 0], [0, 2.0, -1.0]], np.float32), np.array([0.5, -1.0], np.float32)
-    span = usual_span(f, W_S, b_S)
-    driven = f @ W_S.T + b_S
-    np.testing.assert_allclose(np.mean(driven < span[0], axis=0), 0.0005, atol=1e-4)
-    np.testing.assert_allclose(np.mean(driven > span[1], axis=0), 0.0005, atol=1e-4)
-    beyond = log_variance(np.array([[9.0, 9.0, -9.0], [-9.0, -9.0, 9.0]], np.float32), W_S, b_S, span)
-    np.testing.assert_array_equal(beyond, span[::-1])
-
-
 def test_the_network_normalises_errors_of_association_by_their_expected_spread():
     rng = np.random.default_rng(0)
     association = some_association(rng, 13, 6, 5)
@@ -103,67 +78,6 @@ def test_no_group_predicts_itself():
     assert np.array_equal(reaches[:, CHANGES], GROUPS[:, None] != GROUPS)
     assert reaches[:, :5].all()
     assert reaches[:, 10:].all()
-
-
-def test_linear_relations_are_exact_and_noise_is_not_learned_by_heart():
-    rng = np.random.default_rng(5)
-    N = 400
-    cause = rng.normal(size=(N, 2))
-    delta = np.column_stack([cause, cause @ [0.6, -0.8], rng.normal(size=N)]).astype(np.float32)
-    inputs = np.hstack([delta, np.ones((N, 1), np.float32)])
-    w = learn_association(inputs, delta, np.array([0, 0, 1, 2]), slice(0, 4), 32, rng)
-    np.testing.assert_allclose(w.D[2, :2], [0.6, -0.8], atol=1e-4)
-    assert w.remainder[2] < 2e-4  # tied to the others exactly
-    error = inputs[:, 3] - complete(hidden_units(inputs, w.V), inputs, w.U, w.D)[:, 3]
-    assert error.std() > 0.9 * delta[:, 3].std()  # tied to nothing
-
-
-def few(rows: int) -> Association:
-    """Association from rows of two groups, each change linear in the past and in noise that they share."""
-    rng = np.random.default_rng(6)
-    past = rng.normal(size=(rows, 3))
-    noise = rng.normal(size=(rows, 1))
-    delta = past @ np.array([[0.5, 0.0], [0.0, -0.7], [0.2, 0.2]]) + 0.3 * noise
-    inputs = np.hstack([past, delta, np.ones((rows, 1))]).astype(np.float32)
-    return learn_association(inputs, inputs[:, 3:5], np.array([0, 1]), slice(3, 5), 8, rng)
-
-
-def test_few_rows_teach_the_past_only_and_more_teach_other_senses_too():
-    w = few(ROWS_PER_INPUT * 6 - 1)
-    for nothing in (w.U, w.W_S, w.b_S, w.D[:, 3:5]):
-        assert not nothing.any()
-    np.testing.assert_allclose(w.D[:, :3], [[0.5, 0.0, 0.2], [0.0, -0.7, 0.2]], atol=0.12)
-    np.testing.assert_allclose(w.remainder, 0.3, rtol=0.2)
-    assert w.V.any()  # units that skills are named from
-    w = few(ROWS_PER_INPUT * 6)
-    np.testing.assert_allclose([w.D[0, 4], w.D[1, 3]], 1.0, atol=0.05)
-    assert w.U.any() or w.W_S.any()
-
-
-def test_a_missing_linear_part_changes_like_one_of_zeros():
-    rng = np.random.default_rng(4)
-    a, delta = rng.normal(size=(4, 13)).astype(np.float32), rng.normal(size=(4, 5)).astype(np.float32)
-    V, U, D, *_ = some_association(rng, 13, 6, 5)
-    nothing, spread = np.zeros_like(D), np.ones(5, np.float32)
-    change, error = association_change(a, delta, spread, V, U, nothing[:, :0])
-    expected, errors = association_change(a, delta, spread, V, U, nothing)
-    for found, wanted in ((change.V, expected.V), (change.U, expected.U), (error, errors)):
-        np.testing.assert_array_equal(found, wanted)
-
-
-def test_hidden_units_learn_nonlinear_relations_and_their_noise():
-    rng = np.random.default_rng(0)
-    N = 6000
-    cause = rng.normal(size=(N, 2))
-    noise = 0.05 * rng.normal(size=(N, 2)) * np.where(cause[:, :1] > 0, 4.0, 1.0)
-    delta = np.stack([cause[:, 0], cause[:, 1], *(np.sin(2 * cause) + noise).T], axis=1).astype(np.float32)
-    inputs = np.hstack([delta, np.ones((N, 1), np.float32)])
-    w = learn_association(inputs, delta, np.array([0, 0, 1, 1]), slice(0, 4), 32, rng)
-    f = hidden_units(inputs, w.V)
-    error = (delta - complete(f, inputs, w.U, w.D))[:, 2:]
-    deviation = (w.remainder * np.exp(0.5 * log_variance(f, w.W_S, w.b_S, w.span_S)))[:, 2:]
-    assert error.std() < 0.25  # 0.15 is the noise alone, 0.66 the best that a line could do
-    assert deviation[cause[:, 0] > 0.5].mean() > 1.8 * deviation[cause[:, 0] < -0.5].mean()
 
 
 def test_all_rules_of_the_memory_descend_one_energy():
@@ -227,19 +141,6 @@ def test_a_memory_keeps_its_feedback_and_refuses_an_unknown_one(tmp_path):
         MemoryConfig(feedback="none")
 
 
-def test_thirds_are_of_whole_episodes_and_of_similar_size():
-    lengths = [5, 9, 1, 7, 30, 2, 4, 8]
-    third = thirds(sum(lengths), lengths, np.random.default_rng(0))
-    whole = np.split(third, np.cumsum(lengths)[:-1])
-    assert all(len(set(rows)) == 1 for rows in whole)
-    assert sorted(np.bincount([rows[0] for rows in whole])) == [2, 3, 3]
-    skill = np.arange(60) % THIRDS  # episodes that alternate between skills
-    third = thirds(60, [1] * 60, np.random.default_rng(0))
-    assert all(len(set(third[skill == s])) == THIRDS for s in range(THIRDS))
-    for few_episodes in ((), (10,), (3, 7)):
-        assert thirds(10, few_episodes, np.random.default_rng(0)).tolist() == [0, 0, 0, 0, 1, 1, 1, 2, 2, 2]
-
-
 def test_crossfit_predicts_every_row_without_it():
     rng = np.random.default_rng(1)
     truth = rng.normal(size=(60, 2)).astype(np.float32)
@@ -259,29 +160,6 @@ def test_trust_is_the_share_of_predictions_that_fresh_rows_confirm():
     left = expected * np.array([1.0, 0.5, 0.0, -1.0], np.float32) + 0.1 * rng.normal(size=expected.shape)
     np.testing.assert_allclose(trust(left, expected), [1.0, 0.5, 0.0, 0.0], atol=0.02)
     assert np.array_equal(trust(left, np.zeros_like(expected)), np.zeros(4))
-
-
-def lesson(rng: np.random.Generator, episodes: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inputs and changes of two groups; each episode bends their relation in a way of its own, as skills do."""
-    rows = []
-    for _ in range(episodes):
-        cause, own = rng.normal(size=(steps, 2)), rng.normal(size=2)
-        bent = np.sin(2 * cause) + 0.5 * np.cos(3 * cause + own) + 0.05 * rng.normal(size=cause.shape)
-        rows.append(np.hstack([cause, bent]))
-    delta = np.concatenate(rows).astype(np.float32)
-    return np.hstack([delta, np.ones((len(delta), 1), np.float32)]), delta
-
-
-def test_precision_is_that_of_rows_that_were_not_learned():
-    rng = np.random.default_rng(2)
-    layout, ticks = (np.array([0, 0, 1, 1]), slice(0, 4), 64), []
-    inputs, delta = lesson(rng, 12, 50)
-    w = learn_association(inputs, delta, *layout, rng, lambda: ticks.append(1), lengths=[50] * 12)
-    assert len(ticks) == ALL_TICKS
-    inputs, delta = lesson(rng, 100, 50)
-    f = hidden_units(inputs, w.V)
-    error = (delta - complete(f, inputs, w.U, w.D)) / w.remainder
-    assert 0.6 < np.mean(error**2 * np.exp(-log_variance(f, w.W_S, w.b_S, w.span_S))) < 1.7
 
 
 @pytest.mark.parametrize("penalty", [1e-6, 0.1, 10.0])
@@ -305,17 +183,6 @@ def mixed_rows(N: int = 500) -> np.ndarray:
     return np.hstack([mixed, np.ones((N, 1))]).astype(np.float32)
 
 
-def test_few_rows_give_the_ridge_regression_on_everything_but_changes():
-    a = mixed_rows(60)
-    D, exact = learn_from_past(a, CHANGES), a.astype(np.float64)
-    past = np.setdiff1d(np.arange(12), np.arange(12)[CHANGES])
-    X, Y = (exact[:, part] - exact[:, part].mean(axis=0) for part in (past, CHANGES))
-    W = np.linalg.solve(X.T @ X / len(X) + FEW_PENALTY * np.eye(len(past)), X.T @ Y / len(X))
-    np.testing.assert_allclose(D[:, past], W.T, atol=1e-5)
-    assert not D[:, CHANGES].any()
-    np.testing.assert_allclose((exact @ D.T).mean(axis=0), exact[:, CHANGES].mean(axis=0), atol=1e-4)
-
-
 def test_each_sense_gets_the_penalty_that_held_out_rows_choose():
     rng = np.random.default_rng(1)
     N = 60
@@ -336,14 +203,6 @@ def test_few_rows_constants_and_copies_stay_finite():
         assert np.isfinite(D).all()
         np.testing.assert_allclose(a[:, 8] - a @ D[3], 0.0, atol=1e-3)
     assert D[1, 7] == pytest.approx(1.0, abs=1e-2)
-
-
-@pytest.mark.parametrize("name", ["neural_asm", "association_linear"])
-def test_a_stream_too_wide_for_all_against_all_is_refused(name):
-    spec = StreamSpec((Channel("pixels", 10_000), Channel("action", 1, group="action")), dt=0.05)
-    episode = Episode.from_stream(np.random.default_rng(0).normal(size=(4, 10_001)), spec)
-    with pytest.raises(ValueError, match=r"at most 8192 of them"):
-        make_monitor(name, spec).fit([episode])
 
 
 def test_following_removes_the_share_of_an_error_that_was_asked_for():
@@ -437,11 +296,3 @@ def test_a_promise_holds_on_average_and_nearly_always_below_its_bound():
     assert np.mean(shares) == pytest.approx(promises[0].rate, abs=0.002)
     assert promises[0].rate <= rate
     assert np.mean(np.array(shares) <= promises[0].at_most) == pytest.approx(0.95, abs=0.015)
-
-
-def test_twenty_episodes_promise_what_they_can(body):
-    asm = body.with_threshold(body.threshold)
-    with pytest.raises(ValueError, match=r"at least 99 nominal episodes, got 20, .* 0\.048 at best"):
-        asm.calibrate(sine_episodes(20, seed=8), 0.01)
-    promise = asm.calibrate(sine_episodes(20, seed=8), 0.048).promise
-    assert promise == Promise(20, pytest.approx(1 / 21), pytest.approx(1 - 0.05 ** (1 / 20)))

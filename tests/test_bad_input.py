@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from asm_gym.episode import Episode
-from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.monitors.skills import learn_skills
+from asm_gym.monitors import make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes
 
@@ -92,10 +91,3 @@ def test_ten_thousand_senses_are_refused_at_once_with_what_to_do(name):
     episode = Episode.from_stream(np.random.default_rng(0).normal(size=(6, 10_001)), spec)
     with pytest.raises(ValueError, match=r"at most 8192 of them.* makes \d+: leave channels out"):
         fresh(name, spec).fit([episode])
-
-
-def test_skills_are_learned_from_one_episode_and_from_constant_and_copied_senses():
-    episodes = changed(changed(sine_episodes(6), constant), copied)
-    asm = NeuralASM(episodes[0].spec, hidden_size=8, association_size=24, epochs=2).fit(episodes)
-    for learned in (episodes, episodes[:1]):
-        assert np.isfinite(learn_skills(asm, learned).score(episodes[1]).of_skill).all()

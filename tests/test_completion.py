@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from asm_gym.episode import Episode
 from asm_gym.memory.completion import Completion, sensors_of
-from asm_gym.monitors import NeuralASM, Surprise
-from asm_gym.monitors.diagnosis import CLASSES, Diagnosis, Readout
+from asm_gym.monitors import Surprise
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
 from tests.arms import MEMORY, SENSES, SPEC, STREAMS, Arm, Judge, Repaired, arm, offset
@@ -142,14 +140,6 @@ def test_a_policy_under_the_guard_sees_what_a_faulty_sense_should_say():
     assert out[-1][1]["asm"]["completed"] == ("observation[0]",)
 
 
-def test_what_is_completed_already_completes_nothing_else(monkeypatch):
-    monitor = Judge({21, 30})
-    named = iter(monitor.diagnosis_.hypotheses)
-    monkeypatch.setattr(Diagnosis, "named", lambda *_: next(named))  # another one each time
-    out = played(NeuralASMSafety(Arm(offset), monitor, on_alarm="graded"), 60)
-    assert [info["asm"]["completed"] for _, info in out[22:]] == [("observation[0]",)] * 39
-
-
 def test_an_observation_that_a_wrapper_has_changed_is_refused():
     env = gym.make("asm_gym/Lift-v0")
     shorter = gym.wrappers.TransformObservation(env, lambda o: o[:5], spaces.Box(-100, 100, (5,), np.float32))
@@ -176,22 +166,3 @@ def test_the_numbers_of_an_observation_are_found_in_the_stream(observation):
         np.testing.assert_allclose(other["joint_position"], seen["joint_position"] + 1, rtol=1e-6)
         np.testing.assert_array_equal(other["cube_pos"], seen["cube_pos"])
     env.close()
-
-
-def test_a_memory_keeps_its_completion_in_its_file(tmp_path):
-    episodes = [Episode.from_stream(s, SPEC) for s in STREAMS]
-    asm = NeuralASM(SPEC, hidden_size=8, association_size=8, epochs=1).fit(episodes)
-    asm.save(tmp_path / "arm.asm")
-    again = NeuralASM.load(tmp_path / "arm.asm").diagnosis_
-    np.testing.assert_allclose(again.completion.covariance, asm.diagnosis_.completion.covariance, rtol=1e-5)
-    assert again.hypotheses[0].part == "encoder[0]"
-
-
-def test_the_readout_learns_by_the_delta_rule_what_tells_families_apart():
-    rng = np.random.default_rng(0)
-    families = rng.integers(0, 3, 300)
-    evidence = np.eye(len(CLASSES))[families][:, :4] + 0.1 * rng.standard_normal((300, 4))
-    readout = Readout.fit(evidence, families, np.ones(300), steps=300)
-    found = readout(evidence)
-    np.testing.assert_allclose(found.sum(axis=1), 1.0)
-    assert (found.argmax(axis=1) == families).mean() > 0.98

@@ -23,7 +23,7 @@ from asm_gym.detection import (
     hourly_promise,
     hourly_threshold,
 )
-from asm_gym.detection.detector import STEPS_PER_NUMBER, USUAL, habituate, usual_levels
+from asm_gym.detection.detector import USUAL, habituate, usual_levels
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, Evidence, accumulated, no_evidence, pool, strength
 from asm_gym.detection.hourly import MINUTE
 from asm_gym.detection.repetition import (
@@ -84,15 +84,6 @@ def test_no_error_exceeds_the_bound_and_small_ones_count_in_full(size, bound):
     assert abs(pulled[0, 0]) <= bound * (1 + 1e-12)
     assert np.sign(pulled[0, 0]) == np.sign(size)
     np.testing.assert_allclose(pulled[0, 1], small, rtol=1e-9)
-
-
-def test_evidence_of_white_noise_has_mean_one_from_the_first_row_on():
-    rng, streams, size, gains = np.random.default_rng(0), 4000, 3, np.array([0.2, 0.05, 1.0])
-    evidence = no_evidence(streams, 3, size)
-    for _ in range(12):
-        evidence = accumulate(evidence, rng.normal(size=(streams, size)), np.zeros((streams, 0)), gains)
-        for value in strength(evidence, gains).mean(axis=2).T:
-            assert value.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / size / streams))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 40])
@@ -158,15 +149,6 @@ def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[ModelOu
     return made
 
 
-def judged(detector: Detector, run: ModelOutput) -> np.ndarray:
-    evidence, values = detector.start(1), []
-    for e, c in zip(run.errors, run.contexts, strict=True):
-        evidence, value, parts = detector.step(evidence, e[None], c[None])
-        np.testing.assert_allclose(parts.sum(), value[0])
-        values.append(value[0])
-    return np.array(values)
-
-
 def test_the_compiled_step_is_the_same_equations_put_together():
     rng = np.random.default_rng(2)
     detector = Detector.fit(runs(rng, 8), runs(rng, 8), [0.8, 0.2], 5.0, 1e-3, rng)
@@ -183,36 +165,6 @@ def test_the_compiled_step_is_the_same_equations_put_together():
         np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
         for a, b in zip(evidence, plain, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
-
-
-def test_a_usual_context_alarms_no_more_than_others_once_enough_rows_taught_it():
-    rng = np.random.default_rng(0)
-    detector = Detector.fit(runs(rng, 40), runs(rng, 40), [0.8, 0.2], 10.0, 1e-3, rng)
-    values: list[list[np.ndarray]] = [[], []]
-    for run in runs(rng, 20):
-        settled = np.arange(200) % 50 >= 25  # the evidence of the last context has gone
-        for rough in (0, 1):
-            values[rough].append(judged(detector, run)[settled & (run.contexts[:, 0] == rough)])
-    a, b = (np.quantile(np.concatenate(v), 0.95) for v in values)
-    assert 0.6 < b / a < 1.7  # 16 without habituation
-    for steps, learned in ((4 * STEPS_PER_NUMBER - 1, False), (4 * STEPS_PER_NUMBER, True)):
-        found = Detector.fit(runs(rng, 1, steps), [], [0.8, 0.2], 10.0, 1e-3, rng)
-        assert found.context_quantile[:-1].any() == learned
-
-
-def test_a_fault_in_a_calm_error_is_not_drowned_by_a_wild_one():
-    rng = np.random.default_rng(1)
-
-    def episode() -> ModelOutput:
-        errors = rng.normal(size=(100, 2))
-        errors[rng.integers(100), 0] = 40.0  # one knock in every episode, in the first error only
-        return ModelOutput(errors, np.zeros((100, 0)))
-
-    detector = Detector.fit([episode() for _ in range(60)], [episode() for _ in range(60)], [0.8, 0.2], 10.0, 1e-3, rng)
-    threshold = np.quantile([judged(detector, episode()).max() for _ in range(100)], 0.95)
-    faulty = episode()
-    faulty.errors[50:, 1] += 3.0
-    assert judged(detector, faulty)[50:].max() > threshold
 
 
 @pytest.mark.parametrize(("rate", "episodes"), [(0.5, 1), (0.1, 9), (0.05, 19), (0.01, 99), (0.07, 14), (0.001, 999)])
@@ -323,26 +275,6 @@ def test_too_few_hours_are_refused_with_the_hours_missing(rate, hours, message):
         hourly_threshold(Blocks(np.ones(10), np.full(10, hours / 10)), rate)
 
 
-def test_hours_as_long_as_needed_suffice_and_rates_that_are_none_are_refused():
-    for rate in (0.1, 0.3, 1.0, 3.0, 7.0):
-        assert hourly_threshold(Blocks(np.arange(10.0), np.full(10, 1.0 / rate / 10)), rate) == 9.0
-    for wrong in (0.0, -1.0, np.nan, np.inf, 1e308, "1", None, True):
-        with pytest.raises(ValueError, match="false_alarms_per_hour must be"):
-            hourly_threshold(Blocks(np.ones(3), np.ones(3)), wrong)
-
-
-def test_a_rate_holds_in_each_group():
-    values = [np.full(round(360 / DT), v) for v in range(40)]  # 0.1 hours each, cut into six blocks
-    blocks = Blocks.of(values, DT, ["Lift"] * 20 + ["Door"] * 20)
-    assert hourly_threshold(blocks, 10.0) == 36.0  # of Door's 2 hours 19 blocks may exceed it: six of 39, 38, 37 each
-    assert hourly_threshold(Blocks(*blocks[:2]), 10.0) == 33.0  # 39 of all 4 hours'
-    assert Blocks.restored(blocks.array).groups[1].maxima.tolist() == blocks.maxima[120:].tolist()
-    promise = hourly_promise(blocks, 37.0, 40)
-    assert (promise.rate, promise.hours) == (pytest.approx(13 / 2), pytest.approx(4))
-    with pytest.raises(ValueError, match=r"got 0\.0167"):  # one group has too few hours
-        hourly_threshold(Blocks.of([np.ones(ROWS)] * 61, DT, ["Lift"] * 60 + ["Door"]), 1.0)
-
-
 def alarms_of(how: AdaptiveThreshold, maxima: np.ndarray, start: float = 1.0) -> np.ndarray:
     """(K,) which episodes of these maxima alarm."""
     running, alarms = how.start(start), []
@@ -416,18 +348,6 @@ def test_repetitions_are_counted_after_a_change_and_after_a_repetition():
     np.testing.assert_allclose(np.exp(-found[:2, 0]), [first, (1 + first) / (2 + 1)])
 
 
-def test_senses_with_declared_noise_are_watched_and_without_any_those_that_never_repeated():
-    streams = [np.random.default_rng(seed).normal(size=(100, 3)) for seed in range(2)]
-    counted = count_repetitions(streams, np.array([True, False, False]))
-    stuck = repetitions(np.full((20, 3), 12.0), counted)[-1].unlikely[0]
-    assert stuck[0] > REPETITION_OFFSET
-    assert stuck[1] == 0.0  # a command at its limit
-    streams[1][50, 1] = streams[1][49, 1]
-    found = count_repetitions(streams, np.zeros(3, np.bool_))
-    assert (found[:2, [0, 2]] > 2.0).all()
-    assert (found[:2, 1] == 0.0).all()
-
-
 def test_evidence_for_a_stuck_sense_is_that_of_pages_test():
     p = np.array([[1e-4], [1e-2]])  # of a repetition after a change, and after a repetition
     states = repetitions(np.array([[1.0], [1.0], [1.0], [2.0], [np.nan], [np.nan]]), -np.log(p))
@@ -464,33 +384,6 @@ def test_a_sense_that_was_stuck_for_long_is_believed_again_soon():
     assert n[5015] < REPETITION_OFFSET
 
 
-def test_repetitions_of_nominal_episodes_and_rest_are_not_held_against_a_sense():
-    still = np.concatenate([quantised(200, 0), np.ones((30, 1)), quantised(200, 1)])
-    counted = count_repetitions([still], np.array([True]))
-    assert counted[2, 0] == max(s.unlikely[0, 0] for s in repetitions(still, counted)) > REPETITION_OFFSET
-    rng, t = np.random.default_rng(0), np.arange(400) / 50
-
-    def moving() -> np.ndarray:
-        phase = rng.uniform(0, 6)
-        encoder = np.rint((np.sin(2 * t + phase) + 1e-5 * rng.normal(size=400)) / 1e-3) * 1e-3
-        return np.stack([encoder, np.cos(2 * t + phase) + 0.05 * rng.normal(size=400)], axis=1)
-
-    counted = count_repetitions([moving() for _ in range(10)], np.array([True, True]))
-    rest = np.stack([np.full(500, 0.5), 0.05 * rng.normal(size=500)], axis=1)
-    assert max(s.unlikely.max() for s in repetitions(rest, counted)) < REPETITION_OFFSET
-    rest[:, 1] = 0.3  # a noisy sense does not rest
-    assert repetitions(rest[:20], counted)[-1].unlikely[0, 1] > REPETITION_OFFSET
-
-
-def test_the_fewer_episodes_the_longer_a_rest_is_believed():
-    def rows_until(episodes: int) -> int:
-        streams = [np.random.default_rng(seed).normal(size=(100, 1)) for seed in range(episodes)]
-        states = repetitions(np.full((40, 1), 0.5), count_repetitions(streams, np.array([True])))
-        return int(np.argmax([s.unlikely[0, 0] > REPETITION_OFFSET for s in states]))
-
-    assert [rows_until(n) for n in (4, 12, 90)] == [5, 4, 2]  # 12 = 4.15 * log(0.9 * 20), 3.0 * log(54), 2 * log(405)
-
-
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
     noisy = replace(sine_spec(), channels=tuple(replace(c, noise=0.5) for c in sine_spec().channels))
@@ -509,17 +402,3 @@ def test_a_frozen_sense_alarms_within_four_rows_however_poor_the_prediction(asm)
         state, _ = asm.observe(state, row)
     assert state.detection.repetition.unlikely.any()
     assert not asm.reset_evidence(state).detection.repetition.unlikely.any()
-
-
-def test_repetitions_of_an_older_memory_load_and_damaged_ones_are_refused(asm):
-    detection, senses = asm.detection, len(asm.spec.sensory)
-    learned = detection.learned_ | {"repetition": detection.learned_["repetition"][:2]}
-    old = type(detection)(asm.spec, gains=detection.gains).restore(learned)
-    state, row = old.start(1, senses), np.ones((1, asm.spec.size))
-    output = ModelOutput(np.zeros((1, senses)), np.zeros((1, asm.hidden_size)))
-    for _ in range(4):
-        state, _ = old.attribute_step(state, output, row, lambda parts: np.zeros((1, asm.spec.size)))
-    assert (state.repetition.unlikely > REPETITION_OFFSET).all()
-    for damaged in (np.full((3, 2), -1.0), np.zeros((1, 2)), np.full((3, senses), np.nan)):
-        with pytest.raises(ValueError, match="repetition of evidence"):
-            old.restore(learned | {"repetition": damaged})

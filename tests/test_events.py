@@ -3,15 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.detector import GAINS
 from asm_gym.detection.events import EVENTS, EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, Excuses, event_of
 from asm_gym.monitors import Surprise
-from asm_gym.spec import Channel, StreamSpec
-from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from tests.fakes import SPEC, FadingMonitor, FakeEnv
+from asm_gym.spec import StreamSpec
+from asm_gym.wrappers import NeuralASMSafety
+from tests.fakes import FadingMonitor, FakeEnv
 from tests.streams import EVENTFUL_ARM as ARM
 from tests.streams import UNEVENTFUL
 
@@ -79,36 +78,6 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
         left = EXCUSED * (1 - min(GAINS)) ** (2 * np.arange(1, len(fading) + 1))  # of evidence
         assert (np.diff(fading) <= 0).all()
         np.testing.assert_allclose(fading, np.maximum(left, 1.0))
-
-
-def test_a_stop_fades_once_the_joint_has_left_it():
-    found = excused([changed(0, 0.98), *[UNEVENTFUL] * (FADING + 1)])
-    assert [event for event, _ in found] == ["stop"] * (FADING + 1) + [""]
-    assert found[0][1] == EXCUSED
-    assert found[1][1] == pytest.approx(EXCUSED * (1 - min(GAINS)) ** 2)
-
-
-def test_the_end_of_a_knocks_second_is_no_fault_and_a_fault_that_comes_then_is():
-    memory = NeuralASM(ARM, hidden_size=8, association_size=8, epochs=1, excuses=True).fit(wild(20))
-    calm = wild(1, seed=2)[0].stream
-    knocked = calm.copy()
-    knocked[40, 5:8] += 1000.0
-    surprise, over = memory.score(Episode.from_stream(knocked, ARM)), 40 + round(KNOCKED_S / ARM.dt)
-    later = slice(over, over + FADING)
-    fading, second = surprise.value[later], surprise.value[over - 5 : over].max()
-    assert surprise.raw[over] > 3 * second  # a tenth of it would be excused no more
-    usual = memory.score(Episode.from_stream(calm, ARM)).value[later].max()
-    assert fading.max() < 1.5 * max(second, usual)
-    knocked[over + 3, 0] += 0.5
-    assert memory.score(Episode.from_stream(knocked, ARM)).value[over + 3] > 3 * fading.max()
-
-
-def test_a_finger_has_moved_for_a_tenth_of_a_second():
-    assert [d for _, d in excused([changed(8, -0.1), UNEVENTFUL, UNEVENTFUL])] == [SLIPPED, SLIPPED, 1.0]
-
-
-def test_streams_without_such_senses_excuse_nothing():
-    assert excused([np.full(5, 1e9)], SPEC) == [("", 1.0)]
 
 
 def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
@@ -215,15 +184,6 @@ def test_a_knock_hides_no_number_that_is_missing(reaction):
         assert said[4][2] == "reflex"
 
 
-def test_many_environments_say_the_same():
-    envs = SyncVectorEnv([lambda: FakeEnv(), lambda: FakeEnv(first=100)])
-    watched = VectorNeuralASMSafety(envs, Eventful([5]), "hold", release_after=3)
-    watched.reset(seed=0)
-    for t in range(1, 7):
-        *_, info = watched.step(np.zeros((2, 3), np.float32))
-        assert info["asm"]["event"].tolist() == ["knock" if t == 5 else "", ""]
-
-
 def test_a_knock_that_presses_too_hard_is_held_by_the_limits_all_the_same():
     """The hand is driven down on the table under a memory that excuses whatever it feels."""
 
@@ -247,22 +207,3 @@ def test_a_knock_that_presses_too_hard_is_held_by_the_limits_all_the_same():
     assert all(s["intervened"] for s in said[1:])  # braked from the first on
     assert max(s["severity"]["speed"] for s in said) < 0.19
     lift.close()
-
-
-def test_arms_of_the_package_know_their_stops():
-    lift = gym.make("asm_gym/Lift-v0")
-    stops = next(c.stops for c in lift.unwrapped.stream_spec.channels if c.name == "joint_position")
-    assert stops[3] == pytest.approx((-3.0718, -0.0698))
-    assert StreamSpec.from_json(lift.unwrapped.stream_spec.to_json()) == lift.unwrapped.stream_spec
-    lift.close()
-
-
-def test_stops_of_another_number_of_joints_are_refused():
-    with pytest.raises(ValueError, match="channel 'q' has size 2 but 1 pairs of stops"):
-        Channel("q", 2, "rad", stops=((0.0, 1.0),))
-
-
-@pytest.mark.parametrize("stops", [1, np.inf, ((0.0,),), ((1.0, 0.0),), ((0.0, np.nan),), [(0.0, 1.0)], "ab"])
-def test_what_is_no_pair_of_stops_is_refused(stops):
-    with pytest.raises(TypeError, match="channel 'q': stops must be a tuple of pairs"):
-        Channel("q", 1, "rad", stops=stops)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episode import Episode
+from asm_gym.memory import motor
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.acting import learn_to_act
@@ -71,29 +72,30 @@ def pilot() -> NeuralASM:
     return learn_to_act(NeuralASM(episodes[0].spec, **SMALL).fit(episodes), episodes, 64)
 
 
-def test_what_is_linear_is_learned_as_least_squares_would():
+def test_what_is_linear_is_learned_as_least_squares_would(monkeypatch):
     rng = np.random.default_rng(0)
     m = np.hstack([rng.normal(size=(8000, 4)), np.ones((8000, 1))]).astype(np.float32)
     commands = (m @ rng.normal(size=(5, 2)) + 0.1 * rng.normal(size=(8000, 2))).astype(np.float32)
     best = m @ np.linalg.lstsq(m, commands, rcond=None)[0]
-    found = learn_motor(m, commands, 4, np.random.default_rng(1), updates=3000, forgetting=0.0).command(m)
+    monkeypatch.setattr(motor, "FORGETTING", 0.0)
+    found = learn_motor(m, commands, 4, np.random.default_rng(1)).command(m)
     assert np.sqrt(np.mean((found - best) ** 2)) < 0.03
 
 
 def test_where_one_in_five_closes_the_expected_grip_is_their_mean_and_not_their_median():
     m = np.ones((1000, 1), np.float32)
     commands = np.where(np.arange(1000) % 5 == 0, 1.0, -1.0).astype(np.float32)[:, None]
-    motor = learn_motor(m, commands, 4, np.random.default_rng(0), updates=1500)
-    assert motor.command(m[:1])[0, 0] == pytest.approx(-0.6, abs=0.05)
+    learned = learn_motor(m, commands, 4, np.random.default_rng(0))
+    assert learned.command(m[:1])[0, 0] == pytest.approx(-0.6, abs=0.05)
 
 
-def test_synapses_forget_what_nothing_asks_for():
+def test_synapses_forget_what_nothing_asks_for(monkeypatch):
     rng = np.random.default_rng(0)
     m, commands = rng.normal(size=(500, 6)).astype(np.float32), rng.normal(size=(500, 1)).astype(np.float32)
-    sizes = [
-        np.abs(learn_motor(m, commands, 16, np.random.default_rng(0), 500, forgetting).V).mean()
-        for forgetting in (0.0, 3.0)
-    ]
+    sizes = []
+    for forgetting in (0.0, 3.0):
+        monkeypatch.setattr(motor, "FORGETTING", forgetting)
+        sizes.append(np.abs(learn_motor(m, commands, 16, np.random.default_rng(0)).V).mean())
     assert sizes[1] < 0.5 * sizes[0]
 
 

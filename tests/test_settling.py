@@ -92,18 +92,6 @@ def test_every_rule_is_the_slope_of_the_energy(settled):
         assert slope == pytest.approx(-np.sum(getattr(delta, name) * way), rel=2e-3, abs=1e-5), name
 
 
-def test_more_inference_never_has_more_energy_and_ends_where_it_is_flat():
-    w, before, u, x, end = problem(settled=True)
-    mu, curvature = np.tanh(before) @ w.W_H.T + u @ w.W_U.T, 2.0 + 1.5 * np.linalg.norm(w.W_F, 2) ** 2
-    steps = [infer(mu, x - w.b_F, w.W_F, 2.0, np.full_like(x, 1.5), curvature, n) for n in (0, 1, 2, 5, 20, 100)]
-    energies = [total_energy(w, before, u, x, z, 2.0, 1.5) for z in (*steps, end)]
-    assert all(b <= a + 1e-9 for a, b in itertools.pairwise(energies))
-    assert energies[0] > 1.05 * energies[-1]
-    for way in np.random.default_rng(1).normal(size=(5, *end.shape)):
-        up, down = (total_energy(w, before, u, x, end + step * way, 2.0, 1.5) for step in (1e-3, -1e-3))
-        assert abs(up - down) / 2e-3 < 1e-3
-
-
 def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
     # Small states, for which tanh is linear: z = μ + K (x - C μ),  K = Cᵀ (C Cᵀ + Π_z/Π_x)⁻¹
     rng, small = np.random.default_rng(0), 1e-3
@@ -129,29 +117,9 @@ def test_a_sense_that_is_not_seen_does_not_move_the_state():
     np.testing.assert_array_equal(a, b)
 
 
-def test_running_on_is_following_the_own_predictions():
-    net, (senses, commands) = network(iterations=200), rows(5)
-    z = follow(net, net.at_rest(3), senses, commands).traces
-    alone = run_on(net, z, 8)
-    fed_back = np.concatenate([alone.commands, np.ones((8, 3, 1), np.float32)], axis=2)
-    along = follow(net, z, alone.senses, fed_back)
-    np.testing.assert_allclose(along.senses, alone.senses, atol=1e-3)
-    np.testing.assert_allclose(along.commands, alone.commands, atol=1e-3)
-
-
 def some_trajectories(count: int) -> list[Trajectory]:
     senses, commands = rows(40, count)
     return [Trajectory(senses[: 30 + n, n], commands[: 30 + n, n], senses[: 30 + n, n]) for n in range(count)]
-
-
-def test_learning_sees_the_energy_that_the_network_has():
-    net, (senses, commands) = network(), rows(1)
-    step = net.follow(net.at_rest(3), commands[0], senses[0], np.ones_like(senses[0]))
-    learner = SettlingLearner(net.weights, SCHEDULE, np.random.default_rng(0))
-    _, z, energy = learner.step(net.at_rest(3), commands[0], senses[0], rate=0.0)
-    total = 3 * total_energy(net.weights, net.at_rest(3), commands[0], senses[0], step.z, 1.0, 1.0)
-    assert energy == pytest.approx(total, rel=1e-4)
-    np.testing.assert_allclose(z, step.z, atol=1e-3)  # the norm is that of twenty power iterations
 
 
 def test_learning_lowers_the_energy_and_is_reproducible():
@@ -214,21 +182,6 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
     for row in episode.stream:
         state, _ = asm.observe(state, row[None])
     assert asm.expected_action(state).shape == (1, 2)
-
-
-def test_more_inference_a_row_makes_it_expect_the_next_better(asm):
-    # The speed-accuracy trade-off in small: without inference the state never hears of the senses.
-    reader, network = asm.senses_, asm.model.network
-    errors = {}
-    for count in (0, 1, 5, 50):
-        net, wrong = network.with_iterations(count), []
-        for e in sine_episodes(10, 9):
-            reading = reader.read_episode(e.stream)
-            found = follow(net, net.at_rest(1), reading.senses[:, None], reading.commands[:, None])
-            wrong.append(np.mean((found.senses[10:, 0] - reading.senses[10:]) ** 2))
-        errors[count] = np.mean(wrong)
-    assert errors[0] > 1.5 * errors[1] > 1.5 * errors[5]
-    assert errors[50] < 1.1 * errors[5]
 
 
 def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):

@@ -1,6 +1,7 @@
-"""The stream's layout, and episodes that hold one."""
+"""The stream's layout, episodes that hold one, and their files."""
 
-import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asm_gym.episode import Episode
+from asm_gym.episode import Episode, EpisodeLabel, load_episode, save_episode
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec(
@@ -49,14 +50,6 @@ def test_a_spec_survives_json(chosen, dt):
     assert spec.difference(StreamSpec.from_json(spec.to_json())) == []
 
 
-def test_a_spec_written_before_sensors_had_a_resolution_is_read():
-    written = json.loads(SPEC.to_json())
-    for channel in written["channels"]:
-        del channel["resolution"]
-    assert StreamSpec.from_json(json.dumps(written)) == SPEC
-    assert not SPEC.resolution.any()
-
-
 @pytest.mark.parametrize(
     ("other", "says"),
     [
@@ -93,6 +86,7 @@ def test_the_spec_of_plain_spaces_is_observation_then_action():
         lambda: Channel("x", 1, resolution=-1.0),
         lambda: Channel("x", 1, resolution=float("nan")),
         lambda: Channel("x", 2, elements=("a",)),
+        lambda: Channel("q", 2, "rad", stops=((0.0, 1.0),)),
         lambda: StreamSpec((Channel("x", 1), Channel("x", 2)), 0.1),
         lambda: StreamSpec((Channel("a", 1, group=MOTOR),), 0.1),
         lambda: StreamSpec((Channel("x", 1),), 0.0),
@@ -110,3 +104,53 @@ def test_an_episode_from_a_recorded_stream_is_float32_and_as_long():
     assert len(episode) == 7
     assert episode.stream.dtype == np.float32
     assert episode.success
+
+
+@pytest.mark.parametrize("stops", [1, np.inf, ((0.0,),), ((1.0, 0.0),), ((0.0, np.nan),), [(0.0, 1.0)], "ab"])
+def test_what_is_no_pair_of_stops_is_refused(stops):
+    with pytest.raises(TypeError, match="channel 'q': stops must be a tuple of pairs"):
+        Channel("q", 1, "rad", stops=stops)
+
+
+X = (np.arange(30, dtype=np.float32) / 8).reshape(6, 5)
+EPISODE = Episode(
+    X,
+    SPEC,
+    success=True,
+    seed=7,
+    actions=X[:, 2:],
+    observations=np.vstack([X[:1, :2], X[:, :2]]),
+    rewards=np.ones(6, np.float32),
+    faults=np.arange(6) >= 2,
+    contact_force=np.arange(6, dtype=np.float32),
+    label=EpisodeLabel("Lift", "faulty", "push", "mild", 7, onset=2, affected_channels=frozenset({"force"})),
+    info={"terminated": False},
+)
+
+
+@pytest.mark.parametrize("episode", [EPISODE, replace(EPISODE, label=None), Episode(X, SPEC)])
+def test_what_was_saved_is_loaded(episode, tmp_path):
+    loaded = load_episode(save_episode(tmp_path / "deep" / "one.npz", episode))
+    for name in ("stream", "actions", "observations", "rewards", "faults", "contact_force"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(episode, name), name)
+    for name in ("success", "seed", "spec", "label", "info"):
+        assert getattr(loaded, name) == getattr(episode, name)
+    if episode.label is not None:
+        assert loaded.label.affected_channels == episode.label.affected_channels
+
+
+def test_a_label_names_a_file_and_an_episode_without_one_says_so():
+    assert EPISODE.labelled.path == Path("episodes/Lift/faulty/push-mild-7.npz")
+    with pytest.raises(ValueError, match="has no label"):
+        Episode(X, SPEC).labelled  # noqa: B018 (a property that raises)
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    whole = save_episode(tmp_path / "new.npz", EPISODE).read_bytes()
+    path = tmp_path / "one.npz"
+    for damaged in (whole[: len(whole) // 2], b"", whole[:200] + bytes(b ^ 255 for b in whole[200:250]) + whole[250:]):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"one\.npz is damaged"):
+            load_episode(path)
+    with pytest.raises(FileNotFoundError):
+        load_episode(tmp_path / "none.npz")
