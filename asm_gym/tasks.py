@@ -109,12 +109,7 @@ def task(name: str) -> TaskSpec:
 
 
 def env_id(name: str) -> str:
-    """Return the Gymnasium id of a task, or of any other environment that goes by its id.
-
-    Raises:
-        ValueError: neither is known; the message lists the tasks.
-        ImportError: the module of ``module:id`` is not installed; the message names the package.
-    """
+    """Return the Gymnasium id of a task or any environment. Raises ValueError or ImportError where it is not known."""
     if name in OWN:
         gym.registry[OWN[name].id] = OWN[name]  # which a worker has not done yet
         return OWN[name].id

@@ -125,11 +125,7 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
 
 
 def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
-    """Return ``values`` as float32; those that are too large become infinite.
-
-    Raises:
-        ValueError: they are no array of numbers.
-    """
+    """Return ``values`` as float32, infinite where too large. Raises ValueError where they are no array of numbers."""
     if type(values) is np.ndarray and values.dtype == np.float32:
         return values
     if isinstance(values, np.ma.MaskedArray) and bool(np.any(values.mask)):

@@ -22,10 +22,8 @@ from asm_gym.memory.association import (
     unbounded,
 )
 from asm_gym.memory.association_learning import (
-    FEEDBACK,
     PRECISION_BATCH,
     PRECISION_BATCHES,
-    TRANSPORTED,
     association_change,
     crossfit,
     learn_association,
@@ -39,7 +37,7 @@ from asm_gym.memory.linear import (
     moments,
 )
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
-from asm_gym.monitors import MemoryConfig, NeuralASM, make_monitor
+from asm_gym.monitors import NeuralASM, make_monitor
 from tests.problems import CHANGES, energy, some_association
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -116,29 +114,14 @@ def test_all_rules_of_the_memory_descend_one_energy():
             assert rules[name][index] == pytest.approx(-(ends[0] - ends[1]) / 2e-5, rel=1e-3, abs=1e-4), name
 
 
-def left_by(feedback):
-    """The association taught so, and the deviation that it leaves: 0.65 by a line, 0.05 by the noise alone."""
+def test_hidden_units_learn_what_is_not_linear():
     rng = np.random.default_rng(0)
     cause = rng.normal(size=(3000, 2))
     delta = np.hstack([cause, np.sin(2 * cause) + 0.05 * rng.normal(size=cause.shape)]).astype(np.float32)
     a = np.hstack([delta, np.ones((len(delta), 2))]).astype(np.float32)
-    layout = np.array([0, 0, 1, 1]), slice(0, 4), 20
-    w = learn_association(a, delta, *layout, np.random.default_rng(1), feedback=feedback)
-    return w, float((delta - complete(hidden_units(a, w.V), a, w.U, w.D))[:, 2:].std())
-
-
-@pytest.mark.parametrize("way", FEEDBACK)
-def test_hidden_units_learn_by_each_feedback(way):
-    assert left_by(way)[1] < 0.45
-
-
-def test_a_memory_keeps_its_feedback_and_refuses_an_unknown_one(tmp_path):
-    episodes = sine_episodes(16)
-    asm = NeuralASM(episodes[0].spec, 8, 16, epochs=1, config=MemoryConfig(feedback=TRANSPORTED)).fit(episodes)
-    asm.save(tmp_path / "a.asm")
-    assert NeuralASM.load(tmp_path / "a.asm").model.feedback == TRANSPORTED
-    with pytest.raises(ValueError, match=r"feedback 'none'; known: .*learned"):
-        MemoryConfig(feedback="none")
+    w = learn_association(a, delta, np.array([0, 0, 1, 1]), slice(0, 4), 20, np.random.default_rng(1))
+    left = (delta - complete(hidden_units(a, w.V), a, w.U, w.D))[:, 2:].std()
+    assert left < 0.45  # 0.65 by a line, 0.05 by the noise alone
 
 
 def test_crossfit_predicts_every_row_without_it():

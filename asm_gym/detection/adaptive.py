@@ -61,12 +61,9 @@ class RunningThreshold:
         return self._alarms / self._episodes if self._episodes else math.nan
 
     def follow(self, largest: float, judged_by: float | None = None, confirmed: bool = False) -> None:
-        """Move after an episode.
+        """Move after an episode of greatest surprise ``largest``, ``judged_by`` a threshold that may have been another.
 
-        Args:
-            largest: its greatest surprise.
-            judged_by: its own threshold; the present one by default.
-            confirmed: whether an alarm in it was true.
+        A ``confirmed`` alarm was true, and moves nothing.
         """
         alarm = not largest <= (self.value if judged_by is None else judged_by)
         if alarm and (confirmed or not largest <= self.ceiling):

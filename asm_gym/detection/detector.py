@@ -59,13 +59,7 @@ def _step(
     gains: Any,
     bound: float,
 ) -> Any:
-    """Return the fields of the new evidence, the value (B,) and the shares of the errors (B, X).
-
-    Args:
-        vector, running, steps: fields of ``Evidence``.
-        errors, context: (B, X) normalised, and (B, C).
-        whitening, ceiling, tail, context_quantile, context_range, gains, bound: fields of ``Detector``.
-    """
+    """Return the fields of the new ``Evidence``, the value (B,) and the shares of the errors (B, X)."""
     B, X = errors.shape
     G, C = len(gains), context.shape[1]
     new, recent, value = np.empty((B, G, X)), np.empty((B, C)), np.empty(B)

@@ -83,12 +83,7 @@ class EvidenceDetection:
         return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
 
     def with_ceilings(self, maxima: Array, anew: bool) -> EvidenceDetection:
-        """Return a copy with q from the largest v in each of N healthy episodes (N, G, X), and κ by a smaller ξ_0.
-
-        Args:
-            maxima: (N, G, X).
-            anew: whether κ does not go by the smaller ξ_0 yet.
-        """
+        """Return a copy with q from the largest v (N, G, X) in healthy episodes, and κ ``anew`` by a smaller ξ_0."""
         tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index if anew else 1.0), 1.0)
         how = self.gains, self.bound, self.shrinkage, self.habituates, self.tail_index
         learned = {**self.learned_, "ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}

@@ -70,10 +70,7 @@ def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.boo
 def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0.
 
-    Args:
-        streams: (T, X) the senses in nominal episodes.
-        noisy: (X,) senses with declared noise; only those are watched, and where there are none, senses that never
-            repeated themselves.
+    ``streams`` are the senses (T, X) in nominal episodes, ``noisy`` (X,) those with declared noise.
     """
     chances, happened = np.zeros((2, len(noisy))), np.zeros((2, len(noisy)))
     for stream in streams:
@@ -100,11 +97,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
 
 
 def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (2, 2, X): what a change and a repetition add to n, after a change and after a repetition.
-
-    Args:
-        surprise: (2, X) -log p; a sense that repeats itself more often than a stuck one adds nothing.
-    """
+    """Return (2, 2, X) from -log p (2, X): what a change and a repetition add to n, after a change and a repetition."""
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
         steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
@@ -114,12 +107,7 @@ def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @compiled
 def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any, most: Any) -> Any:
-    """Return the fields of ``Repetition`` after the next rows (B, X).
-
-    Args:
-        row, again, unlikely: the fields before.
-        rows, steps, most: (B, X); (2, 2, X) of ``evidence_steps``; (X,) upper bound of n.
-    """
+    """Return the fields of ``Repetition`` after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
     B, X = rows.shape
     now, evidence = np.zeros((B, X), np.bool_), np.zeros((B, X))
     for n in range(B):

@@ -34,15 +34,7 @@ LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped when pena
 
 
 def followed(association: Association, exists: Change, a: Array, delta: Array, rate: float) -> Association:
-    """Return the association after a batch of rows; the given one is unchanged.
-
-    Args:
-        association: the synapses.
-        exists: masks of them, as in ``association.synapses``.
-        a: (B, I) inputs.
-        delta: (B, X) changes, standardised.
-        rate: η in (0, 1].
-    """
+    """Return the association after a batch of inputs (B, I) and changes (B, X), ``rate`` being η in (0, 1]."""
     f = hidden_units(a, association.V)
     variance = log_variance(f, association.W_S, association.b_S, association.span_S)
     spread = association.remainder * np.exp(np.float32(0.5) * variance)
@@ -56,14 +48,7 @@ def followed(association: Association, exists: Change, a: Array, delta: Array, r
 def specialise(
     known: Association, a: Array, delta: Array, groups: NDArray[np.intp], changes: slice, size: int
 ) -> Association:
-    """Return the association that has also learned these rows; the given one is unchanged.
-
-    Args:
-        known: association of the body.
-        a: (N, I) inputs of whole episodes, concatenated.
-        delta: (N, X) changes, standardised.
-        groups, changes, size: as in ``synapses``.
-    """
+    """Return the association that has also learned inputs (N, I) and changes (N, X); the rest as in ``synapses``."""
     exists = synapses(groups, changes, a.shape[1], size)
     f = hidden_units(a, known.V)
     left = (delta - complete(f, a, known.U, known.D)) / known.remainder

@@ -127,14 +127,9 @@ def normalised_errors(
     remainder: Array,
     spans: NDArray[np.intp],
 ) -> tuple[Array, Array]:
-    """Return ε (B, X) and f(h) (B, M).
+    """Return ε (B, X) and f(h) (B, M) for inputs (B, I) and changes (B, X).
 
-    Args:
-        inputs: (B, I).
-        changes: (B, X) Δ.
-        whole: (B, 1) 0 for a row with missing values, whose errors are then 0.
-        V, U, D, W_S, b_S, span_S, remainder: the fields of ``Association``.
-        spans: (X, 2) ``spans(U)``; columns outside of it are skipped.
+    Errors are 0 where ``whole`` (B, 1) is 0. Columns outside of ``spans(U)`` are skipped.
     """
     f = hidden_units(inputs, V)
     out = outward(inputs, D)

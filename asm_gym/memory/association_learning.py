@@ -6,8 +6,8 @@
     c = Σ_n ψ(r_n) Δ̂_n / Σ_n Δ̂_n², in [0, 1]       share of the hidden units' predictions Δ̂ to believe
     ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ                     gradient of the Gaussian log likelihood
 
-By transported feedback B = U, the gradient of a Huber loss. By learned feedback B changes as U does and both decay, so
-that B approaches U, and each change is local. c and the precision are learned on cross-fitted errors: each row is
+Errors come back by weights B of their own. B changes as U does and both decay, so that B approaches U, which would be
+the gradient of a Huber loss; each change is local. c and the precision are learned on cross-fitted errors: each row is
 predicted by what was learned from the two thirds of the episodes that it is not in. From very few rows neither is
 known: then D reads the past and the command only, and U and W_S are 0.
 
@@ -38,9 +38,7 @@ from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, Tick, coincidence, cosine_decay, shuffled
 from asm_gym.memory.linear import learn_from_past, learn_linear
 
-TRANSPORTED, LEARNED = "transported", "learned"
-FEEDBACK = TRANSPORTED, LEARNED
-FEEDBACK_GAIN = 1e-3  # initial gain of learned feedback
+FEEDBACK_GAIN = 1e-3  # initial gain of B
 DECAY = 0.3  # share of its step size by which a synapse of U or B decays
 
 UPDATES, PASSES, BATCH = 6000, 40, 256  # largest number of batches, and of passes over the rows; rows of a batch
@@ -85,11 +83,9 @@ def association_change(
     """Return the change of each synapse, as if all existed, and the errors (B, X).
 
     Args:
-        a: (B, I) inputs.
-        delta: (B, X) changes.
+        a, delta: (B, I) inputs, and (B, X) changes.
         spread: (X,) σ.
-        V, U: (M, I) and (X, M).
-        D: (X, I), or (X, 0) without a linear part.
+        V, U, D: (M, I), (X, M), and (X, I) or (X, 0) without a linear part.
         bound: of ψ.
         back: (X, M) feedback weights; ``U`` where None.
     """
@@ -108,7 +104,6 @@ def learn_association(
     size: int,
     rng: np.random.Generator,
     tick: Tick = lambda: None,
-    feedback: str = TRANSPORTED,
     lengths: Sequence[int] = (),
     independent: int | None = None,
 ) -> Association:
@@ -120,7 +115,6 @@ def learn_association(
         groups, changes, size: as in ``synapses``.
         rng: draws initial weights and the order of the rows.
         tick: called ``ALL_TICKS`` times.
-        feedback: how errors come back to the hidden units, one of ``FEEDBACK``.
         lengths: rows of each episode; without them cross-fitting cuts the rows into three consecutive parts.
         independent: number of rows if overlapping changes are counted once; N where None.
     """
@@ -138,7 +132,7 @@ def learn_association(
     left /= remainder
 
     def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
-        return _learn_hidden(a[rows], left[rows], exists, rng, tick, feedback)
+        return _learn_hidden(a[rows], left[rows], exists, rng, tick)
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
         V, U = learned(learned_from)
@@ -160,29 +154,24 @@ def _random(exists: Array, rng: np.random.Generator) -> Array:
     return V
 
 
-def _learn_hidden(
-    a: Array, left: Array, exists: Change, rng: np.random.Generator, tick: Tick, feedback: str
-) -> tuple[Array, Array]:
+def _learn_hidden(a: Array, left: Array, exists: Change, rng: np.random.Generator, tick: Tick) -> tuple[Array, Array]:
     """Return V and U learned from inputs (N, I) and what the linear part leaves (N, X), standardised."""
     updates = max(TICKS, min(UPDATES, PASSES * len(a) // BATCH))
     V = _random(exists.V, rng)
     U, no_linear = np.zeros_like(exists.U), exists.D[:, :0]
     into, out_of = Synapse(V), Synapse(U)
     spread = np.ones(left.shape[1], np.float32)
-    back = out_of
-    if feedback == LEARNED:
-        each = np.maximum(exists.U.sum(axis=1, keepdims=True), 1.0)
-        B = (FEEDBACK_GAIN * rng.standard_normal(exists.U.shape) / np.sqrt(each)).astype(np.float32) * exists.U
-        back = Synapse(B)
+    each = np.maximum(exists.U.sum(axis=1, keepdims=True), 1.0)
+    B = (FEEDBACK_GAIN * rng.standard_normal(exists.U.shape) / np.sqrt(each)).astype(np.float32) * exists.U
+    back = Synapse(B)
     for n, rows in zip(range(updates), shuffled(len(a), BATCH, rng), strict=False):
-        change, error = association_change(a[rows], left[rows], spread, V, U, no_linear, back=back.W)
+        change, error = association_change(a[rows], left[rows], spread, V, U, no_linear, back=B)
         rate, outward_change = _rate(n / updates), change.U * exists.U
         into.learn(change.V * exists.V, rate)
         out_of.learn(outward_change, rate)
-        if feedback == LEARNED:
-            back.learn(outward_change, rate)
-            for W in (U, back.W):
-                W *= np.float32(1.0 - DECAY * rate)
+        back.learn(outward_change, rate)
+        for W in (U, B):
+            W *= np.float32(1.0 - DECAY * rate)
         now = np.sqrt(np.mean(np.minimum(error**2, 9 * spread**2), axis=0))
         spread += TRACKING * (np.maximum(now, SMALLEST_SPREAD) - spread)
         if (n + 1) * TICKS // updates > n * TICKS // updates:
@@ -197,13 +186,7 @@ def _rate(progress: float) -> float:
 
 
 def thirds(rows: int, lengths: Sequence[int], rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return the third (N,) of each row: 0, 1 or 2.
-
-    Args:
-        rows: N.
-        lengths: rows of each episode. With fewer than three episodes, thirds are of consecutive rows.
-        rng: draws the third of each episode, as rows of one episode are alike.
-    """
+    """Return the third (N,) of each row: of whole episodes by their ``lengths``; of rows if there are fewer than 3."""
     if len(lengths) >= THIRDS:
         return np.repeat(rng.permutation(len(lengths)) % THIRDS, lengths)
     return np.arange(rows) * THIRDS // max(rows, 1)
@@ -214,10 +197,7 @@ def crossfit(
 ) -> Array:
     """Return the prediction (N, X) of each row by what was learned from the other thirds.
 
-    Args:
-        expect: learns from the rows of one mask (N,), and predicts (M, X) the M rows of another.
-        third: (N,) of ``thirds``.
-        size: X.
+    ``expect`` learns from the rows of one mask (N,), and predicts those of another (M, X).
     """
     found = np.zeros((len(third), size), np.float32)
     for k in range(THIRDS):

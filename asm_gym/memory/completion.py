@@ -170,8 +170,7 @@ class Completion:
 def sensors_of(spec: StreamSpec) -> tuple[tuple[str, NDArray[np.intp]], ...]:
     """Return name and columns of each sensor, whose numbers fail together.
 
-    These are a joint's position and velocity, the wrist's forces and torques, and a mean with its peak; every other
-    number is a sensor by itself.
+    A joint's position and velocity, the wrist's forces and torques, a mean and its peak are one; others are alone.
     """
     found: dict[str, list[int]] = {}
     for channel in spec.channels:

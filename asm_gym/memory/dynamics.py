@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association_learning import ALL_TICKS, TRANSPORTED, learn_association
+from asm_gym.memory.association_learning import ALL_TICKS, learn_association
 from asm_gym.memory.learning import Schedule, Trajectory, passes
 from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, learn_settling, settling_shapes
 from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
@@ -57,7 +57,6 @@ def train(
     schedule: Schedule,
     rng: np.random.Generator,
     progress: Callable[[int, int], object] | None = None,
-    feedback: str = TRANSPORTED,
     dynamics: str = TRACES,
 ) -> Trained:
     """Learn the synapses through time, then those of association, from whole episodes.
@@ -69,7 +68,6 @@ def train(
         schedule: of the temporal network.
         rng: draws everything random.
         progress: called with steps done and their total.
-        feedback: how errors come back to the hidden units of association, one of ``FEEDBACK``.
         dynamics: one of ``DYNAMICS``.
     """
     done, total = 0, passes(trajectories, schedule) + ALL_TICKS
@@ -84,5 +82,5 @@ def train(
     inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
     deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
     independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
-    association = learn_association(inputs, deltas, *layout, rng, tick, feedback, lengths, independent)
+    association = learn_association(inputs, deltas, *layout, rng, tick, lengths, independent)
     return Trained(network.with_association(association), energy)

@@ -127,12 +127,10 @@ def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_
     """Return ∂F/∂z (B, H), and the most that the bend of f adds to the curvature of F (B,).
 
     Args:
-        z: (B, H) hidden state.
-        mu: (B, H) its expectation.
+        z, mu: (B, H) hidden state, and its expectation.
         x: (B, X) senses and actions, less what is predicted past the state.
         W_F: (X, H) from hidden units to these.
-        pi_z: Π_z, precision of the hidden units.
-        pi_x: (B, X) Π_x, precision of the sensory units; 0 where a number was not sensed.
+        pi_z, pi_x: Π_z, and (B, X) Π_x, 0 where a number was not sensed.
     """
     f = activate(z)  # (B, H)
     gradient = feedback(f, x, W_F, pi_x)
@@ -151,9 +149,7 @@ def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_
 def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int) -> Array:
     """Return z_t (B, H) after steps down the energy from ``mu``; arguments as in ``energy_gradient``.
 
-    Args:
-        curvature: Π_z + max Π_x ‖W_F‖², spectral norm.
-        iterations: largest number of steps.
+    ``curvature`` is Π_z + max Π_x ‖W_F‖², ``iterations`` the largest number of steps.
     """
     z = mu.copy()
     for _ in range(iterations):

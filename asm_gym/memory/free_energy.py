@@ -150,10 +150,7 @@ class FreeEnergy:
         return self._of(self._given(moment), row, z)[1]
 
     def settled(self, moment: Before, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
-        """Return the row (D,) of lowest F over its ``free`` (D,) numbers and the state, and F there.
-
-        F has several valleys: ``free`` numbers should begin near likely values.
-        """
+        """Return the row (D,) of lowest F over its ``free`` (D,) numbers, which begin near it, and F there."""
         from scipy.optimize import minimize  # takes a third of a second to import
 
         spread, count = self.senses.spread, int(free.sum())
@@ -198,10 +195,7 @@ class FreeEnergy:
         return self.senses.size + len(self.senses.spec.motor)
 
     def _read(self, moment: Before, row: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return senses (S,), command (A + 1,), inputs (I,) and changes (X,) of a row.
-
-        Not rounded as those of ``StreamScaler.read`` are: L-BFGS takes rounding for valleys.
-        """
+        """Return senses (S,), command (A + 1,), inputs (I,) and changes (X,) of a row, unrounded for L-BFGS."""
         senses, spec, before = self.senses, self.senses.spec, moment.before[0]
         value, moved = (row - senses.mean) / senses.spread, (row - before) / senses.change
         x = np.concatenate([value[spec.sensory], moved[senses.slow]])

@@ -126,13 +126,9 @@ class Learner(ABC):
         names: of those that are learned.
         schedule: how to learn.
         rng: draws the first direction of the power iteration.
-
-    Attributes:
-        norm: ‖W_F‖², spectral.
-        early: 1 if running alone is drawn for the row to come, 0 if for the row itself.
     """
 
-    early: int
+    early: int  # 1 if running alone is drawn for the row to come, 0 if for the row itself
 
     def __init__(self, weights: Any, names: Collection[str], schedule: Schedule, rng: np.random.Generator) -> None:
         self.weights, self.schedule = weights, schedule
@@ -187,17 +183,7 @@ def one_after_another(trajectories: Sequence[Trajectory], size: int, rng: np.ran
 
 
 class Practice:
-    """Streams that a learner follows.
-
-    Args:
-        learner: changes its synapses.
-        size: B.
-        rng: draws cues and which streams run on alone.
-
-    Attributes:
-        state: (B, Z) what is carried from row to row.
-        cue: (B, 1) rows that must be read first.
-    """
+    """``size`` streams that a learner follows; ``rng`` draws their cues and which run on alone."""
 
     def __init__(self, learner: Learner, size: int, rng: np.random.Generator) -> None:
         self.learner, self.rng = learner, rng
@@ -207,11 +193,7 @@ class Practice:
         self._alone = np.zeros((size, 1), np.bool_)
 
     def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:
-        """Learn from the moments; return the sum of all energies.
-
-        Args:
-            free: probability of running on alone in a row after the cue.
-        """
+        """Learn from the moments, alone after the cue with probability ``free``; return the sum of all energies."""
         total, early = 0.0, self.learner.early
         for now in moments:
             state = np.where(now.begins, np.float32(0), self.state)

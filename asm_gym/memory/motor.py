@@ -122,17 +122,7 @@ def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[
 
 
 def learn_motor(m: Array, commands: Array, units: int, rng: np.random.Generator) -> Motor:
-    """Learn the synapses from N rows in random order.
-
-    Args:
-        m: (N, I) situations.
-        commands: (N, A) the next command in each.
-        units: M.
-        rng: draws initial weights and the order of rows.
-
-    Raises:
-        ValueError: fewer than one unit.
-    """
+    """Learn M ``units`` from situations (N, I) and the next command in each (N, A), in random order."""
     if units < 1:
         raise ValueError(f"units must be at least 1, got {units}")
     mean, spread = commands.mean(axis=0, dtype=np.float64), commands.std(axis=0, dtype=np.float64)

@@ -36,14 +36,7 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
 
 @kernel
 def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Array:
-    """Return L_t (B, K) from L_{t-1}.
-
-    Args:
-        L: (B, K), 0 before the first row.
-        units: (B, M) f(h).
-        state: (B, H) f(μ); not used where W_K has M columns only.
-        W_K, b_K: (K, M + H) or (K, M), and (K,).
-    """
+    """Return L_t (B, K) from L_{t-1}, f(h) (B, M) and f(μ) (B, H), which is not used where W_K has M columns only."""
     rates, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]
     rates[:, :M] = units
     rates[:, M:] = state[:, : W_K.shape[1] - M]

@@ -35,13 +35,9 @@ class Recalled(NamedTuple):
 
 
 def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -> Recalled:
-    """Recall online: predict every row, then read it.
+    """Recall online from a carried state ``c`` (B, I): predict every row, then read it.
 
-    Args:
-        network: the memory.
-        c: (B, I) the carried state before the first row.
-        senses: (T, B, S) standardised; NaN where missing.
-        commands: (T, B, A + 1), the last one a constant 1.
+    ``senses`` (T, B, S) are NaN where missing; the last of ``commands`` (T, B, A + 1) is a constant 1.
     """
     steps = []
     for x, u in zip(senses, commands, strict=True):

@@ -90,13 +90,7 @@ class SettlingNetwork(TemporalNetwork):
 def initial_settling_weights(
     hidden: int, sensory: int, motor: int, rng: np.random.Generator, least: float = LEAST
 ) -> SettlingWeights:
-    """Return random weights of about unit gain, with W_H near the identity, and no biases.
-
-    Args:
-        hidden, sensory, motor: H, S, A.
-        rng: draws them.
-        least: smallest weight of a unit on its own last state.
-    """
+    """Return random weights of about unit gain, W_H near the identity, with ``least`` to 1 on its diagonal."""
     weights = {n: np.zeros(shape, np.float32) for n, shape in settling_shapes(hidden, sensory, motor).items()}
     for name in ("W_H", "W_U", "W_F", "W_A"):
         W = weights[name]
@@ -111,9 +105,8 @@ def settling_change(
     """Return the change of each array: local products, averaged over the batch.
 
     Args:
-        before, z: (B, H) the state carried so far, and the inferred one.
+        before, h, z: (B, H) the state before, that of the motor prediction, and the inferred one.
         u: (B, A + 1) the action that μ used, and a constant 1.
-        h: (B, H) the state that the motor prediction used.
         errors: Π_z ε_z (B, H), Π_x ε_x (B, S) at ``z``, and ε_a (B, A).
         W_A: (A, H), by whose transpose ε_a comes back to h.
     """
@@ -160,8 +153,7 @@ class SettlingLearner(Learner):
 
         Args:
             before: (B, H) z_{t-1}.
-            u: (B, A + 1) the action as commanded, and a constant 1.
-            x: (B, S) what is sensed.
+            u, x: (B, A + 1) the action as commanded, and a constant 1; (B, S) what is sensed.
             rate: of the synapses.
             taken: (B, A + 1) the action that μ uses; ``u`` where None.
         """

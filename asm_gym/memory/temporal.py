@@ -90,8 +90,7 @@ class TemporalNetwork(ABC):
         Args:
             c: (B, I) the carried state.
             u: (B, A + 1) the action as commanded, standardised, and a constant 1.
-            x: (B, S) what was sensed, standardised.
-            seen: (B, S) 1 where ``x`` is a measurement, 0 where it is to be ignored.
+            x, seen: (B, S) what was sensed, standardised; 1 where it is a measurement, 0 where it is to be ignored.
         """
 
     @abstractmethod

@@ -118,12 +118,7 @@ def carry(
     iterations: int,
     context: bool,
 ) -> tuple[Array, Array]:
-    """Return f(μ_t) (B, H) and c_t (B, I); the state is inferred only where a sense is missing.
-
-    Args:
-        c, u, x, seen: (B, I), (B, A + 1), (B, S), (B, S) as in ``Network.follow``.
-        context: whether f(μ_t) is wanted; if not, and all senses are seen, it is 0.
-    """
+    """Return f(μ_t) (B, H), 0 unless ``context`` or a sense is missing, and c_t (B, I)."""
     B, S = x.shape
     rows = np.hstack((x, u))
     whole = seen.all()
@@ -203,8 +198,7 @@ def hebbian_change(
     """Apply the local learning rules.
 
     Args:
-        c: (B, I) the traces before.
-        u: (B, A + 1) the action, and a constant 1.
+        c, u: (B, I) the traces before; (B, A + 1) the action, and a constant 1.
         mu, z: (B, H) the expected state, and the inferred one.
         error: (B, S + A) Π_x ε_x at ``z``.
         pi_z: Π_z.
@@ -250,8 +244,7 @@ class TracesLearner(Learner):
 
         Args:
             c: (B, I) the traces before.
-            u: (B, A + 1) the action as commanded, and a constant 1.
-            x: (B, S) what is sensed.
+            u, x: (B, A + 1) the action as commanded, and a constant 1; (B, S) what is sensed.
             rate: of the synapses.
             taken: (B, A + 1) the action that the prediction of the senses uses; ``u`` where None.
         """

@@ -119,6 +119,10 @@ def write_monitor(path: str | Path, monitor: CalibratedMonitor) -> None:
     write_checkpoint(path, monitor.model.kind, header, packed(arrays))
 
 
+RETIRED = "feedback"
+"""A hyperparameter of older files that made no difference once a memory was fitted."""
+
+
 class Restorable(Protocol):
     """Anything that takes over a checkpoint of its own kind."""
 
@@ -137,7 +141,8 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
     if is_older(saved.arrays):
         raise ValueError(f"{path} was written by an older asm-gym: make it anew, by asm-gym fit or asm-gym babble")
     try:
-        return make(StreamSpec.from_json(saved.header["spec"]), **saved.header["hyperparameters"]).restore(saved)
+        how = {n: value for n, value in saved.header["hyperparameters"].items() if n != RETIRED}
+        return make(StreamSpec.from_json(saved.header["spec"]), **how).restore(saved)
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
 

@@ -8,8 +8,7 @@ from typing import Any
 
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.detection.tails import TAIL_INDEX
-from asm_gym.memory.association_learning import FEEDBACK, LEARNED
-from asm_gym.validation import check_choice, check_number
+from asm_gym.validation import check_number
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a damaged file must not ask for a thousand million."""
@@ -29,7 +28,6 @@ class MemoryConfig:
         prior_precision: Π_z, trust in what was expected. By default 30 by traces, for the firmer, the closer local
             learning is to the gradient; 1 by settling, where the senses are to move the state.
         sensory_precision: Π_x, trust in what is sensed.
-        feedback: how errors come back to the hidden units of association, a name of ``association_learning.FEEDBACK``.
         gains: a in (0, 1], weights of the newest step in the accumulated evidence; several, for faults that come as
             a knock and faults that creep.
         bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
@@ -43,7 +41,6 @@ class MemoryConfig:
     batch_size: int = 64
     prior_precision: float | None = None
     sensory_precision: float = 1.0
-    feedback: str = LEARNED
     gains: Sequence[float] = GAINS
     bound: float = BOUND
     shrinkage: float = 1e-3
@@ -60,6 +57,5 @@ class MemoryConfig:
             checked["iterations"] = check_number("iterations", self.iterations, low=1, high=MOST_ITERATIONS, whole=True)
         if self.prior_precision is not None:
             checked["prior_precision"] = check_number("prior_precision", self.prior_precision, above=0.0)
-        check_choice("feedback", self.feedback, FEEDBACK)
         for name, value in checked.items():
             object.__setattr__(self, name, value)

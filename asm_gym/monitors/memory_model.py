@@ -16,7 +16,6 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.adaptation import followed, specialise
 from asm_gym.memory.association import Association, association_shapes, existing
-from asm_gym.memory.association_learning import LEARNED
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
@@ -40,7 +39,6 @@ class MemoryModel(StreamModel):
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
         schedule: how to learn and to infer.
-        feedback: how errors come back to the hidden units of association, one of ``FEEDBACK``.
         dynamics: how the past is carried on, one of ``memory.dynamics.DYNAMICS``.
 
     Attributes:
@@ -58,11 +56,10 @@ class MemoryModel(StreamModel):
         hidden_size: int,
         association_size: int,
         schedule: Schedule,
-        feedback: str = LEARNED,
         dynamics: str = TRACES,
     ) -> None:
         super().__init__(spec)
-        self.feedback, self.dynamics = feedback, dynamics
+        self.dynamics = dynamics
         self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
@@ -95,8 +92,7 @@ class MemoryModel(StreamModel):
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
         trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
-        how = self.feedback, self.dynamics
-        trained = train(trajectories, *layout, self.schedule, rng, progress, *how)
+        trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
         learned = {**senses.arrays, "energy": trained.energy}
         network, completion = trained.network, Completion.fit(senses, streams)
         filled = completion.named() if completion is not None else {}

@@ -127,7 +127,7 @@ class NeuralASM(CalibratedMonitor):
             raise ValueError("a body model predicts torques, which only values=True judges")
         Derived.of(spec, friction=True, body=False, urdf=urdf)  # refuses a body model that does not fit
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
-        model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, config.feedback, dynamics)
+        model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         evidence = EvidenceDetection(spec, config.gains, config.bound, config.shrinkage, habituates, config.tail_index)
         checked = {name: getattr(evidence, name) for name in ("gains", "bound", "shrinkage", "tail_index")}
         self.config, self.habituates = replace(config, **checked), evidence.habituates
