@@ -10,6 +10,7 @@ from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, pool, stren
 from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps
 from asm_gym.detection.whitening import bounded
+from asm_gym.memory.energy import activate
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
 from asm_gym.memory.state import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
@@ -28,7 +29,8 @@ def expected_by(asm, state, rows):
     traces, expected = state.traces.copy(), state.expected.copy()
     if due.any():
         read = reading.commands[due], reading.senses[due], reading.seen[due]
-        expected[due], traces[due] = network.carry_on(traces[due], *read)
+        step = network.follow(traces[due], *read)
+        expected[due], traces[due] = activate(step.mu), step.traces
     a = network.association
     units = np.tanh(reading.inputs @ a.V.T)
     spread = np.clip(units @ a.W_S.T + a.b_S, *a.span_S)
