@@ -129,8 +129,10 @@ def test_a_model_that_learned_no_arrays_is_saved_by_its_own_state(tmp_path, regi
 
 
 def test_an_argument_of_robosuite_is_refused_by_name():
-    with pytest.raises(TypeError, match="robots"):
+    with pytest.raises(TypeError, match=r"asm_gym/Lift-v0 takes robot=, got robots='Panda'"):
         gym.make("asm_gym/Lift-v0", robots="Panda")
+    with pytest.raises(ValueError, match="makes Lift, got task='Door'"):
+        gym.make("asm_gym/Lift-v0", task="Door")
 
 
 def own_class():

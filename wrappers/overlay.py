@@ -1,80 +1,75 @@
-"""Pictures that show what the monitor thinks: a strip chart of surprise under every rendered frame."""
+"""Draw a strip chart of surprise under every rendered picture.
+
+The chart scrolls to the left, the latest step at its right edge. Its vertical axis is logarithmic and fixed in units of
+the threshold, so that a film does not rescale.
+"""
 
 from __future__ import annotations
 
-from typing import Any, SupportsFloat
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
+import matplotlib as mpl
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
-from asm_gym.validation import check_number, short_repr
-from asm_gym.wrappers.chart import StripChart, arrow, compose, project
-
-ARROW_M = 0.01
-"""Length of a force's arrow [m/N]."""
-
-ARROW_S = 0.5
-"""How long it is shown after the alarm that named the force [s]."""
+from asm_gym.episode import spans
+from asm_gym.spec import control_period
+from asm_gym.validation import check_number, check_text
 
 SURE = 0.9
 """Least probability at which a cause is named."""
 
-FELT = 1.0
-"""Least force that a fault presses with for an arrow [N]."""
+PAPER, INK, FAINT, RULE = "#14171c", "#f2f2f2", "#a0a8b2", "#343a42"
+CURVE, ALARM, FAULT = "#56B4E9", "#FF4B3E", "#E69F00"
+
+LOW, HIGH = 0.03, 30.0
+"""The vertical axis, in thresholds."""
+
+SCALE = 2
+"""Curves are drawn at this size and averaged down."""
+
+
+class Step(NamedTuple):
+    """What is drawn of a control step; ``ratio`` is surprise in thresholds, and may be infinite."""
+
+    ratio: float
+    alarm: bool
+    fault: bool
 
 
 class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Draws surprise, threshold, alarm and ground-truth fault under the pictures of a watched environment.
+    """Draw surprise, threshold, alarm and ground-truth fault under the pictures of a guarded environment.
 
-    Goes over ``NeuralASMSafety``, and under ``RecordVideo``. Reads ``info["asm"]`` (surprise, threshold, alarm,
-    intervened) and, where there is one, ``info["fault"]`` (truthy while a fault is active). Changes nothing but
-    what ``render`` returns.
+    Put it over ``NeuralASMSafety``, and under ``RecordVideo``. It changes nothing but what ``render`` returns.
 
     Args:
         env: an environment with ``render_mode="rgb_array"``.
-        caption: what to call the episode, such as the condition.
+        caption: a name for the episode, such as the condition.
         seconds: time the chart shows [s].
-        chart_height: [px]; a quarter of the picture where None.
-        camera: of the pictures; where it is given, an arrow shows the force that a fault presses with, or else that
-            the monitor takes a contact for, in environments of this package.
     """
 
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        caption: str = "",
-        seconds: float = 5.0,
-        chart_height: int | None = None,
-        camera: str | None = None,
-    ) -> None:
-        RecordConstructorArgs.__init__(self, caption=caption, seconds=seconds, chart_height=chart_height, camera=camera)
+    def __init__(self, env: gym.Env[Any, Any], caption: str = "", seconds: float = 5.0) -> None:
+        RecordConstructorArgs.__init__(self, caption=caption, seconds=seconds)
         gym.Wrapper.__init__(self, env)
         if env.render_mode != "rgb_array":
             raise ValueError(
                 f'SurpriseOverlay draws on pictures and needs render_mode="rgb_array", got {env.render_mode!r}: '
                 'make the environment with gym.make(..., render_mode="rgb_array")'
             )
-        if not isinstance(caption, str):
-            raise ValueError(f"caption must be a text, got {short_repr(caption)}")
-        self.caption = caption
-        self._seconds = check_number("seconds", seconds, above=0, high=3600)
-        if chart_height is not None:
-            check_number("chart_height", chart_height, low=1, high=4096, whole=True)
-        self._chart_height, self._camera = chart_height, camera
-        self._dt = _control_period(env)
-        self._chart: StripChart | None = None  # made at the first picture, whose width it needs
+        self.caption = caption and check_text("caption", caption)
+        self._dt = control_period(env)
+        self._shown = max(2, round(check_number("seconds", seconds, above=0, high=3600) / self._dt))  # steps
         self._clear()
 
     def _clear(self) -> None:
-        self._ratio: list[float] = []  # surprise / threshold, one a step
-        self._alarm: list[bool] = []
-        self._fault: list[bool] = []
+        self._steps: list[Step] = []
         self._intervened = False
-        self._cause = self._completed = ""  # named at the last alarm
-        self._force: dict[str, Any] | None = None
-        self._since_force = 0  # steps
+        self._cause = self._completed = ""
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -89,67 +84,115 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 'SurpriseOverlay found no info["asm"]: put it over NeuralASMSafety, '
                 f"as in SurpriseOverlay(NeuralASMSafety(env, monitor)); it is over {self.env}"
             )
-        surprise, threshold = float(asm["surprise"]), float(asm["threshold"])
-        if not threshold > 0:
-            raise ValueError(f"a log axis needs a threshold > 0, got {threshold}")
-        self._ratio.append(surprise / threshold)
-        self._alarm.append(bool(asm["alarm"]))
-        self._fault.append(bool(info.get("fault")))
+        ratio = float(asm["surprise"]) / float(asm["threshold"])
+        self._steps.append(Step(ratio, bool(asm["alarm"]), bool(info.get("fault"))))
         self._intervened = bool(asm["intervened"])
         cause = asm.get("cause") or {}
         if cause.get("family"):
             sure = cause["family"] != "unknown" and cause["probability"] >= SURE
             self._cause = " ".join(filter(None, (cause["family"], cause["part"]))) if sure else ""
-        self._since_force += 1
-        if cause.get("force", {}).get("link"):
-            self._force, self._since_force = cause["force"], 0
         completed = asm.get("completed") or ()
         self._completed = f"{', '.join(completed)} completed" if completed else ""
         return observation, reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8]:
-        """(H + chart height, W, 3) uint8."""
+        """Return the picture with the chart under it, (H + H/4, W, 3) uint8."""
         frame = np.asarray(self.env.render())
         height, width = frame.shape[:2]
-        frame = self._with_arrow(frame)
-        if self._chart is None or self._chart.width != width:
-            # In units of the threshold, the chart is the same whatever the monitor.
-            steps = max(2, round(self._seconds / self._dt))
-            self._chart = StripChart(width, self._chart_height or max(72, height // 4), steps)
-        strip = self._chart.draw(self._ratio, self._alarm, self._fault)
-        return compose(frame, strip, bool(self._alarm and self._alarm[-1]), self._line())
+        chart = strip_chart(width, max(72, height // 4), self._steps[-self._shown :], self._shown)
+        picture = np.concatenate([frame, chart])
+        return annotated(picture, height, self.line(), bool(self._steps and self._steps[-1].alarm))
 
-    def _with_arrow(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """An arrow that ends where the arm is pressed: by a fault, or else by what the monitor named."""
-        if self._camera is None:
-            return frame
-        from asm_gym.envs.robosuite_env import RobosuiteEnv  # charts need no robosuite
-
-        inner = self.env.unwrapped
-        if not isinstance(inner, RobosuiteEnv):
-            return frame
-        model, data = inner.simulation.model, inner.simulation.data
-        pressed = int(np.argmax(np.linalg.norm(data.xfrc_applied[:, :3], axis=1)))
-        force, where = data.xfrc_applied[pressed, :3], data.xipos[pressed]
-        newtons = float(np.linalg.norm(force))
-        if newtons < FELT:
-            if self._force is None or self._since_force * self._dt >= ARROW_S:
-                return frame
-            force, where = np.asarray(self._force["vector"]), data.body(self._force["link"]).xpos
-            newtons = self._force["newtons"]
-        eye = model.camera(self._camera).id
-        axes, size = data.cam_xmat[eye].reshape(3, 3), (frame.shape[0], frame.shape[1])
-        ends = np.stack([where - ARROW_M * force, where])
-        seen = project(ends, data.cam_xpos[eye], axes, float(model.cam_fovy[eye]), size)
-        return arrow(frame, seen, f"{newtons:.0f} N")
-
-    def _line(self) -> str:
-        time = f"{len(self._ratio) * self._dt:.2f} s"
+    def line(self) -> str:
+        """Return the line of text at the top of the picture."""
+        time = f"{len(self._steps) * self._dt:.2f} s"
         acting = "override acting" if self._intervened else "policy acting"
         return "   ".join(part for part in (self.caption, time, acting, self._completed or self._cause) if part)
 
 
-def _control_period(env: gym.Env[Any, Any]) -> float:
-    """[s] from the stream's spec, or from the frame rate of environments that have no stream."""
-    spec = getattr(env.unwrapped, "stream_spec", None)
-    return float(spec.dt if spec is not None else 1.0 / env.metadata.get("render_fps", 20))
+def strip_chart(width: int, height: int, history: list[Step], shown: int) -> NDArray[np.uint8]:
+    """Return a chart of the last steps, (height, width, 3) uint8.
+
+    Args:
+        width: [px].
+        height: [px].
+        history: at most ``shown`` steps, the latest last.
+        shown: steps from edge to edge.
+    """
+    bar = max(12, height // 7)  # [px] height of the fault's bar, and of the alarm's
+    top, bottom = bar + 3, height - bar - 3
+
+    def y(ratio: Any) -> Any:
+        """[px] of a surprise in thresholds; NaN at the top."""
+        ratio = np.clip(np.where(np.isnan(ratio), HIGH, ratio), LOW, HIGH)
+        return bottom - (bottom - top) * np.log(ratio / LOW) / np.log(HIGH / LOW)
+
+    ratios = np.array([step.ratio for step in history])
+    edges = width * (1.0 - (len(history) - np.arange(len(history) + 1)) / shown)  # [px] of each step
+    image = _paper(width, height, tuple(float(y(level)) for level in (10.0, 1.0, 0.1)))
+    pen = ImageDraw.Draw(image)
+    runs = [spans(np.array([getattr(step, name) for step in history], bool)) for name in ("fault", "alarm")]
+    bars = ("fault", runs[0], 0, FAULT), ("alarm", runs[1], height - bar, ALARM)
+    for _, found, start_y, colour in bars:
+        for start, stop in found:
+            left, right = edges[start] * SCALE, edges[stop] * SCALE
+            pen.rectangle((left, start_y * SCALE, right, (start_y + bar) * SCALE - 1), fill=colour)
+    if len(history) > 1:
+        points = np.column_stack([edges[1:], y(ratios)]) * SCALE
+        pen.line(points.ravel().tolist(), fill=CURVE, width=2 * SCALE, joint="curve")
+    image = image.reduce(SCALE)
+    size = max(10, bar - 3)
+    for level, text in ((10.0, "× 10"), (1.0, "threshold"), (0.1, "× 0.1")):
+        _paste(image, _text(text, size, INK if level == 1.0 else FAINT), 3, float(y(level)))
+    for name, found, start_y, colour in bars:
+        word = _text(name, size, "#000000", colour)
+        for start, stop in found:
+            left = max(0.0, edges[start])
+            if edges[stop] - left > word.width:
+                _paste(image, word, left, start_y + bar / 2)
+    return np.asarray(image)
+
+
+def annotated(picture: NDArray[np.uint8], height: int, line: str, alarm: bool) -> NDArray[np.uint8]:
+    """Return a picture with a line of text at its top; in alarm, its first ``height`` rows [px] get a red border."""
+    image, width = Image.fromarray(picture), picture.shape[1]
+    size, margin = max(11, min(18, width // 32)), max(4, width // 100)  # [px]
+    while len(line) > 1 and _font(size).getlength(line) > width - 5 * margin:
+        line = line[:-2].rstrip() + "…"
+    text = _text(line, size, INK)
+    _paste(image, text, 2 * margin, 2 * margin + text.height / 2)
+    if alarm:
+        ImageDraw.Draw(image).rectangle((0, 0, width - 1, height - 1), outline=ALARM, width=margin)
+        word = _text("ALARM", 2 * size, "#000000", ALARM)
+        _paste(image, word, width - word.width, height - word.height / 2)
+    return np.asarray(image)
+
+
+def _paper(width: int, height: int, levels: tuple[float, float, float]) -> Image.Image:
+    """Return an empty chart at the scale of the curves: lines at the decades, dashes at the threshold between them."""
+    image = Image.new("RGB", (width * SCALE, height * SCALE), PAPER)
+    pen, right = ImageDraw.Draw(image), width * SCALE
+    for y, colour, dash in zip(levels, (RULE, INK, RULE), (right, 6 * SCALE, right), strict=True):
+        for x in range(0, right, dash * 10 // 6):
+            pen.line([(x, y * SCALE), (x + dash, y * SCALE)], fill=colour, width=SCALE)
+    return image
+
+
+@lru_cache(maxsize=64)
+def _text(text: str, size: int, ink: str, paper: str = PAPER) -> Image.Image:
+    """Return one line on a background of its own, readable on any picture."""
+    font = _font(size)
+    ascent, descent = font.getmetrics()
+    image = Image.new("RGB", (round(font.getlength(text)) + size // 2, ascent + descent // 2 + 1), paper)
+    ImageDraw.Draw(image).text((size // 4, ascent), text, font=font, fill=ink, anchor="ls")
+    return image
+
+
+def _paste(image: Image.Image, text: Image.Image, left: float, middle: float) -> None:
+    image.paste(text, (round(left), round(middle - text.height / 2)))
+
+
+@lru_cache(maxsize=16)
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    """Return DejaVu Sans at this size [px]: it comes with matplotlib, and unlike Pillow's own font has Greek and ×."""
+    return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), size)

@@ -95,7 +95,7 @@ def record_video(
             made = gym.make(trial.env_id, **dict(config.settings), **PICTURE)
             with closing(made), staged(trial, config, made) as faulty:
                 guarded = _guarded(faulty, monitor, trial)
-                watched = SurpriseOverlay(guarded, caption=trial.kind, camera=PICTURE["camera"])
+                watched = SurpriseOverlay(guarded, caption=trial.kind)
                 play(trial, config, watched, lambda _, film=watched: writer.append_data(film.render()))
             progress(k + 1, len(trials))
     return path
