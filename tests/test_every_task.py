@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import warnings
+from functools import cache
 
 import gymnasium as gym
 import numpy as np
@@ -35,10 +36,11 @@ def digest(env, seed=5, steps=20):
 
 @pytest.fixture(scope="module")
 def elsewhere():
-    """The same hashes from another process with another hash seed, made in another order."""
+    """Function of the same hashes from another process with another hash seed, made in another order."""
     code = "import json, tests.test_every_task as t; print(json.dumps(t.all_digests()))"
     environment = {**os.environ, "PYTHONHASHSEED": "7", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    return subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    return cache(lambda: json.loads(process.communicate()[0]))
 
 
 def all_digests():
@@ -48,16 +50,6 @@ def all_digests():
         hashes[name] = digest(env)
         env.close()
     return hashes
-
-
-# Asked for once, read by every test below: reading it twice would wait for ever.
-_answers: dict[str, str] = {}
-
-
-def answer(process, name):
-    if not _answers:
-        _answers.update(json.loads(process.communicate()[0]))
-    return _answers[name]
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -81,7 +73,7 @@ def test_a_task_keeps_the_contract(name, elsewhere):
     here = digest(env)
     env.close()
     env.close()
-    assert here == answer(elsewhere, name)
+    assert here == elsewhere()[name]
 
 
 @pytest.mark.parametrize("name", TASKS)

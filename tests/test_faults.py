@@ -1,6 +1,5 @@
 """Faults change the simulation while they act, nothing before, and nothing after a reset."""
 
-import dataclasses
 from contextlib import ExitStack
 
 import gymnasium as gym
@@ -14,7 +13,6 @@ from asm_gym.faults.suite import (
     GROUPS,
     HARMLESS,
     KINDS,
-    SEVERITIES,
     harmless_variation,
     kinds_of,
     possible,
@@ -88,7 +86,7 @@ def test_a_fault_acts_on_time_and_only_then(stack, course, kind):
     assert (len(inner.edits), inner.corruptions, inner.deliveries, inner.substep_hooks) == (0, [], [], [])
 
 
-@pytest.mark.parametrize("fault", [Push(), WeakJoint(), FrozenEncoder(), faults.Payload(), faults.HeldByPerson()])
+@pytest.mark.parametrize("fault", [Push(onset=4), WeakJoint(onset=4), faults.Payload(onset=4)])
 def test_after_a_hard_reset_the_environment_is_as_new(lift, fault):
     def second_episode(env):
         """The episode after one that was cut short while the fault was active, up to its next onset."""
@@ -99,20 +97,8 @@ def test_after_a_hard_reset_the_environment_is_as_new(lift, fault):
         return np.array([env.step(np.full(7, 0.2, np.float32))[4]["stream"] for _ in range(4)])
 
     fresh = gym.make("asm_gym/Lift-v0")
-    fault = dataclasses.replace(fault, onset=4)
     np.testing.assert_array_equal(second_episode(FaultInjection(lift, [fault])), second_episode(fresh))
     fresh.close()
-
-
-def test_severities_grow(stack, course):
-    actions, healthy = course
-    for kind in ("push", "encoder_bias", "action_bias", "payload", "held_by_person"):
-        sizes = []
-        for severity in SEVERITIES:
-            fault = suite_fault(kind, stack.unwrapped, severity, ONSET, seed=4)
-            stream, _ = play(FaultInjection(stack, [fault]), actions)
-            sizes.append(np.abs((stream - healthy)[ONSET : ONSET + 8, :14]).max())
-        assert sizes[0] < sizes[1] < sizes[2], kind
 
 
 def test_every_kind_of_the_suite_is_in_one_group_and_another_kind_moves_none():
@@ -161,13 +147,10 @@ def test_two_weaknesses_of_one_joint_multiply_across_wrappers(lift):
 def test_the_stream_carries_the_action_as_commanded(lift):
     env = FaultInjection(lift, [faults.SignFlip(axis=0, onset=0)])
     env.reset(seed=0)
-    forth = np.array([1, 0, 0, 0, 0, 0, 0], np.float32)
-    x = []
-    for _ in range(6):
-        stream = env.step(forth)[4]["stream"]
-        spec = lift.unwrapped.stream_spec
-        np.testing.assert_array_equal(stream[spec.motor], forth)
-        x.append(stream[spec.slices["hand_position"]][0])
+    forth, spec = np.array([1, 0, 0, 0, 0, 0, 0], np.float32), lift.unwrapped.stream_spec
+    streams = np.array([env.step(forth)[4]["stream"] for _ in range(6)])
+    np.testing.assert_array_equal(streams[:, spec.motor], np.tile(forth, (6, 1)))
+    x = streams[:, spec.slices["hand_position"]][:, 0]
     assert x[-1] < x[0] - 0.005
     env.reset()
 
@@ -175,11 +158,8 @@ def test_the_stream_carries_the_action_as_commanded(lift):
 def test_a_person_holds_on_with_no_more_than_their_force(lift):
     env = FaultInjection(lift, [faults.HeldByPerson(newtons=30.0, stiffness=5000.0, onset=0)])
     env.reset(seed=0)
-    body = lift.unwrapped.simulation.model.body("robot0_link5").id
-    sizes = []
-    for _ in range(20):
-        env.step(np.array([0, 1, 0, 0, 0, 0, 0], np.float32))
-        sizes.append(np.linalg.norm(lift.unwrapped.simulation.data.xfrc_applied[body, :3]))
+    force = lift.unwrapped.simulation.data.body("robot0_link5").xfrc_applied[:3]
+    sizes = [env.step(np.eye(7, dtype=np.float32)[1]) and np.linalg.norm(force) for _ in range(20)]
     assert max(sizes) == pytest.approx(30.0, rel=1e-6)
     env.reset()
 
@@ -232,27 +212,18 @@ def test_a_fault_that_the_robot_cannot_have_is_refused(lift, fault, message):
 
 
 @pytest.mark.parametrize(
-    ("make", "message"),
+    ("kind", "bad"),
     [
-        (lambda: Push(onset=-1), "onset.*-1"),
-        (lambda: Push(duration=0), "duration.*0"),
-        (lambda: Push(newtons=float("nan")), "newtons.*nan"),
-        (lambda: Push(newtons="a"), "newtons.*'a'"),
-        (lambda: Push(direction=(0, 0, 0)), "direction"),
-        (lambda: Push(direction=(float("inf"), 0, 0)), "direction"),
-        (lambda: Push(onset=2.5), "onset.*2.5"),
-        (lambda: WeakJoint(joint=1.5), "joint.*1.5"),
-        (lambda: WeakJoint(strength=1.5), "strength.*1.5"),
-        (lambda: faults.Payload(kilograms=0), "kilograms.*0"),
-        (lambda: faults.Spikes(probability=2), "probability.*2"),
-        (lambda: faults.Delay(steps=0), "steps.*0"),
-        (lambda: faults.Touch(newtons=3.0), "newtons.*3.0"),
-        (lambda: faults.NoisySensors(factor=0.5), "factor.*0.5"),
+        *((Push, bad) for bad in ({"onset": -1}, {"onset": 2.5}, {"duration": 0}, {"newtons": float("nan")})),
+        *((Push, bad) for bad in ({"newtons": "a"}, {"direction": (0, 0, 0)}, {"direction": (float("inf"), 0, 0)})),
+        *((WeakJoint, bad) for bad in ({"joint": 1.5}, {"strength": 1.5})),
+        *[(faults.Payload, {"kilograms": 0}), (faults.Spikes, {"probability": 2}), (faults.Delay, {"steps": 0})],
+        *[(faults.Touch, {"newtons": 3.0}), (faults.NoisySensors, {"factor": 0.5})],
     ],
 )
-def test_a_bad_description_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_a_bad_description_is_refused(kind, bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        kind(**bad)
 
 
 def test_unknown_kinds_and_severities_list_the_known(lift):
@@ -271,12 +242,3 @@ def test_faults_need_one_of_our_environments(lift):
         FaultInjection(lift, ["push"])
     with pytest.raises(TypeError, match="Sequence"):
         FaultInjection(lift, Push())
-
-
-def test_closing_undoes_a_running_fault():
-    env = FaultInjection(gym.make("asm_gym/Lift-v0"), [FrozenEncoder(onset=0)])
-    env.reset(seed=0)
-    env.step(np.zeros(7, np.float32))
-    inner = env.unwrapped
-    env.close()
-    assert inner.corruptions == []

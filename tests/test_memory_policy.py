@@ -89,16 +89,6 @@ def test_where_one_in_five_closes_the_expected_grip_is_their_mean_and_not_their_
     assert learned.command(m[:1])[0, 0] == pytest.approx(-0.6, abs=0.05)
 
 
-def test_synapses_forget_what_nothing_asks_for(monkeypatch):
-    rng = np.random.default_rng(0)
-    m, commands = rng.normal(size=(500, 6)).astype(np.float32), rng.normal(size=(500, 1)).astype(np.float32)
-    sizes = []
-    for forgetting in (0.0, 3.0):
-        monkeypatch.setattr(motor, "FORGETTING", forgetting)
-        sizes.append(np.abs(learn_motor(m, commands, 16, np.random.default_rng(0)).V).mean())
-    assert sizes[1] < 0.5 * sizes[0]
-
-
 def scene() -> StreamSpec:
     channels = (
         Channel("hand_position", 2, "m", group="hand"),
@@ -139,13 +129,6 @@ def test_the_memory_steers_to_the_goal_and_closes_there(pilot):
     assert sum(rollout(env, policy, seed) for seed in range(1000, 1020)) >= 19
 
 
-def test_without_a_motor_association_the_traces_alone_know_what_is_commanded_next():
-    env = Point()
-    episodes = taught(env)
-    asm = NeuralASM(episodes[0].spec, **SMALL).fit(episodes)
-    assert sum(rollout(env, NeuralASMPolicy(asm, env), seed) for seed in range(1000, 1020)) > 10
-
-
 def test_a_memory_file_is_a_policy_and_acts_the_same(pilot, tmp_path):
     env = Point()
     pilot.save(tmp_path / "skills.asm")
@@ -160,17 +143,6 @@ def test_a_memory_file_is_a_policy_and_acts_the_same(pilot, tmp_path):
         np.testing.assert_array_equal(*actions)
         assert env.action_space.contains(actions[0])
         observation, *_ = env.step(actions[0])
-
-
-def test_an_episode_that_starts_forgets_the_last(pilot):
-    env = Point()
-    policy = NeuralASMPolicy(pilot, env)
-    observation, _ = env.reset(seed=1)
-    _, state = policy.predict(observation)
-    _, later = policy.predict(observation, state)
-    _, again = policy.predict(observation, state, np.array([True]))
-    assert later.memory.model.history.steps.tolist() == [2]
-    assert again.memory.model.history.steps.tolist() == [1]
 
 
 def test_learning_to_act_leaves_the_surprise_as_it_was(pilot):
@@ -189,11 +161,6 @@ def told(shares: list[float], dt: float = 0.05) -> NDArray[np.float64]:
     return np.stack(actions)[:, 2]
 
 
-def test_a_gripper_is_told_at_first_what_is_likelier():
-    assert told([0.1]) == [1.0]
-    assert told([-0.1]) == [-1.0]
-
-
 @pytest.mark.parametrize("sure", [1.0, 0.5, 0.2, 0.1])
 def test_a_gripper_changes_once_the_sum_of_what_speaks_for_it_reaches_the_bound(sure):
     ratio = np.exp(-0.05 / FORGETS)
@@ -202,15 +169,6 @@ def test_a_gripper_changes_once_the_sum_of_what_speaks_for_it_reaches_the_bound(
     found = told([1.0] + [1.0 - 2 * sure] * (waits + 1))[1:]
     np.testing.assert_array_equal(found, [1.0] * waits + [-1.0])
     assert reached.any()
-
-
-def test_what_is_hardly_ever_expected_is_never_done():
-    assert 0.05 * 0.04 / (1 - np.exp(-0.05 / FORGETS)) < ENOUGH
-    assert set(told([0.92] * 2000)) == {1.0}
-
-
-def test_a_gripper_that_lets_go_is_not_told_to_close_by_what_is_sensed_meanwhile():
-    assert told([1.0] + [-1.0] * 4 + [0.6] * 3 + [-1.0] * 5).tolist() == [1.0] * 4 + [-1.0] * 9
 
 
 def test_with_long_steps_it_is_still_the_likelier_command_that_is_given():
@@ -265,16 +223,6 @@ def test_learning_to_act_refuses_what_it_cannot_learn_from(pilot):
         learn_to_act(silent, [Episode.from_stream(np.zeros((5, 3)), silent.spec)])
     with pytest.raises(ValueError, match="units must be at least 1, got 0"):
         learn_to_act(pilot, taught(Point(), 2), 0)
-
-
-def test_a_damaged_motor_association_is_refused(pilot, tmp_path):
-    pilot.save(tmp_path / "broken.asm")
-    saved = read_checkpoint(tmp_path / "broken.asm", pilot.kind)
-    arrays = unpacked(saved.arrays) | {"motor_D": np.zeros((3, 1), np.float32)}
-    header = saved.header | {"shapes": {name: list(array.shape) for name, array in arrays.items()}}
-    write_checkpoint(tmp_path / "broken.asm", pilot.kind, header, arrays)
-    with pytest.raises(ValueError, match="motor_D should be of shape"):
-        NeuralASM.load(tmp_path / "broken.asm")
 
 
 def test_a_motor_association_that_read_its_senses_otherwise_is_refused(pilot, tmp_path):

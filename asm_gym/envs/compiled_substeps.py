@@ -44,8 +44,7 @@ MOTOR = slice(JOINTS, 2 * JOINTS)
 WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
 CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
 VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
-OUTSIDE = slice(2 * JOINTS + 15, 2 * JOINTS + 18)
-SAMPLE = OUTSIDE.stop
+SAMPLE = VELOCITY.stop
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
@@ -75,8 +74,8 @@ def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
 def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
     """Write the sensor values of every arm after substep ``k`` into samples (A, K, SAMPLE)."""
     edited = nominal.model != 0
-    mass = nominal.mass if edited else views.mass
-    bias = nominal.bias if edited else views.bias
+    mass = nominal.mass if edited else views.qM
+    bias = nominal.bias if edited else views.qfrc_bias
     needed = np.empty(JOINTS)
     for a in range(len(arms.joints)):
         row = samples[a, k]
@@ -86,7 +85,7 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
             i = arms.tree[a, t]
             if i < 0:
                 break
-            j, at = i, views.mass_address[i]
+            j, at = i, views.dof_Madr[i]
             while j >= 0:
                 for r in range(n):
                     if arms.dofs[a, r] == i:
@@ -94,24 +93,23 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
                     elif arms.dofs[a, r] == j:
                         needed[r] += mass[at] * views.qacc[i]
                 at += 1
-                j = views.parent[j]
+                j = views.dof_parentid[j]
         for i in range(n):
             dof = arms.dofs[a, i]
-            damped = views.passive[dof] + (views.damping[dof] - nominal.damping[dof]) * views.qvel[dof]
-            row[i] = needed[i] + bias[dof] - damped - views.actuator[dof]
-            row[JOINTS + i] = views.actuator[dof]
+            damped = views.qfrc_passive[dof] + (views.dof_damping[dof] - nominal.damping[dof]) * views.qvel[dof]
+            row[i] = needed[i] + bias[dof] - damped - views.qfrc_actuator[dof]
+            row[JOINTS + i] = views.qfrc_actuator[dof]
         at = arms.wrench[a]
         for i in range(6):
             row[2 * JOINTS + i] = views.sensordata[at + i]
         for i in range(3):
-            row[2 * JOINTS + 6 + i] = row[2 * JOINTS + 15 + i] = 0.0
+            row[2 * JOINTS + 6 + i] = 0.0
         for t in range(arms.bodies.shape[1]):
             body = arms.bodies[a, t]
             if body < 0:
                 break
             for i in range(3):
-                row[2 * JOINTS + 6 + i] += views.contact[body, 3 + i] - views.applied[body, i]
-                row[2 * JOINTS + 15 + i] += views.contact[body, 3 + i]
+                row[2 * JOINTS + 6 + i] += views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
         hand_velocity(views, arms, a, views.subtree_com[arms.root[a]], row[2 * JOINTS + 9 :])
 
 
@@ -236,14 +234,13 @@ def quantise(row: Floats, steps: Floats, carried: Ints, stream: NDArray[np.float
 
 
 @compiled
-def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Floats) -> tuple[float, float, float]:
+def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Floats) -> float:
     """Write the mean, signed peak and last of the first ``count`` substeps into mean, peak and last (A, SAMPLE).
 
     Returns:
-        The largest contact force on an arm, the largest force on it from anything outside, and the mean of the latter
-        [N], norms of their vectors; not finite where a sample is not.
+        The largest norm of the contact force on an arm [N]; not finite where a sample is not.
     """
-    largest = external = total = 0.0
+    largest = 0.0
     for a in range(len(samples)):
         mean[a] = 0.0
         peak[a] = 0.0
@@ -258,11 +255,7 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
             force = np.sqrt(np.sum(row[2 * JOINTS + 6 : 2 * JOINTS + 9] ** 2))
             if not force <= largest and largest == largest:
                 largest = force
-            outside = np.sqrt(np.sum(row[2 * JOINTS + 15 : 2 * JOINTS + 18] ** 2))
-            total += outside / count
-            if not outside <= external and external == external:
-                external = outside
-    return largest, external, total
+    return largest
 
 
 @compiled

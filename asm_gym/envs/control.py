@@ -71,7 +71,7 @@ def solve(M: Floats, n: int, b: Floats) -> None:
 def mass_matrix(sparse: Floats, views: Views, dofs: Ints, n: int, M: Floats) -> None:
     """Writes the mass matrix of one arm's joints (n, n), numbered from the base on, into M."""
     for i in range(n):
-        at = views.mass_address[dofs[i]]
+        at = views.dof_Madr[dofs[i]]
         j, column = dofs[i], i
         while j >= 0 and column >= 0:
             while column >= 0 and dofs[column] > j:
@@ -80,7 +80,7 @@ def mass_matrix(sparse: Floats, views: Views, dofs: Ints, n: int, M: Floats) -> 
                 M[i, column] = sparse[at]
                 M[column, i] = sparse[at]
             at += 1
-            j = views.parent[j]
+            j = views.dof_parentid[j]
 
 
 @compiled
@@ -203,9 +203,9 @@ def _believed(views: Views, nominal: NominalViews, arms: Arms, a: int, M: Floats
     """Writes mass matrix (n, n) and bias (n,) of arm ``a``, as the robot knows itself, into M and h."""
     n, dofs = arms.joints[a], arms.dofs[a]
     edited = nominal.model != 0
-    mass_matrix(nominal.mass if edited else views.mass, views, dofs, n, M)
+    mass_matrix(nominal.mass if edited else views.qM, views, dofs, n, M)
     for i in range(n):
-        h[i] = nominal.bias[dofs[i]] if edited else views.bias[dofs[i]]
+        h[i] = nominal.bias[dofs[i]] if edited else views.qfrc_bias[dofs[i]]
 
 
 @compiled
@@ -213,7 +213,7 @@ def _command(views: Views, arms: Arms, a: int, tau: Floats) -> None:
     """Gives the motors of arm ``a`` torques (n,), as far as they go."""
     for i in range(arms.joints[a]):
         m = arms.motors[a, i]
-        views.ctrl[m] = min(max(tau[i], views.ctrlrange[m, 0]), views.ctrlrange[m, 1])
+        views.ctrl[m] = min(max(tau[i], views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
 
 
 @compiled

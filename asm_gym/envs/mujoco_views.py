@@ -21,7 +21,7 @@ OSC_POSE, JOINT_POSITION = 0, 1
 
 
 class Views(NamedTuple):
-    """MuJoCo's own arrays of one model and its data, not copies, and the addresses of both."""
+    """MuJoCo's own arrays of one model and its data, by its own names and not copied; and the addresses of both."""
 
     model: int
     data: int
@@ -29,50 +29,28 @@ class Views(NamedTuple):
     qvel: Floats  # (nv,)
     qacc: Floats  # (nv,)
     ctrl: Floats  # (nu,)
-    mass: Floats  # (nM,) the sparse mass matrix
-    bias: Floats  # (nv,) Coriolis, centrifugal and gravity
-    passive: Floats  # (nv,)
-    actuator: Floats  # (nv,)
+    qM: Floats  # noqa: N815  # (nM,) the sparse mass matrix
+    qfrc_bias: Floats  # (nv,) Coriolis, centrifugal and gravity
+    qfrc_passive: Floats  # (nv,)
+    qfrc_actuator: Floats  # (nv,)
     cdof: Floats  # (nv, 6)
     cvel: Floats  # (nbody, 6)
     subtree_com: Floats  # (nbody, 3)
     site_xpos: Floats  # (nsite, 3)
     site_xmat: Floats  # (nsite, 9)
     sensordata: Floats
-    contact: Floats  # (nbody, 6) contact and applied force: torque, then force
-    applied: Floats  # (nbody, 6) applied force: force, then torque
-    ctrlrange: Floats  # (nu, 2)
-    damping: Floats  # (nv,)
-    mass_address: NDArray[np.int32]  # (nv,) where a row of `mass` begins
-    parent: NDArray[np.int32]  # (nv,) the next joint towards the base, -1 at its end
+    cfrc_ext: Floats  # (nbody, 6) contact and applied force: torque, then force
+    xfrc_applied: Floats  # (nbody, 6) applied force: force, then torque
+    actuator_ctrlrange: Floats  # (nu, 2)
+    dof_damping: Floats  # (nv,)
+    dof_Madr: NDArray[np.int32]  # noqa: N815  # (nv,) where a row of `qM` begins
+    dof_parentid: NDArray[np.int32]  # (nv,) the next joint towards the base, -1 at its end
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Views:
-        """The arrays of a loaded model."""
-        return cls(
-            model=model._address,
-            data=data._address,
-            qpos=data.qpos,
-            qvel=data.qvel,
-            qacc=data.qacc,
-            ctrl=data.ctrl,
-            mass=data.qM,
-            bias=data.qfrc_bias,
-            passive=data.qfrc_passive,
-            actuator=data.qfrc_actuator,
-            cdof=data.cdof,
-            cvel=data.cvel,
-            subtree_com=data.subtree_com,
-            site_xpos=data.site_xpos,
-            site_xmat=data.site_xmat,
-            sensordata=data.sensordata,
-            contact=data.cfrc_ext,
-            applied=data.xfrc_applied,
-            ctrlrange=model.actuator_ctrlrange,
-            damping=model.dof_damping,
-            mass_address=model.dof_Madr,
-            parent=model.dof_parentid,
-        )
+        """Return the arrays of a loaded model."""
+        arrays = (getattr(data if hasattr(data, name) else model, name) for name in cls._fields[2:])
+        return cls(model._address, data._address, *arrays)
 
 
 class NominalViews(NamedTuple):

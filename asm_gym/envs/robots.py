@@ -229,7 +229,7 @@ class NominalDynamics:
         self._live = {name: getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA}
         self._frozen = {name: live.copy() for name, live in self._live.items()}
         v = views
-        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.mass, v.bias, v.damping.copy())
+        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.qM, v.qfrc_bias, v.dof_damping.copy())
         """Views of the live model, valid while the robots' masses are as they were loaded."""
         self._copy: tuple[mujoco.MjModel, mujoco.MjData, NominalViews] | None = None
 

@@ -93,7 +93,7 @@ class Proprioception:
             "qpos": views.qpos,
             "qvel": views.qvel,
             "ctrl": views.ctrl,
-            "force": views.actuator,
+            "force": views.qfrc_actuator,
             "site": views.site_xpos.ravel(),
             "body": data.xmat.ravel(),
         }

@@ -37,6 +37,7 @@ class Simulation:
         self.substeps = substeps
         self.model: mujoco.MjModel = env.sim.model._model
         self.data: mujoco.MjData = env.sim.data._data
+        self.warnings: Any = self.data.warning.number  # a view
         self._rotations = importlib.import_module("robosuite.utils.transform_utils")
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
@@ -47,7 +48,7 @@ class Simulation:
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
         self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64))
         self.proprioception = Proprioception(self.parts, self.views, self.data)
-        self.contact_force = self.external_force = self.mean_external_force = 0.0
+        self.contact_force = 0.0
         """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
         its bodies. A grasp's own squeeze cancels in the sum, and loads that a fault applies are left out."""
         self.keeps_history = False
@@ -58,7 +59,7 @@ class Simulation:
         """Take up the controllers, which robosuite makes anew in every reset."""
         robots = self.env.robots
         self._done = self._row_began = 0
-        self._forces_before = (0.0, 0.0, 0.0)
+        self._force_before = 0.0
         self._fresh = False
         self._action = np.zeros(sum(robot.action_dim for robot in robots))
         self.controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self.parts]
@@ -102,7 +103,7 @@ class Simulation:
             if limits is not self._limits_set:
                 self._limits.most[self._limited], self._limits_set = limits.most(limited), limits
             self._limits.state[ARMED], self._limits.state[ACTS] = 1, limits.stays
-        self._forces_before = (0.0, 0.0, 0.0)
+        self._force_before = 0.0
 
     def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
         """Give the controllers a new set-point, which they take up in the next substep.
@@ -157,8 +158,8 @@ class Simulation:
         kernels.run(*state, self._deltas, self._turns, self._samples, self._fresh, first, count)
 
     def begin_row(self) -> None:
-        """Begin another row of the stream; forces go on to be those of the whole control step."""
-        self._forces_before = (self.contact_force, self.external_force, self._done * self.mean_external_force)
+        """Begin another row of the stream; the contact force goes on to be that of the whole control step."""
+        self._force_before = self.contact_force
         self._row_began = self._done
 
     @property
@@ -205,13 +206,10 @@ class Simulation:
         return row
 
     def _add_up(self, count: int) -> None:
-        """Summarise ``count`` substeps, and take the forces of the row into those of the control step."""
-        p = self.proprioception
-        contact, external, mean = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
-        contact_before, external_before, sum_before = self._forces_before
-        self.contact_force = _larger(contact, contact_before)
-        self.external_force = _larger(external, external_before)
-        self.mean_external_force = (sum_before + count * mean) / (self._row_began + count)
+        """Summarise ``count`` substeps, and take the force of the row into that of the control step; NaN stays."""
+        p, before = self.proprioception, self._force_before
+        force = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
+        self.contact_force = force if force != force or force > before else before
 
     def _remember(self, wrenches: list[NDArray[np.float64]]) -> None:
         """Fill the buffers that robosuite fills in the first substep; the acceleration is its running estimate."""
@@ -233,7 +231,7 @@ class Simulation:
         controller.scale_action(np.zeros(controller.control_dim))  # which works out the numbers below
         c, gripper, ctrl = controller, robot.gripper[arm], self.views.ctrl
         middle, half = 0.5 * (c.actuator_max + c.actuator_min), 0.5 * (c.actuator_max - c.actuator_min)
-        least, most = self.views.ctrlrange[motors].T.copy()
+        least, most = self.views.actuator_ctrlrange[motors].T.copy()
 
         def move(action: NDArray[np.float64]) -> None:
             # As robosuite's controller does it, less its reading of the joints, which nothing here uses.
@@ -254,8 +252,3 @@ class Simulation:
     def motors(self) -> NDArray[np.intp]:
         """The actuators of the arms' joints, from the base on."""
         return np.concatenate([robot._ref_actuators_indexes_dict[arm] for robot, arm in self.parts])
-
-
-def _larger(now: float, before: float) -> float:
-    """Return the larger of two forces; NaN stays."""
-    return now if now != now or now > before else before

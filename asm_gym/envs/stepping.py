@@ -1,0 +1,164 @@
+"""One control step: its commands, the rows of its stream, and what faults and guards may change within it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.envs.actions import Actions
+from asm_gym.envs.backend import ObjectSensors
+from asm_gym.envs.edits import SimulatorEdits
+from asm_gym.envs.robots import PHYSICS_FREQ, force_behind
+from asm_gym.envs.senses import Reading, Senses
+from asm_gym.envs.sensors import Corruption
+from asm_gym.envs.simulation import Simulation
+from asm_gym.spec import Channel
+
+_UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
+
+
+class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
+    """An environment whose control steps can be watched and changed from within."""
+
+    simulation: Simulation
+    """Physics, controllers and sensors of the loaded model."""
+    felt_channels: tuple[Channel, ...]
+    """Channels that contact limits apply to, of one arm after another."""
+    _actions: Actions
+    _objects: ObjectSensors
+    _senses: Senses
+    _row_substeps: int
+
+    def __init__(self, substeps: int) -> None:
+        self.substeps = substeps
+        """Physics substeps of a control step."""
+        self.corruptions: list[Corruption] = []
+        """Sensor faults: each edits the measured row in place, after the noise."""
+        self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
+        """Action faults: each replaces the commanded action."""
+        self.edits = SimulatorEdits()
+        """Changes of the simulator's numbers that will be undone."""
+        self.substep_hooks: list[Callable[[int], None]] = []
+        """Called after every physics substep with its number in the control step; a hook may call ``measure()`` and
+        ``command()``."""
+        self.row_hooks: list[Callable[[NDArray[np.float32]], None]] = []
+        """Called with every row of the stream within a control step but the last; a hook may call ``command()``."""
+        self.holding = False
+        """Set, the arms stay in the next control step, and the grippers keep their command, whatever action arrives;
+        from within a hook, in the rest of the step. The step unsets it."""
+        self.keeps_holding = False
+        """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
+        self.contact_limits: ContactLimits | None = None
+        """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then holds ``contact_load``,
+        the largest share of a limit that was reached within the step, ``contact_left_s``, when in it a limit was passed
+        [s], NaN where none was, and ``contact_felt``, the step's mean load."""
+
+    def _run(self, action: NDArray[np.float32]) -> None:
+        """Run the substeps of a control step, and read the rows of the stream before its end."""
+        limits, self._rows, self._finite = self.contact_limits, [], True
+        self.simulation.begin(limits, self.felt_channels)
+        self._command(action)
+        stride = 1 if self.substep_hooks else self._row_substeps
+        for done in range(stride, self.substeps + 1, stride):
+            self.simulation.advance(stride)
+            for hook in self.substep_hooks:
+                hook(done - 1)
+            if done % self._row_substeps == 0 and done < self.substeps:
+                reading = self._read(within_step=True)
+                self._finite &= reading.stream_finite
+                self.simulation.begin_row()
+                self._rows.append(reading.stream)
+                for row_hook in self.row_hooks:
+                    row_hook(reading.stream)
+        if limits is not None and limits.stays and self.simulation.passed_limit is not None:
+            # What was done last is what the stream says was commanded.
+            self._action = self._actions.resting(self.simulation, self._action)
+
+    def command(self, action: NDArray[np.float32]) -> None:
+        """From within a hook: command another action for the rest of the control step, efference copy included.
+
+        Raises:
+            ValueError: a wrong shape, or an action that is not finite.
+        """
+        self._command(self._actions.checked(action))
+
+    def _command(self, action: NDArray[np.float32]) -> None:
+        held, self.holding = self.holding, self.holding and self.keeps_holding
+        self._action = self._actions.resting(self.simulation, self._action) if held else self._slowed(action)
+        self.simulation.command(self._delivered(self._action), held)
+
+    def _slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the action (A,) at the hand speed that the contact limits allow."""
+        limits = self.contact_limits
+        if limits is None or not limits.limits_speed:
+            return action
+        return self._actions.slowed(self.simulation, action, limits.hand_speed)
+
+    def _delivered(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the action that arrives, in robosuite's units."""
+        for deliver in self.deliveries:
+            action = np.clip(deliver(action), -1.0, 1.0)
+        return self._actions.scaled(action)
+
+    def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """Return the action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
+
+        Args:
+            turns: [rad] for every joint of every arm, from the base on.
+
+        Returns:
+            (A,) in [-1, 1]; 0 for grippers.
+
+        Raises:
+            ValueError: the controller is neither OSC_POSE nor JOINT_POSITION.
+        """
+        return self._actions.turning(self.simulation, np.asarray(turns, np.float64))
+
+    def measure(self) -> NDArray[np.float64]:
+        """Read every sensor once, over the time since the last row of the stream: noise, faults, resolution.
+
+        Returns:
+            (M,) as ``measured_spec`` names it.
+        """
+        return self._read().row
+
+    def _read(self, within_step: bool = False) -> Reading:
+        rest = self._action, self.corruptions, self.np_random
+        return self._senses.read(self.simulation, self._objects, *rest, within_step=within_step)
+
+    @property
+    def felt(self) -> NDArray[np.float64]:
+        """(K, N) noiseless loads in each physics substep since the row began; see ``felt_channels``."""
+        return self.simulation.felt
+
+    def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
+        """Return the link on which a force explains external torques (J,) [N m] best, and that force (3,) [N]."""
+        sim = self.simulation
+        return force_behind(sim.model, sim.data, sim.motors, sim.dofs, np.asarray(torques, np.float64))
+
+    @property
+    def motors(self) -> NDArray[np.intp]:
+        """The actuators of the arms' joints, from the base on."""
+        return self.simulation.motors
+
+    def _forces(self, unstable: bool) -> dict[str, Any]:
+        """Return what ``info`` says of contact; NaN, or infinite, where the simulation diverged."""
+        sim = self.simulation
+        found: dict[str, Any] = {"contact_force": np.nan if unstable else sim.contact_force}
+        if self.contact_limits is not None:
+            passed = sim.passed_limit
+            found["contact_load"] = np.inf if unstable else sim.load
+            found["contact_left_s"] = np.nan if passed is None else (passed + 1) / PHYSICS_FREQ
+            found["contact_felt"] = sim.mean_felt
+        return found
+
+    def _divergences(self) -> int:
+        """Return how often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
+        counts = self.simulation.warnings
+        return sum(int(counts[w]) for w in _UNSTABLE)
