@@ -17,7 +17,7 @@ from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.extras import require
 from asm_gym.spec import Channel
 from asm_gym.tasks import TaskSpec
-from asm_gym.validation import check_choice, short_repr
+from asm_gym.validation import check_choice, check_text
 
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
@@ -25,12 +25,12 @@ CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK
 IK_ROBOTS = ("Panda", "Sawyer")
 """Arms that robosuite's inverse kinematics knows."""
 
-# Tasks that choose one of several objects for each episode, and the attribute that holds the choice.
-_CHOSEN = {"PickPlaceSingle": "object_id", "NutAssemblySingle": "nut_id"}
+# Tasks that choose one of several objects for each episode: attributes with the objects and with the choice.
+_CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("nuts", "nut_id")}
 
 
 def import_robosuite() -> Any:
-    """Robosuite, without the warnings it prints at import about optional parts."""
+    """Return robosuite, without the warnings it prints at import about optional parts."""
     logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
     with _opencv_or_none():
         return require("robosuite", what="a robosuite environment")
@@ -38,78 +38,61 @@ def import_robosuite() -> Any:
 
 @contextmanager
 def _opencv_or_none() -> Iterator[None]:
-    """Lets robosuite be imported where opencv cannot be, for want of libGL: only its own viewer would use it."""
+    """Let robosuite be imported where opencv cannot be, for want of libGL: only its own viewer would use it."""
     try:
         import cv2  # noqa: F401
     except ImportError:
         sys.modules["cv2"] = ModuleType("cv2")
-        try:
-            yield
-        finally:
-            del sys.modules["cv2"]
+        yield
+        del sys.modules["cv2"]
     else:
         yield
 
 
 def row_substeps(rate: int, control_freq: int) -> int:
-    """Physics substeps between two rows of a stream of ``rate`` rows a second.
+    """Return the physics substeps between two rows of a stream of ``rate`` rows a second.
 
     Raises:
         ValueError: a rate that does not fit physics or control; the message lists those that do.
     """
-    physics = PHYSICS_FREQ
-    possible = [f for f in range(control_freq, physics + 1) if not (physics % f or f % control_freq)]
+    possible = [f for f in range(control_freq, PHYSICS_FREQ + 1) if not (PHYSICS_FREQ % f or f % control_freq)]
     if rate not in possible:
         raise ValueError(
-            f"stream_freq must divide the physics rate of {physics} Hz and be a multiple of the control rate of "
+            f"stream_freq must divide the physics rate of {PHYSICS_FREQ} Hz and be a multiple of the control rate of "
             f"{control_freq} Hz, one of {', '.join(map(str, possible))}, got {rate}"
         )
-    return physics // rate
+    return PHYSICS_FREQ // rate
 
 
-def make(
-    task: TaskSpec,
-    robots: tuple[str, ...],
-    controller: str | dict[str, Any],
-    control_freq: int,
-    reward_shaping: bool,
-) -> Any:
-    """Robosuite's environment; every limit of an episode is left to the caller.
+def make(task: TaskSpec, robots: tuple[str, ...], controller: str, control_freq: int, reward_shaping: bool) -> Any:
+    """Return robosuite's environment; every limit of an episode is left to the caller.
 
     Raises:
-        ValueError: an unknown controller.
+        ValueError: an unknown controller, or one that does not know the robot.
     """
     robosuite = import_robosuite()
-    if not isinstance(controller, str | dict):
-        raise ValueError(f"controller must be a name or a configuration, got {short_repr(controller)}")
-    if isinstance(controller, str):
-        check_choice("controller", controller, CONTROLLERS)
+    check_choice("controller", check_text("controller", controller), CONTROLLERS)
     unknown = [robot for robot in robots if robot not in IK_ROBOTS]
-    if unknown and (controller == "IK_POSE" or (isinstance(controller, dict) and controller.get("type") == "IK_POSE")):
+    if unknown and controller == "IK_POSE":
         raise ValueError(f"IK_POSE is for {', '.join(IK_ROBOTS)}, and not for {unknown[0]}")
-    try:
-        return robosuite.make(
-            task.name,
-            robots=list(robots),
-            controller_configs=None if controller == "OSC_POSE" else [_configuration(controller, r) for r in robots],
-            has_renderer=False,
-            has_offscreen_renderer=False,
-            use_camera_obs=False,
-            control_freq=control_freq,
-            reward_shaping=reward_shaping and task.name != "TwoArmTransport",  # which has no dense reward
-            ignore_done=True,
-        )
-    except Exception as error:
-        if isinstance(controller, str):
-            raise
-        raise ValueError(f"controller: robosuite cannot use {short_repr(controller)}: {error!r}") from error
+    return robosuite.make(
+        task.name,
+        robots=list(robots),
+        controller_configs=None if controller == "OSC_POSE" else [_configuration(controller, r) for r in robots],
+        has_renderer=False,
+        has_offscreen_renderer=False,
+        use_camera_obs=False,
+        control_freq=control_freq,
+        reward_shaping=reward_shaping and task.name != "TwoArmTransport",  # which has no dense reward
+        ignore_done=True,
+    )
 
 
-def _configuration(controller: str | dict[str, Any], robot: str) -> dict[str, Any]:
+def _configuration(controller: str, robot: str) -> dict[str, Any]:
     from robosuite.controllers import load_part_controller_config
     from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
 
-    part = load_part_controller_config(default_controller=controller) if isinstance(controller, str) else controller
+    part = load_part_controller_config(default_controller=controller)
     configuration: dict[str, Any] = refactor_composite_controller_config(part, robot, ["right"])
     return configuration
 
@@ -126,9 +109,9 @@ def choose_object(env: Any, task: TaskSpec) -> None:
     Robosuite would draw from the order of a set of strings, which differs from process to process.
     """
     if task.name in _CHOSEN:
-        candidates = env.objects if task.name == "PickPlaceSingle" else env.nuts
+        candidates, chosen = _CHOSEN[task.name]
         env.single_object_mode = 2  # "the object that is named", where 1 is "draw one"
-        setattr(env, _CHOSEN[task.name], int(env.rng.integers(len(candidates))))
+        setattr(env, chosen, int(env.rng.integers(len(getattr(env, candidates)))))
 
 
 def speed_up_contacts(env: Any) -> None:

@@ -25,7 +25,7 @@ from asm_gym.envs.mujoco_views import JOINT_POSITION, Arms, Floats, Goals, Ints,
 
 @compiled
 def cholesky(M: Floats, n: int, L: Floats) -> bool:
-    """Writes the lower factor of M (n, n) into L; False where M is not positive definite."""
+    """Write the lower factor of M (n, n) into L; False where M is not positive definite."""
     for i in range(n):
         for j in range(i + 1):
             s = M[i, j]
@@ -69,7 +69,7 @@ def solve(M: Floats, n: int, b: Floats) -> None:
 
 @compiled
 def mass_matrix(sparse: Floats, views: Views, dofs: Ints, n: int, M: Floats) -> None:
-    """Writes the mass matrix of one arm's joints (n, n), numbered from the base on, into M."""
+    """Write the mass matrix of one arm's joints (n, n), numbered from the base on, into M."""
     for i in range(n):
         at = views.dof_Madr[dofs[i]]
         j, column = dofs[i], i
@@ -85,7 +85,7 @@ def mass_matrix(sparse: Floats, views: Views, dofs: Ints, n: int, M: Floats) -> 
 
 @compiled
 def jacobian(views: Views, dofs: Ints, n: int, point: Floats, com: Floats, J: Floats) -> None:
-    """Writes the Jacobian (6, n) of a point on the arm into J: linear, then angular velocity."""
+    """Write the Jacobian (6, n) of a point on the arm into J: linear, then angular velocity."""
     x, y, z = point[0] - com[0], point[1] - com[1], point[2] - com[2]
     for i in range(n):
         a = views.cdof[dofs[i]]
@@ -121,7 +121,7 @@ def _base(views: Views, site: int) -> tuple[Floats, Floats]:
 
 @compiled
 def set_goal(views: Views, arms: Arms, goals: Goals, a: int, delta: Floats, turn: Floats) -> None:
-    """Moves the set-point of arm ``a`` by ``delta`` (JOINTS,) and ``turn`` (3, 3) from where the arm is now."""
+    """Move the set-point of arm ``a`` by ``delta`` (JOINTS,) and ``turn`` (3, 3) from where the arm is now."""
     if arms.kind[a] == JOINT_POSITION:
         for i in range(arms.joints[a]):
             goal = views.qpos[arms.qpos[a, i]] + delta[i]
@@ -135,7 +135,7 @@ def set_goal(views: Views, arms: Arms, goals: Goals, a: int, delta: Floats, turn
 
 @compiled
 def hand_velocity(views: Views, arms: Arms, a: int, com: Floats, out: Floats) -> None:
-    """Writes the velocity of arm ``a``'s hand (6,), linear then angular, into out."""
+    """Write the velocity of arm ``a``'s hand (6,), linear then angular, into out."""
     v = views.cvel[arms.site_body[a]]
     point = views.site_xpos[arms.site[a]]
     x, y, z = point[0] - com[0], point[1] - com[1], point[2] - com[2]
@@ -147,7 +147,7 @@ def hand_velocity(views: Views, arms: Arms, a: int, com: Floats, out: Floats) ->
 
 @compiled
 def osc_torques(M: Floats, J: Floats, n: int, wrench: Floats, posture: Floats, bias: Floats, tau: Floats) -> None:
-    """Writes the torques (n,) of operational space control into tau.
+    """Write the torques (n,) of operational space control into tau.
 
     Args:
         M: (n, n) mass matrix.
@@ -191,7 +191,7 @@ def osc_torques(M: Floats, J: Floats, n: int, wrench: Floats, posture: Floats, b
 
 @compiled
 def hold_at(views: Views, arms: Arms, goals: Goals, a: int) -> None:
-    """From now on arm ``a`` is held where it is; where it is held already, where it was."""
+    """Hold arm ``a`` where it is from now on; where it is held already, where it was."""
     if not goals.held[a]:
         for i in range(arms.joints[a]):
             goals.anchor[a, i] = views.qpos[arms.qpos[a, i]]
@@ -200,7 +200,7 @@ def hold_at(views: Views, arms: Arms, goals: Goals, a: int) -> None:
 
 @compiled
 def _believed(views: Views, nominal: NominalViews, arms: Arms, a: int, M: Floats, h: Floats) -> None:
-    """Writes mass matrix (n, n) and bias (n,) of arm ``a``, as the robot knows itself, into M and h."""
+    """Write mass matrix (n, n) and bias (n,) of arm ``a``, as the robot knows itself, into M and h."""
     n, dofs = arms.joints[a], arms.dofs[a]
     edited = nominal.model != 0
     mass_matrix(nominal.mass if edited else views.qM, views, dofs, n, M)
@@ -210,7 +210,7 @@ def _believed(views: Views, nominal: NominalViews, arms: Arms, a: int, M: Floats
 
 @compiled
 def _command(views: Views, arms: Arms, a: int, tau: Floats) -> None:
-    """Gives the motors of arm ``a`` torques (n,), as far as they go."""
+    """Give the motors of arm ``a`` torques (n,), as far as they go."""
     for i in range(arms.joints[a]):
         m = arms.motors[a, i]
         views.ctrl[m] = min(max(tau[i], views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
@@ -218,7 +218,7 @@ def _command(views: Views, arms: Arms, a: int, tau: Floats) -> None:
 
 @compiled
 def brake(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: int) -> None:
-    """Commands the motors of arm ``a`` so that it is held at its anchor, which follows what presses too hard."""
+    """Command the motors of arm ``a`` so that it is held at its anchor, which follows what presses too hard."""
     n, dofs = arms.joints[a], arms.dofs[a]
     M, h, J = np.empty((n, n)), np.empty(n), np.empty((6, n))
     off, spring, tau = np.empty(n), np.empty(n), np.empty(n)
@@ -259,16 +259,12 @@ def brake(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: int)
 
 @compiled
 def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: int) -> None:
-    """Commands the motors of arm ``a``."""
+    """Command the motors of arm ``a``."""
     if goals.held[a]:
         brake(views, nominal, arms, goals, a)
         return
-    n = arms.joints[a]
-    dofs = arms.dofs[a]
-    M = np.empty((n, n))
-    h = np.empty(n)
-    p = np.empty(n)
-    tau = np.empty(n)
+    n, dofs = arms.joints[a], arms.dofs[a]
+    M, h, p, tau = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
     _believed(views, nominal, arms, a, M, h)
     if arms.kind[a] == JOINT_POSITION:
         for i in range(n):
@@ -281,15 +277,13 @@ def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: in
     else:
         for i in range(n):
             p[i] = 10.0 * (arms.rest[a, i] - views.qpos[arms.qpos[a, i]]) - 2.0 * np.sqrt(10.0) * views.qvel[dofs[i]]
-        site = arms.site[a]
-        com = views.subtree_com[arms.root[a]]
+        site, com = arms.site[a], views.subtree_com[arms.root[a]]
         origin, R0 = _base(views, arms.base[a])
         hand = views.site_xmat[site].copy().reshape(3, 3)
         target = R0 @ goals.orientation[a]
         position = origin + R0 @ goals.position[a]
-        velocity = np.empty(6)
+        velocity, wrench, J = np.empty(6), np.empty(6), np.empty((6, n))
         hand_velocity(views, arms, a, com, velocity)
-        wrench = np.empty(6)
         for i in range(3):
             wrench[i] = position[i] - views.site_xpos[site, i]
             j, k = (i + 1) % 3, (i + 2) % 3
@@ -299,7 +293,6 @@ def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, a: in
             wrench[3 + i] = 0.5 * turn
         for r in range(6):
             wrench[r] = arms.kp[a, r] * wrench[r] - arms.kd[a, r] * velocity[r]
-        J = np.empty((6, n))
         jacobian(views, dofs, n, views.site_xpos[site], com, J)
         osc_torques(M, J, n, wrench, M @ p, h, tau)
     _command(views, arms, a, tau)

@@ -100,11 +100,6 @@ class Window:
         self._viewer: Any = None
         self._next = 0.0
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the window is on the screen."""
-        return self._viewer is not None and bool(self._viewer.is_running())
-
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Bring the window up to date, and wait until the next state is due.
 
@@ -113,7 +108,7 @@ class Window:
         """
         if self._model is not model:
             self._open(model, data)
-        elif self.is_open:
+        elif self._viewer.is_running():
             mujoco.mj_copyData(self._data, model, data)
             self._viewer.sync()
         self._next = max(self._next + self.dt, time.perf_counter())

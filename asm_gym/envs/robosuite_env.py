@@ -48,7 +48,7 @@ class RobosuiteEnv(SteppedEnv):
         render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
         observation: ``"flat"`` for one Box, ``"dict"`` for named arrays.
         control_freq: actions a second [Hz]; must divide 500.
-        controller: one of ``asm_gym.envs.backend.CONTROLLERS``, or a robosuite controller configuration.
+        controller: one of ``asm_gym.envs.backend.CONTROLLERS``.
         horizon: control steps before truncation; the task's own where None.
         reward_shaping: dense reward where True, for success alone where False.
         terminate_on_success: end the episode (``terminated``) when the task is solved.
@@ -73,7 +73,7 @@ class RobosuiteEnv(SteppedEnv):
         render_mode: str | None = None,
         observation: Literal["flat", "dict"] = "flat",
         control_freq: int = 20,
-        controller: str | dict[str, Any] = "OSC_POSE",
+        controller: str = "OSC_POSE",
         horizon: int | None = None,
         reward_shaping: bool = True,
         terminate_on_success: bool = False,
@@ -110,7 +110,7 @@ class RobosuiteEnv(SteppedEnv):
         self._ended = True
         self._steps_taken = 0
 
-        self.controller = controller if isinstance(controller, str) else "custom"
+        self.controller = controller
         """Name of the arms' controller."""
         self.robosuite_env: Any = backend.make(
             self.task, self.robots, controller, control_freq, check_flag("reward_shaping", reward_shaping)

@@ -65,24 +65,10 @@ def gripper_actions(robots: list[Any]) -> tuple[int, ...]:
 
 
 def is_compilable(robot: Any, arm: str) -> bool:
-    """Whether the compiled loop implements the arm's controller."""
+    """Whether the compiled loop implements the arm's controller, which has robosuite's own settings."""
     controller = robot.composite_controller.part_controllers[arm]
-    if len(robot.arms) > 1 or robot.is_mobile or controller.name not in ("OSC_POSE", "JOINT_POSITION"):
-        return False
-    if controller.impedance_mode != "fixed" or controller.input_type != "delta" or not controller.lite_physics:
-        return False
-    if controller.joint_dim > JOINTS:
-        return False
-    if controller.name == "JOINT_POSITION":
-        return controller.interpolator is None
-    return bool(
-        controller.uncoupling
-        and controller._goal_update_mode == "achieved"
-        and controller.interpolator_pos is None
-        and controller.interpolator_ori is None
-        and controller.position_limits is None
-        and controller.orientation_limits is None
-    )
+    known = controller.name in ("OSC_POSE", "JOINT_POSITION") and controller.joint_dim <= JOINTS
+    return known and len(robot.arms) == 1 and not robot.is_mobile
 
 
 def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:

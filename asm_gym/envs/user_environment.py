@@ -54,25 +54,25 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             reseed(self.robosuite_env, self.np_random)
             self._seeded = True
         sensed = self.robosuite_env.reset()
-        return self._read(sensed, self._all), self._info(sensed, np.zeros(self.action_space.shape or (), np.float32))
+        return _row(sensed, self._all), self._info(sensed, np.zeros(self.action_space.shape or (), np.float32))
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One control step with an action (A,) in the box of the robot's controllers."""
         sensed, reward, _, _ = self.robosuite_env.step(np.asarray(action, np.float64))
-        return self._read(sensed, self._all), float(reward), False, False, self._info(sensed, action)
+        return _row(sensed, self._all), float(reward), False, False, self._info(sensed, action)
 
     def close(self) -> None:
-        """Ends the simulation."""
+        """End the simulation."""
         self.robosuite_env.close()
 
     def _info(self, sensed: dict[str, Any], action: NDArray[np.float32]) -> dict[str, Any]:
-        stream = np.concatenate([self._read(sensed, self._own), np.asarray(action, np.float32)])
+        stream = np.concatenate([_row(sensed, self._own), np.asarray(action, np.float32)])
         return {"stream": stream, "success": bool(self.robosuite_env._check_success())}
 
-    @staticmethod
-    def _read(sensed: dict[str, Any], names: tuple[str, ...]) -> NDArray[np.float32]:
-        row: NDArray[np.float32] = np.concatenate([np.ravel(sensed[name]) for name in names]).astype(np.float32)
-        return row
+
+def _row(sensed: dict[str, Any], names: tuple[str, ...]) -> NDArray[np.float32]:
+    row: NDArray[np.float32] = np.concatenate([np.ravel(sensed[name]) for name in names]).astype(np.float32)
+    return row
 
 
 def _unit(name: str) -> str:
