@@ -62,7 +62,7 @@ _HOME = {
 for _task in TASKS.values():
     gymnasium.register(
         id=_task.id,
-        entry_point=f"asm_gym.envs.robosuite_env:{_task.name}",
+        entry_point=f"asm_gym.envs:{_task.name}",
         kwargs={"task": _task.name},
         # The environment truncates itself, so that `horizon` is an argument like any other.
         max_episode_steps=None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal, NoReturn
 
 import gymnasium as gym
@@ -20,7 +19,6 @@ from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
 from asm_gym.spec import StreamSpec
-from asm_gym.tasks import TASKS
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, short_repr
 
@@ -300,22 +298,3 @@ class RobosuiteEnv(SteppedEnv):
             self.robosuite_env.close()
             self.robosuite_env = None
         self._ended = True
-
-
-def _make(registered: str, task: str, **arguments: Any) -> RobosuiteEnv:
-    """Make the task of a Gymnasium id, and no other."""
-    identifier = task_spec(registered).id
-    if task != registered:
-        raise ValueError(f"{identifier} makes {registered}, got task={short_repr(task)}: leave it out")
-    if "robots" in arguments:
-        raise TypeError(f"{identifier} takes robot=, got robots={short_repr(arguments['robots'])}")
-    return RobosuiteEnv(task, **arguments)
-
-
-def __getattr__(name: str) -> Callable[..., RobosuiteEnv]:
-    """Return what Gymnasium calls for the id of a task."""
-    if name not in TASKS:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    make: Any = partial(_make, name)
-    make.metadata = RobosuiteEnv.metadata
-    return make  # type: ignore[no-any-return]
