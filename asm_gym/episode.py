@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -122,7 +122,7 @@ class Episode:
     def from_table(
         cls,
         frame: Any,
-        channels: StreamSpec | Mapping[str, str | Sequence[str]] | Sequence[str] | None = None,
+        channels: StreamSpec | Sequence[str] | None = None,
         rate: float | None = None,
         action: Sequence[str] = (),
         labels: Sequence[str] = (),
@@ -132,8 +132,7 @@ class Episode:
 
         Args:
             frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
-            channels: the columns to read, as patterns such as ``joint*``; or patterns by channel; or a spec. By
-                default all columns of numbers.
+            channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all columns of numbers.
             rate: rows a second [Hz]; by default that of its clock.
             action: patterns of the commanded columns.
             labels: patterns of further columns that label faults.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -42,46 +42,28 @@ MUJOCO_BELOW = "3.10"
 
 def check_mujoco() -> None:
     """Raise ImportError where the installed MuJoCo does not work with robosuite."""
-    try:
-        found = version("mujoco")
-    except PackageNotFoundError:  # its importer says so
-        return
-    if Version(found) >= Version(MUJOCO_BELOW):
-        raise ImportError(
-            f"robosuite needs MuJoCo below {MUJOCO_BELOW}, got {found}: pip install 'mujoco<{MUJOCO_BELOW}'"
-        )
+    with suppress(PackageNotFoundError):  # its importer says so
+        if Version(found := version("mujoco")) >= Version(MUJOCO_BELOW):
+            remedy = f"pip install 'mujoco<{MUJOCO_BELOW}'"
+            raise ImportError(f"robosuite needs MuJoCo below {MUJOCO_BELOW}, got {found}: {remedy}")
 
 
-def require(module: str, *, what: str, extra: str = "") -> Any:
-    """Return an imported module.
-
-    Args:
-        module: dotted name.
-        what: feature that needs it, for the message.
-        extra: extra that installs it; looked up by default.
-
-    Raises:
-        ImportError: it is not installed; the message says what to install.
-    """
-    with needed_for(what, extra):
+def require(module: str, *, what: str) -> Any:
+    """Return an imported module, which a feature ``what`` needs; the ImportError says what to install."""
+    with needed_for(what):
         return import_module(module)
 
 
 @contextmanager
-def needed_for(what: str, extra: str = "") -> Iterator[None]:
-    """Say what to install where the block misses a package; other errors pass.
-
-    Raises:
-        ImportError: a package that an extra brings is not installed.
-    """
+def needed_for(what: str) -> Iterator[None]:
+    """Say what to install where the block misses a package of an extra; other errors pass."""
     try:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
-        extra = extra or BROUGHT_BY.get(package, "")
-        if not extra or package == "asm_gym":
+        if package not in BROUGHT_BY:
             raise
-        remedy = f"pip install 'asm-gym[{extra}]'"
+        remedy = f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
         if package in NOT_ON_3_13 and sys.version_info >= (3, 13):
             remedy = f"take Python 3.12, for 3.13 there is none: {NOT_ON_3_13[package]}"
         raise ImportError(f"{what} needs {package}: {remedy}", name=package) from error

@@ -6,7 +6,6 @@ import errno
 import os
 import platform
 import re
-import shutil
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -20,9 +19,6 @@ UNFINISHED = ".unfinished"
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """What writing ends with where a disk, a share of it, or a file takes no more."""
-
-SPARE = 16 * 2**20
-"""[bytes] that a disk must have beyond what is to be written."""
 
 
 @contextmanager
@@ -76,16 +72,6 @@ def regular_file(path: str | Path) -> int:
     if not stat.S_ISREG(found.st_mode):
         raise ValueError(f"{path} is no regular file")
     return found.st_size
-
-
-def require_space(folder: Path, needed: int) -> None:
-    """Raises OSError unless the disk under ``folder``, which may not exist yet, has room for so many bytes."""
-    there = next(f for f in (folder, *folder.absolute().parents) if f.exists())
-    free = shutil.disk_usage(there).free
-    if free < needed + SPARE:
-        raise OSError(
-            errno.ENOSPC, f"{needed / 1e6:.0f} MB are needed there, and {free / 1e6:.0f} MB are free", str(folder)
-        )
 
 
 def _checked(path: str | Path) -> Path:

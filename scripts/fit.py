@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,29 +17,26 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from asm_gym.body_model import read_urdf
-from asm_gym.data.commands import feedback
 from asm_gym.data.gaps import filled
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
     SHORTEST_S,
-    NormalEpisodes,
     complete_parts,
     normal_episodes,
     pieces,
     split_at_random,
     split_in_time,
     with_shared_noise,
-    without_marked_rows,
 )
 from asm_gym.detection import conformal_episodes
-from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.conformal import EPISODE
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.monitors.arm_inputs import Derived
+from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.progress import stage
@@ -124,97 +122,71 @@ class Args:
         return conformal_episodes(self.false_alarm_rate) if self.promise.per == EPISODE else 0
 
 
-def record_live(args: Args, console: Console) -> Args:
+def record_live(args: Args, say: Callable[[str], None]) -> Args:
     """Record a live source; return how to learn from that, cut into as many pieces as the promise needs."""
     to = args.out.with_suffix(".jsonl")
     seconds, ended = record(lines_from(str(args.data), sys.stdin, SILENCE_S), to, args.minutes)
-    console.print(f"{ended}, kept in {to}", soft_wrap=True, highlight=False, markup=False)
+    say(f"{ended}, kept in {to}")
     count = args.needed / args.calibration_share + SPARE if args.needed else 1
     split = args.split or min(PIECE_S, seconds / count)
     return replace(args, data=to, split=max(split, SHORTEST_S), in_time=True)
 
 
-def read_normal(args: Args, progress: Any) -> tuple[NormalEpisodes, list[str]]:
-    """Return the normal episodes, and the notes of the reader. Raises ValueError where there are none."""
-    layout = LogLayout(None, args.rate, args.action, args.channels, args.label, args.columns, by_name=True)
-    with noted() as notes:
-        logs = read_logs(args.data, layout)
-        found = normal_episodes(logs if args.split is None else without_marked_rows(logs), progress=progress)
-    if not found.episodes:
-        left_out = ", ".join(f"{count} {why}" for why, count in found.left_out.items())
-        hint = "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
-        raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    return found, notes
-
-
 def divide(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from, and to calibrate on. Raises ValueError where they are too few for the promise."""
-    episodes = [part for log in logs for part in log]
-    if args.in_time or (args.promise.per == HOUR and args.split is not None):
+    episodes, by_episode = [part for log in logs for part in log], args.promise.per == EPISODE
+    if args.in_time or (args.split is not None and not by_episode):
         fitting, calibration = split_in_time(logs, args.calibration_share)
         if len(calibration) < args.needed:
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to calibrate on, got "
                 f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
             )
-    elif args.promise.per == EPISODE:
+    else:
         total, seconds = math.ceil(args.needed / args.calibration_share) + SPARE, 3600 * hours_of(episodes)
         length = math.floor(100 * seconds / total) / 100
-        if args.split is None and 2 * len(episodes) < total and length >= SHORTEST_S:
+        if by_episode and args.split is None and 2 * len(episodes) < total and length >= SHORTEST_S:
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {total} normal episodes, got {len(episodes)} "
                 f"that are {seconds:.4g} s long together: --split {min(length, PIECE_S):g} cuts them"
             )
-        return split_at_random(episodes, args.false_alarm_rate, args.calibration_share, args.seed)
-    else:
-        fitting, calibration = split_at_random(episodes, ANY_EPISODE, args.calibration_share, args.seed)
+        rate = args.false_alarm_rate if by_episode else ANY_EPISODE
+        fitting, calibration = split_at_random(episodes, rate, args.calibration_share, args.seed)
     args.promise.check_hours(hours_of(calibration))
-    return fitting, calibration
+    return fitting[: args.most], calibration
 
 
-def make(args: Args, spec: StreamSpec) -> Any:
-    """Return the monitor, with the hyperparameters that suit the recordings."""
+def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
+    """Return the hyperparameters that suit the recordings."""
     known = monitor_class(args.monitor).hyperparameters
-    settings: dict[str, Any] = {"seed": args.seed}
+    made: dict[str, Any] = {"seed": args.seed}
     if args.epochs is not None and "epochs" in known:
-        settings["epochs"] = args.epochs
+        made["epochs"] = args.epochs
     if spec.source == "table" and "values" in known:
-        settings["values"] = True  # an arm's log holds pushes that last, and torques
+        made["values"] = True  # an arm's log holds pushes that last, and torques
     if args.urdf is not None:
-        settings["urdf"] = read_urdf(args.urdf)
-    return make_monitor(args.monitor, spec, **settings)
+        made["urdf"] = read_urdf(args.urdf)
+    return made
 
 
-def notes_on_commands(args: Args, episodes: list[Episode]) -> list[str]:
-    """Return notes on the commands in logs: which columns, and which are outputs of a controller."""
-    spec = episodes[0].spec
-    if spec.source != "table":
-        return []
-    names = ", ".join(dict.fromkeys(c.name for c in spec.channels if c.group == MOTOR))
-    if not names:
-        return ["no command is recorded: it is guessed from the motion, and faults are found later; --action names one"]
-    notes = [] if args.action else [f"taken as commanded, by name: {names}"]
-    return notes + [
-        f"{label} answers what is sensed (R² {share:.2f}): it is a controller's output, which holds a push already; "
-        "leave it out by --channels, or record the controller's set point"
-        for label, share in feedback(episodes).items()
-    ]
-
-
-def notes_on_body(args: Args, spec: StreamSpec) -> list[str]:
-    """Return a note on the joints of the body model that the log's angles belong to; none without a model."""
-    if args.urdf is None:
-        return []
-    links = Derived.of(spec, friction=True, body=False, urdf=read_urdf(args.urdf)).links
-    assert links is not None
-    joints = ", ".join(links.names[i] for i in np.argsort(links.columns))
-    return [f"the angles are taken for these joints of {args.urdf}, in this order: {joints}"]
+def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
+    """Yield notes on which columns of a log are commands, and which are joints of the body model."""
+    names = ", ".join(c.name for c in spec.channels if c.group == MOTOR)
+    if spec.source == "table" and not names:
+        yield "no command is recorded: it is guessed from the motion, and faults are found later; --action names one"
+    elif spec.source == "table" and not args.action:
+        yield f"taken as commanded, by name: {names}; the output of a controller would hide pushes"
+    if args.urdf is not None:
+        links = Derived.of(spec, friction=True, body=False, urdf=read_urdf(args.urdf)).links
+        assert links is not None
+        joints = ", ".join(links.names[i] for i in np.argsort(links.columns))
+        yield f"the angles are taken for these joints of {args.urdf}, in this order: {joints}"
 
 
 def promise_in_words(args: Args, calibration: list[Episode]) -> str:
     """Return how often the threshold lets normal operation alarm."""
     hours = hours_of(calibration)
-    if args.promise.per == HOUR:
+    if args.promise.per != EPISODE:
         return f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     hourly = args.false_alarm_rate * len(calibration) / hours
     return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {hourly:.3g} an hour at their length"
@@ -227,26 +199,31 @@ def hours_of(episodes: list[Episode]) -> float:
 
 def fit(args: Args, console: Console) -> None:
     """Read, learn, calibrate, save, and print a summary."""
+    say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     if live_source(str(args.data)) is not None:
-        args = record_live(args, console)
+        args = record_live(args, say)
     start = time.perf_counter()
-    with stage("reading", console, {}) as progress:
-        found, notes = read_normal(args, progress)
+    layout = LogLayout(None, args.rate, args.action, args.channels, args.label, args.columns, by_name=True)
+    with stage("reading", console, {}) as progress, noted() as notes:
+        found = normal_episodes(read_logs(args.data, layout), args.split is not None, progress)
+    left_out = ", ".join(f"{count} {why}" for why, count in found.left_out.items())
+    if not found.episodes:
+        hint = "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
+        raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in with_shared_noise(found.episodes)]
     parts = [part for episode in bridged for part in complete_parts(episode)]
     fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts])
-    fitting = fitting[: args.most]
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:
-        monitor = make(args, spec).fit(fitting, progress).calibrate(calibration, **args.promise.named)
+        monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(fitting, progress)
+        monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
-    say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    for line in [*notes, *notes_on_commands(args, found.episodes), *notes_on_body(args, spec)]:
+    for line in [*notes, *notes_on_columns(args, spec)]:
         say(f"Note: {line}.")
     rows = sum(map(len, fitting))
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
-    if found.left_out:
-        say("Left out: " + ", ".join(f"{count} {why}" for why, count in found.left_out.items()) + ".")
+    if left_out:
+        say(f"Left out: {left_out}.")
     if len(parts) != len(found.episodes):
         hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
         say(f"Rows were lost: {len(found.episodes)} episodes were cut there, into {len(parts)} parts.{hint}")

@@ -12,7 +12,7 @@ import csv
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -22,7 +22,7 @@ from typing import Any
 from rich.console import Console
 
 from asm_gym.data.live import lines_from, live_source
-from asm_gym.data.logs import Log, LogLayout, read_logs
+from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
 from asm_gym.evaluation.rerun_view import write_rerun
@@ -59,68 +59,55 @@ class Args:
     """Names of the columns of files without a header."""
     bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
     """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
-    silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
-    """Without a row for so long a live source has died, which is an alarm."""
     wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
     """For how long a controller or a topic that has died may take to come back; then it is watched anew."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
-    figures: int = option(4, check=partial(check_number, "figures", low=1, whole=True))
+    silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
+    """Without a row for so long a live source has died, which is an alarm."""
+    figures: int = option(4, least=1)
     """How many of the most surprising episodes are drawn."""
 
     def __post_init__(self) -> None:
         check_options(self)
 
 
-def in_groups(logs: Iterable[Log], size: int) -> Iterator[list[Log]]:
-    """So many at a time: a folder of recordings may be larger than memory."""
-    rest = iter(logs)
-    while group := list(islice(rest, size)):
-        yield group
-
-
 def review(args: Args, monitor: Any, console: Console) -> int:
-    """Scores a recording, writes what came of it, and prints the alarms."""
+    """Score a recording, write its alarms and a report, and print the alarms."""
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
     episodes, excused = 0, Counter[str]()
-    layout = LogLayout(monitor.spec, args.rate, columns=args.columns)
     with stage("watching", console, {}) as progress, noted() as notes:
-        for group in in_groups(read_logs(args.source, layout), AT_ONCE):
+        logs = iter(read_logs(args.source, LogLayout(monitor.spec, args.rate, columns=args.columns)))
+        while group := list(islice(logs, AT_ONCE)):  # a folder of recordings may be larger than memory
             traces = traces_of(group, monitor, args.bridge)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
             excused.update(event for trace in traces for event in Counter(excused_in(trace)).elements())
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
             episodes += len(group)
             progress(episodes, episodes)
-    said = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
-    said += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
-    write_alarms(args.out / "alarms.csv", alarms)
-    lacks = publish(args, said, alarms, worst)
+    summary = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
+    summary += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
+    args.out.mkdir(parents=True, exist_ok=True)
+    with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
+    written = publish(args, summary, alarms, worst)
     if args.rerun is not None:
         write_rerun(args.rerun, monitor.spec, worst, getattr(monitor, "model", None))
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")
     shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
-    say(said + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
+    say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
-    for cells in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
-        log, start, end, channel, why, excess = cells
+    for log, start, end, channel, why, excess in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
-    say(lacks or f"Wrote {args.out / 'report.html'} and alarms.csv")
+    say(written)
     return BAD_NEWS if alarms else DONE
 
 
-def write_alarms(path: Path, alarms: Sequence[Alarm]) -> None:
-    """Writes the table of all alarms."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
-
-
-def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:
-    """Writes a report with the most surprising episodes; what it lacks where nothing can be drawn."""
+def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:
+    """Write a report with the most surprising episodes; return what was written, and what is missing for more."""
     try:
         with needed_for("the report"):
             from asm_gym.evaluation import figures
@@ -137,16 +124,16 @@ def publish(args: Args, said: str, alarms: Sequence[Alarm], worst: Sequence[Scor
     write_report(
         args.out / "report.html",
         f"asm-gym watch: {args.source}",
-        f"{said}, as {args.monitor} sees them.",
+        f"{summary}, as {args.monitor} sees them.",
         [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
         dict(drawn.values()),
         details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
     )
-    return ""
+    return f"Wrote {args.out / 'report.html'} and alarms.csv"
 
 
 def watch(args: Args, console: Console) -> int:
-    """Watches whichever it is."""
+    """Watch a recording or a live source."""
     live = live_source(args.source)
     if args.rerun is not None:
         if live is not None:
@@ -164,7 +151,7 @@ def watch(args: Args, console: Console) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Watches, and returns the exit code."""
+    """Watch, and return the exit code."""
     return run("watch", Args, watch, argv)
 
 

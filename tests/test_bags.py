@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -81,23 +80,6 @@ def test_a_bag_that_is_cut_off_or_has_no_joints_is_named(tmp_path):
         list(read_logs(tmp_path / "cut.mcap"))
     with pytest.raises(ValueError, match=r"no sensor_msgs/JointState; its topics: /joint_states.*/wrist"):
         list(read_logs(bag(tmp_path / "none", "MCAP", joints=False)))
-
-
-def test_a_small_mcap_file_that_claims_a_gigabyte_is_refused_unread(tmp_path):
-    mcap = needs("mcap.writer")
-    with (tmp_path / "bomb.mcap").open("wb") as file:
-        writer = mcap.Writer(file, chunk_size=2**26)
-        writer.start()
-        channel = writer.register_channel("/x", "json", 0)
-        writer.add_message(channel, 0, bytes(30_000_000), 0)
-        writer.finish()
-    assert (tmp_path / "bomb.mcap").stat().st_size < 100_000
-    tracemalloc.start()
-    with pytest.raises(ValueError, match=r"bomb\.mcap declares 30\d+ bytes, and has \d+"):
-        list(read_logs(tmp_path / "bomb.mcap"))
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 5_000_000
 
 
 def lerobot(folder: Path, version: str, success: list[bool] | None = None) -> list[np.ndarray]:

@@ -1,18 +1,15 @@
 """Files: complete or not there, nothing left behind by the dead, nothing read that is no file."""
 
-import errno
 import os
 import signal
 import stat
 import subprocess
 import sys
-from collections import namedtuple
 from pathlib import Path
 
 import pytest
 
-from asm_gym import files
-from asm_gym.files import regular_file, require_space, written_whole
+from asm_gym.files import regular_file, written_whole
 
 KILLED = """
 import os, signal, sys
@@ -74,12 +71,3 @@ def test_a_path_that_can_name_no_file_is_refused(path, said):
     for use in (regular_file, lambda path: written_whole(path).__enter__()):
         with pytest.raises(ValueError, match=f"a path must name a file, got {said}"):
             use(path)
-
-
-def test_a_full_disk_is_noticed_before_anything_is_written(tmp_path, monkeypatch):
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage(100, 50, files.SPARE + 1000))
-    require_space(tmp_path / "not" / "there", 1000)
-    with pytest.raises(OSError, match="MB are needed") as full:
-        require_space(tmp_path, 1001)
-    assert full.value.errno == errno.ENOSPC

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from asm_gym.data.commands import REACTS, feedback
 from asm_gym.data.inspection import inspected
 from asm_gym.data.logs import Log
 from asm_gym.data.selection import normal_episodes, pieces, split_at_random, split_in_time, with_shared_noise
@@ -304,7 +303,7 @@ def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):
         (["fit", "nowhere", "--rate", "-1"], "rate must be"),
         (["fit", "nowhere", "--out", "."], "is a folder"),
         (["watch", "nowhere", "--monitor", "none.asm"], "none.asm"),
-        (["watch", "nowhere", "--monitor", "x.asm", "--silence", "0"], "silence must be"),
+        (["watch", "nowhere", "--monitor", "x.asm", "--wait", "-1"], "wait must be"),
         (["watch", "-", "--monitor", "x.asm", "--rerun", "x.rrd"], "--rerun is for a recording, and - is live"),
     ],
 )
@@ -376,56 +375,3 @@ def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "Learned from 54 episodes: 2700 rows" in said  # half of 44 pieces before the mark, 64 after it
     assert "with a fault" not in said
-
-
-# ------------------------------------------------------------------ commands of a controller
-
-
-FAST = 100.0
-
-
-def controlled_arm(seed: int, rows: int = 1500) -> dict[str, np.ndarray]:
-    """Three joints under a PD controller, that follow a plan against friction and pushes by chance."""
-    rng = np.random.default_rng(seed)
-    plan = np.sin(np.outer(np.arange(rows) / FAST, [1, 1.7, 2.3]) + rng.uniform(0, 6, 3))
-    q, v, found = plan[0].copy(), np.zeros(3), []
-    for k in range(rows):
-        sensed = q + 1e-3 * rng.normal(size=3)
-        torque = 100 * (plan[k] - sensed) - 10 * v
-        found.append([*sensed, *(v + 1e-3 * rng.normal(size=3)), *torque])
-        v = v + (torque - 0.5 * np.tanh(v / 0.05) + 0.3 * rng.normal(size=3)) / FAST
-        q = q + v / FAST
-    said = np.array(found)
-    forward = 3 * np.sin(plan) + 0.2 * np.gradient(plan, axis=0) * FAST
-    made = {"q": said[:, :3], "dq": said[:, 3:6], "output": said[:, 6:], "plan": plan, "forward": forward}
-    return {**made, "rounded": np.round(plan, 3), "chance": rng.normal(size=(rows, 3))}
-
-
-@pytest.fixture(scope="module")
-def controlled():
-    return [controlled_arm(seed) for seed in range(3)]
-
-
-def episodes(controlled, command, late=0):
-    return [
-        Episode.from_table({"q": a["q"], "dq": a["dq"], "cmd": np.roll(a[command], late, axis=0)}, None, FAST, ["cmd"])
-        for a in controlled
-    ]
-
-
-@pytest.mark.parametrize("command", ["plan", "rounded", "forward", "chance"])
-def test_a_plan_answers_nothing(controlled, command):
-    assert feedback(episodes(controlled, command)) == {}
-
-
-@pytest.mark.parametrize(("late", "least"), [(0, 3), (1, 2)])
-def test_a_controllers_output_answers_what_is_sensed(controlled, late, least):
-    found = feedback(episodes(controlled, "output", late))
-    assert len(found) >= least
-    assert all(share > REACTS for share in found.values())
-
-
-def test_of_few_rows_or_no_command_nothing_is_said(controlled):
-    short = [{k: v[:200] for k, v in controlled[0].items()}]
-    assert feedback(episodes(short, "output")) == {}
-    assert feedback([Episode.from_table({"q": controlled[0]["q"]}, rate=FAST)]) == {}

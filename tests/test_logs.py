@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.data.arrays import read_parquet
 from asm_gym.data.channels import read_recorded
 from asm_gym.data.clock import clock_among, evenly, period
 from asm_gym.data.logs import FILES, LogLayout, read_logs
@@ -82,10 +81,7 @@ def test_a_frame_an_arrow_table_and_a_dictionary_say_the_same(frame):
     np.testing.assert_array_equal(made.stream, wanted.stream)
 
 
-def test_channels_can_be_chosen_and_named():
-    picked = Episode.from_table(log(0), channels={"arm": "q*", "effort": ["torque"], "order": "cmd*"}, action=["order"])
-    assert picked.spec.labels == ("arm[q_0]", "arm[q_1]", "effort", "order[cmd_0]", "order[cmd_1]")
-    assert list(picked.spec.motor) == [3, 4]
+def test_channels_can_be_chosen():
     assert Episode.from_table(log(0), channels=["torque", "q_1"]).spec.labels == ("q[1]", "torque")
 
 
@@ -436,9 +432,9 @@ def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
         (
             lambda p: p.mkdir(),
             FileNotFoundError,
-            "no episodes: no .npz, .npy, .csv, .parquet.*no LeRobot or Minari",
+            "no episodes: no .npz, .npy, .parquet, .csv.*no LeRobot or Minari",
         ),
-        (lambda p: p.write_bytes(b"PK"), ValueError, "files that can be read end in .npz, .npy, .csv"),
+        (lambda p: p.write_bytes(b"PK"), ValueError, "files that can be read end in .npz, .npy, .parquet"),
     ],
 )
 def test_what_holds_no_log_is_refused(make, error, message, tmp_path):
@@ -493,15 +489,6 @@ def test_a_damaged_parquet_file_is_named(damage, message, tmp_path):
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match=message):
         list(read_logs(path))
-
-
-def test_a_small_file_that_claims_a_gigabyte_is_refused_unread(tmp_path):
-    path = tmp_path / "bomb.parquet"
-    zeros = pa.array(np.zeros(2_000_000))
-    pq.write_table(pa.table({f"x{k}": zeros for k in range(8)}), path, compression="zstd")
-    assert path.stat().st_size < 1_000_000
-    with pytest.raises(ValueError, match=r"bomb.parquet declares \d+ bytes, and has \d+"):
-        read_parquet(path)
 
 
 def test_a_damaged_header_of_an_array_is_one_line(tmp_path):

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.data.arrays import check_declared
+from asm_gym.data.text import Columns
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
@@ -39,32 +38,23 @@ def _wrench(message: Any) -> Numbers:
     return {f"{name}[{axis}]": float(getattr(part, axis)) for name, part in parts.items() for axis in "xyz"}
 
 
-def _array(message: Any) -> Numbers:
-    return {f"data[{k}]": float(v) for k, v in enumerate(message.data)}
-
-
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MESSAGES: dict[str, Callable[[Any], Numbers]] = {
     JOINT_STATE: _joints,
     "geometry_msgs/msg/WrenchStamped": _wrench,
-    "std_msgs/msg/Float64MultiArray": _array,
+    "std_msgs/msg/Float64MultiArray": lambda message: {f"data[{k}]": float(v) for k, v in enumerate(message.data)},
 }
 """The numbers of a message, by its type."""
 
-MCAP_MAGIC, MCAP_CHUNK = 8, 0x06
-"""Bytes before the first record of an MCAP file, and the opcode of a chunk (mcap.dev/spec)."""
 
-
-def read_bag(path: Path) -> dict[str, NDArray[np.float64]]:
+def read_bag(path: Path) -> Columns:
     """Return the columns of a bag (``.mcap``, ``.db3``, ``.bag``), ``time`` among them [s].
 
     Raises:
-        ValueError: it is damaged, declares far more than it holds, or has no JointState; the message lists its topics.
+        ValueError: it is damaged, or has no JointState; the message lists its topics.
         ImportError: rosbags is not installed.
     """
-    size = regular_file(path)
-    if path.suffix == ".mcap":
-        check_declared(path, _bytes_in_chunks(path, size), size)
+    regular_file(path)
     highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
@@ -76,20 +66,7 @@ def read_bag(path: Path) -> dict[str, NDArray[np.float64]]:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def _bytes_in_chunks(path: Path, size: int) -> int:
-    """[bytes] that the chunks of an MCAP file declare, none of them expanded."""
-    total = 0
-    with path.open("rb") as file:
-        file.seek(MCAP_MAGIC)
-        while len(head := file.read(9)) == 9:  # opcode, length
-            end = file.tell() + min(int.from_bytes(head[1:], "little"), size)
-            if head[0] == MCAP_CHUNK:
-                total += int.from_bytes(file.read(24)[16:], "little")  # after two times
-            file.seek(end)
-    return total
-
-
-def _columns(bag: Any) -> dict[str, NDArray[np.float64]]:
+def _columns(bag: Any) -> Columns:
     chosen = [c for c in bag.connections if c.msgtype in MESSAGES]
     states = [c for c in chosen if c.msgtype == JOINT_STATE]
     if not any(c.msgcount for c in states):
@@ -103,8 +80,13 @@ def _columns(bag: Any) -> dict[str, NDArray[np.float64]]:
         numbers = MESSAGES[connection.msgtype](message)
         latest |= {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
         if connection.topic == clock:
-            stamp = message.header.stamp
-            rows.append({"time": stamp.sec + 1e-9 * stamp.nanosec or 1e-9 * written, **latest})
-    names = list(dict.fromkeys(name for row in rows for name in row))
+            rows.append({"time": stamp_of(message) or 1e-9 * written, **latest})
+    names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     return columns | {"time": columns["time"] - columns["time"][0]}  # seconds since 1970 would cost digits
+
+
+def stamp_of(message: Any) -> float:
+    """Return the time in the header of a message [s]; 0 where it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return 0.0 if stamp is None else float(stamp.sec + 1e-9 * stamp.nanosec)

@@ -23,10 +23,6 @@ from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.validation import check_number, short_repr
 
-Patterns = str | Sequence[str]
-Choice = StreamSpec | Mapping[str, Patterns] | Sequence[str]
-"""Which columns are read, and what they are called."""
-
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
 """Words of a label that say that nothing is wrong."""
 
@@ -41,23 +37,14 @@ RATE_TOLERANCE = 0.01
 
 
 class Column(NamedTuple):
-    """A column of a log, and what is done with it.
+    """A column of a log, and what is done with it."""
 
-    Attributes:
-        name: in the log, without the unit.
-        unit: as the log says; empty where it does not.
-        role: sense, command, clock, counter, label or words.
-        channel: the channel that it belongs to.
-        element: which element of that; empty where it is the only one.
-        values: (T,).
-    """
-
-    name: str
-    unit: str
-    role: str
-    channel: str
-    element: str
-    values: NDArray[Any]
+    name: str  # without the unit
+    unit: str  # empty where the log does not say
+    role: str  # sense, command, clock, counter, label or words
+    channel: str  # which it belongs to
+    element: str  # of the channel; empty where it is the only one
+    values: NDArray[Any]  # (T,)
 
     @property
     def read(self) -> bool:
@@ -79,7 +66,7 @@ class Recorded(NamedTuple):
 
 def read_recorded(
     frame: Any,
-    channels: Choice | None = None,
+    channels: StreamSpec | Sequence[str] | None = None,
     rate: float | None = None,
     action: Sequence[str] = (),
     labels: Sequence[str] = (),
@@ -110,8 +97,8 @@ def read_recorded(
         used = [c._replace(values=values) for c, values in zip(used, rows.T, strict=False)]
         if marks:
             faults = np.nan_to_num(rows[:, -1]) > 0
-    if spec is not None:
-        return Recorded(_rows_of(spec, used, dt), spec, faults)
+    if isinstance(channels, StreamSpec):
+        return Recorded(_rows_of(channels, used, dt), channels, faults)
     if dt is None:
         raise ValueError("how many rows come a second? Say the rate [Hz] of this layout, or add a column time [s]")
     return Recorded(*_described(used, channels, dt, action), faults)
@@ -198,12 +185,10 @@ def _alike(dt: float, other: float) -> bool:
 
 
 def _described(
-    columns: list[Column], channels: Any, dt: float, action: Sequence[str]
+    columns: list[Column], channels: Sequence[str] | None, dt: float, action: Sequence[str]
 ) -> tuple[NDArray[np.float32], StreamSpec]:
     """The rows (T, D) of the columns that are chosen, and their spec."""
-    if isinstance(channels, Mapping):
-        columns = [c for name, patterns in channels.items() for c in _renamed(name, _chosen(columns, patterns))]
-    elif channels is not None:
+    if channels is not None:
         columns = _chosen(columns, channels)
     commanded = {c.name for c in _chosen(columns, action)}
     parts: dict[str, list[Column]] = {}
@@ -213,19 +198,13 @@ def _described(
     return np.column_stack([c.values for part in parts.values() for c in part]).astype(np.float32), spec
 
 
-def _chosen(columns: Sequence[Column], patterns: Patterns) -> list[Column]:
+def _chosen(columns: Sequence[Column], patterns: Sequence[str]) -> list[Column]:
     """Those that match one of the patterns, in the order of the table. Raises ValueError where one finds nothing."""
-    asked = [patterns] if isinstance(patterns, str) else list(patterns)
-    for pattern in asked:
+    for pattern in patterns:
         if not any(c.matches(pattern) for c in columns):
             names = ", ".join(c.name for c in columns) or "none"
             raise ValueError(f"no column of these channels is called {pattern!r}; there are: {names}")
-    return [c for c in columns if any(c.matches(pattern) for pattern in asked)]
-
-
-def _renamed(channel: str, columns: Sequence[Column]) -> list[Column]:
-    """As elements of this channel."""
-    return [c._replace(channel=channel, element=c.name if len(columns) > 1 else "") for c in columns]
+    return [c for c in columns if any(c.matches(pattern) for pattern in patterns)]
 
 
 def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Channel:

@@ -47,15 +47,10 @@ MOST_LOST = 4
 
 
 class Clock(NamedTuple):
-    """A column of times.
-
-    Attributes:
-        column: its name.
-        unit: seconds in one of its numbers; None where its name does not say.
-    """
+    """A column of times."""
 
     column: str
-    unit: float | None = None
+    unit: float | None = None  # seconds in one of its numbers; None where its name does not say
 
     def seconds(self, values: NDArray[Any]) -> Floats:
         """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits.
@@ -104,19 +99,12 @@ class Clock(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """When the rows of a log were sensed.
-
-    Attributes:
-        clock: column that tells it.
-        times: (N,) of the rows that are kept [s].
-        kept: (N,) which rows of the log these are: one of several with the same time.
-        dt: from row to row in the mean [s]; None of a single row.
-    """
+    """When the rows of a log were sensed."""
 
     clock: Clock
-    times: Floats
-    kept: NDArray[np.intp]
-    dt: float | None
+    times: Floats  # (N,) of the rows that are kept [s]
+    kept: NDArray[np.intp]  # (N,) which rows of the log these are: one of several with the same time
+    dt: float | None  # from row to row in the mean [s]; None of a single row
 
 
 def clock_among(names: Iterable[str]) -> Clock | None:

@@ -12,7 +12,7 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
-from importlib import import_module
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,10 @@ import numpy as np
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
-from asm_gym.data.arrays import opened_hdf5
+from asm_gym.data.arrays import check_hdf5
 from asm_gym.episode import Episode, check_recorded
 from asm_gym.extras import require
-from asm_gym.files import named, require_space, written_whole
+from asm_gym.files import named, written_whole
 from asm_gym.spec import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
@@ -39,20 +39,11 @@ def require_minari() -> None:
         require(package, what="a dataset")
 
 
-def _minari(name: str) -> Any:
-    """Something of Minari's, which is an extra."""
-    require_minari()
-    module, attribute = name.rsplit(".", 1)
-    return getattr(import_module(module), attribute)
-
-
 @typed
 def write_dataset(
     root: Path, dataset_id: str, episodes: Sequence[Episode], env: gym.Env[Any, Any], details: dict[str, Any]
 ) -> Path:
     """Write episodes as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
-
-    ``MINARI_DATASETS_PATH=root`` lets ``minari.load_dataset`` find it.
 
     Args:
         root: the folder of all datasets.
@@ -62,11 +53,14 @@ def write_dataset(
         details: JSON-serialisable; kept in the metadata, for example versions.
 
     Raises:
-        ValueError: no episode, episodes of several specs, or one without observations, actions and rewards; a name that
-            leads out of ``root``, or to a folder that holds what this package did not write.
+        ValueError: episodes are missing, incomplete or of several specs; the name leads out of ``root``, or to a folder
+            that holds what this package did not write.
         OSError: the disk has no room for it.
     """
-    storage_class = _minari("minari.dataset.minari_storage.MinariStorage")
+    require_minari()
+    import minari
+    from minari.dataset.minari_storage import MinariStorage
+
     if not episodes:
         raise ValueError("a dataset needs at least one episode, got none")
     spec = episodes[0].spec
@@ -81,22 +75,26 @@ def write_dataset(
     for before in (folder, unfinished, replaced):
         _refuse_foreign(before)
     image = _hdf5(episodes)
-    require_space(folder, len(image) + 2**20)
     for before in (unfinished, replaced):
         shutil.rmtree(before, ignore_errors=True)
     data = unfinished / "data"
     data.mkdir(parents=True)
-    # A dict is kept as the numbers in it: the stream's channels say which are which.
     spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
     with named(data):
-        storage = storage_class.new(data, **spaces, env_spec=env.spec)
+        storage = MinariStorage.new(data, **spaces, env_spec=env.spec)
         with written_whole(data / ARRAYS) as file:
             file.write(image)
-        counted = {"total_episodes": len(episodes), "total_steps": sum(len(e.rewards) for e in episodes)}
-        about = {"dataset_id": dataset_id, "minari_version": _minari("minari.__version__")}
-        size = {"dataset_size": storage.get_size(), "stream_spec": spec.to_json()}
-        storage.update_metadata({**counted, **size, **details, **about})
-        sums = "".join(f"{_digest(data / name)}  {name}\n" for name in (ARRAYS, METADATA))
+        about = {
+            "total_episodes": len(episodes),
+            "total_steps": sum(len(e.rewards) for e in episodes),
+            "dataset_size": storage.get_size(),
+            "stream_spec": spec.to_json(),
+            **details,
+            "dataset_id": dataset_id,
+            "minari_version": minari.__version__,
+        }
+        storage.update_metadata(about)
+        sums = "".join(f"{_sha256(data / name)}  {name}\n" for name in (ARRAYS, METADATA))
         (data / CHECKSUMS).write_text(sums, encoding="ascii")
     if folder.exists():
         folder.rename(replaced)
@@ -106,7 +104,7 @@ def write_dataset(
 
 
 def _folder(root: Path, dataset_id: str) -> Path:
-    """The folder of a dataset. Raises ValueError for a name that leads anywhere but below ``root``."""
+    """The folder of a dataset, which lies below ``root``."""
     check_text("dataset_id", dataset_id)
     if not all(re.fullmatch(r"\w[\w.-]*", part) for part in dataset_id.split("/")):
         raise ValueError(f"dataset_id must be a name such as asm_gym/lift-v0, got {dataset_id!r}")
@@ -117,7 +115,7 @@ def _folder(root: Path, dataset_id: str) -> Path:
 
 
 def _refuse_foreign(folder: Path) -> None:
-    """Raises ValueError unless a folder that is to be replaced holds at most what ``write_dataset`` writes."""
+    """Raise ValueError where a folder that is to be replaced holds what ``write_dataset`` does not write."""
     found = {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()} if folder.is_dir() else {folder}
     foreign = found - {folder / "data" / name for name in (ARRAYS, METADATA, CHECKSUMS)}
     if folder.exists() and foreign:
@@ -168,12 +166,14 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
         TypeError: its spaces are no Boxes, and it holds no stream.
         ValueError: the dataset is damaged, of another environment, or of one of ours without streams.
     """
-    folder = find_dataset(Path(path))
-    dataset_class = _minari("minari.MinariDataset")
+    folder = _find_dataset(Path(path))
+    require_minari()
+    import minari
+
     try:
         _check_whole(folder)
         metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
-        dataset = dataset_class(folder)
+        dataset = minari.MinariDataset(folder)
         recorded = list(dataset.iterate_episodes())
         notes = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
         spaces = dataset.observation_space, dataset.action_space
@@ -182,14 +182,14 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
     found = dataset.env_spec.id if dataset.env_spec is not None else None
     if env_id is not None and found != env_id:
         raise ValueError(f"{folder} was recorded in {found}, not in {env_id!r}")
-    spec = _spec(folder, metadata, spaces, found, dt)
+    spec = _spec(folder, metadata, dataset, found, dt)
     if not recorded:
         raise ValueError(f"{folder} holds no episode")
     return [_episode(folder, data, note, spec, spaces) for data, note in zip(recorded, notes, strict=True)]
 
 
-def find_dataset(path: Path) -> Path:
-    """Return the folder with the only dataset's metadata at or below ``path``. Raises FileNotFoundError, ValueError."""
+def _find_dataset(path: Path) -> Path:
+    """Return the folder of the only dataset at or below a path. Raises FileNotFoundError or ValueError."""
     if (path / METADATA).is_file():
         return path
     found = [f for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
@@ -201,29 +201,22 @@ def find_dataset(path: Path) -> Path:
     return below[0]
 
 
-def _digest(path: Path) -> str:
-    """The SHA-256 of a file in hexadecimal digits."""
-    with path.open("rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _check_whole(folder: Path) -> None:
-    """Raises ValueError unless the files are those that were written, and hold what they declare."""
+    """Raise ValueError unless the files are those that were written, and hold what they declare."""
     if (folder / CHECKSUMS).is_file():  # others write none
         for line in (folder / CHECKSUMS).read_text(encoding="ascii").splitlines():
             written, _, name = line.partition("  ")
-            if name not in (ARRAYS, METADATA) or _digest(folder / name) != written:
-                raise ValueError(
-                    f"{name} is not as it was written (where it was changed on purpose, remove {CHECKSUMS})"
-                )
+            if name not in (ARRAYS, METADATA) or _sha256(folder / name) != written:
+                raise ValueError(f"{name} is not as it was written; if it was changed on purpose, remove {CHECKSUMS}")
     if (folder / ARRAYS).exists():
-        with opened_hdf5(folder / ARRAYS):
-            pass
+        check_hdf5(folder / ARRAYS)
 
 
-def _spec(
-    folder: Path, metadata: dict[str, Any], spaces: tuple[Any, Any], env_id: str | None, dt: float | None
-) -> StreamSpec:
+def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | None, dt: float | None) -> StreamSpec:
     if "stream_spec" in metadata:
         try:
             return StreamSpec.from_json(metadata["stream_spec"])
@@ -231,21 +224,10 @@ def _spec(
             raise ValueError(f"{folder} names its channels in a way that cannot be read: {error}") from error
     if env_id in {task.id for task in TASKS.values()}:
         raise ValueError(f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`")
-    return StreamSpec.from_spaces(*spaces, dt or _period(env_id))
-
-
-def _period(env_id: str | None) -> float:
-    """[s] of an environment that is registered here; how the file itself says to make it is not followed."""
-    if env_id not in gym.registry:
-        return 1.0
-    try:
-        env = gym.make(env_id)
-    except (gym.error.Error, ImportError):
-        return 1.0
-    try:
-        return control_period(env)
-    finally:
-        env.close()
+    if dt is None and env_id in gym.registry:  # how the file itself says to make it is not followed
+        with suppress(gym.error.Error, ImportError), closing(gym.make(env_id)) as env:
+            dt = control_period(env)
+    return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt or 1.0)
 
 
 def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, spaces: tuple[Any, Any]) -> Episode:
@@ -254,9 +236,8 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, sp
     seed = note.get("seed")
     try:
         for name, length in {"actions": T, "observations": T + 1, "terminations": T, "truncations": T}.items():
-            for found in {len(part) for part in _leaves(getattr(data, name))}:
-                if found != length:
-                    raise ValueError(f"{T} rewards need {length} {name}, got {found}")
+            if found := {len(part) for part in _leaves(getattr(data, name))} - {length}:
+                raise ValueError(f"{T} rewards need {length} {name}, got {found.pop()}")
         observations = flat_rows(spaces[0], data.observations, T + 1)
         if spec.source == "spaces" and "stream" not in infos:
             stream = np.concatenate([observations[1:], flat_rows(spaces[1], data.actions, T)], axis=1)

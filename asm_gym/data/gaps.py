@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from asm_gym.episode import spans
 from asm_gym.validation import check_number
 
+Floats = NDArray[np.floating[Any]]
+
 PAID_BACK = 0.1
 """Of a second that is whole, how much may be missing for good: a tenth of all rows."""
 
@@ -25,13 +27,7 @@ SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite"
 
 
 class Bridge:
-    """Tell of rows as they come which are bridged.
-
-    Args:
-        seconds: that a number may be missing; 0 bridges nothing.
-        dt: from row to row [s].
-        size: D.
-    """
+    """Tell which rows (D,), ``dt`` [s] apart, are bridged: those with numbers missing for at most ``seconds``."""
 
     def __init__(self, seconds: float, dt: float, size: int) -> None:
         self.seconds, self.dt = check_number("bridge", seconds, low=0.0), dt
@@ -44,7 +40,7 @@ class Bridge:
         return bool(missing.any() and (self._spent[missing] <= self.seconds * (1 + 1e-9)).all())
 
 
-def bridged(stream: NDArray[np.floating[Any]], dt: float, seconds: float) -> NDArray[np.bool_]:
+def bridged(stream: Floats, dt: float, seconds: float) -> NDArray[np.bool_]:
     """Return which rows (T,) of a recording (T, D) a bridge of so many seconds goes over."""
     bridge = Bridge(seconds, dt, stream.shape[1])
     return np.array([bridge.over(missing) for missing in np.isnan(stream)], np.bool_)
@@ -61,14 +57,14 @@ def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np
     return out
 
 
-def reason(row: NDArray[np.floating[Any]]) -> str:
+def reason(row: Floats) -> str:
     """Say why a row (D,) whose surprise is over the threshold is an alarm."""
     if np.isnan(row).any():
         return MISSING
     return SURPRISING if np.isfinite(row).all() else NOT_FINITE
 
 
-def blamed(row: NDArray[np.floating[Any]], shares: NDArray[np.floating[Any]]) -> int | None:
+def blamed(row: Floats, shares: Floats) -> int | None:
     """Return the number of a row (D,) that an alarm points to, by their shares (D,); None where all are missing."""
     if np.isnan(row).all():
         return None

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,40 +32,23 @@ TREATMENT = {
 """What is done with columns that are no senses."""
 
 
-@dataclass(frozen=True)
-class ClockFound:
-    """The clock of a log.
+class ClockFound(NamedTuple):
+    """The clock of a log."""
 
-    Attributes:
-        times: (T,) [s], or row numbers without a clock.
-        rate: rows a second in the mean, gaps left out [Hz]; 0 where it is unknown.
-        jitter: standard deviation of a step that is no gap, as a share of the period.
-        gaps: (G, 2) from when to when nothing came [s].
-        trouble: why it cannot be read, in a line; empty where it can.
-    """
-
-    times: NDArray[np.float64]
-    rate: float
-    jitter: float
-    gaps: NDArray[np.float64]
-    trouble: str = ""
+    times: NDArray[np.float64]  # (T,) [s], or row numbers without a clock
+    rate: float  # rows a second in the mean, gaps left out [Hz]; 0 where it is unknown
+    jitter: float  # standard deviation of a step that is no gap, as a share of the period
+    gaps: NDArray[np.float64]  # (G, 2) from when to when nothing came [s]
+    trouble: str = ""  # why it cannot be read
 
 
-@dataclass(frozen=True)
-class Inspection:
-    """A log.
-
-    Attributes:
-        name: where it was found.
-        clock: when its rows were sensed.
-        columns: what is done with each.
-        facts: what the values of each are like, by heading.
-    """
+class Inspection(NamedTuple):
+    """A log."""
 
     name: str
     clock: ClockFound
-    columns: list[Column]
-    facts: list[dict[str, Any]]
+    columns: list[Column]  # what is done with each
+    facts: list[dict[str, Any]]  # what the values of each are like, by heading
 
     def caption(self) -> str:
         """Say in a line how long it is, and at which rate it comes."""

@@ -29,12 +29,9 @@ class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
 
 
 class LiveSource(NamedTuple):
-    """A source that is followed.
+    """A source that is followed: how a user names it, how it is opened, and whether it may come back after it died.
 
-    Attributes:
-        example: how a user names it.
-        open: yields lines, of what follows the prefix, standard input, and after how much silence it has died [s].
-        returns: it may come back after it has died.
+    ``open`` takes what follows the prefix, standard input, and after how much silence it has died [s].
     """
 
     example: str

@@ -29,25 +29,15 @@ from asm_gym.validation import typed
 
 @dataclass(frozen=True)
 class LogLayout:
-    """How to read logs; most are arguments of ``Episode.from_table``.
+    """How to read logs; most are arguments of ``Episode.from_table``."""
 
-    Args:
-        spec: of the memory that is to read them.
-        rate: rows a second [Hz].
-        action: patterns of the columns that were commanded.
-        channels: patterns of the columns that are read; all where empty.
-        labels: patterns of the columns that say what is wrong, beside those that are called so.
-        columns: names of the columns of files without a header.
-        by_name: without an ``action``, columns that are called so were commanded.
-    """
-
-    spec: StreamSpec | None = None
-    rate: float | None = None
-    action: Sequence[str] = ()
-    channels: Sequence[str] = ()
-    labels: Sequence[str] = ()
-    columns: Sequence[str] = ()
-    by_name: bool = False
+    spec: StreamSpec | None = None  # of the memory that is to read them
+    rate: float | None = None  # rows a second [Hz]
+    action: Sequence[str] = ()  # patterns of the columns that were commanded
+    channels: Sequence[str] = ()  # patterns of the columns that are read; all where empty
+    labels: Sequence[str] = ()  # patterns of the columns that say what is wrong, beside those that are called so
+    columns: Sequence[str] = ()  # names of the columns of files without a header
+    by_name: bool = False  # without an ``action``, columns that are called so were commanded
 
     def episode(self, columns: Any) -> Episode:
         """Return the episode of a table; it is a success, for somebody handed it over as one."""
@@ -65,22 +55,13 @@ class LogLayout:
         return is_clock(name) or is_label(name, self.labels)
 
 
-def _text(path: Path, layout: LogLayout) -> Columns:
-    return read_text(path, layout.columns, layout.keeps)
-
-
-def _json(path: Path, layout: LogLayout) -> Columns:
-    return read_json_lines(path, layout.columns, layout.keeps)
-
-
 FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
     ".npz": lambda path, layout: read_arrays(path),
     ".npy": lambda path, layout: read_array(path, layout.columns),
-    ".csv": _text,
     ".parquet": lambda path, layout: read_parquet(path),
+    **dict.fromkeys((".csv", ".tsv", ".txt"), lambda path, layout: read_text(path, layout.columns, layout.keeps)),
+    **dict.fromkeys((".jsonl", ".ndjson"), lambda path, layout: read_json_lines(path, layout.columns, layout.keeps)),
     **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, layout: read_bag(path)),
-    **dict.fromkeys((".tsv", ".txt"), _text),
-    **dict.fromkeys((".jsonl", ".ndjson"), _json),
 }
 """Reader of a file's columns, by its suffix."""
 
@@ -109,7 +90,7 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
         ValueError: a file cannot be read; the message names it.
     """
     path, layout = Path(path), layout or LogLayout()
-    files = files_at(path)
+    files = _files_at(path)
     if (path / INFO).is_file():
         yield from _lerobot(path, layout)
     elif files:
@@ -128,13 +109,8 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
         yield from (Log(f"episode {n}", episode) for n, episode in enumerate(read_dataset(path)))
 
 
-def files_at(path: Path) -> list[Path]:
-    """Return the file, or those in a folder that can be read and are not half-written.
-
-    Raises:
-        FileNotFoundError: there is nothing.
-        ValueError: it is a file of another kind.
-    """
+def _files_at(path: Path) -> list[Path]:
+    """The file, or those in a folder that can be read and are not half-written."""
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
     if path.is_file():
@@ -156,14 +132,9 @@ def _is_episode(path: Path) -> bool:
 
 
 def read_tables(path: str | Path, layout: LogLayout) -> Iterator[tuple[str, Columns]]:
-    """Yield the columns of the logs at ``path`` as they are in their files, by name; of datasets, their streams.
-
-    Raises:
-        FileNotFoundError: there is nothing of the kind.
-        ValueError: a file cannot be read; the message names it.
-    """
+    """Yield the columns of the logs at ``path`` as they are in their files, by name; of datasets, their streams."""
     path = Path(path)
-    files = files_at(path)
+    files = _files_at(path)
     if not files or (path / INFO).is_file() or any(f.suffix == ".npz" for f in files):
         for name, episode in read_logs(path, layout):
             rows = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}

@@ -12,25 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-UNITS: dict[str, tuple[str, float]] = {
-    **dict.fromkeys(("rad", "radian", "radians"), ("rad", 1.0)),
-    **dict.fromkeys(("deg", "°", "degree", "degrees"), ("rad", math.pi / 180)),
-    "rad/s": ("rad/s", 1.0),
-    **dict.fromkeys(("deg/s", "°/s"), ("rad/s", math.pi / 180)),
-    "rpm": ("rad/s", math.pi / 30),
-    **dict.fromkeys(("A", "amp", "ampere", "amperes"), ("A", 1.0)),
-    "mA": ("A", 1e-3),
-    **dict.fromkeys(("m", "meter", "metre"), ("m", 1.0)),
-    "mm": ("m", 1e-3),
-    "m/s": ("m/s", 1.0),
-    "mm/s": ("m/s", 1e-3),
-    **dict.fromkeys(("Nm", "N m", "N*m", "N.m", "N·m"), ("N m", 1.0)),
-    "mNm": ("N m", 1e-3),
-    "N": ("N", 1.0),
-    "kN": ("N", 1e3),
-    "V": ("V", 1.0),
-    "mV": ("V", 1e-3),
-    **dict.fromkeys(("C", "°C", "degC", "celsius"), ("°C", 1.0)),
+UNITS = {
+    name: (base, size)
+    for base, sizes in {
+        "rad": {"rad|radian|radians": 1.0, "deg|°|degree|degrees": math.pi / 180},
+        "rad/s": {"rad/s": 1.0, "deg/s|°/s": math.pi / 180, "rpm": math.pi / 30},
+        "A": {"A|amp|ampere|amperes": 1.0, "mA": 1e-3},
+        "m": {"m|meter|metre": 1.0, "mm": 1e-3},
+        "m/s": {"m/s": 1.0, "mm/s": 1e-3},
+        "N m": {"N m|Nm|N*m|N.m|N·m": 1.0, "mNm": 1e-3},
+        "N": {"N": 1.0, "kN": 1e3},
+        "V": {"V": 1.0, "mV": 1e-3},
+        "°C": {"°C|C|degC|celsius": 1.0},
+    }.items()
+    for names, size in sizes.items()
+    for name in names.split("|")
 }
 """The base unit of each, and how many of that it is."""
 

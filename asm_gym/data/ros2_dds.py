@@ -4,8 +4,8 @@
     a row              a message of the first topic, at the time in its header, with the newest of the others
     numbers            named as those of a bag are, joint_states.position[panda_joint1] (``asm_gym.data.bags``)
 
-So a memory fitted from a bag reads the topics that the bag recorded. A reader asks for no more than best effort, which
-every writer offers. Sources: ROS 2 design, "Topic and Service name mapping to DDS"; ROS_DOMAIN_ID as ROS 2 reads it.
+A reader asks for no more than best effort, which every writer offers. Sources: ROS 2 design, "Topic and Service name
+mapping to DDS"; ROS_DOMAIN_ID as ROS 2 reads it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-from asm_gym.data.bags import MESSAGES, Numbers
+from asm_gym.data.bags import MESSAGES, Numbers, stamp_of
 from asm_gym.data.live import SourceDied
 from asm_gym.extras import require
 
@@ -82,7 +82,6 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
         ValueError: no such names, or a topic is of another type, or ROS_DOMAIN_ID is no number.
         OSError: nobody publishes one of them, or no first row came.
         SourceDied: nothing came for so long after a row.
-        ImportError: cyclonedds is not installed.
     """
     names = [name.strip() for name in topics.split(",")]
     if not all(name.strip("/") for name in names):
@@ -90,8 +89,7 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not domain.isdigit():
         raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
-    participant = _dds("domain").DomainParticipant(int(domain))
-    core = _dds("core")
+    participant, core = _dds("domain").DomainParticipant(int(domain)), _dds("core")
     kinds = {name: _kind(participant, name) for name in names}
     quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(AT_ONCE))
     readers = {}
@@ -103,18 +101,21 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
     unread = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
     condition = core.ReadCondition(readers[clock], unread)
     waiting.attach(condition)
-    last_at = dict.fromkeys(names, time.monotonic())
-    latest: dict[str, Numbers] = {}
-    rows = 0
+    last_at, latest, rows = dict.fromkeys(names, time.monotonic()), dict[str, Numbers](), 0
     while True:
         waiting.wait(_dds("util").duration(seconds=POLL_S))
         for name in (*others, clock):
-            for sample in _taken(readers[name]):
-                last_at[name], latest[name] = time.monotonic(), _named(name, kinds[name], sample)
+            for sample in readers[name].take(N=AT_ONCE):
+                if not getattr(getattr(sample, "sample_info", None), "valid_data", False):
+                    continue  # it only says that a writer went
+                found = MESSAGES[kinds[name]](sample)
+                last_at[name] = time.monotonic()
+                latest[name] = {f"{name.strip('/')}.{number}": value for number, value in found.items()}
                 if name == clock:
                     rows += 1
                     numbers = {n: v for part in latest.values() for n, v in part.items()}
-                    yield json.dumps({"time": _stamp(sample)} | numbers)
+                    seconds = stamp_of(sample) or 1e-9 * sample.sample_info.source_timestamp
+                    yield json.dumps({"time": seconds} | numbers)
             if name != clock and time.monotonic() - last_at[name] > silence:
                 latest.pop(name, None)  # an old value is a missing one
         if time.monotonic() - last_at[clock] > silence:
@@ -144,19 +145,3 @@ def _kind(participant: Any, name: str) -> str:
         time.sleep(POLL_S)
     there = f"; there are {', '.join(sorted(others))}" if others else ""
     raise OSError(f"nobody publishes {name}{there}")
-
-
-def _taken(reader: Any) -> list[Any]:
-    """Messages since the last look, without those that only say that a writer went."""
-    return [s for s in reader.take(N=AT_ONCE) if hasattr(s, "sample_info") and s.sample_info.valid_data]
-
-
-def _named(name: str, kind: str, sample: Any) -> Numbers:
-    return {f"{name.strip('/')}.{number}": value for number, value in MESSAGES[kind](sample).items()}
-
-
-def _stamp(sample: Any) -> float:
-    """The time in its header [s]; where it has none, when it was written."""
-    stamp = getattr(getattr(sample, "header", None), "stamp", None)
-    seconds = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-    return seconds or 1e-9 * sample.sample_info.source_timestamp

@@ -40,11 +40,7 @@ class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of o
 
 
 class Pace:
-    """Follow the clock of a source; ``change`` is a message where its rate changed.
-
-    Args:
-        dt: from row to row of the memory [s].
-    """
+    """Follow the clock of a source for a memory whose rows are ``dt`` [s] apart; ``change`` says a change of rate."""
 
     def __init__(self, dt: float) -> None:
         self.dt, self.kind, self.change = dt, RIGHT, ""
@@ -60,14 +56,14 @@ class Pace:
             ClockWentBack: its time is not later than that of the row before.
         """
         before, self._before, self.change = self._before, stamp, ""
+        self._rows += 1
         if before is None:
             self._read = stamp
             return 0
         if not stamp > before:
             raise ClockWentBack(f"time must increase, got {stamp:g} s after {before:g} s")
         self._steps.append(stamp - before)
-        self._rows += 1
-        if self._rows % NEWEST == 0:
+        if self._rows % NEWEST == 1:
             self._judge(median(self._steps))
         if self.kind == SLOWER:
             self._read = stamp
@@ -90,26 +86,16 @@ class Pace:
 
 
 class Row(NamedTuple):
-    """A row.
+    """A row as it came."""
 
-    Attributes:
-        numbers: (D,) NaN where one was lost.
-        lost: rows that should have come before it.
-        read: whether it stands where the memory reads one.
-        change: a message about the rate, where that changed.
-    """
-
-    numbers: NDArray[np.float64]
-    lost: int = 0
-    read: bool = True
-    change: str = ""
+    numbers: NDArray[np.float64]  # (D,) NaN where one was lost
+    lost: int = 0  # rows that should have come before it
+    read: bool = True  # it stands where the memory reads one
+    change: str = ""  # how the rate changed
 
 
 class RowReader:
-    """Read lines as rows of a stream.
-
-    Args:
-        spec: of the memory that is to read them.
+    """Read lines as rows of the stream of a memory.
 
     Example:
         >>> from asm_gym import Channel, StreamSpec

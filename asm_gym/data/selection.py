@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -25,29 +25,39 @@ AROUND_S = 5.0
 
 
 class NormalEpisodes(NamedTuple):
-    """The episodes that are learned from, how many others were left out, by why, and the logs of the first."""
+    """The episodes that are learned from, and how many others were left out, by why."""
 
     episodes: list[Episode]
     left_out: Counter[str]
-    logs: list[str]
 
 
-def normal_episodes(logs: Iterable[Log], progress: Callable[[int, int], object] | None = None) -> NormalEpisodes:
-    """Return the normal episodes among ``logs``."""
-    kept = NormalEpisodes([], Counter(), [])
-    for n, (name, episode) in enumerate(logs, 1):
+def normal_episodes(
+    logs: Iterable[Log], between_marks: bool = False, progress: Callable[[int, int], object] | None = None
+) -> NormalEpisodes:
+    """Return the normal episodes among logs.
+
+    Args:
+        logs: of any kind.
+        between_marks: whether a table is learned from where no marked row is near, or left out as a whole.
+        progress: called with the number of logs so far.
+    """
+    kept = NormalEpisodes([], Counter())
+    for n, (_, episode) in enumerate(logs, 1):
         if progress is not None:
             progress(n, n)  # how many there are is known at the end
-        if why := _abnormal(episode):
+        if between_marks and episode.spec.source == "table" and episode.faults.any():
+            near = round(AROUND_S / episode.spec.dt)
+            close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
+            kept.episodes.extend(_parts(episode, ~close))
+        elif why := _abnormal(episode):
             kept.left_out[why] += 1
         else:
             kept.episodes.append(episode)
-            kept.logs.append(name)
     return kept
 
 
 def _abnormal(episode: Episode) -> str:
-    """Why an episode is not normal, in a word or two; empty where it is."""
+    """Why an episode is not normal; empty where it is."""
     role = episode.label.role if episode.label is not None else ""
     if episode.faults.any() or role == "faulty":
         return "with a fault"
@@ -56,32 +66,17 @@ def _abnormal(episode: Episode) -> str:
     return "" if episode.success else "failed"
 
 
-def without_marked_rows(logs: Iterable[Log]) -> Iterator[Log]:
-    """Yield logs, and of those from elsewhere the parts that are not near rows that a label marks."""
-    for log in logs:
-        episode = log.episode
-        if episode.spec.source != "table" or not episode.faults.any():
-            yield log
-            continue
-        near = round(AROUND_S / episode.spec.dt)
-        close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
-        for start, stop in _long_spans(~close, episode.spec.dt):
-            part = replace(episode, stream=episode.stream[start:stop], faults=episode.faults[start:stop])
-            yield Log(log.name, part)
-
-
 def complete_parts(episode: Episode) -> list[Episode]:
     """Return the parts of an episode between lost numbers; those under half a second are left out."""
     known = np.isfinite(episode.stream).all(axis=1)
-    if known.all():
-        return [episode]
-    parts = [slice(start, stop) for start, stop in _long_spans(known, episode.spec.dt)]
-    return [Episode.from_stream(episode.stream[part], episode.spec, success=True) for part in parts]
+    return [episode] if known.all() else _parts(episode, known)
 
 
-def _long_spans(mask: NDArray[np.bool_], dt: float) -> list[tuple[int, int]]:
-    least = max(2, round(SHORTEST_S / dt))
-    return [(start, stop) for start, stop in spans(mask) if stop - start >= least]
+def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
+    """The stretches of rows that are wanted (T,), but for short ones."""
+    least = max(2, round(SHORTEST_S / episode.spec.dt))
+    stretches = [(start, stop) for start, stop in spans(wanted) if stop - start >= least]
+    return [Episode.from_stream(episode.stream[start:stop], episode.spec, success=True) for start, stop in stretches]
 
 
 def with_shared_noise(episodes: list[Episode]) -> list[Episode]:
@@ -108,8 +103,7 @@ def pieces(episode: Episode, seconds: float) -> list[Episode]:
 def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
     """Split the pieces of long logs into heads to learn from and tails to calibrate on, a piece between left out.
 
-    Pieces of one log that follow each other are alike: shuffled, those that set the threshold would lie between those
-    that were learned from, and promise too much.
+    Pieces of one log that follow each other are alike: shuffled, they would promise too much.
 
     Raises:
         ValueError: no log is long enough.
@@ -127,16 +121,10 @@ def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[
 def split_at_random(
     episodes: list[Episode], false_alarm_rate: float, calibration_share: float, seed: int
 ) -> tuple[list[Episode], list[Episode]]:
-    """Split episodes into those to learn from and those to calibrate on.
-
-    Args:
-        episodes: all of them.
-        false_alarm_rate: that the threshold is to promise.
-        calibration_share: of the episodes, in (0, 1), that are not learned from.
-        seed: of which are which.
+    """Split episodes by a seed into those to learn from, and a share (0, 1) to calibrate on.
 
     Raises:
-        ValueError: too few of them; the message says how many are needed.
+        ValueError: too few of them for the false-alarm rate; the message says how many are needed.
     """
     n, needed = len(episodes), conformal_episodes(false_alarm_rate)
     order = np.random.default_rng(seed).permutation(n)

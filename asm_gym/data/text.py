@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 Columns = dict[str, NDArray[Any]]
 KeepWords = Callable[[str], bool]
-"""Whether the words of a column of this name are kept."""
 
 LONGEST_WORD = 64
 """Characters that are kept of a word, of a label or a time."""
@@ -46,15 +45,10 @@ FLAGS = {"true": 1.0, "false": 0.0}
 
 
 class Dialect(NamedTuple):
-    """How a line of text is cut into cells, and a cell read.
+    """How a line of text is cut into cells, and a cell read."""
 
-    Attributes:
-        separator: between cells; a blank stands for any number of them.
-        comma: decimals may stand behind a comma.
-    """
-
-    separator: str
-    comma: bool
+    separator: str  # between cells; a blank stands for any number of them
+    comma: bool  # decimals may stand behind a comma
 
     @classmethod
     def of(cls, line: str) -> Dialect:

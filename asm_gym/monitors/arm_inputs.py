@@ -2,7 +2,7 @@
 
     tanh(v/w s)       w ∈ {0.01, 0.1, 1}, of each speed v of spread s
     sin, cos          of angles q, of q_2 + q_3, …, and products of two of them
-    g, M q̈ + c        what the links weigh on each joint, by a body model in place of the sines; see ``body_model``
+    g, M q̈ + c        what the links weigh on each joint, by a body model in place of the sines (``body_model``)
 
 Motor current is torque plus what the sign of the speed says, and weight is a sum of products of sines of angles along
 the chain: a linear model can say neither without. Source: Stribeck friction smoothed by tanh: Makkar et al. 2005.
@@ -16,8 +16,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.body_model import BodyModel
 from asm_gym.data.names import POSITION, SPEED, ratio
+from asm_gym.monitors.body_model import BodyModel
 from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]

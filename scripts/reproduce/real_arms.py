@@ -19,7 +19,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.body_model import read_urdf
 from asm_gym.data.bags import read_bag
 from asm_gym.data.selection import complete_parts, pieces
 from asm_gym.data.text import read_text
@@ -28,6 +27,7 @@ from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.body_model import read_urdf
 from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit

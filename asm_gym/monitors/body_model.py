@@ -35,6 +35,9 @@ KEPT = {
 }
 """Parts of a body model that weight and inertia need."""
 
+NUMBERS = ("xyz", "rpy", "value", "ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+"""Attributes that hold numbers."""
+
 COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-12", "boundinertia": "1e-12"}
 """MuJoCo takes links without a mass as nearly massless, and mends a tensor that no body can have."""
 
@@ -47,11 +50,6 @@ class BodyModel:
         names: (J,) of the joints, from the base outwards.
         columns: (J,) which column of ``torques`` belongs to each joint.
         model: MuJoCo's model of them.
-
-    Example:
-        >>> from asm_gym.body_model import BodyModel, read_urdf
-        >>> body = BodyModel.of(read_urdf("panda.urdf"), spec.labels[:7])  # doctest: +SKIP
-        >>> weight, motion = body.torques(q, velocity, acceleration)  # doctest: +SKIP
     """
 
     names: tuple[str, ...]
@@ -73,7 +71,10 @@ class BodyModel:
         root = _parsed(urdf)
         every = _compiled(root, None)
         names = _joints(every)
-        asked = _named(names, labels) or [names[j] for j in _longest_chain(every)[: len(labels)]]
+        # Each label names a joint by the longest name in it, if all name one of their own.
+        asked = [max((n for n in names if n in label), key=len, default="") for label in labels]
+        if not all(asked) or len(set(asked)) < len(asked):
+            asked = [names[j] for j in _longest_chain(every)[: len(labels)]]
         if len(asked) < len(labels):
             raise ValueError(
                 f"{len(labels)} joints are sensed, and the body's longest chain has {len(asked)} that move"
@@ -123,7 +124,7 @@ def _mujoco() -> Any:
 
 
 def _parsed(urdf: str) -> Element:
-    """The pared tree. Raises ValueError where it is no URDF; entities, which could grow without end, are refused."""
+    """The pared tree; entities, which could grow without end, are refused."""
     if "<!DOCTYPE" in urdf:
         raise ValueError("the body is no URDF: it declares a document type")
     try:
@@ -144,15 +145,15 @@ def _pared(element: Element) -> Element:
 
 
 def _compiled(root: Element, asked: Container[str] | None) -> Any:
-    """MuJoCo's model, in which the joints that are asked for move, or all that can. Raises ValueError."""
+    """MuJoCo's model, in which the joints that are asked for move, or all that can."""
     _check(root)
     body = deepcopy(root)
     for joint in body.findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
             joint.remove(mimic)
-        alone = joint.get("type") in MOVING and mimic is None
-        if not alone or (asked is not None and joint.get("name") not in asked):
+        moves = joint.get("type") in MOVING and mimic is None
+        if not moves or (asked is not None and joint.get("name") not in asked):
             joint.set("type", "fixed")
     for inertial in body.iter("inertial"):
         _align(inertial)
@@ -164,31 +165,27 @@ def _compiled(root: Element, asked: Container[str] | None) -> Any:
 
 
 def _check(root: Element) -> None:
-    """Raises ValueError where links and joints are no tree, or a number is none."""
+    """Raise ValueError where links and joints are no tree, or a number is none."""
     joints, links = root.findall("joint"), [link.get("name") for link in root.findall("link")]
-    ends = {which: [_end(joint, which) for joint in joints] for which in ("parent", "child")}
-    bases = [link for link in links if link not in ends["child"]]
-    known = {end for both in ends.values() for end in both} <= set(links)
-    if len(bases) != 1 or len(set(ends["child"])) != len(joints) or not known or len(joints) > MOST_JOINTS:
+    for joint in joints:
+        for end in ("parent", "child"):
+            if joint.find(end) is None:
+                raise ValueError(f"joint {joint.get('name')} of the body has no <{end}>")
+    parents, children = ([end.get("link") for end in root.iter(which)] for which in ("parent", "child"))
+    bases = [link for link in links if link not in children]
+    tree = len(bases) == 1 and len(set(children)) == len(joints) and {*parents, *children} <= set(links)
+    if not tree or len(joints) > MOST_JOINTS:
         raise ValueError(
             f"the joints of the body are no tree of at most {MOST_JOINTS} with one base: {len(joints)} joints, "
             f"{len(links)} links, of which no joint moves {', '.join(map(str, bases[:5])) or 'none'}"
         )
-    for element in root.iter():
-        for name in {"xyz", "rpy", "value", "ixx", "ixy", "ixz", "iyy", "iyz", "izz"}.intersection(element.keys()):
-            try:
-                finite = all(np.isfinite(float(word)) for word in element.attrib[name].split())
-            except ValueError:
-                finite = False
-            if not finite:
-                raise ValueError(f"{name}={element.attrib[name]!r} of the body should be finite numbers")
-
-
-def _end(joint: Element, which: str) -> str | None:
-    end = joint.find(which)
-    if end is None:
-        raise ValueError(f"joint {joint.get('name')} of the body has no <{which}>")
-    return end.get("link")
+    for name, value in (pair for element in root.iter() for pair in element.items() if pair[0] in NUMBERS):
+        try:
+            finite = all(np.isfinite(float(word)) for word in value.split())
+        except ValueError:
+            finite = False
+        if not finite:
+            raise ValueError(f"{name}={value!r} of the body should be finite numbers")
 
 
 def _align(inertial: Element) -> None:
@@ -210,12 +207,6 @@ def _align(inertial: Element) -> None:
 
 def _joints(model: Any) -> list[str]:
     return [model.joint(j).name for j in range(model.njnt)]
-
-
-def _named(names: Sequence[str], labels: Sequence[str]) -> list[str]:
-    """The joint that each label names, by the longest name in it; none unless each names one of its own."""
-    named = [max((n for n in names if n in label), key=len, default="") for label in labels]
-    return named if all(named) and len(set(named)) == len(named) else []
 
 
 def _longest_chain(model: Any) -> list[int]:
