@@ -24,7 +24,6 @@ from tests.fakes import FakeEnv
 
 ONSET, STEPS = 60, 78
 """In the middle of carrying the cube, and until well after."""
-
 INVISIBLE = {"smoother_object"}
 """Of two surfaces the rougher counts, so a smoother cube changes nothing."""
 
@@ -224,15 +223,6 @@ def test_a_fault_that_the_robot_cannot_have_is_refused(lift, fault, message):
 def test_a_bad_description_is_refused(kind, bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         kind(**bad)
-
-
-def test_unknown_kinds_and_severities_list_the_known(lift):
-    with pytest.raises(ValueError, match=r"'flood'.*push"):
-        suite_fault("flood", lift.unwrapped, "mild", 0, 0)
-    with pytest.raises(ValueError, match=r"'deadly'.*mild, medium, strong"):
-        suite_fault("push", lift.unwrapped, "deadly", 0, 0)
-    with pytest.raises(ValueError, match=r"'flood'.*touch"):
-        harmless_variation("flood", lift.unwrapped, 0, 0)
 
 
 def test_faults_need_one_of_our_environments(lift):

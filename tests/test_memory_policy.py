@@ -11,13 +11,11 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory import motor
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.acting import learn_to_act
-from asm_gym.monitors.packing import unpacked
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.memory_policy import ENOUGH, FORGETS, CommandReadout, StreamReader
 from asm_gym.scaling import StreamScaler
@@ -80,13 +78,6 @@ def test_what_is_linear_is_learned_as_least_squares_would(monkeypatch):
     monkeypatch.setattr(motor, "FORGETTING", 0.0)
     found = learn_motor(m, commands, 4, np.random.default_rng(1)).command(m)
     assert np.sqrt(np.mean((found - best) ** 2)) < 0.03
-
-
-def test_where_one_in_five_closes_the_expected_grip_is_their_mean_and_not_their_median():
-    m = np.ones((1000, 1), np.float32)
-    commands = np.where(np.arange(1000) % 5 == 0, 1.0, -1.0).astype(np.float32)[:, None]
-    learned = learn_motor(m, commands, 4, np.random.default_rng(0))
-    assert learned.command(m[:1])[0, 0] == pytest.approx(-0.6, abs=0.05)
 
 
 def scene() -> StreamSpec:
@@ -171,10 +162,6 @@ def test_a_gripper_changes_once_the_sum_of_what_speaks_for_it_reaches_the_bound(
     assert reached.any()
 
 
-def test_with_long_steps_it_is_still_the_likelier_command_that_is_given():
-    assert told([1.0, 0.1, -0.1], dt=1.0).tolist() == [1.0, 1.0, -1.0]
-
-
 def test_objects_of_other_tasks_read_zero(lift):
     lift.reset(seed=0)
     own = lift.unwrapped.measured_spec
@@ -223,13 +210,3 @@ def test_learning_to_act_refuses_what_it_cannot_learn_from(pilot):
         learn_to_act(silent, [Episode.from_stream(np.zeros((5, 3)), silent.spec)])
     with pytest.raises(ValueError, match="units must be at least 1, got 0"):
         learn_to_act(pilot, taught(Point(), 2), 0)
-
-
-def test_a_motor_association_that_read_its_senses_otherwise_is_refused(pilot, tmp_path):
-    pilot.save(tmp_path / "before.asm")
-    saved = read_checkpoint(tmp_path / "before.asm", pilot.kind)
-    arrays = {name: array for name, array in unpacked(saved.arrays).items() if name != "motor_kappa"}
-    header = saved.header | {"shapes": {name: list(array.shape) for name, array in arrays.items()}}
-    write_checkpoint(tmp_path / "before.asm", pilot.kind, header, arrays)
-    with pytest.raises(ValueError, match="call learn_to_act with this one"):
-        NeuralASM.load(tmp_path / "before.asm")

@@ -171,6 +171,7 @@ def test_a_bad_action_is_refused(lift, action):
         ({"sensor_noise": -1.0}, "sensor_noise.*-1"),
         ({"robot": "panda"}, "'panda'.*did you mean 'Panda'"),
         ({"robot": ("Panda", "Panda")}, "Lift takes 1 robot, got Panda, Panda"),
+        ({"controller": {"type": "OSC_POSE"}}, "controller"),
         ({"controller": "JOINT_VELOCITY"}, "'JOINT_VELOCITY'.*OSC_POSE"),
         ({"render_mode": "ansi"}, "'ansi'.*rgb_array"),
     ],
@@ -178,14 +179,6 @@ def test_a_bad_action_is_refused(lift, action):
 def test_a_bad_argument_is_refused_with_what_exists(arguments, message):
     with pytest.raises(ValueError, match=message):
         gym.make("asm_gym/Lift-v0", **arguments)
-
-
-def test_a_task_with_two_arms_takes_a_pair_or_one_name_for_both():
-    with pytest.raises(ValueError, match="TwoArmLift takes 2 robots, got Panda, Sawyer, Jaco"):
-        gym.make("asm_gym/TwoArmLift-v0", robot=("Panda", "Sawyer", "Jaco"))
-    env = gym.make("asm_gym/TwoArmLift-v0", robot="Sawyer")
-    assert env.unwrapped.robots == ("Sawyer", "Sawyer")
-    env.close()
 
 
 def test_success_ends_the_episode_where_asked():

@@ -34,14 +34,6 @@ def loads_anew(env, seed):
     return env.unwrapped.simulation.model is not before
 
 
-@pytest.fixture(scope="module")
-def lift():
-    env = gym.make("asm_gym/Lift-v0")
-    env.reset(seed=0)
-    yield env
-    env.close()
-
-
 @pytest.mark.parametrize("seeds", [2, pytest.param(20, marks=pytest.mark.slow)])
 def test_what_is_drawn_into_a_model_is_what_loading_draws(seeds, monkeypatch):
     loaded, drawn = (gym.make("asm_gym/Lift-v0") for _ in range(2))
@@ -60,7 +52,9 @@ def test_what_is_drawn_into_a_model_is_what_loading_draws(seeds, monkeypatch):
     drawn.close()
 
 
-def test_a_model_that_others_edit_is_loaded_anew(lift):
+def test_a_model_that_others_edit_is_loaded_anew():
+    lift = gym.make("asm_gym/Lift-v0")
+    lift.reset(seed=0)
     assert not loads_anew(lift, 0)
     inner = lift.unwrapped
     with inner.edits.edit(inner.simulation.model.geom_friction, 0):
@@ -76,3 +70,4 @@ def test_a_model_that_others_edit_is_loaded_anew(lift):
     model = inner.simulation.model
     assert model.body_gravcomp[model.body("cube_main").id] == 1
     inner.robosuite_env._xml_processors.pop()
+    lift.close()

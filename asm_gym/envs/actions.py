@@ -81,11 +81,7 @@ class Actions:
         """
         if self._controller not in _CHANGES:
             raise ValueError(f"actions of {' and '.join(_CHANGES)} are changes, those of {self._controller} are not")
-        return self._turning(simulation, turns)
-
-    def _turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:
-        action = np.zeros(self.size, np.float32)
-        joint = 0
+        action, joint = np.zeros(self.size, np.float32), 0
         for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
             n = int(simulation.arms.joints[a])
             move = turns[joint : joint + n]
@@ -102,7 +98,7 @@ class Actions:
     def resting(self, simulation: Simulation, last: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action (A,) that changes nothing, where there is one, with the grippers as in ``last``."""
         still = np.zeros(len(simulation.motors))
-        action = self._turning(simulation, still) if simulation.compiled else np.zeros(self.size, np.float32)
+        action = self.turning(simulation, still) if simulation.compiled else np.zeros(self.size, np.float32)
         grippers = list(self.grippers)
         action[grippers] = last[grippers]
         return action

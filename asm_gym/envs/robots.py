@@ -74,28 +74,26 @@ def is_compilable(robot: Any, arm: str) -> bool:
 def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
     """Return one row for each arm; the settings of controllers that do not run compiled stay 0."""
     n = len(parts)
-
-    def whole(*shape: int) -> Ints:
-        return np.zeros((n, *shape), np.int64)
-
+    one, each = (n,), (n, JOINTS)
+    whole, real = np.int64, np.float64
     arms = Arms(
-        joints=whole(),
-        qpos=whole(JOINTS),
-        dofs=whole(JOINTS),
-        motors=whole(JOINTS),
-        site=whole(),
-        site_body=whole(),
-        root=whole(),
-        base=whole(),
-        wrench=whole(),
+        joints=np.zeros(one, whole),
+        qpos=np.zeros(each, whole),
+        dofs=np.zeros(each, whole),
+        motors=np.zeros(each, whole),
+        site=np.zeros(one, whole),
+        site_body=np.zeros(one, whole),
+        root=np.zeros(one, whole),
+        base=np.zeros(one, whole),
+        wrench=np.zeros(one, whole),
         bodies=_padded([bodies(model, robot) for robot, _ in parts]),
         tree=_padded([_carried_dofs(model, robot) for robot, _ in parts]),
-        kind=whole(),
-        kp=np.zeros((n, JOINTS)),
-        kd=np.zeros((n, JOINTS)),
-        compensate=np.zeros(n, bool),
-        rest=np.zeros((n, JOINTS)),
-        limits=np.tile([-np.inf, np.inf], (n, JOINTS, 1)),
+        kind=np.zeros(one, whole),
+        kp=np.zeros(each, real),
+        kd=np.zeros(each, real),
+        compensate=np.zeros(one, bool),
+        rest=np.zeros(each, real),
+        limits=np.tile([-np.inf, np.inf], (*each, 1)),
     )
     for a, (robot, arm) in enumerate(parts):
         _fill_indices(arms, a, model, robot, arm)
@@ -174,7 +172,7 @@ def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[C
     mujoco.mj_kinematics(model, data)
     for i, (robot, arm) in enumerate(parts):
         joints = np.asarray(robot._ref_joint_indexes)
-        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
+        body = model.body(robot.robot_model.eef_name[arm]).id
         turns = model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_HINGE)
         if set(_joints_between(model, body)) != set(joints.tolist()) or not turns.all():
             continue

@@ -49,8 +49,8 @@ class Simulation:
         self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64))
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.contact_force = 0.0
-        """The largest net contact force on an arm within the control step [N]: the norm of the summed contact forces on
-        its bodies. A grasp's own squeeze cancels in the sum, and loads that a fault applies are left out."""
+        """The largest net contact force on an arm within the control step [N]. In the sum over its bodies a grasp's own
+        squeeze cancels; loads that a fault applies are left out."""
         self.keeps_history = False
         """Whether robosuite's buffers of recent forces and velocities are kept up, which cost more than a substep."""
         self.begin_episode()
@@ -109,15 +109,13 @@ class Simulation:
         """Give the controllers a new set-point, which they take up in the next substep.
 
         Args:
-            hold: the arms are to stay. No action says that: one of no change follows where the arm drifts or is pushed
-                to, a pose is kept by turning joints, a torque of zero brakes nothing. So the arms are braked beneath
-                their controllers, and held where they were when the hold began (``control.brake``).
+            hold: the arms are to stay, which no action says: one of no change follows a push, a torque of zero brakes
+                nothing. So they are braked beneath their controllers (``control.brake``).
         """
-        for a in range(len(self.parts)):
-            if hold:
-                hold_at(self.views, self.arms, self._goals, a)
-            else:
-                self._goals.held[a] = 0
+        if hold:
+            self._hold_arms()
+        else:
+            self._goals.held[:] = 0
         self._action = action
         self._fresh = True
         if self.compiled:
@@ -130,27 +128,34 @@ class Simulation:
 
     def advance(self, count: int) -> None:
         """Run ``count`` substeps of the control step that was begun."""
-        if self.compiled:
-            if self.keeps_history and self._done == 0:
-                wrenches = [self.data.sensordata[at : at + 6].copy() for at in self.arms.wrench]
-                self._run(count)
-                self._remember(wrenches)
-            else:
-                self._run(count)
+        if not self.compiled:
+            self._run_robosuites(count)
+        elif self.keeps_history and self._done == 0:
+            wrenches = [self.data.sensordata[at : at + 6].copy() for at in self.arms.wrench]
+            self._run(count)
+            self._remember(wrenches)
         else:
-            for k in range(self._done - self._row_began, self._done - self._row_began + count):
-                self.env.sim.step1()
-                self.env._pre_action(self._action, self._fresh)
-                kernels.brake_held(self.views, self.nominal.now(), self.arms, self._goals)
-                self.env.sim.step2()
-                kernels.sample(self.views, self.nominal.now(), self.arms, k, self._samples)
-                kernels.feel(self.arms, self._limits, k, self._samples)
-                if kernels.must_stay(self._limits):
-                    for a in range(len(self.parts)):
-                        hold_at(self.views, self.arms, self._goals, a)
-                self._fresh = False
+            self._run(count)
         self._fresh = False
         self._done += count
+
+    def _run_robosuites(self, count: int) -> None:
+        """Run substeps under robosuite's own controllers."""
+        first = self._done - self._row_began
+        for k in range(first, first + count):
+            self.env.sim.step1()
+            self.env._pre_action(self._action, self._fresh)
+            kernels.brake_held(self.views, self.nominal.now(), self.arms, self._goals)
+            self.env.sim.step2()
+            kernels.sample(self.views, self.nominal.now(), self.arms, k, self._samples)
+            kernels.feel(self.arms, self._limits, k, self._samples)
+            if kernels.must_stay(self._limits):
+                self._hold_arms()
+            self._fresh = False
+
+    def _hold_arms(self) -> None:
+        for a in range(len(self.parts)):
+            hold_at(self.views, self.arms, self._goals, a)
 
     def _run(self, count: int) -> None:
         first = self._done - self._row_began

@@ -43,13 +43,7 @@ class StuckJoint(MotorFault):
 
 
 class JointFriction(MotorFault):
-    """A ``joint`` that moves stiffly.
-
-    Args:
-        joint: counted from the base, 0 first.
-        newton_metres: dry friction [N m].
-        viscous: friction that grows with speed [N m s/rad].
-    """
+    """A ``joint`` that moves stiffly: dry friction in ``newton_metres``, and ``viscous`` friction [N m s/rad]."""
 
     newton_metres: float = within(4.0, low=0, high=1e4)
     viscous: float = within(2.0, low=0, high=1e4)
@@ -63,12 +57,7 @@ class JointFriction(MotorFault):
 
 
 class Backlash(JointFault, HookedFault):
-    """Play in a joint's gear, before its encoder: the reading follows the joint only after it has crossed the gap.
-
-    Args:
-        joint: counted from the base, 0 first.
-        gap: half the play [rad].
-    """
+    """Play of ±``gap`` [rad] in a joint's gear: its encoder follows only after the joint has crossed it."""
 
     hooks = "corruptions"
 

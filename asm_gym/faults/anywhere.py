@@ -57,9 +57,7 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._source.own:
             sensed = np.asarray(info["stream"])[self._source.spec.sensory]
             if not np.allclose(sensed, flat(self.observation_space, observation), equal_nan=True):
-                raise ValueError(
-                    "the senses in this environment's stream are not its observation: no fault can be both"
-                )
+                raise ValueError("this environment's stream does not hold its observation: no fault can be in both")
         return self._sensed(observation, info), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -145,10 +143,9 @@ KINDS: dict[str, Kind] = {
 
 
 def sigmas(env: Interface, streams: list[NDArray[np.float32]]) -> NDArray[np.float64]:
-    """Return (X,) σ of each sensor: its noise, or its spread in the episode where it moves least; 0 of one that stays.
+    """Return (X,) σ of each sensor: its noise, or its spread in the nominal stream (T, X) where it moves least.
 
-    Args:
-        streams: (T, X) readings in nominal episodes.
+    A sensor that stays as it is has 0.
     """
     spread = np.min([np.std(stream, axis=0, dtype=np.float64) for stream in streams], axis=0)
     noise = env.measured_spec.noise
@@ -174,21 +171,8 @@ def faults_anywhere(
     rng = np.random.default_rng([seed, 2])
     spec, struck = env.measured_spec, int(rng.choice(moving))
     name, place = next((n, span) for n, span in spec.slices.items() if span.start <= struck < span.stop)
-    axis = int(rng.integers(len(_halves(env))))
-    drawn = Target(
-        channel=name,
-        element=struck - place.start,
-        sigma=float(sigma[struck]),
-        axis=axis,
-        half=float(_halves(env)[axis]),
-        everything=tuple(spec.slices),
-        onset=onset,
-        seed=seed,
-    )
+    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(np.float64)  # (A,)
+    axis = int(rng.integers(len(halves)))
+    element, spread, half = struck - place.start, float(sigma[struck]), float(halves[axis])
+    drawn = Target(name, element, spread, axis, half, tuple(spec.slices), onset, seed)
     return KINDS[kind](drawn, SEVERITIES.index(severity))
-
-
-def _halves(env: Interface) -> NDArray[np.float64]:
-    """Return (A,) half of the range of each number of the action."""
-    space: Any = env.action_space
-    return np.ravel(0.5 * (space.high - space.low)).astype(np.float64)

@@ -6,16 +6,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import Field, dataclass, field, fields
-from typing import Any, ClassVar, Protocol, cast, dataclass_transform
+from typing import Any, ClassVar, dataclass_transform
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, check_number, check_numbers, check_text, short_repr
+from asm_gym.validation import check_choice, check_number, check_numbers, check_text
 
 Vector3 = tuple[float, float, float]
 """In the world's axes."""
@@ -29,27 +27,8 @@ LONGEST = 10_000
 """The longest delay [control steps]."""
 
 
-class Interface(Protocol):
-    """What faults of sensors and actions act on; any environment with Box spaces has one."""
-
-    measured_spec: StreamSpec
-    corruptions: list[Callable[[Floats], None]]
-    """Each edits the measured row in place."""
-    deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]]
-    """Each replaces the commanded action."""
-
-    @property
-    def measured(self) -> Floats:
-        """The row measured last, laid out as ``measured_spec`` says; a copy."""
-        ...
-
-    @property
-    def gripper_actions(self) -> tuple[int, ...]:
-        """Indices of the action that command grippers."""
-        ...
-
-    @property
-    def action_space(self) -> gym.Space[Any]: ...
+Interface = Any
+"""What faults of sensors and actions act on: ``RobosuiteEnv``, or the ``FaultyInterface`` of any other environment."""
 
 
 @dataclass
@@ -190,25 +169,22 @@ class JointFault(Fault):
         return int(np.concatenate([np.arange(span.start, span.stop) for span in spans])[self.joint])
 
 
-def _check(parameter: Field[Any], value: object) -> None:
+def _check(parameter: Field[Any], value: Any) -> None:
     """Raise ValueError unless a parameter is of its type and within its bounds."""
     low, high, above = (parameter.metadata.get(bound) for bound in ("low", "high", "above"))
     low = -MOST if low is None and above is None else low
     high = MOST if high is None else high
-    if value is None and parameter.type == "int | None":
-        return
-    match parameter.type:
-        case "float":
-            check_number(parameter.name, value, low=low, high=high, above=above)
-        case "int" | "int | None":
-            check_number(parameter.name, value, low=low, high=high, whole=True)
-        case "Vector3":
-            check_numbers(parameter.name, cast(Vector3, value), 3, low=low, high=high)
-            if parameter.name == "direction" and not np.linalg.norm(cast(Vector3, value)) > 0:
-                raise ValueError(f"direction must not be all zero, got {value}")
-        case "str":
-            if not isinstance(value, str):
-                raise ValueError(f"{parameter.name} must be a name, got {short_repr(value)}")
+    name, kind = parameter.name, parameter.type
+    if kind == "float":
+        check_number(name, value, low=low, high=high, above=above)
+    elif kind == "int" or (kind == "int | None" and value is not None):
+        check_number(name, value, low=low, high=high, whole=True)
+    elif kind == "Vector3":
+        check_numbers(name, value, 3, low=low, high=high)
+        if name == "direction" and not np.linalg.norm(value) > 0:
+            raise ValueError(f"direction must not be all zero, got {value}")
+    elif kind == "str" and value != "":
+        check_text(name, value)
 
 
 def along(direction: Vector3) -> Floats:

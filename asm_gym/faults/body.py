@@ -27,13 +27,7 @@ class BodyFault(Fault):
 
 
 class Push(BodyFault, EditingFault):
-    """A steady force on a body of the robot, or of anything else.
-
-    Args:
-        body: a body of the model, such as ``robot0_link5``.
-        newtons: how hard [N].
-        direction: in the world's axes; its length does not matter.
-    """
+    """A steady force of so many ``newtons`` on a ``body``, along a ``direction`` in the world's axes."""
 
     newtons: float = within(20.0, low=-1e4, high=1e4)
     direction: Vector3 = (0.0, 1.0, 0.0)
@@ -45,11 +39,7 @@ class Push(BodyFault, EditingFault):
 
 
 class Touch(Push):
-    """Somebody touches the arm; 2 N is the most that is harmless.
-
-    Args:
-        body, newtons, direction: as for ``Push``.
-    """
+    """Somebody touches the arm; 2 N is the most that is harmless."""
 
     harmless = True
 

@@ -88,13 +88,7 @@ class Slip(ObjectFault, EditingFault):
 
 
 class Snatch(ObjectFault, EditingFault):
-    """Somebody pulls at the object.
-
-    Args:
-        object: its name; the first of the task where empty.
-        newtons: how hard [N].
-        direction: in the world's axes; its length does not matter.
-    """
+    """Somebody pulls at the ``object`` with so many ``newtons``, along a ``direction`` in the world's axes."""
 
     newtons: float = within(15.0, low=-1e4, high=1e4)
     direction: Vector3 = (0.0, 1.0, 0.3)

@@ -143,11 +143,7 @@ class Delay(SensorFault):
 
 
 class FrozenEncoder(JointFault, HookedFault):
-    """Keep a joint's position at its last reading, to the last digit, and its velocity at 0.
-
-    Args:
-        joint: counted from the base, 0 first; a second arm's go on after the first one's.
-    """
+    """Keep a ``joint``'s position at its last reading, to the last digit, and its velocity at 0."""
 
     hooks = "corruptions"
 

@@ -168,18 +168,10 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
     direction = rng.standard_normal(3)
     x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
     elbow = model.jnt_bodyid[model.actuator_trnid[env.motors[4], 0]]
-    return Drawn(
-        env=env,
-        prefix="robot0_" if len(env.robots) > 1 else "",
-        joint=int(rng.integers(len(robot._ref_joint_vel_indexes))),
-        axis=int(rng.integers(axes)),
-        translation=int(rng.integers(3)),
-        direction=(x, y, z),
-        link=model.body(elbow).name,
-        hand=robot.robot_model.eef_name["right"],
-        onset=onset,
-        seed=seed,
-    )
+    joint = int(rng.integers(len(robot._ref_joint_vel_indexes)))
+    axis, translation = int(rng.integers(axes)), int(rng.integers(3))
+    prefix, hand = "robot0_" if len(env.robots) > 1 else "", robot.robot_model.eef_name["right"]
+    return Drawn(env, prefix, joint, axis, translation, (x, y, z), model.body(elbow).name, hand, onset, seed)
 
 
 def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:
