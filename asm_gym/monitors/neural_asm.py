@@ -26,7 +26,6 @@ from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.arm_inputs import Derived
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
-from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.files import restored, split_off
 from asm_gym.monitors.memory_config import MemoryConfig
@@ -286,7 +285,7 @@ class NeuralASM(CalibratedMonitor):
         own, skill = split_off(saved, SKILL)
         own, values = split_off(own, VALUES)
         super().restore(own)
-        self.skill_ = SkillSurprise.found(self.spec, skill, self.seed) if skill else None
+        self.skill_ = SkillSurprise.restored(self.spec, skill, self.seed) if skill else None
         self.values_ = Values.found(self.spec, values, self.seed, self.urdf)
         if self.alarm_on_ != BODY and self.skill_ is None:
             raise ValueError(f"the checkpoint alarms on {short_repr(self.alarm_on_)} surprise, and holds no skills")
@@ -312,8 +311,3 @@ class NeuralASM(CalibratedMonitor):
         self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
         self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()
-
-    def _set_threshold(self, scores: Sequence[Surprise], asked: AlarmRate, each: Sequence[str]) -> None:
-        super()._set_threshold(scores, asked, each)
-        if self.skill_ is not None:
-            self.skill_ = self.skill_.calibrated_on(scores, self.spec.dt)

@@ -12,22 +12,19 @@ Source: Hoerl and Kennard 1970 for ridge regression; ``memory.linear`` for how i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import Blocks, EvidenceDetection, ModelOutput
+from asm_gym.detection import EvidenceDetection, ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.detection.conformal import HOUR
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import RowHistory
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.files import taken_up
 from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
@@ -134,21 +131,16 @@ def _traces(rows: NDArray[np.float32], gains: NDArray[np.float32]) -> NDArray[np
     return np.array(found)
 
 
-@dataclass(frozen=True)
-class SkillSurprise:
+class SkillSurprise(NamedTuple):
     """The surprise of skills beside that of the body.
 
-    Args:
+    Attributes:
         monitor: of skills, fitted.
         weight: factor that brings skill surprise to the scale of the body's, where the two are compared.
-        maxima: (4, n) the largest surprise of each of ``ALARMS_ON`` in the n episodes of the calibration; None before.
-        blocks: (4, m) the same in the m blocks that are counted by the hour; None before.
     """
 
     monitor: CalibratedMonitor
     weight: float
-    maxima: NDArray[np.float64] | None = None
-    blocks: NDArray[np.float64] | None = None
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], body: Sequence[Surprise], seed: int) -> Self:
@@ -158,75 +150,28 @@ class SkillSurprise:
         at_worst = [float(np.median([s.value.max() for s in scores])) for scores in (body, skill)]
         return cls(monitor, at_worst[0] / max(at_worst[1], SMALLEST))
 
-    def ways(self, body: NDArray[np.float64], skill: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the surprise (4, …) of each of ``ALARMS_ON``."""
-        weighed = self.weight * skill
-        return np.array([body, skill, np.maximum(body, weighed), np.minimum(body, weighed)])
-
     def joined(self, body: Surprise, skill: Surprise, alarm_on: str) -> Surprise:
         """Return the surprise of one of ``ALARMS_ON``, attributed as the part is that it comes from."""
-        value = self.ways(body.value, skill.value)[ALARMS_ON.index(alarm_on)]
+        weighed = self.weight * skill.value
+        ways = body.value, skill.value, np.maximum(body.value, weighed), np.minimum(body.value, weighed)
+        value = ways[ALARMS_ON.index(alarm_on)]
         first = value == body.value if alarm_on != "skill" else np.zeros(len(value), np.bool_)
         scale = 1.0 if alarm_on == "skill" else self.weight
         shares = np.where(first[:, None], body.attribution, scale * skill.attribution)
         excused = body if alarm_on == BODY else body._replace(raw=None, excuse=None)
         return excused._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
 
-    def calibrated_on(self, scores: Sequence[Surprise], dt: float) -> Self:
-        """Return it with the maxima of the surprise of nominal episodes, whose rows are ``dt`` [s] apart."""
-        ways = [self.ways(*s.parts) for s in scores]  # (4, T) each
-        blocks = np.array([Blocks.of(own, dt).maxima for own in zip(*ways, strict=True)])
-        return replace(self, maxima=np.array([w.max(axis=1) for w in ways]).T, blocks=blocks)
-
-    def threshold_for(
-        self,
-        which: str,
-        threshold: float | None,
-        maxima: NDArray[np.float64] | None,
-        blocks: Blocks | None,
-        promised: str,
-    ) -> tuple[float | None, NDArray[np.float64] | None, Blocks | None]:
-        """Return the threshold of one of ``ALARMS_ON``, the maxima that it is one of, and blocks; None before.
-
-        Args:
-            which: of ``ALARMS_ON``.
-            threshold: of another of them, at the same rate.
-            maxima: (n,) the largest surprise in the episodes that it was set by.
-            blocks: the same by the hour.
-            promised: ``"episode"`` or ``"hour"``, the unit of that rate.
-        """
-        if self.maxima is None or threshold is None or maxima is None:
-            return None, None, None
-        row = ALARMS_ON.index(which)
-        own, by_hour = self.maxima[row], None
-        if blocks is not None and self.blocks is not None:
-            by_hour = blocks._replace(maxima=self.blocks[row])
-        if promised != HOUR:
-            return same_rank(threshold, maxima, own), own, by_hour
-        if blocks is None or by_hour is None:
-            return None, own, None
-        return same_rank(threshold, blocks.maxima, by_hour.maxima), own, by_hour
-
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays to keep in a checkpoint, by name."""
-        calibrated = {"maxima": self.maxima, "blocks": self.blocks}
-        found = {name: array for name, array in calibrated.items() if array is not None}
-        kept = {**self.monitor.learned_, **found, "weight": np.array(self.weight)}
+        kept = {**self.monitor.learned_, "weight": np.array(self.weight)}
         return {PREFIX + name: array for name, array in kept.items()}
 
     @classmethod
-    def found(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
+    def restored(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
         """Restore it from arrays by their names without the prefix. Raises where they do not fit."""
         weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
-        learned = {n: a for n, a in arrays.items() if n not in ("maxima", "blocks", "weight")}
-        return cls(taken_up(_monitor(spec, seed), learned), weight, arrays.get("maxima"), arrays.get("blocks"))
-
-
-def same_rank(threshold: float, of: NDArray[np.float64], among: NDArray[np.float64]) -> float:
-    """Return the number ``among`` (n,) of the rank that ``threshold`` has in ``of`` (n,)."""
-    below = int((of <= threshold).sum())
-    return float(np.sort(among)[below - 1]) if below else 0.0
+        return cls(_monitor(spec, seed).with_learned({n: a for n, a in arrays.items() if n != "weight"}), weight)
 
 
 def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:

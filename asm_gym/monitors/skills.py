@@ -25,7 +25,7 @@ def learn_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
     The surprise of the body, its threshold and its alarms stay as they are: ``with_alarm_on`` chooses others.
 
     Args:
-        memory: fitted; it is changed.
+        memory: fitted, which alarms on the body; it is changed.
         episodes: nominal ones, of one skill or many; those of ``fit`` will do.
 
     Raises:
@@ -34,21 +34,20 @@ def learn_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
     """
     memory._require_fitted()
     check_nominal(episodes, memory.spec, memory.model.shortest)
-    body = with_alarm_on(memory, BODY)
-    body.skill_ = None
-    memory.skill_ = SkillSurprise.learned(episodes, body.score_episodes(episodes), memory.seed)
-    memory.threshold_, memory.maxima_, memory.about = body.threshold_, body.maxima_, body.about
-    memory.blocks_, memory.promised_ = body.blocks_, body.promised_
+    if memory.alarm_on_ != BODY:
+        raise ValueError(f"this memory alarms on {memory.alarm_on_!r}: take with_alarm_on(memory, {BODY!r})")
+    memory.skill_ = None
+    memory.skill_ = SkillSurprise.learned(episodes, memory.score_episodes(episodes), memory.seed)
     memory._remember(episodes)
     return memory
 
 
 def with_alarm_on(memory: NeuralASM, which: str) -> NeuralASM:
-    """Return the same memory with alarms on another surprise; this one keeps its own.
+    """Return the same memory with alarms on another surprise, without a threshold: ``calibrate`` it.
 
-    ``"body"`` is the surprise at the body, ``"skill"`` that at the skill; ``"either"`` goes by the larger of the two,
-    and ``"both"`` by the smaller. Each has the threshold of the rate that ``calibrate`` was given, and none where the
-    skills were learned after it.
+    Args:
+        memory: fitted; it keeps its own.
+        which: ``"body"`` or ``"skill"``; ``"either"`` goes by the larger of the two, ``"both"`` by the smaller.
 
     Raises:
         ValueError: an unknown name; the message lists what exists.
@@ -61,8 +60,7 @@ def with_alarm_on(memory: NeuralASM, which: str) -> NeuralASM:
     if memory.skill_ is None:
         raise RuntimeError(f"alarm_on={which!r} takes a skill surprise: call learn_skills(memory, episodes) first")
     other.about = {**memory.about, "alarm_on": which}
-    known = memory.threshold_, memory.maxima_, memory.blocks_, memory.promised_
-    other.threshold_, other.maxima_, other.blocks_ = memory.skill_.threshold_for(which, *known)
+    other._uncalibrate()
     return other
 
 

@@ -3,15 +3,13 @@
     RND      ‖f(x) - g(x)‖²              g random and fixed, f trained to follow it on nominal rows
     logpZO   ‖z(x)‖²                     z where the flow dx/ds = v(x, s), s from 0 to 1, carries x; N(0, I) if nominal
 
-There each is averaged over the last five rows, and calibrated by a band in time. Here it has one threshold on that
-mean (``moving_mean``). Source: Xu et al. 2025 (RSS), “Can we
-detect failures without failure data? Uncertainty-aware runtime failure detection for imitation learning policies”;
-Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow. There an embedding of images and the
-action is scored; here the sensorimotor row: values, changes and the action.
+There each is averaged over the last five rows, and calibrated by a band in time; here it has one threshold on that
+mean (``moving_mean``). There an embedding of images and the action is scored; here the sensorimotor row. The networks
+here are smaller: three layers of 512, where the authors train a one-dimensional U-Net of 59 million weights, which
+takes longer for a row on a core than the row lasts at 20 Hz.
 
-The networks here are smaller: three layers of 512, 0.6 million weights, where the authors train a one-dimensional U-Net
-of 256, 512 and 1024 channels, 59 million. On a core that is an hour for each pass over 48,000 rows, and a row takes
-longer to score than it lasts at 20 Hz: a size for a graphics card. ``width`` and ``updates`` go part of the way.
+Source: Xu et al. 2025 (RSS), “Can we detect failures without failure data? Uncertainty-aware runtime failure detection
+for imitation learning policies”; Burda et al. 2019 (ICLR) for distillation, Lipman et al. 2023 (ICLR) for the flow.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from torch import Tensor, nn
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend, steps_of
+from asm_gym.monitors.baselines.torch_model import TorchModel, train_on_rows
 from asm_gym.monitors.stream_model import no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
@@ -42,7 +40,7 @@ FARTHEST = 30.0
 """Where standardised numbers are cut off: networks of this kind diverge far from what they have seen."""
 
 
-class _Rowwise(TorchModel):
+class _RowModel(TorchModel):
     """A network on single rows: values, changes and the command.
 
     Args:
@@ -60,32 +58,35 @@ class _Rowwise(TorchModel):
     def start(self, batch: int) -> RowHistory:
         return RowHistory.empty(batch, 1, self.spec.size)
 
-    @abstractmethod
-    def errors(self, x: Tensor) -> Tensor:
-        """(B, X) of rows (B, N)."""
+    def train(
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+    ) -> None:
+        rows = np.concatenate([_features(r) for r in readings])
+        train_on_rows(self.trained(module), lambda x: self.loss(module, x), rows, BATCH, self.updates, rng, progress)
 
-    def advance(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+    def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
         state, reading, _ = read_next(self.senses_, state, rows)
-        error = self.errors(torch.as_tensor(_features(reading))).cpu().numpy().astype(np.float64)
+        error = self.errors(torch.as_tensor(_features(reading))).numpy().astype(np.float64)
         return state, ModelOutput(error, no_context(rows))
 
-    def size(self, senses: StreamScaler) -> int:
-        """N, numbers in a row as it is scored."""
+    def row_size(self, senses: StreamScaler) -> int:
+        """Return N, the numbers of a row as it is scored."""
         return senses.size + len(self.spec.motor)
 
+    def trained(self, module: nn.Module) -> nn.Module:
+        """Return the part of the network that is trained."""
+        return module
 
-class _Distillation(nn.Module):
-    def __init__(self, size: int, width: int) -> None:
-        super().__init__()
-        self.target = _mlp(size, EMBEDDING, 1, width).requires_grad_(False)
-        self.follower = _mlp(size, EMBEDDING, 2, width)
+    @abstractmethod
+    def loss(self, module: nn.Module, x: Tensor) -> Tensor:
+        """Return the loss of rows (B, N)."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        difference: Tensor = self.follower(x) - self.target(x)
-        return difference
+    @abstractmethod
+    def errors(self, x: Tensor) -> Tensor:
+        """Return the errors (B, X) of rows (B, N)."""
 
 
-class RND(_Rowwise):
+class RND(_RowModel):
     """Random network distillation."""
 
     kind = "rnd"
@@ -96,24 +97,21 @@ class RND(_Rowwise):
         return np.full(EMBEDDING, -1)
 
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _Distillation(self.size(senses), self.width)
+        size = self.row_size(senses)
+        target = _mlp(size, EMBEDDING, 1, self.width).requires_grad_(False)
+        return nn.ModuleDict({"target": target, "follower": _mlp(size, EMBEDDING, 2, self.width)})
 
-    def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
-    ) -> None:
-        assert isinstance(module, _Distillation)
-        optimiser, schedule = adam(module.follower, self.updates)
-        rows = np.concatenate([_features(r) for r in readings])
-        for n, x in enumerate(steps_of(rows, BATCH, self.updates, rng)):
-            tell(n, self.updates)
-            descend((module(x) ** 2).mean(), optimiser, schedule)
+    def trained(self, module: nn.Module) -> nn.Module:
+        return module.get_submodule("follower")
+
+    def loss(self, module: nn.Module, x: Tensor) -> Tensor:
+        return (_difference(module, x) ** 2).mean()
 
     def errors(self, x: Tensor) -> Tensor:
-        difference: Tensor = self.module_(x)
-        return difference
+        return _difference(self.module_, x)
 
 
-class LogpZO(_Rowwise):
+class LogpZO(_RowModel):
     """A flow from rows to noise."""
 
     kind = "logpzo"
@@ -127,18 +125,12 @@ class LogpZO(_Rowwise):
         return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.motor])
 
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _mlp(self.size(senses) + 1, self.size(senses), 3, self.width)
+        return _mlp(self.row_size(senses) + 1, self.row_size(senses), 3, self.width)
 
-    def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
-    ) -> None:
-        optimiser, schedule = adam(module, self.updates)
-        rows = np.concatenate([_features(r) for r in readings])
-        for n, x in enumerate(steps_of(rows, BATCH, self.updates, rng)):
-            tell(n, self.updates)
-            noise, s = torch.randn_like(x), torch.rand(len(x), 1)
-            flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
-            descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
+    def loss(self, module: nn.Module, x: Tensor) -> Tensor:
+        noise, s = torch.randn_like(x), torch.rand(len(x), 1)
+        flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
+        return ((flow - (noise - x)) ** 2).mean()
 
     def errors(self, x: Tensor) -> Tensor:
         for stage in range(STAGES):
@@ -147,8 +139,13 @@ class LogpZO(_Rowwise):
         return x
 
 
+def _difference(module: nn.Module, x: Tensor) -> Tensor:
+    difference: Tensor = module.get_submodule("follower")(x) - module.get_submodule("target")(x)
+    return difference
+
+
 def _features(reading: ScaledRows) -> NDArray[np.float32]:
-    """(B, N) values, changes of slow channels, and the action."""
+    """Return values, changes of slow channels, and the action (B, N)."""
     return np.clip(np.hstack([reading.senses, reading.commands[:, :-1]]), -FARTHEST, FARTHEST)
 
 

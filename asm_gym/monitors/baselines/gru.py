@@ -2,8 +2,6 @@
 
     h_t = GRU(h_{t-1}, [v_{t-1}, Δ_{t-1}, u_t])        Δ̂_t, log σ²_t = linear(h_t)        Gaussian log likelihood
 
-One fifth of the episodes is not trained on: the step size falls where their loss does not, and training ends where the
-smallest brings no gain.
 Source: Cho et al. 2014 (EMNLP); Malhotra et al. 2015 (ESANN) for the Mahalanobis distance of a recurrent network's
 prediction errors.
 """
@@ -21,17 +19,14 @@ from torch import Tensor, nn
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
+from asm_gym.monitors.baselines.torch_model import TorchModel, padded, train_on_episodes
 from asm_gym.monitors.stream_model import read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
-EPOCHS, BATCH = 200, 16
-"""Passes at most; training ends where fresh episodes gain no more."""
-
-CLOSEST = 20.0
-"""Largest error, in standard deviations, whose full weight training feels; contacts would drown all else."""
+LARGEST_ERROR = 20.0
+"""Largest error in training, in standard deviations, that has its full weight; contacts would drown all else."""
 
 
 class _Memory(NamedTuple):
@@ -72,56 +67,36 @@ class GRU(TorchModel):
     def module(self, senses: StreamScaler) -> nn.Module:
         return _Module(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size)
 
-    def sensed(self, reading: ScaledRows) -> NDArray[np.float32]:
-        """(T, S) what it is shown of rows, besides the commands."""
-        return reading.senses
-
-    def judged(self, reading: ScaledRows) -> NDArray[np.float32]:
-        """(T, X) what it is to expect of them."""
-        return reading.changes
-
     def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
     ) -> None:
-        assert isinstance(module, _Module)
-        shown = [self.sensed(r) for r in readings]
-        inputs = [np.hstack([np.vstack([x[:1], x[:-1]]), r.commands]) for x, r in zip(shown, readings, strict=True)]
-        expected = [self.judged(r) for r in readings]
-        trained, fresh = parted(len(readings), rng)
+        inputs = [np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings]
 
-        def loss(chosen: NDArray[np.intp]) -> Tensor:
+        def loss(chosen: NDArray[np.intp], training: bool) -> Tensor:
             x, real = padded([inputs[i] for i in chosen])
-            return _loss(module, x, padded([expected[i] for i in chosen])[0], real)
+            return _loss(module, x, padded([readings[i].changes for i in chosen])[0], real)
 
-        def epoch(optimiser: torch.optim.Optimizer) -> None:
-            order = rng.permutation(trained)
-            for start in range(0, len(order), BATCH):
-                descend(loss(order[start : start + BATCH]), optimiser)
-
-        converge(module, epoch, lambda: loss(fresh), EPOCHS, tell, self.learning_rate)
+        train_on_episodes(module, loss, len(readings), rng, progress, self.learning_rate)
 
     def start(self, batch: int) -> _Memory:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
-        last = self.sensed(self.senses_.read(rows, rows, rows))
+        last = self.senses_.read(rows, rows, rows).senses
         return _Memory(hidden, last, RowHistory.empty(batch, 1, self.spec.size))
 
-    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         history, r, _ = read_next(self.senses_, state.history, rows)
-        sensed = self.sensed(r)
-        last = np.where(state.history.steps[:, None] > 0, state.last, sensed)
+        last = np.where(state.history.steps[:, None] > 0, state.last, r.senses)
         inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
-        mean, log_variance, hidden = (
-            y.cpu().numpy()[:, 0]
-            for y in self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
-        )
-        error = r.whole * (self.judged(r) - mean) * np.exp(-0.5 * log_variance)
-        return _Memory(hidden, sensed, history), ModelOutput(error, hidden)
+        found = self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
+        mean, log_variance, hidden = (y.numpy()[:, 0] for y in found)
+        error = r.whole * (r.changes - mean) * np.exp(-0.5 * log_variance)
+        return _Memory(hidden, r.senses, history), ModelOutput(error, hidden)
 
 
-def _loss(module: _Module, inputs: Tensor, changes: Tensor, real: Tensor) -> Tensor:
-    """The mean over the steps (B, T) that are ``real``."""
+def _loss(module: nn.Module, inputs: Tensor, changes: Tensor, real: Tensor) -> Tensor:
+    """Return the mean over the steps (B, T) that are ``real``."""
     mean, log_variance, _ = module(inputs)
     normalised = (changes - mean) * torch.exp(-0.5 * log_variance)
-    error = nn.functional.huber_loss(normalised, torch.zeros_like(mean), reduction="none", delta=CLOSEST)
+    error = nn.functional.huber_loss(normalised, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR)
     loss: Tensor = (error + 0.5 * log_variance).mean(dim=-1)
     return (loss * real).sum() / real.sum()

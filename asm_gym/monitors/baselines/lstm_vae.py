@@ -3,7 +3,7 @@
 Source: Park, Hoshi and Kemp 2018 (IEEE RA-L 3(3)), “A multimodal anomaly detector for robot-assisted feeding using an
 LSTM-based variational autoencoder”: denoising, a prior that moves on with the episode's progress, the negative log
 likelihood as score, and its expected value, which a support vector regression takes from the latent state, divided by
-(they deduct it). One fifth of the episodes is not trained on, but says when training has converged.
+(they deduct it).
 """
 
 from __future__ import annotations
@@ -21,14 +21,11 @@ from asm_gym.detection import ModelOutput, Nominal
 from asm_gym.detection.scores import Squares
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.baselines.torch_model import TorchModel, converge, descend, padded, parted
+from asm_gym.monitors.baselines.torch_model import TorchModel, padded, train_on_episodes
 from asm_gym.monitors.stream_model import read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
-
-EPOCHS, BATCH = 200, 16
-"""Passes at most; training ends where fresh episodes gain no more."""
 
 CORRUPTION = 0.1
 """Standard deviation of the noise that the encoder's inputs are corrupted with."""
@@ -36,14 +33,9 @@ REGRESSED = 3000
 """Steps that the threshold is learned from; a support vector regression takes the square of their number in time."""
 
 
-class _Cell(NamedTuple):
-    hidden: NDArray[np.float32]  # (B, H)
-    cell: NDArray[np.float32]  # (B, H)
-
-
 class _Memory(NamedTuple):
-    encoder: _Cell
-    decoder: _Cell
+    encoder: NDArray[np.float32]  # (B, 2, H) hidden state and cell
+    decoder: NDArray[np.float32]  # (B, 2, H)
     history: RowHistory
 
 
@@ -95,16 +87,15 @@ class LSTMVAE(TorchModel):
         return np.concatenate([self.spec.sensory, self.senses_.slow])
 
     def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, tell: Progress
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
     ) -> None:
         assert isinstance(module, _Module)
-        longest = max(len(r.senses) for r in readings)
         # The centre of the prior moves through the latent space as the episode goes on.
-        centre = torch.linspace(-1.0, 1.0, longest)[None, :, None]
-        trained, fresh = parted(len(readings), rng)
+        centre = torch.linspace(-1.0, 1.0, max(len(r.senses) for r in readings))[None, :, None]
 
-        def loss(chosen: NDArray[np.intp], noise: float = 1.0) -> Tensor:
+        def loss(chosen: NDArray[np.intp], training: bool) -> Tensor:
             x, real = padded([readings[i].senses for i in chosen])
+            noise = 1.0 if training else 0.0
             mean, log_variance, _ = module.encode(x + noise * CORRUPTION * torch.randn_like(x))
             z = mean + noise * torch.exp(0.5 * log_variance) * torch.randn_like(mean)
             rebuilt, spread, _ = module.decode(z)
@@ -113,24 +104,19 @@ class LSTMVAE(TorchModel):
             divergence = 0.5 * (log_variance.exp() + prior - 1.0 - log_variance).sum(dim=-1)
             return ((likelihood + divergence) * real).sum() / real.sum()
 
-        def epoch(optimiser: torch.optim.Optimizer) -> None:
-            order = rng.permutation(trained)
-            for start in range(0, len(order), BATCH):
-                descend(loss(order[start : start + BATCH]), optimiser)
-
-        converge(module, epoch, lambda: loss(fresh, noise=0.0), EPOCHS, tell, self.learning_rate)
+        train_on_episodes(module, loss, len(readings), rng, progress, self.learning_rate)
 
     def start(self, batch: int) -> _Memory:
-        nothing = _Cell(*np.zeros((2, batch, self.hidden_size), np.float32))
+        nothing = np.zeros((batch, 2, self.hidden_size), np.float32)
         return _Memory(nothing, nothing, RowHistory.empty(batch, 1, self.spec.size))
 
-    def advance(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
+    def predict(self, state: _Memory, rows: NDArray[np.float64]) -> tuple[_Memory, ModelOutput]:
         assert isinstance(self.module_, _Module)
         history, r, _ = read_next(self.senses_, state.history, rows)
-        z, _, encoder = self.module_.encode(torch.as_tensor(r.senses)[:, None], _torch(state.encoder))
-        mean, log_variance, decoder = self.module_.decode(z, _torch(state.decoder))
-        error = r.seen * (r.senses - mean.cpu().numpy()[:, 0]) * np.exp(-0.5 * log_variance.cpu().numpy()[:, 0])
-        return _Memory(_numpy(encoder), _numpy(decoder), history), ModelOutput(error, z.cpu().numpy()[:, 0])
+        z, _, encoder = self.module_.encode(torch.as_tensor(r.senses)[:, None], _cell(state.encoder))
+        mean, log_variance, decoder = self.module_.decode(z, _cell(state.decoder))
+        error = r.seen * (r.senses - mean.numpy()[:, 0]) * np.exp(-0.5 * log_variance.numpy()[:, 0])
+        return _Memory(_kept(encoder), _kept(decoder), history), ModelOutput(error, z.numpy()[:, 0])
 
 
 class LatentThreshold(Squares):
@@ -175,10 +161,10 @@ class LatentThreshold(Squares):
         return parts
 
 
-def _torch(state: _Cell) -> tuple[Tensor, Tensor]:
-    hidden, cell = (torch.as_tensor(np.ascontiguousarray(s))[None] for s in state)
-    return hidden, cell
+def _cell(state: NDArray[np.float32]) -> tuple[Tensor, ...]:
+    """Return hidden state and cell (1, B, H) of a state (B, 2, H)."""
+    return tuple(torch.as_tensor(np.ascontiguousarray(state[:, n]))[None] for n in range(2))
 
 
-def _numpy(state: tuple[Tensor, Tensor]) -> _Cell:
-    return _Cell(state[0].cpu().numpy()[0], state[1].cpu().numpy()[0])
+def _kept(state: tuple[Tensor, Tensor]) -> NDArray[np.float32]:
+    return np.stack([part.numpy()[0] for part in state], axis=1)
