@@ -177,7 +177,7 @@ def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
     elif spec.source == "table" and not args.action:
         yield f"taken as commanded, by name: {names}; the output of a controller would hide pushes"
     if args.urdf is not None:
-        links = Derived.of(spec, friction=True, body=False, urdf=read_urdf(args.urdf)).links
+        links = Derived.of(spec, read_urdf(args.urdf)).links
         assert links is not None
         joints = ", ".join(links.names[i] for i in np.argsort(links.columns))
         yield f"the angles are taken for these joints of {args.urdf}, in this order: {joints}"

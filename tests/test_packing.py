@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.monitors.packing import packed, rounded, unpacked
 from tests.streams import sine_episodes, sine_spec
 
@@ -76,17 +75,6 @@ def test_parts_that_do_not_fit_are_refused():
         unpacked({"V.bits": np.zeros((2, 2), np.int8)})
     with pytest.raises(ValueError, match="the root of moments"):
         unpacked({"moments.root": np.zeros(4, np.int16), "moments.scale": np.array(1.0)})
-
-
-def test_a_file_of_an_older_format_is_refused_in_one_line_that_says_how_to_make_it_anew(tmp_path):
-    memory = NeuralASM(sine_spec(), hidden_size=8, association_size=8, epochs=1).fit(sine_episodes(4))
-    memory.save(tmp_path / "m.asm")
-    saved = read_checkpoint(tmp_path / "m.asm", memory.kind)
-    planes = np.zeros((8, *saved.arrays["mean"].shape), np.uint8)
-    arrays = {n: a for n, a in saved.arrays.items() if n != "mean"} | {"mean.planesf8": planes}
-    write_checkpoint(tmp_path / "m.asm", memory.kind, saved.header, arrays)
-    with pytest.raises(ValueError, match=r"^[^\n]*m\.asm [^\n]*older asm-gym[^\n]*asm-gym babble$"):
-        NeuralASM.load(tmp_path / "m.asm")
 
 
 def test_a_rounded_memory_is_the_same_when_it_is_read_and_smaller(tmp_path):

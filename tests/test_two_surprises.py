@@ -57,6 +57,11 @@ def memory():
 
 
 @cache
+def alarming_on(which, asm=None):
+    """The memory with skills, calibrated for alarms on this surprise."""
+    return with_alarm_on(asm or both(), which).calibrate([carried(100 + s) for s in range(40)], 0.05)
+
+
 def both():
     asm = learn_skills(with_alarm_on(memory(), "body"), [carried(s) for s in range(40)])
     return asm.calibrate([carried(100 + s) for s in range(40)], 0.05)
@@ -75,7 +80,7 @@ def test_listening_for_skills_changes_no_bit_of_what_alarms():
 
 def test_a_policy_that_is_lost_surprises_the_skill_and_not_the_body():
     """The body does as it is told: what is commanded is new, and what follows from it is not."""
-    asm = with_alarm_on(both(), "skill")
+    asm = alarming_on("skill")
     scores = asm.score_episodes([lost(300 + s) for s in range(20)])
     assert np.mean([s.value[LATE:].max() > asm.threshold for s in scores]) == 1.0
     assert np.mean([s.value[:LATE].max() > asm.threshold for s in scores]) <= 0.15
@@ -90,7 +95,7 @@ def test_a_push_surprises_the_body():
 
 @pytest.mark.parametrize("which", ["skill", "either", "both"])
 def test_each_choice_is_calibrated_and_its_shares_add_up(which):
-    asm = with_alarm_on(both(), which)
+    asm = alarming_on(which)
     fresh = asm.score_episodes([carried(500 + s) for s in range(200)])
     assert np.mean([s.value.max() > asm.threshold for s in fresh]) <= 0.12  # 5 % on average over calibrations
     for s in asm.score_episodes([carried(600), lost(601), carried(602, push=0.1)]):
@@ -101,34 +106,16 @@ def test_each_choice_is_calibrated_and_its_shares_add_up(which):
             "both": np.minimum(s.of_body, asm.skill_.weight * s.of_skill),
         }
         np.testing.assert_array_equal(s.value, expected[which])
-    again = with_alarm_on(both(), which).calibrate([carried(100 + s) for s in range(40)], 0.05)
-    assert again.threshold == asm.threshold
-
-
-def test_each_choice_keeps_a_promise_by_the_hour(tmp_path):
-    """40 episodes of 4 s: 160 s, of which three may alarm at 90 an hour, whichever surprise is asked."""
-    asm = with_alarm_on(both(), "body").calibrate([carried(100 + s) for s in range(40)], false_alarms_per_hour=90.0)
-    asm.save(tmp_path / "by_hour.asm")
-    with pytest.raises(ValueError, match="episode 1 was learned from"):  # by what listens for skills
-        asm.calibrate([carried(100), carried(3)] * 40, false_alarms_per_hour=90.0)
-    for known in (asm, load_monitor(tmp_path / "by_hour.asm")):
-        for which in ("body", "skill", "either", "both"):
-            chosen = with_alarm_on(known, which)
-            assert (chosen.blocks_.maxima > chosen.threshold).sum() == 3
-            assert chosen.promise[1:] == asm.promise[1:]
-            assert chosen.promise.rate == pytest.approx(4 / (160 / 3600))
-            assert chosen.threshold == chosen.threshold_at(false_alarms_per_hour=90.0)
 
 
 def test_a_file_keeps_both_surprises_and_the_choice(tmp_path):
-    asm = with_alarm_on(both(), "either")
+    asm = alarming_on("either")
     asm.save(tmp_path / "two.asm")
     loaded = load_monitor(tmp_path / "two.asm")
     assert (loaded.alarm_on_, loaded.threshold) == ("either", asm.threshold)
     episode = lost(700)
     for mine, theirs in zip(asm.score(episode), loaded.score(episode), strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    assert with_alarm_on(loaded, "both").threshold == with_alarm_on(asm, "both").threshold
 
 
 def test_a_number_that_is_not_finite_is_infinite_for_either_and_for_both():
@@ -147,10 +134,13 @@ def test_skills_are_learned_first_and_forgotten_where_the_memory_learns_anew():
         with_alarm_on(both(), "neither")
     with pytest.raises(RuntimeError, match="calibrate"):
         _ = with_alarm_on(learn_skills(memory(), [carried(s) for s in range(5)]), "skill").threshold
-    asm = with_alarm_on(both(), "either")
+    asm = alarming_on("either")
+    threshold = asm.threshold
     with pytest.raises(ValueError, match="at least 19"):
         asm.calibrate([carried(100 + s) for s in range(5)], 0.05)
-    assert with_alarm_on(asm, "skill").threshold == with_alarm_on(both(), "skill").threshold
+    assert asm.threshold == threshold
+    with pytest.raises(ValueError, match="alarms on 'either'"):
+        learn_skills(asm, [carried(s) for s in range(5)])
     asm.fit([carried(s) for s in range(3)])
     assert asm.alarm_on_ == "body"
     assert asm.skill_ is None

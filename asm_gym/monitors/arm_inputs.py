@@ -57,11 +57,19 @@ class Derived(NamedTuple):
     links: BodyModel | None = None
 
     @classmethod
-    def of(cls, spec: StreamSpec, friction: bool, body: bool, urdf: str = "") -> Self:
-        """What a stream has by the names of its channels. Raises ValueError where a body model does not fit it."""
+    def of(cls, spec: StreamSpec, urdf: str = "") -> Self:
+        """Return what a stream has by the names of its channels.
+
+        Args:
+            spec: of the stream.
+            urdf: text of a body model, or empty.
+
+        Raises:
+            ValueError: the body model does not fit the stream.
+        """
         place = {int(column): k for k, column in enumerate(spec.sensory)}
-        moving, from_steps = speeds(spec) if friction else (np.zeros(0, np.intp), False)
-        columns = _named(spec, POSITION) if body or urdf else np.zeros(0, np.intp)
+        moving, from_steps = speeds(spec)
+        columns = _named(spec, POSITION)
         columns = columns if len(columns) <= MOST_ANGLES else columns[:0]
         units = {
             i: c.unit for c, s in zip(spec.channels, spec.slices.values(), strict=True) for i in range(s.start, s.stop)

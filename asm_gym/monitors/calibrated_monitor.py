@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.detection import Detection, Nominal
+from asm_gym.detection import Blocks, Detection, Nominal
+from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import HOUR
 from asm_gym.detection.contact_limits import FamiliarSpeed, healthy_forces
 from asm_gym.episode import Episode
@@ -70,8 +71,7 @@ class CalibratedMonitor(Calibrated):
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
         """All arrays that ``fit`` has found, by name; empty before."""
-        model: Any = self.model
-        found = dict(model.state() if hasattr(model, "state") else model.learned_)
+        found = dict(self.model.learned_)
         for detection in self.detections.values():
             found |= detection.learned_
         return found
@@ -198,16 +198,16 @@ class CalibratedMonitor(Calibrated):
             if asked.per == HOUR:
                 raise
             LOG.warning("%s; the promise by the episode does not hold for these", error)
-        scores = self.score_episodes(episodes)
-        self._set_threshold(scores, asked, each)
-        warn_of_crashes(episodes, [s.value for s in scores], self.threshold, asked, each)
+        values = [s.value for s in self.score_episodes(episodes)]
+        threshold = asked.threshold_of(values, self.spec.dt, each)
+        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
+        self.threshold_, self.promised_ = threshold, asked.per
+        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
+        warn_of_crashes(episodes, values, threshold, asked, each)
         streams = [episode.stream for episode in episodes]
         self.healthy_ = healthy_forces(streams, self.spec)
         self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
         return self
-
-    def _check_threshold(self, threshold: float) -> None:
-        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
 
     @typed
     def initial_state(self, batch: int = 1) -> MonitorState:
@@ -279,20 +279,24 @@ class CalibratedMonitor(Calibrated):
             ValueError: something is missing, or does not fit together.
         """
         found = SavedMonitor.of(saved)
+        self.with_learned(found.arrays, tuple(saved.header["skills"]))
+        vars(self).update(found.kept)
+        if saved.header["detection"] == self.detection.name:
+            self.threshold_ = found.threshold_below(self.detection.reach)
+            vars(self).update(found.calibrated)
+        return self
+
+    def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        """Take over the arrays that ``learned_`` gave, without a threshold, and return it."""
         theirs = {n for d in self.detections.values() for n in d.arrays}
-        missing = [n for n in self.detection.arrays if n not in found.arrays]
+        missing = [n for n in self.detection.arrays if n not in arrays]
         if missing:
             raise ValueError(f"the checkpoint has no {', '.join(missing)}, so fit it anew")
-        self.model.restore({n: a for n, a in found.arrays.items() if n not in theirs}, found.skills)
+        self.model.restore({n: a for n, a in arrays.items() if n not in theirs}, skills)
         self._place_errors()
         for detection in self.detections.values():
-            if found.arrays.keys() >= set(detection.arrays):
-                detection.restore({n: found.arrays[n] for n in detection.arrays})
-        self.about, self.learned_from_, self.ceilings_from_ = found.about, found.learned_from, found.ceilings_from
-        self.familiar_, self.healthy_ = found.familiar, found.healthy
-        if found.detection == self.detection.name:
-            self.threshold_, self.promised_ = found.threshold_below(self.detection.reach), found.promised
-            self.maxima_, self.blocks_ = found.maxima, found.blocks
+            if arrays.keys() >= set(detection.arrays):
+                detection.restore({n: arrays[n] for n in detection.arrays})
         return self
 
     @property

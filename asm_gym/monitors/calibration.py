@@ -24,7 +24,6 @@ from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.detection.contact_limits import FamiliarSpeed
 from asm_gym.detection.hourly import check_hours
 from asm_gym.episode import Episode
-from asm_gym.monitors.base import Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
@@ -149,17 +148,6 @@ class Calibrated:
         if self.promised_ == HOUR and self.blocks_ is not None:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
-
-    def _set_threshold(self, scores: Sequence[Surprise], asked: AlarmRate, each: Sequence[str]) -> None:
-        """Set it by the surprise of nominal episodes. Raises ValueError, and changes nothing, for too few."""
-        values = [s.value for s in scores]
-        threshold = asked.threshold_of(values, self.spec.dt, each)
-        self._check_threshold(threshold)
-        self.threshold_, self.promised_ = threshold, asked.per
-        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
-
-    def _check_threshold(self, threshold: float) -> None:
-        """Raise ValueError for a threshold that will not do."""
 
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = self.familiar_ = None

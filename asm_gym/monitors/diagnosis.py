@@ -93,7 +93,7 @@ class Hypothesis(NamedTuple):
 
 @dataclass(frozen=True)
 class Readout:
-    """Tells classes of causes apart by evidence.
+    """Softmax regression of the class of a cause on evidence.
 
     Args:
         mean, spread: (F,) of the evidence it learned from.
@@ -107,43 +107,21 @@ class Readout:
     bias: NDArray[np.float64]
 
     def __call__(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, C) probabilities of ``CLASSES`` for evidence (N, F)."""
+        """Return the probabilities (N, C) of ``CLASSES`` for evidence (N, F)."""
         return softmax((evidence - self.mean) / self.spread @ self.weights.T + self.bias)
 
     @classmethod
-    def fit(
-        cls,
-        evidence: NDArray[np.float64],
-        classes: NDArray[np.intp],
-        weight: NDArray[np.float64],
-        shrinkage: float = 1e-3,
-        steps: int = 3000,
-        rate: float = 0.5,
-    ) -> Self:
-        """By the delta rule, ΔW ∝ (target - p) evidenceᵀ, for examples (N, F) of classes (N,) that count ``weight``."""
-        mean, spread = evidence.mean(axis=0), evidence.std(axis=0) + 1e-9
-        x = (evidence - mean) / spread
-        target = np.eye(len(CLASSES))[classes]
-        W, b = np.zeros((len(CLASSES), x.shape[1])), np.zeros(len(CLASSES))
-        share = (weight / weight.sum())[:, None]
-        for _ in range(steps):
-            error = share * (target - softmax(x @ W.T + b))
-            W += rate * (error.T @ x - shrinkage * W)
-            b += rate * error.sum(axis=0)
-        return cls(mean, spread, W, b)
-
-    @classmethod
     def shipped(cls) -> Self:
-        """Learned from faults of an arm in simulation: see ``asm-gym reproduce diagnosis``."""
+        """Return the readout that was learned from faults of an arm in simulation."""
         text = resources.files("asm_gym.monitors").joinpath("causes.json").read_text(encoding="utf-8")
         saved = json.loads(text)
         return cls(**{name: np.array(saved[name]) for name in ("mean", "spread", "weights", "bias")})
 
 
 def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses: int) -> NDArray[np.float64]:
-    """(F,) the mean of all ``diagnoses`` of families so far, of which the newest counts a tenth at least.
+    """Return the mean (F,) of all ``diagnoses`` of families so far, of which the newest counts a tenth at least.
 
-    Once it is sure it stays: what comes later is seen from where the fault has brought the arm, where nobody has been.
+    A belief that is sure stays: later rows are from places where a fault has brought the arm.
     """
     if diagnoses > SETTLED_AFTER and belief.max() >= SETTLED:
         return belief
@@ -151,7 +129,7 @@ def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses
 
 
 def softmax(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Along the last axis."""
+    """Return the softmax along the last axis."""
     powers = np.exp(x - x.max(axis=-1, keepdims=True))
     found: NDArray[np.float64] = powers / powers.sum(axis=-1, keepdims=True)
     return found
@@ -178,8 +156,13 @@ class Diagnosis:
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """What may be wrong."""
-        return hypotheses_of(self.completion)
+        """All that may be wrong."""
+        return _hypotheses(self.completion)
+
+    @cached_property
+    def _groups(self) -> list[NDArray[np.intp]]:
+        names = np.array([c.group for c in self.completion.spec.channels for _ in range(c.size)])
+        return [np.flatnonzero(names == group) for group in GROUPS]
 
     @cached_property
     def _freed(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
@@ -192,25 +175,17 @@ class Diagnosis:
             found.append((E, np.linalg.inv(self.precision[np.ix_(E, E)])))
         return found
 
-    def explained(self, lifted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """E (T,), and E_S of each hypothesis (T, H), for y (T, Y)."""
-        y = lifted - self.completion.centre
-        g = y @ self.precision
-        energy = np.einsum("ty,ty->t", y, g)
-        left = [energy - np.einsum("te,ef,tf->t", g[:, E], Q, g[:, E]) for E, Q in self._freed]
-        return energy, np.stack(left, axis=1)
-
     def evidence(
         self, lifted: NDArray[np.float64], attribution: NDArray[np.float64], missing: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, int]]:
-        """(F,) what is weighed, and the best hypothesis of each kind.
+        """Return the evidence (F,), and the best hypothesis of each kind.
 
         Args:
             lifted: (T, Y) y of the last rows.
             attribution: (D,) where the surprise is, of the last row.
             missing: (D,) senses that are completed, and so explain nothing any more.
         """
-        energy, left = self.explained(lifted[-WINDOW:])
+        energy, left = self._explained(lifted[-WINDOW:])
         usual = len(self.completion.covariance)
         total, rest = energy.mean() + 1.0, np.maximum(left.mean(axis=0), 0.0) + 1.0
         explains = np.log(total / rest)
@@ -226,11 +201,13 @@ class Diagnosis:
         groups = [float(shares[columns].sum()) for columns in self._groups]
         return np.array([*found, np.log(total / usual), alone, *groups]), best
 
-    @cached_property
-    def _groups(self) -> list[NDArray[np.intp]]:
-        spec = self.completion.spec
-        names = np.array([c.group for c in spec.channels for _ in range(c.size)])
-        return [np.flatnonzero(names == group) for group in GROUPS]
+    def _explained(self, lifted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return E (T,), and E_S of each hypothesis (T, H), for y (T, Y)."""
+        y = lifted - self.completion.centre
+        g = y @ self.precision
+        energy = np.einsum("ty,ty->t", y, g)
+        left = [energy - np.einsum("te,ef,tf->t", g[:, E], Q, g[:, E]) for E, Q in self._freed]
+        return energy, np.stack(left, axis=1)
 
     def __call__(
         self,
@@ -238,9 +215,11 @@ class Diagnosis:
         attribution: NDArray[np.float64],
         missing: NDArray[np.bool_] | None = None,
     ) -> Cause:
-        """The cause of the surprise in the last of the rows (T, D), of which it attributes (D,).
+        """Return the cause of the surprise in the last row.
 
         Args:
+            rows: (T, D) the last ones of the stream.
+            attribution: (D,) share of each number in the surprise.
             missing: (D,) senses that are completed already, and so are the cause no more.
         """
         stuck = self._stuck(rows, attribution)
@@ -254,13 +233,11 @@ class Diagnosis:
             probabilities[family] += float(q)
         family = max(probabilities, key=lambda name: probabilities[name])
         which = max((q, name) for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True) if own == family)[1]
-        named = self.named(which, evidence, best)
+        able = [kind for kind in CLASSES[which][1] if kind in best]
+        most = max(able, key=lambda kind: evidence[EVIDENCE.index(kind)], default="")
+        named = self.hypotheses[best[most]] if most else None
         columns = named.columns if named is not None and family == "sensor" else np.zeros(0, np.intp)
         return Cause(family, named.part if named else "", probabilities[family], probabilities, columns)
-
-    def is_stuck(self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]) -> bool:
-        """Whether a sensor is at fault beyond doubt, for it repeats itself and surprises by that."""
-        return self._stuck(rows, attribution) is not None
 
     def _stuck(
         self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
@@ -272,16 +249,9 @@ class Diagnosis:
         most = max(self.completion.sensors, key=lambda sensor: float(attribution[sensor[1]].sum()))
         return most if same[most[1]].any() else None
 
-    def named(self, which: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
-        """The part that explains most, of those that a class has, by what ``evidence`` returned."""
-        able = [kind for kind in CLASSES[which][1] if kind in best]
-        if not able:
-            return None
-        return self.hypotheses[best[max(able, key=lambda kind: evidence[EVIDENCE.index(kind)])]]
 
-
-def hypotheses_of(completion: Completion) -> tuple[Hypothesis, ...]:
-    """All that may be wrong in a stream, by the names of its channels."""
+def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
+    """Return all that may be wrong in a stream, by the names of its channels."""
     spec = completion.spec
     groups = {label: c.group for c in spec.channels for label in c.labels}
     labels = np.array(spec.labels)

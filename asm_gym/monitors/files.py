@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint, write_checkpoint
-from asm_gym.detection import Blocks, EvidenceDetection
+from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.detection.contact_limits import FamiliarSpeed
-from asm_gym.monitors.packing import is_older, packed, unpacked
+from asm_gym.monitors.packing import packed, unpacked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
@@ -30,31 +30,15 @@ class SavedMonitor(NamedTuple):
 
     Attributes:
         arrays: what its model and its detections have learned, by name.
-        maxima: (n,) largest surprise in each episode of the calibration; None before it.
-        blocks: the same by the hour; None before it.
-        learned_from: marks of the episodes that were learned from; None where none are kept.
-        ceilings_from: marks of the hours that set ceilings; None where none did.
-        promised: unit that the threshold's promise counts by.
+        kept: attributes of the monitor that it holds under any detection.
+        calibrated: attributes of the monitor that hold under the detection that it was calibrated with.
         threshold: as it was written.
-        detection: the one that the threshold is of.
-        skills: names of those that the model knows.
-        about: anything else.
-        healthy: (N,) largest forces in the calibration episodes.
-        familiar: speed of the hand in them; None where the stream has no hand.
     """
 
     arrays: Arrays
-    maxima: NDArray[np.float64] | None
-    blocks: Blocks | None
-    learned_from: NDArray[np.float64] | None
-    ceilings_from: NDArray[np.float64] | None
-    promised: str
+    kept: dict[str, Any]
+    calibrated: dict[str, Any]
     threshold: object
-    detection: str
-    skills: tuple[str, ...]
-    about: dict[str, Any]
-    healthy: tuple[float, ...]
-    familiar: FamiliarSpeed | None
 
     @classmethod
     def of(cls, saved: Checkpoint) -> Self:
@@ -64,25 +48,21 @@ class SavedMonitor(NamedTuple):
         if undeclared:
             raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
         arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
-        maxima, blocks, learned, ceilings = (
-            arrays.pop(name, None) for name in (MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM)
-        )
-        promised = header.get("promised", EPISODE)
+        blocks, promised = arrays.pop(BLOCKS, None), header.get("promised", EPISODE)
         check_choice("promise", promised, (EPISODE, HOUR))
-        return cls(
-            arrays,
-            maxima,
-            None if blocks is None else Blocks.restored(blocks),
-            learned,
-            ceilings,
-            promised,
-            header["threshold"],
-            header["detection"],
-            tuple(header["skills"]),
-            dict(header["about"]),
-            tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
-            FamiliarSpeed.restored(header.get("familiar", [])),
-        )
+        calibrated = {
+            "maxima_": arrays.pop(MAXIMA, None),
+            "blocks_": None if blocks is None else Blocks.restored(blocks),
+            "promised_": promised,
+        }
+        kept = {
+            "learned_from_": arrays.pop(LEARNED_FROM, None),
+            "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
+            "about": dict(header["about"]),
+            "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
+            "familiar_": FamiliarSpeed.restored(header.get("familiar", [])),
+        }
+        return cls(arrays, kept, calibrated, header["threshold"])
 
     def threshold_below(self, reach: float) -> float | None:
         """Return the threshold. Raises ValueError where surprise, which never comes to ``reach``, cannot exceed it."""
@@ -103,7 +83,7 @@ def write_monitor(path: str | Path, monitor: CalibratedMonitor) -> None:
         LEARNED_FROM: monitor.learned_from_,
         CEILINGS_FROM: monitor.ceilings_from_,
     }
-    arrays = learned | {name: array for name, array in kept.items() if array is not None}
+    arrays: dict[str, NDArray[Any]] = learned | {name: array for name, array in kept.items() if array is not None}
     header = {
         "spec": monitor.spec.to_json(),
         "hyperparameters": monitor.get_params(),
@@ -138,8 +118,6 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
     Raises:
         ValueError: the file is damaged, or of an older format.
     """
-    if is_older(saved.arrays):
-        raise ValueError(f"{path} was written by an older asm-gym: make it anew, by asm-gym fit or asm-gym babble")
     try:
         how = {n: value for n, value in saved.header["hyperparameters"].items() if n != RETIRED}
         return make(StreamSpec.from_json(saved.header["spec"]), **how).restore(saved)
@@ -153,10 +131,3 @@ def split_off(saved: Checkpoint, prefix: str) -> tuple[Checkpoint, Arrays]:
     shapes = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(prefix)}
     arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(prefix)}
     return Checkpoint({**saved.header, "shapes": shapes}, arrays), beside
-
-
-def taken_up(monitor: R, learned: Arrays) -> R:
-    """Return a monitor that a memory keeps beside it, with what it had learned; it has no threshold of its own."""
-    shapes = {name: array.shape for name, array in learned.items()}
-    header = {"shapes": shapes, "skills": (), "threshold": None, "detection": EvidenceDetection.name, "about": {}}
-    return monitor.restore(Checkpoint(header, dict(learned)))

@@ -124,7 +124,7 @@ class NeuralASM(CalibratedMonitor):
         self.values, self.excuses = check_flag("values", values), check_flag("excuses", excuses)
         if urdf and not values:
             raise ValueError("a body model predicts torques, which only values=True judges")
-        Derived.of(spec, friction=True, body=False, urdf=urdf)  # refuses a body model that does not fit
+        Derived.of(spec, urdf)  # refuses a body model that does not fit
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         evidence = EvidenceDetection(spec, config.gains, config.bound, config.shrinkage, habituates, config.tail_index)

@@ -18,9 +18,6 @@ from numpy.typing import NDArray
 BITS, SCALE, ROOT = ".bits", ".scale", ".root"
 """Ends of the names of packed arrays."""
 
-OLDER = ".planes", ".half"
-"""What names of arrays contain in files of older versions."""
-
 WEIGHTS = "V", "U", "W_S", "W_C", "W_D", "W_F"
 """Of association and of the traces' network."""
 
@@ -84,11 +81,6 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
         elif not name.endswith(SCALE):
             found[name] = array
     return found
-
-
-def is_older(arrays: Mapping[str, NDArray[Any]]) -> bool:
-    """Return whether an older version has packed the arrays."""
-    return any(end in name for name in arrays for end in OLDER)
 
 
 def _quantised(W: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:

@@ -64,7 +64,6 @@ class MonitorKind:
 
     def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
         """Return the monitor, not yet fitted."""
-
         unknown = hyperparameters.keys() - set(self.hyperparameters)
         if unknown:
             raise TypeError(f"{self.model_class.kind} has no hyperparameter {', '.join(sorted(unknown))}")
@@ -73,20 +72,15 @@ class MonitorKind:
             return made(kind, spec, {n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters})
 
         own = part(self.model_class)
-        if self._whole:
-            used = self.detection if self.detection in own.detections else part(self.detection_classes[0])
-            monitor: CalibratedMonitor = own if used == own.detection.name else own.with_detection(used)
-            return monitor
-        detections = map(part, self.detection_classes)
-        return CalibratedMonitor(own, *detections, seed=hyperparameters.get("seed", 0))
+        if not self._whole:
+            return CalibratedMonitor(own, *map(part, self.detection_classes), seed=hyperparameters.get("seed", 0))
+        used = self.detection if self.detection in own.detections else part(self.detection_classes[0])
+        monitor: CalibratedMonitor = own if used == own.detection.name else own.with_detection(used)
+        return monitor
 
     def load(self, path: str | Path) -> CalibratedMonitor:
         """Read what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
         return restored(path, read_checkpoint(path, self.model_class.kind), self)
-
-    def under(self, detection: str) -> MonitorKind:
-        """Return the same, with another detection in use."""
-        return replace(self, detection=detection)
 
     @property
     def _whole(self) -> bool:
@@ -94,34 +88,38 @@ class MonitorKind:
         return issubclass(self.model_class, CalibratedMonitor)
 
 
-def _row(model: str, own: str) -> MonitorKind:
-    return MonitorKind(f"asm_gym.monitors.baselines.{model}", own, own)
+def _rival(model: str, own: str) -> MonitorKind:
+    return MonitorKind(f"asm_gym.monitors.{model}", own, own)
 
 
-_BASELINES = {
-    "logpzo": _row("fail_detect:LogpZO", "moving_mean"),
-    "rnd": _row("fail_detect:RND", "moving_mean"),
-    "lstm_vae": _row("lstm_vae:LSTMVAE", "latent_threshold"),
-    "gru": _row("gru:GRU", "mahalanobis"),
-    "kalman": _row("kalman:Kalman", "mahalanobis"),
-    "association_linear": _row("association_linear:LinearAssociation", "mahalanobis"),
-    "association_values": MonitorKind(
-        "asm_gym.monitors.value_association:ValueAssociation", "mahalanobis", "mahalanobis"
-    ),
-    "window_pca": _row("window_pca:WindowPCA", "squares"),
-}
+def _with_evidence(rows: dict[str, MonitorKind]) -> dict[str, MonitorKind]:
+    """Return each row, followed by the same model under the detection of the Neural ASM."""
+    return {n: k for name, row in rows.items() for n, k in ((name, row), (name + EVIDENCE, _under(row, "evidence")))}
+
+
+def _under(kind: MonitorKind, detection: str) -> MonitorKind:
+    return replace(kind, detection=detection)
+
 
 MONITORS: Registry[MonitorKind] = Registry(
     "monitor",
     "asm_gym.monitors.registry:MONITORS",
     {
         "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
-        **{
-            n: k for name, row in _BASELINES.items() for n, k in ((name, row), (name + EVIDENCE, row.under("evidence")))
-        },
-        "external_torque_limit": _row("limits:ExternalTorqueLimit", "largest"),
-        "force_limit": _row("limits:ForceLimit", "squares"),
-        "channel_limit": _row("limits:ChannelLimit", "largest"),
+        **_with_evidence(
+            {
+                "logpzo": _rival("baselines.logpzo:LogpZO", "moving_mean"),
+                "lstm_vae": _rival("baselines.lstm_vae:LSTMVAE", "latent_threshold"),
+                "gru": _rival("baselines.gru:GRU", "mahalanobis"),
+                "kalman": _rival("baselines.linear:Kalman", "mahalanobis"),
+                "association_linear": _rival("baselines.linear:LinearAssociation", "mahalanobis"),
+                "association_values": _rival("value_association:ValueAssociation", "mahalanobis"),
+                "window_pca": _rival("baselines.linear:WindowPCA", "squares"),
+            }
+        ),
+        "external_torque_limit": _rival("baselines.limits:ExternalTorqueLimit", "largest"),
+        "force_limit": _rival("baselines.limits:ForceLimit", "squares"),
+        "channel_limit": _rival("baselines.limits:ChannelLimit", "largest"),
         "memory_skill": MonitorKind("asm_gym.monitors.skill_surprise:SkillModel"),
     },
 )
@@ -152,12 +150,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
         raise ValueError(f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}")
     row = MonitorKind(model, detection, detection)
     MONITORS.register(name, row)
-    MONITORS[name + EVIDENCE] = row.under("evidence")
-
-
-def model_of(name: str) -> str:
-    """Return the name of a monitor without that of a detection, as in ``gru`` of ``gru+evidence``."""
-    return name.partition("+")[0]
+    MONITORS[name + EVIDENCE] = _under(row, "evidence")
 
 
 def check_monitor_name(name: str) -> None:
@@ -202,7 +195,7 @@ def monitor_class(name: str) -> MonitorKind:
     """
     check_monitor_name(name)
     model, _, detection = name.partition("+")
-    kind = MONITORS[name] if name in MONITORS else MONITORS[model].under(detection)
+    kind = MONITORS[name] if name in MONITORS else _under(MONITORS[model], detection)
     with needed_for(f"monitor {name}"):
         _ = kind.model_class, kind.detection_classes
     return kind
@@ -236,7 +229,7 @@ def make_monitor(
         >>> monitor.detection.name
         'evidence'
     """
-    kind = monitor_class(name if not isinstance(detection, str) else f"{model_of(name)}+{detection}")
+    kind = monitor_class(name if not isinstance(detection, str) else f"{name.partition('+')[0]}+{detection}")
     for parameter in hyperparameters:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
     made = kind(spec, **hyperparameters)
@@ -253,4 +246,4 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
-    return restored(path, saved, kind.under(saved.header.get("detection", kind.detection)))
+    return restored(path, saved, _under(kind, saved.header.get("detection", kind.detection)))

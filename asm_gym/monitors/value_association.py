@@ -66,8 +66,6 @@ class ValueAssociation(StreamModel):
 
     Args:
         spec: the stream it is to expect.
-        friction: whether smooth signs of the speeds are among the inputs.
-        body: whether sines of the angles are; angles are taken to stand in the order of the chain.
         changes: whether changes are judged too.
         urdf: text of a body model, as ``read_urdf`` reads it: what links weigh, and their inertia, in place of sines.
     """
@@ -75,16 +73,13 @@ class ValueAssociation(StreamModel):
     kind = "association_values"
 
     @typed
-    def __init__(
-        self, spec: StreamSpec, friction: bool = True, body: bool = True, changes: bool = True, urdf: str = ""
-    ) -> None:
+    def __init__(self, spec: StreamSpec, changes: bool = True, urdf: str = "") -> None:
         super().__init__(spec)
-        self.friction, self.body = check_flag("friction", friction), check_flag("body", body)
         self.changes = check_flag("changes", changes)
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
         self.urdf = urdf
-        self._derived = Derived.of(spec, friction, body, urdf)
+        self._derived = Derived.of(spec, urdf)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -118,19 +113,18 @@ class ValueAssociation(StreamModel):
         left = np.concatenate([given.left[told], moved.left[certain]])
         judging = np.unique(senses.groups[told]) if inputs.shape[1] <= MOST_INPUTS else ()
         far = [_far(inputs, fold, own[g]) for g in judging]
-        return self.restore(
-            {
-                **senses.arrays,
-                **{"derived_mean": middle, "derived_spread": width},
-                **{
-                    "judged_values": told * 1.0,
-                    "judged_changes": certain * 1.0,
-                    "R2_values": given.told,
-                },
-                **{"D": given.weights[told], "E": moved.weights[certain], "remainder": np.maximum(left, FAINTEST)},
-                "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
-            }
-        )
+        learned = {
+            "derived_mean": middle,
+            "derived_spread": width,
+            "judged_values": told * 1.0,
+            "judged_changes": certain * 1.0,
+            "R2_values": given.told,
+            "D": given.weights[told],
+            "E": moved.weights[certain],
+            "remainder": np.maximum(left, FAINTEST),
+            "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
+        }
+        return self.restore({**senses.arrays, **learned})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self.senses_ = StreamScaler.of(self.spec, learned, self.lag)

@@ -23,7 +23,6 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import State, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.files import taken_up
 from asm_gym.monitors.stream_model import read_next
 from asm_gym.monitors.value_association import MOST_INPUTS, STIFFNESS, ValueAssociation
 from asm_gym.scaling import StreamScaler
@@ -70,7 +69,7 @@ class Values(NamedTuple):
         if not arrays:
             return cls()
         own = {n: a for n, a in arrays.items() if n not in ("leverage", "usual")}
-        monitor, leverage = taken_up(_monitor(spec, seed, urdf), own), arrays["leverage"]
+        monitor, leverage = _monitor(spec, seed, urdf).with_learned(own), arrays["leverage"]
         size = _senses(monitor).inputs + 1
         if leverage.shape not in ((size, size), (0, 0)):
             raise ValueError(f"the leverage of values should be of shape {(size, size)}, found {leverage.shape}")

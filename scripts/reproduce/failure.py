@@ -66,7 +66,7 @@ class Config(kit.Config):
     tasks: tuple[str, ...] = option(("Lift", "Stack"), quick=("Lift",), least=1, known=AGENTS)
     """Tasks that have an agent; one monitor learns all of them."""
     monitors: tuple[str, ...] = option(
-        ("memory_skill", "neural_asm", "logpzo", "rnd", INCONSISTENCY),
+        ("memory_skill", "neural_asm", "logpzo", INCONSISTENCY),
         quick=("memory_skill", "neural_asm"),
         least=1,
         known=(*MONITORS, INCONSISTENCY),

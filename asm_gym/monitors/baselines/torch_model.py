@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.memory.learning import shuffled
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import ScaledRows, StreamScaler
@@ -115,22 +114,6 @@ def train_on_episodes(
         if optimiser.param_groups[0]["lr"] < SLOWEST:
             break
     module.load_state_dict(best)
-
-
-def train_on_rows(
-    module: nn.Module,
-    loss: Callable[[Tensor], Tensor],
-    rows: NDArray[np.float32],
-    batch: int,
-    updates: int,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> None:
-    """Train by Adam on random batches of rows (N, …), its step size decaying to 0 along a cosine."""
-    optimiser, schedule = adam(module, updates)
-    for n, chosen in zip(range(updates), shuffled(len(rows), batch, rng), strict=False):
-        progress(n, updates)
-        descend(loss(torch.as_tensor(rows[chosen])), optimiser, schedule)
 
 
 def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.optim.Optimizer, Any]:

@@ -1,0 +1,198 @@
+"""Linear baselines: a Kalman filter, principal components of a window, and ridge regression across the senses.
+
+    Kalman      x_t = A x_{t-1} + B u_t + c + w, w ~ N(0, Q)      y_t = x_t + v, v ~ N(0, R)     ε: innovations
+    WindowPCA   w_t = [x_{t-R+1}, …, x_t] standardised            ε_t = w_t - W Wᵀ w_t, of x_t
+    ridge       ε_t = (Δ_t - D a_t)/s                             D, s, a_t: association without hidden units
+
+R is the sensor noise that the stream's spec states; A, B, c by ridge regression; Q is what is left of the residuals.
+W: the leading eigenvectors of the windows' covariance, as many as hold most of the variance. What the memory's hidden
+units, precision and temporal network are worth is what it finds beyond ``LinearAssociation``.
+
+Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in innovations; Jackson and Mudholkar 1979
+(Technometrics 21(3)) for residuals of principal components; Ku et al. 1995 for windows; Hoerl and Kennard 1970.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, solve_discrete_are
+
+from asm_gym.detection import ModelOutput
+from asm_gym.detection.base import Arrays
+from asm_gym.episode import Episode
+from asm_gym.memory.linear import check_inputs, learn_linear
+from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
+from asm_gym.scaling import StreamScaler, rows_apart
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
+
+FAINTEST = 1e-4
+"""Smallest spread of what is left of a standardised number, and smallest variance of w and v."""
+
+LEAST_SPREAD = 1e-6
+"""Smallest spread of a channel [its unit]."""
+
+Floats = NDArray[np.float64]
+
+
+class _Filtered(NamedTuple):
+    estimate: Floats  # (B, X) x̂, standardised
+    steps: NDArray[np.int64]  # (B,)
+
+
+class Kalman(StreamModel):
+    """A steady-state Kalman filter; its errors are innovations in standard deviations.
+
+    Args:
+        spec: the stream it is to expect.
+        ridge: penalty on A, B and c, of the standardised inputs.
+    """
+
+    kind = "kalman"
+
+    @typed
+    def __init__(self, spec: StreamSpec, ridge: float = 1e-6) -> None:
+        super().__init__(spec)
+        self.ridge = check_number("ridge", ridge, low=0.0)
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        check_inputs(self.spec.size + 1)
+        streams = [e.stream for e in episodes]
+        sensed = [s[:, self.spec.sensory].astype(np.float64) for s in streams]
+        mean, spread = _scale(np.concatenate(sensed))
+        xs = [(x - mean) / spread for x in sensed]
+        before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
+        u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
+        Z = np.hstack([before, u, np.ones((len(u), 1))])
+        weights = np.linalg.solve(Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after)  # (X + A + 1, X)
+        X = len(self.spec.sensory)
+        A, residual = weights[:X].T, after - Z @ weights
+        R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / spread) ** 2, FAINTEST))
+        # A residual holds the new measurement's noise and, through A, that of the last.
+        Q = _positive(residual.T @ residual / len(residual) - R - A @ R @ A.T)
+        try:
+            P = solve_discrete_are(A.T, np.eye(X), Q, R)
+        except (LinAlgError, ValueError):  # an unstable A: trust the measurements
+            P = Q + R
+        S = P + R
+        gain = np.linalg.solve(S.T, P.T).T
+        filtered = {"weights": weights, "gain": gain, "deviation": np.sqrt(np.diag(S))}
+        return self.restore({"mean": mean, "spread": spread, **filtered})
+
+    def start(self, batch: int) -> _Filtered:
+        return _Filtered(np.zeros((batch, len(self.spec.sensory))), np.zeros(batch, np.int64))
+
+    def predict(self, state: _Filtered, rows: Floats) -> tuple[_Filtered, ModelOutput]:
+        y = (rows[:, self.spec.sensory] - self.learned_["mean"]) / self.learned_["spread"]
+        u = rows[:, self.spec.motor]
+        begun = (state.steps > 0)[:, None]
+        inputs = np.hstack([state.estimate, np.where(np.isfinite(u), u, 0.0), np.ones((len(u), 1))])
+        expected = np.where(begun, inputs @ self.learned_["weights"], np.where(np.isfinite(y), y, 0.0))
+        innovation: Floats = np.where(np.isfinite(y), y - expected, 0.0)
+        estimate = expected + innovation @ self.learned_["gain"].T
+        error = innovation / self.learned_["deviation"]
+        return _Filtered(estimate, state.steps + 1), ModelOutput(error, no_context(rows))
+
+
+class _Window(NamedTuple):
+    rows: Floats  # (B, R - 1, D) the newest last, standardised; what was not finite is the mean
+    steps: NDArray[np.int64]  # (B,)
+
+
+class WindowPCA(StreamModel):
+    """The residual of each sense beyond the principal components of a few rows; it has no context.
+
+    Args:
+        spec: the stream it is to expect.
+        rows: R, of a window.
+        kept: share in (0, 1] of the variance that the components hold.
+    """
+
+    kind = "window_pca"
+
+    @typed
+    def __init__(self, spec: StreamSpec, rows: int = 5, kept: float = 0.999) -> None:
+        super().__init__(spec)
+        self.rows = check_number("rows", rows, low=1, whole=True)
+        self.kept = check_number("kept", kept, above=0.0, high=1.0)
+        self.shortest = self.rows
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        check_inputs(self.rows * self.spec.size)
+        mean, spread = _scale(np.concatenate([e.stream for e in episodes]).astype(np.float64))
+        windows = np.concatenate([_windows((e.stream - mean) / spread, self.rows) for e in episodes])  # (N, R D)
+        values, vectors = np.linalg.eigh(windows.T @ windows / len(windows))
+        count = int(np.searchsorted(np.cumsum(values[::-1]), self.kept * values.sum())) + 1
+        W = np.ascontiguousarray(vectors[:, ::-1][:, :count])
+        senses = windows.shape[1] - self.spec.size + self.spec.sensory
+        left = windows[:, senses] - (windows @ W) @ W[senses].T
+        deviation = np.maximum(np.sqrt(np.mean(left**2, axis=0)), FAINTEST)
+        return self.restore({"mean": mean, "spread": spread, "components": W, "deviation": deviation})
+
+    def start(self, batch: int) -> _Window:
+        return _Window(np.zeros((batch, self.rows - 1, self.spec.size)), np.zeros(batch, np.int64))
+
+    def predict(self, state: _Window, rows: Floats) -> tuple[_Window, ModelOutput]:
+        scaled = (rows - self.learned_["mean"]) / self.learned_["spread"]
+        known = np.isfinite(scaled)
+        window = np.concatenate([state.rows, np.where(known, scaled, 0.0)[:, None]], axis=1)  # (B, R, D)
+        flat, W = window.reshape(len(rows), -1), self.learned_["components"]
+        senses = (self.rows - 1) * self.spec.size + self.spec.sensory
+        left = (flat[:, senses] - (flat @ W) @ W[senses].T) / self.learned_["deviation"]
+        judged = known[:, self.spec.sensory] & (state.steps >= self.rows - 1)[:, None]
+        return _Window(window[:, 1:], state.steps + 1), ModelOutput(np.where(judged, left, 0.0), no_context(rows))
+
+
+class LinearAssociation(StreamModel):
+    """Ridge regression of each group's changes; it has no context."""
+
+    kind = "association_linear"
+
+    def __init__(self, spec: StreamSpec) -> None:
+        super().__init__(spec)
+        self.lag = rows_apart(spec.dt)
+        self.shortest = 1 + self.lag
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        senses = StreamScaler.fit(self.spec, streams, self.lag)
+        check_inputs(senses.inputs)
+        a = np.concatenate([senses.read_episode(s).inputs[self.lag :] for s in streams])
+        D = learn_linear(a, senses.groups, senses.changes)
+        left = np.sqrt(np.mean((a[:, senses.changes] - a @ D.T) ** 2, axis=0))
+        return self.restore({**senses.arrays, "D": D, "remainder": np.maximum(left, FAINTEST)})
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
+        return super().restore(learned, skills)
+
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, self.lag, self.spec.size)
+
+    def predict(self, state: RowHistory, rows: Floats) -> tuple[RowHistory, ModelOutput]:
+        state, r, known = read_next(self.senses_, state, rows)
+        error = known * (r.changes - r.inputs @ self.learned_["D"].T) / self.learned_["remainder"]
+        return state, ModelOutput(error, no_context(rows))
+
+
+def _scale(rows: Floats) -> tuple[Floats, Floats]:
+    """Return the mean and the spread (D,) of rows (N, D)."""
+    return rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_SPREAD)
+
+
+def _positive(matrix: Floats) -> Floats:
+    """Return the nearest symmetric matrix whose eigenvalues are at least ``FAINTEST``."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    nearest: Floats = (vectors * np.maximum(values, FAINTEST)) @ vectors.T
+    return nearest
+
+
+def _windows(rows: Floats, count: int) -> Floats:
+    """Return the windows (T - R + 1, R D) of rows (T, D), the oldest row first."""
+    return np.hstack([rows[k : len(rows) - count + 1 + k] for k in range(count)])
