@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.monitors.hub import CARD, FILE, card_of, from_hub
+from asm_gym.monitors.hub import CARD, FILE, from_hub
 from asm_gym.scripts.cli import main
 from tests.streams import sine_episodes
 
@@ -101,7 +101,7 @@ def test_a_memory_that_was_pushed_comes_back_the_same_with_its_card(server, memo
     assert main(["push", str(path), "me/panda"]) == 0
     assert f"/me/panda/commit/{COMMIT}" in capsys.readouterr().out
     assert server.files[FILE] == path.read_bytes()
-    assert "| channel | numbers | unit | group |" in server.files[CARD].decode()
+    assert "- channels: joint_position, command" in server.files[CARD].decode()
     back = from_hub("me/panda")
     episode = sine_episodes(1)[0]
     np.testing.assert_array_equal(back.score(episode).value, asm.score(episode).value)
@@ -116,13 +116,6 @@ def test_what_the_hub_refuses_is_one_line(server, memory, capsys):
         from_hub("me/no/such thing")
     assert main(["push", "no.asm", "me/panda"]) == 2
     assert "no.asm" in capsys.readouterr().err
-
-
-def test_a_card_says_what_the_file_says(memory):
-    _, path = memory
-    text = card_of(path)
-    assert text.startswith("---\nlibrary_name: asm-gym")
-    assert "neural_asm" in text
 
 
 def test_without_its_library_the_hub_names_the_extra(memory, monkeypatch):

@@ -7,7 +7,6 @@ from asm_gym.monitors.base import (
     ExplainsItself,
     ForgetsEvidence,
     LearnsOnTheJob,
-    Model,
     Monitor,
     Surprise,
 )
@@ -24,6 +23,7 @@ from asm_gym.monitors.registry import (
     register_monitor,
 )
 from asm_gym.monitors.shipped import pretrained, pretrained_for
+from asm_gym.monitors.stream_model import StreamModel
 
 __all__ = [
     "DETECTIONS",
@@ -35,9 +35,9 @@ __all__ = [
     "ForgetsEvidence",
     "LearnsOnTheJob",
     "MemoryConfig",
-    "Model",
     "Monitor",
     "NeuralASM",
+    "StreamModel",
     "Surprise",
     "load_monitor",
     "make_monitor",

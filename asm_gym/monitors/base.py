@@ -1,4 +1,4 @@
-"""Surprise, and the protocols of a monitor and of a model."""
+"""Surprise, and the protocols of a monitor."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import ModelOutput
-from asm_gym.detection.base import Arrays
 from asm_gym.detection.events import EVENTS, KNOCK, STOP, event_of
 from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
@@ -50,12 +48,6 @@ class Surprise(NamedTuple):
             return "<Surprise of no row>"
         return f"<Surprise of {len(self.value)}: last {self.value[-1]:.4g}, largest {self.value.max():.4g}>"
 
-    @property
-    def parts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Surprise of the body (B,) and of the skill (B,); the latter is NaN where no skill model runs."""
-        body = self.value if self.of_body is None else self.of_body
-        return body, np.full(len(body), np.nan) if self.of_skill is None else self.of_skill
-
     def of(self, stream: int) -> Surprise:
         """Return the surprise of one stream, as a batch of one."""
         at = slice(stream, stream + 1)
@@ -77,13 +69,8 @@ class Surprise(NamedTuple):
 
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """Return it with no surprise ``where`` (B,) nothing is judged."""
-
-        def kept(value: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-            return None if value is None else np.where(where, 0.0, value)
-
         shares = np.where(where[:, None], 0.0, self.attribution)
-        value, (body, skill, raw) = np.where(where, 0.0, self.value), map(kept, self._parts)
-        return self._replace(value=value, attribution=shares, of_body=body, of_skill=skill, raw=raw)
+        return self._replace(attribution=shares, **self._mapped(lambda value: np.where(where, 0.0, value)))
 
     def without(self, columns: NDArray[np.bool_]) -> Surprise:
         """Return what is left of it where the precision of ``columns`` (D,) is 0."""
@@ -94,17 +81,12 @@ class Surprise(NamedTuple):
         judged = np.isfinite(self.value) & (self.value > 0)
         left[judged] -= self.attribution[judged][:, columns].sum(axis=1) / self.value[judged]
         left = np.clip(left, 0.0, 1.0)
+        return self._replace(attribution=shares, **self._mapped(lambda value: np.where(judged, left * value, value)))
 
-        def kept(value: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-            return None if value is None else np.where(judged, left * value, value)
-
-        value = np.where(judged, left * self.value, self.value)
-        body, skill, raw = map(kept, self._parts)
-        return self._replace(value=value, attribution=shares, of_body=body, of_skill=skill, raw=raw)
-
-    @property
-    def _parts(self) -> tuple[NDArray[np.float64] | None, ...]:
-        return self.of_body, self.of_skill, self.raw
+    def _mapped(self, change: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> dict[str, Any]:
+        """Return every surprise that is known, changed."""
+        values = {name: getattr(self, name) for name in ("value", "of_body", "of_skill", "raw")}
+        return {name: change(value) for name, value in values.items() if value is not None}
 
 
 class Monitor(Protocol):
@@ -126,48 +108,6 @@ class Monitor(Protocol):
     def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]: ...
 
     def save(self, path: str | Path) -> None: ...
-
-
-class Model(Protocol):
-    """Predicts each row of a stream, and returns its errors; a detection makes surprise of them.
-
-    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
-
-    Attributes:
-        kind: its name, in ``make_monitor`` and in checkpoints.
-        shortest: fewest steps of an episode to learn from.
-        held_out: one in so many episodes is not learned, but shows how large errors usually are; 0 for none.
-        learned_: arrays that ``fit`` has found, by name; empty before.
-        skills_: names of the skills it knows; empty where it was given none.
-    """
-
-    kind: str
-    shortest: int
-    held_out: int
-    spec: StreamSpec
-    learned_: Arrays
-    skills_: tuple[str, ...]
-
-    @property
-    def error_columns(self) -> NDArray[np.intp]:
-        """(X,) the column of the stream that each error belongs to; -1 for an error that all senses share."""
-        ...
-
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        """Learn from whole nominal episodes."""
-        ...
-
-    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        """Take over learned arrays. Raises ValueError where they do not fit together."""
-        ...
-
-    def start(self, batch: int) -> State:
-        """Return the state before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B."""
-        ...
-
-    def predict(self, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
-        """Return the new state after the next rows (B, D), perhaps not all finite, and the errors."""
-        ...
 
 
 @runtime_checkable

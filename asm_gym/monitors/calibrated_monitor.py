@@ -17,10 +17,17 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import HOUR
 from asm_gym.detection.contact_limits import FamiliarSpeed, healthy_forces
 from asm_gym.episode import Episode
-from asm_gym.monitors.base import Model, Progress, State, Surprise
+from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import LOG, AlarmRate, Calibrated, require_sight, warn_of_crashes
 from asm_gym.monitors.files import SavedMonitor, write_monitor
-from asm_gym.monitors.stream_model import ErrorPlaces, batch_of, model_outputs, parameter_names, side_by_side
+from asm_gym.monitors.stream_model import (
+    ErrorPlaces,
+    StreamModel,
+    batch_of,
+    model_outputs,
+    parameter_names,
+    side_by_side,
+)
 from asm_gym.monitors.training_data import Marks, check_fresh, check_nominal, sketch
 from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
 
@@ -49,9 +56,9 @@ class CalibratedMonitor(Calibrated):
         ceilings_from_: marks of the episodes that ``learn_ceilings`` was given; None where there were none.
     """
 
-    model: Model
+    model: StreamModel
 
-    def __init__(self, model: Model, *detections: Detection, seed: int = 0) -> None:
+    def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
         if not detections:
             raise ValueError("a monitor needs a detection, got none")
         self.seed = check_number("seed", seed, low=0, whole=True)
@@ -89,18 +96,14 @@ class CalibratedMonitor(Calibrated):
 
     @typed
     def with_threshold(self, value: float) -> Self:
-        """Return the same monitor with another threshold, ``inf`` for no alarm; this one keeps its own."""
+        """Return a copy with another threshold, ``inf`` for no alarm."""
         other = self._copy()
         other.threshold_ = check_number("threshold", value, infinite=True)
         return other
 
     @typed
     def with_detection(self, detection: str | Detection) -> Self:
-        """Return the same model under another detection, without a threshold.
-
-        Args:
-            detection: a new one, which needs ``fit``, or the name of one that was fitted beside it.
-        """
+        """Return a copy without a threshold, under a new detection, or one that was fitted beside it, by name."""
         other = self._copy()
         if isinstance(detection, str):
             check_choice(f"detection of this {self._name}", detection, self.detections)
@@ -117,7 +120,7 @@ class CalibratedMonitor(Calibrated):
             episodes: of this spec.
             progress: called as ``progress(done, total)`` while learning.
             warm_start: go on from what it knows, for a model that can: 10 to 50 episodes are enough then. Its detection
-                stays as it is, for so few episodes do not show how large errors can be.
+                stays as it is.
 
         Raises:
             ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
@@ -173,18 +176,15 @@ class CalibratedMonitor(Calibrated):
         ``threshold_at`` then knows the threshold of every other rate too.
 
         Args:
-            episodes: at least ``conformal_episodes(false_alarm_rate)`` of them: 99 for 0.01, 19 for 0.05; or together
-                one hour for each false alarm in so many: 10 hours for 0.1 an hour.
+            episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
             false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
             false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
                 comes back within a minute of the same episode, is one alarm.
-            each: task or policy of each episode. Then the promise holds in each of them, by the greatest threshold that
-                one needs; without it, it holds over all of them together.
+            each: task or policy of each episode, where the promise is to hold in each of them.
 
         Raises:
             ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
-                by the hour also episodes that overlap, or that ``fit`` has learned from, which are only logged where
-                the rate is per episode. Or not exactly one rate.
+                by the hour also episodes that overlap, or that ``fit`` has learned from. Or not exactly one rate.
         """
         self._require_fitted()
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)  # refuses a bad rate before the work begins
@@ -217,14 +217,10 @@ class CalibratedMonitor(Calibrated):
         return MonitorState(self.model.start(batch), self.detection.start(batch, len(self.model.error_columns)))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
-        """Return the new state after the next row of each stream, and how surprising the row was.
+        """Return the new state after the next row (B, D) of each stream, and how surprising the rows were.
 
         A number that is not finite makes the value and its own attribution infinite; it counts as unseen, so that
-        later rows can be judged again.
-
-        Args:
-            state: as returned last; it is not changed.
-            stream: (B, D) one row a stream.
+        later rows can be judged again. The old state is not changed.
         """
         self._require_fitted()
         rows = self._rows(state, stream)
@@ -243,7 +239,7 @@ class CalibratedMonitor(Calibrated):
 
     @typed
     def score(self, episode: Episode) -> Surprise:
-        """Return the surprise of each step of an episode: value (T,), attribution (T, D); no names of skills."""
+        """Return the surprise of each step of an episode; no names of skills."""
         return self.score_episodes([episode])[0]
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
@@ -273,7 +269,7 @@ class CalibratedMonitor(Calibrated):
     def restore(self, saved: Checkpoint) -> Self:
         """Take over what ``save`` wrote of a monitor of the same spec, model and hyperparameters.
 
-        A file may hold several detections; where it was calibrated for another one than this, it has no threshold here.
+        It has a threshold only where it was calibrated under the detection in use.
 
         Raises:
             ValueError: something is missing, or does not fit together.
@@ -312,7 +308,7 @@ class CalibratedMonitor(Calibrated):
         return other
 
     def _remember(self, episodes: Sequence[Episode]) -> None:
-        """Keep marks of episodes that were learned from, so that no promise by the hour is made of them."""
+        """Mark episodes as learned from, so that no promise by the hour is made of them."""
         before = np.zeros(0) if self.learned_from_ is None else self.learned_from_
         self.learned_from_ = np.union1d(before, sketch(episodes))
 
@@ -335,5 +331,5 @@ class CalibratedMonitor(Calibrated):
         return rows
 
     def _place_errors(self) -> None:
-        """Find the column of the stream that each error belongs to, once the model knows."""
+        """Find the columns of errors, once the model knows them."""
         self._places = ErrorPlaces(self.model.error_columns, self.spec)

@@ -77,11 +77,7 @@ class AlarmRate(NamedTuple):
         return hourly_threshold(blocks, self.rate)
 
     def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
-        """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups.
-
-        Raises:
-            ValueError: there are too few episodes, or too few hours, in all of them or in a group.
-        """
+        """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups."""
         threshold = self.threshold(np.array([v.max() for v in values]), Blocks.of(values, dt, each))
         for name in dict.fromkeys(each):
             own = [v for v, of in zip(values, each, strict=True) if of == name]
@@ -124,12 +120,7 @@ class Calibrated:
     def threshold_at(
         self, false_alarm_rate: float | None = None, *, false_alarms_per_hour: float | None = None
     ) -> float:
-        """Return the threshold of another rate, from the episodes that ``calibrate`` was given.
-
-        Raises:
-            ValueError: there were too few of them for this rate; the message says how many it takes. Or not one rate.
-            RuntimeError: it is not calibrated.
-        """
+        """Return the threshold of another rate, from the episodes of ``calibrate``; raises as that does."""
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         kept = self.blocks_ if asked.per == HOUR else self.maxima_
         if kept is None or self.maxima_ is None:
@@ -138,11 +129,7 @@ class Calibrated:
 
     @property
     def promise(self) -> Promise:
-        """How often the threshold promises an alarm in nominal operation, by which unit, and how surely.
-
-        Raises:
-            RuntimeError: it is not calibrated, or keeps no surprise of nominal episodes.
-        """
+        """How often the threshold promises an alarm in nominal operation. Raises RuntimeError before ``calibrate``."""
         if self.maxima_ is None:
             raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
         if self.promised_ == HOUR and self.blocks_ is not None:
@@ -162,10 +149,9 @@ def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, thresho
     """Return the labels of the senses whose errors alone could never pass the threshold, however large and lasting.
 
     Args:
-        detection: one whose ``reach_of`` says how far each error can go; others know nothing of it.
+        detection: its ``reach_of`` says how far each error can go; without one, nothing is known.
         errors: (X,) column of each error in the stream; -1 for none.
-        spec: of the stream.
-        threshold: of the surprise.
+        spec, threshold: of the stream, and of its surprise.
     """
     if not hasattr(detection, "reach_of"):
         return []

@@ -36,20 +36,18 @@ def push(path: str | Path, repo: str, card: str | Path | None = None, private: b
         ValueError: the file is no monitor; the repository's name is none.
         ConnectionError: the hub cannot be reached, or refuses; the message has its answer.
     """
-    hub, text = _hub(), card_of(path) if card is None else Path(card).read_text(encoding="utf-8")
-    check_text("repo", repo)
-    with _errors_in_one_line(repo):
+    text = _card(path) if card is None else Path(card).read_text(encoding="utf-8")
+    with _hub(repo) as hub:
         api = hub.HfApi(endpoint=_endpoint())
         api.create_repo(repo, private=private, exist_ok=True)
         files = {FILE: Path(path).read_bytes(), CARD: text.encode()}
         operations = [hub.CommitOperationAdd(name, content) for name, content in files.items()]
-        done = api.create_commit(repo, operations, commit_message=f"Upload {Path(path).name}")
-    return str(done.commit_url)
+        return str(api.create_commit(repo, operations, commit_message=f"Upload {Path(path).name}").commit_url)
 
 
 @typed
 def from_hub(repo: str, revision: str | None = None) -> NeuralASM:
-    """Return a memory that ``push`` or ``asm-gym push`` has put on the hub; it is downloaded once.
+    """Return a memory that ``push`` has put on the hub; it is downloaded once.
 
     Args:
         repo: ``owner/name``.
@@ -58,31 +56,23 @@ def from_hub(repo: str, revision: str | None = None) -> NeuralASM:
     Raises:
         ImportError, ConnectionError: as ``push``.
     """
-    hub = _hub()
-    with _errors_in_one_line(check_text("repo", repo)):
-        path = Path(hub.hf_hub_download(repo, FILE, revision=revision, endpoint=_endpoint()))
-    return NeuralASM.load(path)
+    with _hub(repo) as hub:
+        path = hub.hf_hub_download(repo, FILE, revision=revision, endpoint=_endpoint())
+    return NeuralASM.load(Path(path))
 
 
-def card_of(path: str | Path) -> str:
+def _card(path: str | Path) -> str:
     """Return a card in Markdown from the header of a file."""
     header = read_header(path)
-    spec, about = StreamSpec.from_json(header["spec"]), dict(header.get("about", {}))
-    rows = [f"| {c.name} | {c.size} | {c.unit} | {c.group} |" for c in spec.channels]
-    facts = [f"- {name}: {value}" for name, value in sorted(about.items()) if isinstance(value, str | int | float)]
+    spec, about = StreamSpec.from_json(header["spec"]), header.get("about", {})
+    facts = {"kind": header["kind"], "threshold": header["threshold"], "channels": ", ".join(spec.slices), **about}
     lines = [
-        "---\nlibrary_name: asm-gym\ntags: [robotics, anomaly-detection]\n---",
-        f"# A monitor of {spec.source or 'a stream'} at {1 / spec.dt:g} Hz",
-        f"It is of the kind `{header['kind']}`, and alarms above {header['threshold']}.",
-        '```python\nfrom asm_gym.monitors.hub import from_hub\n\nasm = from_hub("OWNER/NAME")\n```',
-        "\n".join(["| channel | numbers | unit | group |", "|---|---|---|---|", *rows]),
-        "\n".join(facts),
+        "---\nlibrary_name: asm-gym\ntags: [robotics, anomaly-detection]\n---\n",
+        f"# A monitor of {spec.source or 'a stream'} at {1 / spec.dt:g} Hz\n",
+        'Load it by `asm_gym.monitors.hub.from_hub("OWNER/NAME")`.\n',
+        *(f"- {name}: {value}" for name, value in facts.items() if isinstance(value, str | int | float)),
     ]
-    return "\n\n".join(filter(None, lines)) + "\n"
-
-
-def _hub() -> Any:
-    return require("huggingface_hub", what="the hub")
+    return "\n".join(lines) + "\n"
 
 
 def _endpoint() -> str | None:
@@ -90,10 +80,12 @@ def _endpoint() -> str | None:
 
 
 @contextmanager
-def _errors_in_one_line(repo: str) -> Iterator[None]:
-    """Turn what the hub's library raises into one line."""
+def _hub(repo: str) -> Iterator[Any]:
+    """Give the hub's library, whose errors become one line."""
+    hub = require("huggingface_hub", what="the hub")
+    check_text("repo", repo)
     try:
-        yield
+        yield hub
     except Exception as error:
         if type(error).__name__ == "HFValidationError":
             raise ValueError(f"repo must be owner/name, got {repo!r}") from error

@@ -133,7 +133,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
 
     Args:
         name: the ``kind`` of the model, by which its files are known too.
-        model: a class of models (see ``Model``), or of whole monitors; or ``module:class``.
+        model: a class of models (see ``StreamModel``), or of whole monitors; or ``module:class``.
         detection: which judges it unless asked otherwise; a name in ``DETECTIONS``.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
@@ -15,27 +16,33 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.state import RowHistory
-from asm_gym.monitors.base import Model, State
+from asm_gym.monitors.base import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
-
-HELD_OUT = 5
-"""One in so many training episodes is not learned by the model, but shows how large its errors usually are."""
 
 AT_ONCE = 64
 """Episodes run side by side; with more the arrays no longer fit the cache."""
 
 
 class StreamModel:
-    """Base class of models: an error for each sense, and arrays that are used as they are.
+    """Base class of models: predicts each row of a stream, and returns its errors; a detection makes surprise of them.
+
+    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
 
     Args:
         spec: the stream to predict.
+
+    Attributes:
+        kind: its name, in ``make_monitor`` and in checkpoints.
+        shortest: fewest steps of an episode to learn from.
+        held_out: one in so many episodes is not learned, but shows how large errors usually are; 0 for none.
+        learned_: arrays that ``fit`` has found, by name; empty before.
+        skills_: names of the skills it knows; empty where it was given none.
     """
 
     kind: str
     shortest: int = 2
-    held_out: int = HELD_OUT
+    held_out: int = 5
 
     def __init__(self, spec: StreamSpec) -> None:
         self.spec = spec
@@ -44,15 +51,25 @@ class StreamModel:
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
+        """Column (X,) of the stream that each error belongs to; -1 for an error that all senses share."""
         return self.spec.sensory
 
-    def state(self) -> Arrays:
-        """Return the arrays of floats that a file keeps and ``restore`` is given."""
-        return self.learned_
+    @abstractmethod
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        """Learn from whole nominal episodes."""
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        """Take over learned arrays. Raises ValueError where they do not fit together."""
         self.learned_, self.skills_ = learned, skills
         return self
+
+    @abstractmethod
+    def start(self, batch: int) -> State:
+        """Return the state before the first row of ``batch`` streams: a NamedTuple of arrays whose first axis is B."""
+
+    @abstractmethod
+    def predict(self, state: Any, rows: NDArray[np.float64]) -> tuple[Any, ModelOutput]:
+        """Return the new state after the next rows (B, D), perhaps not all finite, and the errors."""
 
 
 class ErrorPlaces:
@@ -117,7 +134,7 @@ def made(kind: Callable[..., Any], spec: StreamSpec, parameters: Mapping[str, An
     return kind(spec, **known, config=config(**own))
 
 
-def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput]:
+def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[ModelOutput]:
     """Return errors (T, X) and contexts (T, C) of each episode, whose numbers are finite.
 
     Raises:
@@ -131,7 +148,7 @@ def model_outputs(model: Model, episodes: Sequence[Episode]) -> list[ModelOutput
     return [outputs[i] for i in range(len(episodes))]
 
 
-def _predicted(model: Model, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
+def _predicted(model: StreamModel, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
     found: Any = model.predict(state, rows)
     asked, wanted = f"predict of {model.kind} must give", (len(rows), len(model.error_columns))
     if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], ModelOutput):
