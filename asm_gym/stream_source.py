@@ -6,7 +6,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers import NormalizeObservation
+from gymnasium.wrappers.vector import NormalizeObservation as VectorNormalizeObservation
 from numpy.typing import NDArray
 
 from asm_gym.spec import StreamSpec, control_period, flat
@@ -27,7 +29,7 @@ class StreamSource:
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env, self.own = env, env.has_wrapper_attr("stream_spec")
         if not self.own:
-            _refuse_running_statistics(env)
+            refuse_running_statistics(env)
             self._spaces = StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
 
     @property
@@ -57,10 +59,7 @@ class StreamSource:
         if self.own:
             return self.row(observation, None, info)
         sensed = flat(self._env.observation_space, observation)
-        row: NDArray[np.float32] = np.concatenate([sensed, np.zeros(self._spaces.size - len(sensed))]).astype(
-            np.float32
-        )
-        return row
+        return as_float32(np.concatenate([sensed, np.zeros(self._spaces.size - len(sensed))]))
 
     def rows(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""
@@ -68,12 +67,12 @@ class StreamSource:
         return found
 
 
-def _refuse_running_statistics(env: gym.Env[Any, Any]) -> None:
-    """Raises ValueError for a wrapper by which the same sense reads differently the longer it runs."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, NormalizeObservation) and env.update_running_mean:
+def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:
+    """Raise ValueError for a wrapper, of one or many, by which the same sense reads differently the longer it runs."""
+    while isinstance(env, gym.Wrapper | VectorWrapper):
+        if isinstance(env, NormalizeObservation | VectorNormalizeObservation) and env.update_running_mean:
             raise ValueError(
                 "NormalizeObservation changes what it makes of the same sense as it goes on: put it outside, as in "
-                "NormalizeObservation(NeuralASMSafety(env, monitor)), or set its update_running_mean to False"
+                f"NormalizeObservation({guard}(env, monitor)), or set its update_running_mean to False"
             )
         env = env.env

@@ -16,7 +16,6 @@ from tests.fakes import SPEC, FadingMonitor, FakeEnv, Remembered
 
 LENGTHS = (9, 7, 12)
 CUE = (2, 3, 103, 104, 105, 106, 107, 208)
-NEXT, SAME = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
 OPTIONS = [
     {"on_alarm": "monitor"},
     {"on_alarm": "hold", "release_after": 2},
@@ -60,11 +59,11 @@ def monitor(own_stream=True):
     return FadingMonitor(CUE, spec=spec)
 
 
-def both(options, mode, own_stream=True, many=SyncVectorEnv):
+def both(options, own_stream=True, many=SyncVectorEnv):
     """One wrapper around all environments, and a wrapper around each."""
-    bare = many(fakes(lambda e: e, own_stream), autoreset_mode=mode)
+    bare = many(fakes(lambda e: e, own_stream))
     wrapped = fakes(lambda e: NeuralASMSafety(e, monitor(own_stream), **options), own_stream)
-    return VectorNeuralASMSafety(bare, monitor(own_stream), **options), SyncVectorEnv(wrapped, autoreset_mode=mode)
+    return VectorNeuralASMSafety(bare, monitor(own_stream), **options), SyncVectorEnv(wrapped)
 
 
 def assert_same_report(ours, theirs, present, stepped):
@@ -90,32 +89,23 @@ def assert_equal_step_by_step(ours, theirs, steps):
         for mine, other in zip(a[:4], b[:4], strict=True):
             np.testing.assert_array_equal(mine, other)
         ended = a[2] | a[3]
-        same = ours.metadata["autoreset_mode"] == SAME
-        assert_same_report(a[4], b[4], everyone, ~ended if same else ~begun)
+        assert_same_report(a[4], b[4], everyone, ~begun)
         np.testing.assert_array_equal(a[4]["success"], b[4]["success"])
-        assert ("final_info" in a[4]) == (same and ended.any())
-        if same and ended.any():
-            np.testing.assert_array_equal(a[4]["_final_info"], ended)
-            assert_same_report(a[4]["final_info"], b[4]["final_info"], ended, ended)
-            for i in np.flatnonzero(ended):
-                np.testing.assert_array_equal(a[4]["final_obs"][i], b[4]["final_obs"][i])
         begun = ended
         seen.append((a[4]["asm"]["intervened"].any(), ended.any()))
     return np.array(seen).any(axis=0)
 
 
-@pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
 @pytest.mark.parametrize("options", [*OPTIONS, {"on_alarm": Counter()}], ids=lambda o: "-".join(map(str, o.values())))
-def test_one_wrapper_around_many_equals_many_wrappers(options, mode):
-    acted, ended = assert_equal_step_by_step(*both(options, mode), steps=40)
+def test_one_wrapper_around_many_equals_many_wrappers(options):
+    acted, ended = assert_equal_step_by_step(*both(options), steps=40)
     assert ended
     assert acted == (options["on_alarm"] not in ("monitor", "terminate"))
 
 
 @pytest.mark.filterwarnings("ignore:.*the robot holds instead")
-@pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
-def test_where_a_reflex_fails_only_that_environment_holds(mode):
-    ours, theirs = both({"on_alarm": Broken()}, mode)
+def test_where_a_reflex_fails_only_that_environment_holds():
+    ours, theirs = both({"on_alarm": Broken()})
     assert_equal_step_by_step(ours, theirs, steps=25)
     ours.reset()
     for _ in range(4):
@@ -124,15 +114,13 @@ def test_where_a_reflex_fails_only_that_environment_holds(mode):
     np.testing.assert_allclose(asm["executed_action"], [[0, 0, 0.2], [0.5] * 3, [0.2] * 3], rtol=1e-6)
 
 
-@pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
-def test_environments_without_a_stream_are_watched_through_their_spaces(mode):
-    assert_equal_step_by_step(*both({"on_alarm": "hold", "release_after": 2}, mode, own_stream=False), steps=30)
+def test_environments_without_a_stream_are_watched_through_their_spaces():
+    assert_equal_step_by_step(*both({"on_alarm": "hold", "release_after": 2}, own_stream=False), steps=30)
 
 
-@pytest.mark.parametrize("mode", [NEXT, SAME], ids=["next", "same"])
 @pytest.mark.parametrize("many", [AsyncVectorEnv, ThreadVectorEnv])
-def test_members_in_processes_and_on_threads_are_watched_alike(mode, many):
-    ours, theirs = both({"on_alarm": "hold", "max_override": 2}, mode, many=many)
+def test_members_in_processes_and_on_threads_are_watched_alike(many):
+    ours, theirs = both({"on_alarm": "hold", "max_override": 2}, many=many)
     assert_equal_step_by_step(ours, theirs, steps=25)
     ours.close()
 
@@ -184,6 +172,8 @@ def test_what_makes_no_sense_is_refused(lift):
     VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5)))  # has no memory
     with pytest.raises(ValueError, match="release_below"):
         VectorNeuralASMSafety(many, monitor(), release_below=2.0)
+    with pytest.raises(ValueError, match="needs AutoresetMode.NEXT_STEP or DISABLED, got SAME_STEP"):
+        VectorNeuralASMSafety(SyncVectorEnv(fakes(lambda e: e), autoreset_mode=AutoresetMode.SAME_STEP), monitor())
     with pytest.raises(TypeError, match="VectorEnv"):
         VectorNeuralASMSafety(FakeEnv(), monitor())
     with pytest.raises(gym.error.ResetNeeded):

@@ -32,6 +32,7 @@ from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
 from asm_gym.monitors import Monitor, load_monitor
+from asm_gym.policies.base import Policy
 from asm_gym.validation import check_choice, check_number
 
 Floats = NDArray[np.float64]
@@ -64,13 +65,12 @@ class _Reaction:
         self._slow = slow
 
     def predict(
-        self, observation: _Seen, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Floats, Floats]:
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Floats32, Any]:
         present, wanted = observation
         held = present if state is None else np.where(np.isfinite(state), state, present)
-        if not self._slow:
-            return held, held
-        return present + SLOW * (np.where(np.isfinite(wanted), wanted, present) - present), held
+        way = SLOW * (np.where(np.isfinite(wanted), wanted, present) - present)
+        return (present + way if self._slow else held).astype(np.float32), held
 
 
 class LeRobotGuard:
@@ -146,7 +146,8 @@ class LeRobotGuard:
         asked = wanted.astype(np.float32)
 
         def command() -> Floats32:
-            return engine.act(asked[None], lambda _: seen).actions[0]
+            action: Floats32 = engine.act(asked[None], lambda _: seen).actions[0]
+            return action
 
         executed = command() if acts else asked
         row = self._row(observation, executed)
@@ -170,7 +171,7 @@ class LeRobotGuard:
         dt = self._spec.dt
         low, high, unknown = (np.full(len(self._names), value, np.float32) for value in (-np.inf, np.inf, np.nan))
         robots = Robots(1, low, high, rest=unknown, rests=False, dt=dt)
-        policies = [] if self.on_alarm == "monitor" else [_Reaction(self.on_alarm == "slow")]
+        policies: list[Policy] = [] if self.on_alarm == "monitor" else [_Reaction(self.on_alarm == "slow")]
         quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
         options = GuardOptions(policies[0] if policies else "monitor", quiet_rows, 1.0, contact_limits=None)
         return Engine(robots, self.monitor, options, policies)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -11,27 +11,18 @@ from numpy.typing import NDArray
 from asm_gym.spec import StreamSpec
 
 
-class Place(NamedTuple):
-    """Where columns of a stream stand in a part of an observation."""
-
-    part: str  # of a dict; empty for an array
-    columns: NDArray[np.intp]
-    entries: NDArray[np.intp]
-
-
 class ObservationMap:
     """Where the numbers of a stream stand in the observation.
 
     Args:
         space: of the observation.
         spec: of the stream.
-        has_stream: the environment says its stream; else observation and action are it.
+        has_stream: the environment has a stream of its own; else observation and action are it.
         layout: parts of the observation in order, by the names of channels, and how many numbers each has.
         own: the space that the layout is of; it must be that of the observation.
 
     Raises:
-        ValueError: it is not known where they stand: the environment does not say, or a wrapper inside has changed the
-            observation.
+        ValueError: the environment does not say where they stand, or a wrapper inside has changed the observation.
     """
 
     def __init__(
@@ -42,19 +33,19 @@ class ObservationMap:
         layout: dict[str, int] | None = None,
         own: spaces.Space[Any] | None = None,
     ) -> None:
-        self._space = space
-        if layout is not None and has_stream:
-            if own is not None and space != own:
-                raise ValueError(f"a wrapper inside has changed the observation, which was {own}")
-            self._places = _laid_out(layout, spec, space)
-        elif not has_stream and isinstance(space, spaces.Box):
-            self._places = [Place("", spec.sensory, np.arange(len(spec.sensory)))]
-        else:
+        self._space, senses = space, len(spec.sensory)
+        if not has_stream and isinstance(space, spaces.Box):
+            self._places = [("", spec.sensory, np.arange(senses))]
+        elif not has_stream or layout is None:
             raise ValueError("the environment does not say where its stream stands in its observation")
+        elif own is not None and space != own:
+            raise ValueError(f"a wrapper inside has changed the observation, which was {own}")
+        else:
+            self._places = _laid_out(layout, spec, space)
         self.shown = np.zeros(spec.size, bool)
         """(D,) which columns stand in the observation; a policy that sees nothing else cannot read the others."""
-        for place in self._places:
-            self.shown[place.columns] = True
+        for _, columns, _ in self._places:
+            self.shown[columns] = True
 
     def repaired(self, observation: Any, row: NDArray[np.float32], missing: NDArray[np.bool_]) -> Any:
         """Return the observation with the numbers of ``row`` (D,) where they are ``missing`` (D,)."""
@@ -71,15 +62,16 @@ class ObservationMap:
         return observation
 
 
-def _laid_out(layout: dict[str, int], spec: StreamSpec, space: spaces.Space[Any]) -> list[Place]:
-    """Return the places of channels in a flat observation, in its ``state``, or in a dict of named arrays."""
+def _laid_out(
+    layout: dict[str, int], spec: StreamSpec, space: spaces.Space[Any]
+) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
+    """Return part, columns and entries of each channel in a flat observation, its ``state``, or a dict of arrays."""
     named = isinstance(space, spaces.Dict) and "state" not in space.spaces
     flat = "state" if isinstance(space, spaces.Dict) else ""
     found, start = [], 0
     for name, size in layout.items():
         if name in spec.slices:
             columns = np.arange(spec.size)[spec.slices[name]]
-            entries = np.arange(size) + (0 if named else start)
-            found.append(Place(name if named else flat, columns, entries))
+            found.append((name if named else flat, columns, np.arange(size) + (0 if named else start)))
         start += size
     return found

@@ -129,7 +129,7 @@ def strip_chart(width: int, height: int, history: list[Step], shown: int) -> NDA
 
     ratios = np.array([step.ratio for step in history])
     edges = width * (1.0 - (len(history) - np.arange(len(history) + 1)) / shown)  # [px] of each step
-    image = _paper(width, height, tuple(float(y(level)) for level in (10.0, 1.0, 0.1)))
+    image = _paper(width, height, (float(y(10.0)), float(y(1.0)), float(y(0.1))))
     pen = ImageDraw.Draw(image)
     runs = [spans(np.array([getattr(step, name) for step in history], bool)) for name in ("fault", "alarm")]
     bars = ("fault", runs[0], 0, FAULT), ("alarm", runs[1], height - bar, ALARM)

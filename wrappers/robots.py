@@ -9,15 +9,16 @@ from typing import Any, Protocol, runtime_checkable
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
-from gymnasium.wrappers.vector import NormalizeObservation
 from numpy.typing import NDArray
 
 from asm_gym.guard.checks import shipped_memory
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.severity import nothing_felt
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies.reflexes import changed_by, nearest_to_rest, no_rest, outside, resting_action
+from asm_gym.policies.base import Policy, Reflex
+from asm_gym.policies.reflexes import Hold, changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
+from asm_gym.validation import check_number, short_repr
 from asm_gym.wrappers.observation_map import ObservationMap
 
 DELTAS = ("OSC_POSE", "JOINT_POSITION")
@@ -215,12 +216,78 @@ def memory_of(envs: VectorEnv[Any, Any, Any], watched: StreamSpec) -> NeuralASM:
     return shipped_memory(envs, watched, str(controller))
 
 
-def refuse_running_statistics(envs: VectorEnv[Any, Any, Any]) -> None:
-    """Raise ValueError for a wrapper around all members by which the same sense reads differently as it goes on."""
-    while isinstance(envs, VectorWrapper):
-        if isinstance(envs, NormalizeObservation) and envs.update_running_mean:
+def policy_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:
+    """Return the user's own policy that acts during an alarm in ``env``.
+
+    Args:
+        on_alarm: a policy, or what makes one for an environment: a class such as ``BackOff``, or a function.
+
+    Raises:
+        ValueError: no policy, or a reflex that was made for another environment, whose arm it would move.
+    """
+    made: Any = on_alarm
+    refused = "on_alarm must be a name, have a predict(), or make such a policy, got "
+    if isinstance(on_alarm, type) or (callable(on_alarm) and not hasattr(on_alarm, "predict")):
+        try:
+            made = on_alarm(env)
+        except TypeError as error:
+            raise ValueError(f"{refused}{short_repr(on_alarm)}: {error}") from error
+    if not callable(getattr(made, "predict", None)):
+        raise ValueError(f"{refused}{short_repr(made)}")
+    if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
+        name = type(made).__name__
+        raise ValueError(
+            f"this {name} was made for another environment, and would move that: give the class, on_alarm={name}, "
+            "or a function of the environment that makes it"
+        )
+    policy: Policy = made
+    return policy
+
+
+def shared_policy(policy: Any) -> Policy:
+    """Return a policy that acts in all environments.
+
+    Raises:
+        ValueError: it is none, or knows one environment.
+    """
+    if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
+        raise ValueError(
+            f"on_alarm must be a name or one policy with a predict() that all environments share, got "
+            f"{short_repr(policy)}"
+        )
+    if isinstance(policy, Reflex) and not (isinstance(policy, Hold) and policy.explicit):
+        raise ValueError(f"one {type(policy).__name__} cannot act in several environments: give its name instead")
+    shared: Policy = policy
+    return shared
+
+
+@runtime_checkable
+class SensesWithinSteps(Protocol):
+    """An environment whose stream can run faster than control, and whose action can be replaced within a step."""
+
+    row_hooks: list[Any]
+    stream_freq: int
+
+    def stream_spec_at(self, rate: int) -> StreamSpec: ...
+
+    def command(self, action: NDArray[np.float32]) -> None: ...
+
+
+def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> SensesWithinSteps:
+    """Return the environment underneath, once its stream can run at ``rate`` [Hz]; nothing is changed.
+
+    Raises:
+        ValueError: it cannot, or a wrapper inside changes actions, which a reflex within a step would pass by.
+    """
+    check_number("monitor_freq", rate, low=1, whole=True)
+    inner = env.unwrapped
+    if not isinstance(inner, SensesWithinSteps):
+        raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
+    wrapper = env
+    while isinstance(wrapper, gym.Wrapper):
+        if isinstance(wrapper, gym.ActionWrapper) and rate > 1 / control_period(env):
             raise ValueError(
-                "NormalizeObservation changes what it makes of the same sense as it goes on: put it outside, as in "
-                "NormalizeObservation(VectorNeuralASMSafety(envs, monitor)), or set its update_running_mean to False"
+                f"{type(wrapper).__name__} changes actions, and a reflex within a step would pass it by: put it outside"
             )
-        envs = envs.env
+        wrapper = wrapper.env
+    return inner

@@ -1,9 +1,9 @@
-"""Watches a policy's every step, and takes over or stops when what the robot feels is not what it expected."""
+"""Guard a policy: watch every step, and take over or stop when the robot senses what the memory does not expect."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Protocol, SupportsFloat, runtime_checkable
+from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -19,98 +19,68 @@ from asm_gym.guard.motion import Command
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
-from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold, HoldsItself
-from asm_gym.spec import StreamSpec, control_period
+from asm_gym.policies.reflexes import HoldsItself
+from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
-from asm_gym.validation import as_float32, check_choice, check_number, short_repr
-from asm_gym.wrappers.robots import body_memory, felt_by, robots_of
-
-
-@runtime_checkable
-class SensesWithinSteps(Protocol):
-    """An environment whose stream can run faster than control, and whose action can be replaced within a step."""
-
-    row_hooks: list[Any]
-    stream_freq: int
-
-    def stream_spec_at(self, rate: int) -> StreamSpec: ...
-
-    def command(self, action: NDArray[np.float32]) -> None: ...
+from asm_gym.validation import as_float32, check_choice, short_repr
+from asm_gym.wrappers.robots import body_memory, felt_by, policy_for, robots_of, sensing_within_steps
 
 
 class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """A safety layer around any environment with a Box action space, under any policy; others can be watched.
+    """Guard an environment with a Box action space under any policy; other environments can be watched.
 
-    After each step the monitor compares what was sensed with what it expected. From the step after an alarm on, a
+    After each step the monitor compares the row of the stream with its prediction. From the step after an alarm on, a
     reflex acts in the policy's place, until surprise has stayed under ``release_below`` of the threshold for
-    ``release_after`` steps; what has alarmed is not counted again, so that a nudge costs a pause and not the task. With
-    ``monitor_freq`` it watches within control steps too, and the reflex takes over at the next physics substep.
+    ``release_after`` steps. A failure is an alarm too: a monitor that raises or returns nonsense, a stream that is
+    missing, an action of the policy that is not finite (it is not executed). A reflex that fails is replaced by a hold.
 
-    What fails is an alarm too, with the reflex in charge: a monitor that raises or returns nonsense, a stream that is
-    missing, a policy whose action is not finite, which is not done. A reflex that fails is replaced by staying; its
-    actions are clipped to the box. Where an exception leaves ``reset`` or ``step``, the episode has ended.
+    In environments of this package contact force comes first: from the physics substep that passes ``contact_limits``
+    on the arm holds, which is an alarm whatever the surprise. Under ``"graded"`` severity and cause decide what is
+    done, and a sensor at fault is completed in observation and stream.
 
-    What presses decides, not what it is called: in environments of this package the arm stays from the physics substep
-    on in which it felt more than ``contact_limits``, and its hand goes no faster than they say; that is an alarm,
-    whatever the surprise. What is wrong is named at every alarm, by monitors that can: ``info["asm"]["cause"]``. Under
-    ``"graded"`` severity and cause decide what is done, and from the step after an alarm about a sensor on observation
-    and stream hold what that sensor should say, completed from all others, until it has been well for a second. A
-    number that is not finite is an alarm; under ``"graded"`` it is completed, and surprise goes on from what is left.
-
-    ``info["asm"]`` says what came of a step: see ``asm_gym.guard.report.report``. For loggers the same stands
-    beside it as NumPy scalars: ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, and
-    ``info["cost"]``, which is 1.0 on every step with an alarm and 0.0 otherwise, as safe-RL libraries expect.
-    ``info["overridden"]`` is True after a step that began with another than the policy in charge: a policy with a state
-    then resumes where it was left, if it is given the state from before, as ``asm_gym.policies.rollout`` does.
+    ``info["asm"]`` describes a step: see ``asm_gym.guard.report.report``. Beside it stand, as NumPy scalars,
+    ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, ``info["cost"]`` (1.0 on every step
+    with an alarm) and ``info["cost_sum"]`` (of the episode so far). ``info["overridden"]`` is True after a step that
+    began with another action than the policy's: a policy with a state then resumes from its state before.
 
     Args:
-        env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream. No
-            reflex can act where actions are not a Box: ``on_alarm`` must be ``"monitor"`` or ``"terminate"`` there. A
-            wrapper inside that makes several steps of one is held in all of them; one outside sees ``info`` of the last
-            alone, and ``info["asm"]["alarms"]`` and ``info["cost_sum"]`` count those that it skips.
-        monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that ``env`` moves.
-        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip, in environments of this package under
-            every controller and wrapper; ``"retract"`` goes back along the path; ``"comply"`` gives way;
-            ``"recall"`` goes on as the memory expects; ``"graded"`` does what severity and cause ask for
-            (``responses``), hands back on trial, and ends the episode where trials fail, or the policy presses too
-            often; ``"terminate"`` ends the episode; any other policy acts itself, and where it raises, or returns what
-            is no finite action, the robot holds. A class, or a function that makes a policy for an environment, is
-            given this one. None for
-            ``"graded"`` with a monitor that names causes, and for ``"hold"`` with any other.
-        release_after: control steps of quiet after which control is handed back.
-        release_below: share of the threshold, in (0, 1], that surprise must be under to count as quiet.
-        max_override: control steps for which a reflex may act, after which the episode ends; an alarm that is back
-            within ``release_after`` steps of handing back has not gone, and the count goes on. None for as many as it
-            takes, with ``"graded"`` for 3 s.
-        try_after: control steps of override after which control is handed back on trial, though surprise is not quiet;
-            after each trial that fails, twice as many. None for no trials, with ``"graded"`` for 0.5 s.
+        env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
+            Without a Box action space ``on_alarm`` must be ``"monitor"`` or ``"terminate"``.
+        monitor: a fitted and calibrated monitor; where None, the shipped memory of the robot in ``env``.
+        on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip; ``"retract"`` goes back along the
+            path; ``"comply"`` gives way; ``"recall"`` goes on as the memory expects; ``"graded"`` does what severity
+            and cause ask for (``responses``), hands back on trial, and ends the episode where trials fail or the policy
+            presses too often; ``"terminate"`` ends the episode; any other policy acts itself. A class, or a function
+            that makes a policy for an environment, is given this one. None for ``"graded"`` with a monitor that names
+            causes, and for ``"hold"`` with any other.
+        release_after: control steps of low surprise after which control is handed back.
+        release_below: share of the threshold, in (0, 1], under which surprise is low.
+        max_override: control steps for which a reflex may act, after which the episode ends; an alarm within
+            ``release_after`` steps of handing back continues the count. None for no limit, with ``"graded"`` for 3 s.
+        try_after: control steps of override after which control is handed back on trial; after each trial that fails,
+            twice as many. None for no trials, with ``"graded"`` for 0.5 s.
         truncate: an episode that is ended by an alarm is truncated rather than terminated.
         online_learning_rate: above 0 the monitor goes on learning from steps that do not surprise it, by its
-            ``adapt``, which changes it for all who watch with it: for a robot that slowly wears.
-        monitor_freq: rows watched a second [Hz], by a monitor fitted at that rate, on environments whose
-            ``stream_freq`` can be set; it is set to this. None for the rate that the environment's stream has.
-        on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` says so once, ``"alarm"``
-            takes it for infinite surprise, and ``"ignore"`` is for simulations, which wait. The first row does not
-            count.
+            ``adapt``, which changes it for all that use it.
+        monitor_freq: rows watched a second [Hz], on environments whose ``stream_freq`` can be set, which it is. None
+            for the rate that the environment's stream has.
+        on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` once, ``"alarm"``, or
+            ``"ignore"``, for simulations. The first row does not count.
         adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
-            then holds the ``threshold`` of this episode, its ``ceiling``, and ``level``, the share of episodes so far
-            with a false alarm. Not counted are alarms above the ceiling, those that went on while the reflex acted, and
-            those that ``confirm_alarm`` was called for. None for a threshold that stays.
-        responses: under ``"graded"``, what is done about which cause, where it is not what
-            ``asm_gym.guard.responses.DEFAULT`` says: ``{"contact": "comply"}``. None may let a pressing arm go on.
-        contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the usual ones, and more
-            where the monitor's calibration episodes have shown that healthy motion here does. None for none: then
-            nobody knows what presses, and ``"graded"`` holds at every alarm but a sensor's.
-        info: ``"full"``, or ``"flat"`` for the scalars that stand beside ``info["asm"]`` and not that itself. It costs
-            little in steps in which nobody reads it, for most of it is put together then.
+            then holds ``ceiling`` and ``level`` too. Alarms above the ceiling, alarms that went on while the reflex
+            acted, and episodes with ``confirm_alarm`` do not count as false. None for a threshold that stays.
+        responses: under ``"graded"``, responses by cause that replace those of ``asm_gym.guard.responses.DEFAULT``:
+            ``{"contact": "comply"}``. None may let a pressing arm go on.
+        contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the defaults, raised where
+            the monitor's calibration episodes exceed them. None for none; ``"graded"`` then holds at every alarm but a
+            sensor's.
+        info: ``"full"``, or ``"flat"`` for the scalars without ``info["asm"]``.
 
     Raises:
-        ValueError: an unknown ``on_alarm``, cause or response, a response that lets a pressing arm go on, a reflex
-            that was made for another environment, a monitor fitted for another stream or rate (the message
-            names what differs), no monitor where no shipped memory fits (the message lists them), a rate that does not
-            fit, ``"recall"`` with a monitor that expects no action, or a wrapper inside that changes actions, where the
-            reflex cannot know what reaches the robot. Nothing is changed then.
+        ValueError: an unknown ``on_alarm``, cause or response; a response that lets a pressing arm go on; a reflex
+            made for another environment; a monitor fitted for another stream or rate (the message names what differs);
+            no shipped memory that fits (the message lists them); ``"recall"`` with a monitor that expects no action; a
+            wrapper inside that changes actions, where a reflex cannot know what reaches the robot.
         RuntimeError: the monitor is not calibrated.
 
     Example:
@@ -142,27 +112,21 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
         info: Literal["full", "flat"] = "full",
     ) -> None:
-        given: dict[str, Any] = {
-            "on_alarm": on_alarm,
-            "release_after": release_after,
-            "release_below": release_below,
-            "max_override": max_override,
-            "try_after": try_after,
-            "truncate": truncate,
-            "online_learning_rate": online_learning_rate,
-            "on_overrun": on_overrun,
-            "adaptive_threshold": adaptive_threshold,
-            "responses": responses,
-            "contact_limits": contact_limits,
-        }
-        RecordConstructorArgs.__init__(
-            self,
-            _disable_deepcopy=True,  # a reflex holds its environment, and a memory is large
-            monitor=monitor,
-            monitor_freq=monitor_freq,
-            info=info,
-            **given,
+        self._options = GuardOptions(
+            on_alarm=on_alarm,
+            release_after=release_after,
+            release_below=release_below,
+            max_override=max_override,
+            try_after=try_after,
+            truncate=truncate,
+            online_learning_rate=online_learning_rate,
+            on_overrun=on_overrun,
+            adaptive_threshold=adaptive_threshold,
+            responses=responses,
+            contact_limits=contact_limits,
         )
+        recorded = {"monitor": monitor, "monitor_freq": monitor_freq, "info": info, **vars(self._options)}
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
         if self._box is None and on_alarm not in ("monitor", "terminate"):
@@ -172,11 +136,10 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         check_choice("info", info, INFO)
         self._full = info == "full"
-        self._options = GuardOptions(**given)
         self._source = StreamSource(env)
         self._spec = self._source.spec
         if monitor_freq is not None:
-            sensing = _can_sense(env, monitor_freq)
+            sensing = sensing_within_steps(env, monitor_freq)
             self._spec = sensing.stream_spec_at(monitor_freq)
         self._rows_per_step = max(1, round(control_period(env) / self._spec.dt)) if self._source.own else 1
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
@@ -203,7 +166,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
-        policies = () if isinstance(chosen, str) else (made_for(chosen, self.env),)
+        policies = () if isinstance(chosen, str) else (policy_for(chosen, self.env),)
         robots, self._places = robots_of(self.env, monitor.spec)
         self._engine = Engine(robots, monitor, self._options, policies, self._rows_per_step)
         self._robots, self._monitor = robots, monitor
@@ -338,51 +301,3 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         done = None if executed is None else np.array(executed)
         more = alarms if running is None else alarms | {"ceiling": running.ceiling, "level": running.level}
         return LazyInfo(lambda: report(rows, 0, self._spec, done, failed) | more)
-
-
-def made_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:
-    """Return the user's own policy that acts during an alarm in ``env``.
-
-    Args:
-        on_alarm: a policy, or what makes one for an environment: a class such as ``BackOff``, or a function.
-
-    Raises:
-        ValueError: no policy, or a reflex that was made for another environment, whose arm it would move.
-    """
-    made: Any = on_alarm
-    refused = "on_alarm must be a name, have a predict(), or make such a policy, got "
-    if isinstance(on_alarm, type) or (callable(on_alarm) and not hasattr(on_alarm, "predict")):
-        try:
-            made = on_alarm(env)
-        except TypeError as error:
-            raise ValueError(f"{refused}{short_repr(on_alarm)}: {error}") from error
-    if not callable(getattr(made, "predict", None)):
-        raise ValueError(f"{refused}{short_repr(made)}")
-    if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
-        name = type(made).__name__
-        raise ValueError(
-            f"this {name} was made for another environment, and would move that: give the class, on_alarm={name}, "
-            "or a function of the environment that makes it"
-        )
-    policy: Policy = made
-    return policy
-
-
-def _can_sense(env: gym.Env[Any, Any], rate: int) -> SensesWithinSteps:
-    """Return the environment underneath, once its stream can run at ``rate`` [Hz]; nothing is changed.
-
-    Raises:
-        ValueError: it cannot, or a wrapper inside changes actions, which a reflex within a step would pass by.
-    """
-    check_number("monitor_freq", rate, low=1, whole=True)
-    inner = env.unwrapped
-    if not isinstance(inner, SensesWithinSteps):
-        raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
-    wrapper = env
-    while isinstance(wrapper, gym.Wrapper):
-        if isinstance(wrapper, gym.ActionWrapper) and rate > 1 / control_period(env):
-            raise ValueError(
-                f"{type(wrapper).__name__} changes actions, and a reflex within a step would pass it by: put it outside"
-            )
-        wrapper = wrapper.env
-    return inner

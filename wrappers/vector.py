@@ -1,4 +1,4 @@
-"""Watches many environments of one ``gym.make_vec`` at once, and lets a reflex act in those that are in alarm."""
+"""Guard many environments of one ``gym.make_vec`` at once."""
 
 from __future__ import annotations
 
@@ -18,33 +18,28 @@ from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
-from asm_gym.policies.base import Policy, Reflex
-from asm_gym.policies.reflexes import Hold
 from asm_gym.spec import StreamSpec, control_period
-from asm_gym.validation import as_float32, check_choice, short_repr
-from asm_gym.wrappers.robots import askable, felt_by, memory_of, refuse_running_statistics, robots_of_many
-from asm_gym.wrappers.vector_infos import Mask, final, put, replace, said_by
+from asm_gym.stream_source import refuse_running_statistics
+from asm_gym.validation import as_float32, check_choice
+from asm_gym.wrappers.robots import askable, felt_by, memory_of, robots_of_many, shared_policy
 
-FELT = "contact_load", "contact_left_s", "contact_felt"
-"""What environments say of what their arms felt within a step."""
+Mask = NDArray[np.bool_]
 
 
 class VectorNeuralASMSafety(VectorWrapper):
     """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
 
-    Arguments, promises and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is
-    n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` are (n,). A
-    monitor that raises has judged nobody, and all are in alarm; any other failure is that of one environment. Where an
-    episode has just begun, surprise is 0 and ``executed_action`` NaN. Under ``AutoresetMode.SAME_STEP`` the last step
-    of an episode is reported in ``info["final_info"]``.
-
-    An episode that the wrapper itself ends begins anew as any other does. Under ``AutoresetMode.NEXT_STEP`` its
-    environment, which cannot know, takes one more step before that, which nobody sees.
+    Arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is n, and
+    ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` are (n,). A monitor
+    that raises puts all environments in alarm; any other failure is that of one environment. Where an episode has just
+    begun, surprise is 0 and ``executed_action`` NaN. An episode that the guard ends begins anew as any other; under
+    ``AutoresetMode.NEXT_STEP`` its environment takes one more step before that, which nobody sees.
 
     Args:
-        env: of ``gym.make_vec``; where ``info`` has no ``"stream"``, observation and action are the stream.
+        env: of ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``; where ``info`` has no ``"stream"``,
+            observation and action are the stream.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
-        on_alarm: a name as in ``NeuralASMSafety``, or one policy that is shared, and must keep what it knows in its
+        on_alarm: a name as in ``NeuralASMSafety``, or one policy that all share and that keeps what it knows in its
             state.
         release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there.
         adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
@@ -52,9 +47,8 @@ class VectorNeuralASMSafety(VectorWrapper):
 
     Raises:
         TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
-        ValueError: an unknown ``on_alarm``, a monitor fitted for another stream (the message names the channels), or a
-            wrapper inside that changes actions, where the reflex cannot know what reaches the robot, or what it
-            makes of the same sense as it goes on.
+        ValueError: an unknown ``on_alarm``, another mode of autoreset, a monitor fitted for another stream (the message
+            names the channels), or a wrapper inside that changes actions or normalises by running statistics.
         RuntimeError: the monitor is not calibrated.
 
     Example:
@@ -86,21 +80,18 @@ class VectorNeuralASMSafety(VectorWrapper):
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
-        refuse_running_statistics(env)
+        refuse_running_statistics(env, "VectorNeuralASMSafety")
         check_choice("info", info, INFO)
         self._full = info == "full"
-        self._options = GuardOptions(
-            on_alarm,
-            release_after,
-            release_below,
-            max_override,
-            try_after,
-            truncate,
-            responses,
-            contact_limits,
-            adaptive_threshold,
-        )
-        self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        options = on_alarm, release_after, release_below, max_override, try_after, truncate
+        self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold)
+        mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        if mode == AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "VectorNeuralASMSafety needs AutoresetMode.NEXT_STEP or DISABLED, got SAME_STEP: make the environments "
+                "without it, or wrap each in NeuralASMSafety"
+            )
+        self._resets_itself = mode == AutoresetMode.NEXT_STEP
         self._members = askable(env)
         self._spec, self._own_stream = self._stream()
         self._watch_with(memory_of(env, self._spec) if monitor is None else monitor)
@@ -126,10 +117,8 @@ class VectorNeuralASMSafety(VectorWrapper):
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:
             first.require(other, "the first environment")
-        periods = (
-            self._members.call("get_wrapper_attr", "dt") if all(self._members.call("has_wrapper_attr", "dt")) else ()
-        )
-        if periods and round(periods[0] / first.dt) > 1:
+        timed = all(self._members.call("has_wrapper_attr", "dt"))
+        if timed and round(self._members.call("get_wrapper_attr", "dt")[0] / first.dt) > 1:
             raise ValueError("many environments are watched at their control rate: make them without stream_freq")
         return first, True
 
@@ -139,7 +128,7 @@ class VectorNeuralASMSafety(VectorWrapper):
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         self._robots, self._places = robots_of_many(self.env, monitor.spec)
-        policies = () if isinstance(chosen, str) else [_shared(chosen)] * self.num_envs
+        policies = () if isinstance(chosen, str) else [shared_policy(chosen)] * self.num_envs
         self._engine = Engine(self._robots, monitor, self._options, policies)
         self._monitor = self._next = monitor
         self._taken_up = Fitted.of(monitor, self._spec)
@@ -183,41 +172,31 @@ class VectorNeuralASMSafety(VectorWrapper):
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
-        if self._ended is None or (self._mode == AutoresetMode.DISABLED and self._ended.any()):
+        if self._ended is None or (not self._resets_itself and self._ended.any()):
             raise gym.error.ResetNeeded("call reset() before step(): an environment's episode is not running")
         begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
-        # Those of ``begun`` begin an episode in this step; none of them under SAME_STEP.
         executed, failed = self._command(actions, begun)
         observations, rewards, terminated, truncated, infos = self.env.step(executed.copy())
         infos = dict(infos)
         if self._forced.any():
             forced = self._forced
             observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
-            infos = replace(infos, fresh, forced)
+            infos = _replaced(infos, fresh, forced)
             rewards, terminated, truncated = (np.where(forced, 0, x) for x in (rewards, terminated, truncated))
-        same = self._mode == AutoresetMode.SAME_STEP
-        known = np.asarray(terminated | truncated, bool)
-        last = known if same else np.zeros_like(known)
-        rows, failures = self._sensed(observations, executed, infos, last)
-        said = self._engine.judge(rows, executed, self._felt(infos, last), failures, active=~begun)
-        said = said.with_failures(failed)
-        stopped = (said.gave_up | (said.ends & self._engine.ends_on_alarm)) & ~begun
+        rows, failures = self._sensed(observations, executed, infos)
+        felt = felt_by(self._robots, infos, infos.get("_contact_load"))
+        report = self._engine.judge(rows, executed, felt, failures, active=~begun).with_failures(failed)
+        stopped = (report.gave_up | (report.ends & self._engine.ends_on_alarm)) & ~begun
+        self._forced = stopped & ~np.asarray(terminated | truncated, bool)
         terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
         truncated = np.asarray(truncated, bool) | (stopped & self._options.truncate)
-        self._forced = stopped & ~known
-        observations = self._repaired(observations, infos, ~begun & ~last)
-        if same and self._forced.any():
-            observations, infos = self._restart(observations, infos)
+        self._observations = self._repaired(observations, infos, ~begun)
         executed[begun] = np.nan
         self._ended = np.zeros_like(begun)
-        if same:
-            self._report_ends(infos, said, executed, terminated | truncated)
-        else:
-            self._begin(begun)
-            self._report(infos, said, executed, np.ones(self.num_envs, bool))
-            self._ended = terminated | truncated
-        self._observations = observations
-        return observations, rewards, terminated, truncated, infos
+        self._begin(begun)
+        self._report(infos, report, executed, np.ones(self.num_envs, bool))
+        self._ended = terminated | truncated
+        return self._observations, rewards, terminated, truncated, infos
 
     def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], Mapping[int, str]]:
         """Return (n, A) what is done, and what failed when it was chosen."""
@@ -237,19 +216,21 @@ class VectorNeuralASMSafety(VectorWrapper):
         return command.actions.reshape(chosen.shape), command.failures
 
     def _sensed(
-        self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any], last: Mask
+        self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any]
     ) -> tuple[NDArray[np.float32], dict[int, str]]:
-        """Return (n, D) what was sensed in this step, and what failed at that by environment; of episodes that were in
-        their ``last`` one, before they began anew."""
+        """Return (n, D) what was sensed in this step, and what failed at that by environment."""
         n, size = self.num_envs, self._spec.size
         stream: Any = infos.get("stream")
-        told = infos.get("_stream", np.ones(n, bool))
-        if self._own_stream and not last.any() and np.all(told) and np.shape(stream) == (n, size):
+        there = np.asarray(infos.get("_stream", np.ones(n, bool)))
+        if self._own_stream and there.all() and np.shape(stream) == (n, size):
             return np.array(as_float32(stream)), {}
         rows, failures = np.full((n, size), np.nan, np.float32), {}
         for i in range(n):
             try:
-                row = self._row(i, observations, executed, infos, bool(last[i]))
+                if self._own_stream and not (stream is not None and there[i]):
+                    raise KeyError('info has no "stream"')
+                parts = [stream[i]] if self._own_stream else [np.ravel(observations[i]), np.ravel(executed[i])]
+                row = as_float32(np.concatenate(parts))
                 if row.shape != (size,):
                     raise ValueError(f"a row has the shape {(size,)}, got {row.shape}")
                 rows[i] = row
@@ -257,35 +238,15 @@ class VectorNeuralASMSafety(VectorWrapper):
                 failures[i] = f"stream: {error!r}"
         return rows, failures
 
-    def _row(
-        self, i: int, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any], last: bool
-    ) -> NDArray[np.float32]:
-        """Return (D,) of one environment."""
-        if self._own_stream:
-            said = said_by(infos, i, last, ("stream",))
-            if "stream" not in said:
-                raise KeyError('info has no "stream"')
-            return as_float32(said["stream"])
-        sensed = infos["final_obs"][i] if last else observations[i]
-        return as_float32(np.concatenate([np.ravel(sensed), np.ravel(executed[i])]))
-
-    def _felt(self, infos: dict[str, Any], last: Mask) -> NDArray[np.float64]:
-        """Return what the arms felt in this step, those of episodes in their ``last`` one before they began anew."""
-        now = felt_by(self._robots, infos, infos.get(f"_{FELT[0]}"))
-        if not last.any():
-            return now
-        before = felt_by(self._robots, infos["final_info"], infos["final_info"].get(f"_{FELT[0]}"))
-        return np.where(last[:, None], before, now)
-
     def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
         """Return the observations, and set the streams, with what is completed in the environments of ``where``."""
         for i, (row, missing) in self._engine.repaired.items():
             if not where[i] or self._places is None:
                 continue
             seen = list(iterate(self.observation_space, observations))[i]
-            observations = put(observations, i, self._places.repaired(seen, row, missing))
+            observations = _with(observations, i, self._places.repaired(seen, row, missing))
             if "stream" in infos:
-                infos["stream"] = put(infos["stream"], i, row)
+                infos["stream"] = _with(infos["stream"], i, row)
         return observations
 
     def _begin(self, begun: Mask) -> RowReport:
@@ -306,26 +267,6 @@ class VectorNeuralASMSafety(VectorWrapper):
             self._members.set_attr("contact_limits", list(limits))
         self._limits = limits
 
-    def _restart(self, observations: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Begin anew what this wrapper has ended, in the same step."""
-        forced = self._forced
-        infos = final(infos, list(iterate(self.observation_space, observations)), forced)
-        observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
-        return observations, replace(infos, fresh, forced, keep=("final_obs", "final_info"))
-
-    def _report_ends(self, infos: dict[str, Any], said: RowReport, executed: NDArray[np.float32], ended: Mask) -> None:
-        """Report what ended in ``final_info``, and what has begun in its place in ``infos``."""
-        if ended.any():
-            infos["final_info"] = dict(infos["final_info"])
-            self._report(infos["final_info"], said, executed, ended)
-            self._begin(ended)
-            executed = np.where(ended[:, None], np.float32(np.nan), executed)
-            self._alarms -= said.alarm & ~ended  # counted by the next report
-            said = said.of(~ended)
-        else:
-            self._begin(ended)
-        self._report(infos, said, executed, np.ones(self.num_envs, bool))
-
     def _report(self, infos: dict[str, Any], said: RowReport, executed: NDArray[np.float32], present: Mask) -> None:
         """Add ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
         self._alarms += said.alarm
@@ -345,18 +286,28 @@ class VectorNeuralASMSafety(VectorWrapper):
         infos.update(found | {f"_{key}": present for key in found})
 
 
-def _shared(policy: Any) -> Policy:
-    """Return a policy that acts in all environments.
+def _with(batch: Any, i: int, value: Any) -> Any:
+    """Return a copy of a batch, an array or a dict of such, with ``value`` at ``i``."""
+    if isinstance(batch, dict):
+        return {key: _with(part, i, value[key]) for key, part in batch.items()}
+    changed = np.array(batch)
+    changed[i] = value
+    return changed
 
-    Raises:
-        ValueError: it is none, or knows one environment.
-    """
-    if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
-        raise ValueError(
-            f"on_alarm must be a name or one policy with a predict() that all environments share, got "
-            f"{short_repr(policy)}"
-        )
-    if isinstance(policy, Reflex) and not (isinstance(policy, Hold) and policy.explicit):
-        raise ValueError(f"one {type(policy).__name__} cannot act in several environments: give its name instead")
-    shared: Policy = policy
-    return shared
+
+def _replaced(infos: dict[str, Any], by: dict[str, Any], mask: Mask) -> dict[str, Any]:
+    """Return infos in which the environments of ``mask`` (n,) have what ``by`` says of them, and nothing else."""
+    merged = dict(infos)
+    for key in infos.keys() | by.keys():
+        old, new = infos.get(key), by.get(key)
+        if isinstance(old, dict) or isinstance(new, dict):
+            merged[key] = _replaced(old or {}, new or {}, mask)
+            continue
+        old = _blank(new) if old is None else old
+        new = _blank(old) if new is None else new
+        merged[key] = np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    return merged
+
+
+def _blank(like: Any) -> NDArray[Any]:
+    return np.full(like.shape, None, object) if like.dtype == object else np.zeros_like(like)

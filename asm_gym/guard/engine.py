@@ -23,7 +23,7 @@ from asm_gym.guard.diagnosis import Alarm, Diagnostician
 from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import Observation, Observer, joined
-from asm_gym.guard.options import TRUST_S, GuardOptions
+from asm_gym.guard.options import LEANS_S, TRUST_S, GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
 from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import NO_RESPONSE, Response, responses_from
@@ -92,7 +92,7 @@ class Engine:
         self._arbiter = Arbiter(n, rule, self.fitted.threshold)
         self._motions = Motions(robots, reflexes, policies, self._arbiter.take_over, self._warn)
         self._observer = Observer(monitor, n, recalls)
-        self._severity = SeverityEstimator(n, spec, robots.felt_channels, options.leans_s, self._arbiter)
+        self._severity = SeverityEstimator(n, spec, robots.felt_channels, LEANS_S, self._arbiter)
         table = responses_from(options.responses)
         self._diagnostician = Diagnostician(robots, spec, diagnosis, table, graded)
         completion = diagnosis.completion if diagnosis is not None and graded else None
@@ -233,6 +233,10 @@ class Engine:
             return NOTHING
         found = {i: (self._rows.last(i, 1)[0], repair.missing) for i, repair in self._rows.repairs.items()}
         return {i: (row, missing) for i, (row, missing) in found.items() if missing.any()}
+
+    def amend(self, rows: NDArray[np.float32]) -> None:
+        """Tell the monitor that the last rows (n, D) were these: something else was commanded than it seemed."""
+        self._observer.amend(rows)
 
     def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> dict[int, str]:
         """Return all that is known to have failed before the rows are looked at, by robot."""

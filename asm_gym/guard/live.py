@@ -92,7 +92,7 @@ class _Watch:
         self.event = NO_EVENT
 
     def _judge(self, numbers: Any, bridged: bool) -> RowReport:
-        return self.engine.judge(as_float32(numbers)[None], self.no_action, bridged=np.array([bridged]))
+        return self.engine.judge(as_float32(numbers)[None], self.no_action, active=np.array([not bridged]))
 
     def alarm(self, what: str, row: int | None = None) -> None:
         """Count an alarm, and say at which row it was, by default at the newest."""

@@ -82,6 +82,13 @@ class Observer:
                 failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
         return Observation(_infinite(surprise, failures) if failures else surprise, expected, failures, latency)
 
+    def amend(self, rows: NDArray[np.float32]) -> None:
+        """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
+        try:
+            self._state, _ = self._monitor.observe(self._before, rows)
+        except Exception:  # the state stays as it is: the next row is judged from there
+            return
+
     def forget(self, acted_on: Mask) -> str:
         """Let the evidence begin anew in the streams of ``acted_on`` (n,); return what failed."""
         if self._forgets is None:

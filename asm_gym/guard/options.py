@@ -71,7 +71,6 @@ class GuardOptions:
     Args:
         on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits,
             adaptive_threshold, online_learning_rate, on_overrun: as there.
-        leans_s: how long an arm may press with more than healthy motion does below its limits [s].
 
     Raises:
         ValueError: a number out of its range, an unknown name, or responses that let a pressing arm go on.
@@ -88,7 +87,6 @@ class GuardOptions:
     adaptive_threshold: AdaptiveThreshold | None = None
     online_learning_rate: float = 0.0
     on_overrun: str = "ignore"
-    leans_s: float = LEANS_S
 
     def __post_init__(self) -> None:
         if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:
