@@ -31,7 +31,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     written,
 )
 from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
-from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
+from asm_gym.scripts.reproduce.recurrent import Batch
 from asm_gym.scripts.reproduce.two_links import (
     COMMAND,
     CUE,
@@ -47,9 +47,8 @@ from asm_gym.scripts.reproduce.two_links import (
     joints,
 )
 from asm_gym.scripts.reproduce.two_links import DT as ARM_DT
-from tests.problems import trajectory
 
-STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, rise=0.0, onset=-0.05, sigma=0.3)
+STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, onset=-0.05, sigma=0.3)
 
 
 def test_a_stroke_ends_at_its_chord_and_is_fastest_at_the_mode_of_its_lognormal():
@@ -57,27 +56,26 @@ def test_a_stroke_ends_at_its_chord_and_is_fastest_at_the_mode_of_its_lognormal(
     end = (velocity(Letter("a", (STROKE,)), time) * 2e-5).sum(axis=0)
     # ∫_0^1 exp(i (θ + Δθ u)) du = (exp(i (θ + Δθ)) - exp(i θ)) / (i Δθ)
     chord = 4.0 * (np.exp(1j * 1.8) - np.exp(1j * 0.3)) / (1j * 1.5)
-    np.testing.assert_allclose(end, [chord.real, chord.imag, 0.0], atol=1e-3)
+    np.testing.assert_allclose(end, [chord.real, chord.imag], atol=1e-3)
     time = np.linspace(0.01, 1.0, 100_000)
     speed = np.linalg.norm(velocity(Letter("a", (STROKE,)), time), axis=1)
     assert time[speed.argmax()] == pytest.approx(-0.05 + math.exp(-1.75 - 0.3**2), abs=1e-4)
 
 
 def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
-    episode = written(repertoire(1, 3, np.random.default_rng(0))[0], 3, np.random.default_rng(1))
-    gone = episode.stream[:, :3] - np.cumsum(episode.stream[:, 3:], axis=0) * DT
-    assert episode.stream.shape == (STEPS, 6)
-    assert gone.std() == pytest.approx(NOISE, rel=0.2)
-    letter = repertoire(1, 2, np.random.default_rng(0))[0]
-    slow, fast = (written(letter, 2, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
+    letter = repertoire(1, np.random.default_rng(0))[0]
+    episode = written(letter, np.random.default_rng(1))
+    noise = episode.stream[:, :2] - np.cumsum(episode.stream[:, 2:], axis=0) * DT
+    assert noise.std() == pytest.approx(NOISE, rel=0.2)
+    slow, fast = (written(letter, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
     assert len(fast) == len(slow) / 2
     np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
 
 
 def letters_of(count: int, each: int = 6) -> tuple[list, list]:
     rng = np.random.default_rng(0)
-    letters = repertoire(count, 2, rng)
-    return copybook(letters, each, 2, rng), copybook(letters, 3, 2, rng)
+    letters = repertoire(count, rng)
+    return copybook(letters, each, rng), copybook(letters, 3, rng)
 
 
 def test_a_hopfield_network_completes_what_it_stored_and_answers_with_the_mean_when_cold():
@@ -99,24 +97,10 @@ def test_a_recurrent_rival_offline_reads_its_own_predictions(cell):
     np.testing.assert_array_equal(offline, model.express(np.where(row < 20, streams, 9.0), 20))
 
 
-def test_batches_hold_every_episode_once_and_let_short_ones_end():
-    rng = np.random.default_rng(0)
-    episodes = [
-        trajectory(rng.normal(size=(20 + n % 3, 5)).astype(np.float32), np.ones((20 + n % 3, 1), np.float32))
-        for n in range(11)
-    ]
-    made = batches(episodes, 4, rng)
-    assert sum(b.active.sum() for b in made) == sum(len(t.senses) for t in episodes)
-    assert max(b.senses.shape[1] for b in made) == 4
-    batch = side_by_side(episodes[:3])  # 20, 21 and 22 rows
-    assert list(batch.active[-3:]) == [3, 2, 1]
-    np.testing.assert_array_equal(batch.senses[:, 0], episodes[2].senses)
-
-
 def test_the_memory_recalls_each_letter_from_its_cue():
     train, tests = letters_of(2, each=8)
     memory = ExpressionMemory.learned(train, 32, np.random.default_rng(0), 4000)
-    error, right = recalled(memory, tests, mean_demonstrations(train, 2), 20)
+    error, right = recalled(memory, tests, mean_demonstrations(train), 20)
     streams = np.stack([e.stream for e in tests], axis=1)
     still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()
     assert right >= 5 / 6
@@ -128,7 +112,7 @@ def test_traces_need_no_inference_and_a_settling_state_does():
     found = {}
     for dynamics in ("traces", "settling"):
         rng = np.random.default_rng(0)
-        records = speed_accuracy.by_iterations(repertoire(2, 2, rng), config, rng, dynamics)
+        records = speed_accuracy.by_iterations(repertoire(2, rng), config, rng, dynamics)
         found[dynamics] = {(r["iterations"], r["shorter"]): r["next_cm"] for r in records}
     assert len(set(found["traces"].values())) == 1  # to the bit: nothing is inferred
     settling = [found["settling"][at] for at in ((1, 20), (5, 20), (30, 20), (100, 1))]
@@ -142,7 +126,7 @@ def small_batch(steps: int) -> tuple[Weights, Batch]:
     weights = initial_weights(7, 5, 2, rng)
     weights.W_F[:] = rng.normal(size=weights.W_F.shape)
     weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(5, 2)
-    return weights, Batch(senses, commands, np.full(steps, 4))
+    return weights, Batch(senses, commands)
 
 
 def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finite_differences():
@@ -181,7 +165,7 @@ def test_the_local_change_is_the_gradient_of_the_energy_and_of_the_error_for_a_f
 @pytest.fixture(scope="module")
 def arm():
     rng = np.random.default_rng(0)
-    two = repertoire(2, 2, rng)
+    two = repertoire(2, rng)
     return demonstrations(two, 12, rng), demonstrations(two, 4, rng)
 
 

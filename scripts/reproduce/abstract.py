@@ -91,7 +91,7 @@ class Lessons(NamedTuple):
 def lessons(seed: int, config: Config) -> Lessons:
     """Draw the letters of a seed."""
     rng = np.random.default_rng(seed)
-    letters = repertoire(config.skills, 2, rng)
+    letters = repertoire(config.skills, rng)
     train, calibration, tests = (
         demonstrations(letters, n, rng) for n in (config.writings, config.calibration, config.tests)
     )

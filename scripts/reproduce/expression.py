@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+from scipy.special import softmax
 
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
@@ -21,6 +22,7 @@ from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.memory.traces import learn_traces
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
+from asm_gym.scripts.reproduce.recurrent import Batch
 
 Rows = NDArray[np.float64]
 
@@ -36,16 +38,16 @@ class Expresser(Protocol):
         ...
 
 
-def read(reader: StreamScaler, streams: Rows) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return senses (T, B, S) and commands (T, B, A + 1), standardised, of streams (T, B, D)."""
-    readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
-    return np.stack([r.senses for r in readings], axis=1), np.stack([r.commands for r in readings], axis=1)
-
-
 def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Trajectory]:
     """Return the episodes as a network reads them."""
     readings = [reader.read_episode(e.stream) for e in episodes]
     return [Trajectory(r.senses, r.commands, r.inputs) for r in readings]
+
+
+def read(reader: StreamScaler, streams: Rows) -> Batch:
+    """Return the senses and commands, standardised, of streams (T, B, D)."""
+    readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
+    return Batch(*(np.stack([getattr(r, name) for r in readings], axis=1) for name in Batch._fields))
 
 
 @dataclass(frozen=True)
@@ -80,13 +82,12 @@ class ExpressionMemory:
         reader, how, size = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]), DYNAMICS[dynamics], 64
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
         schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, FREE)
-        asked = trajectories(reader, episodes), hidden, schedule, rng, _silent
+        asked = trajectories(reader, episodes), hidden, schedule, rng, lambda: None
         trained = learn_traces(*asked, gain) if dynamics == TRACES else how.learn(*asked)
         return cls(reader, trained.network)
 
     def express(self, streams: Rows, cue: int) -> Rows:
-        senses, commands = read(self.reader, streams[:cue])
-        cued = follow(self.network, self.network.at_rest(streams.shape[1]), senses, commands)
+        cued = follow(self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams[:cue]))
         rows = to_rows(self.reader, cued)
         if cue == len(streams):
             return rows
@@ -99,40 +100,27 @@ class ExpressionMemory:
         return ExpressionMemory(self.reader, network)
 
 
-def _silent() -> None:
-    """Report no progress."""
-
-
 @dataclass(frozen=True)
 class Backpropagated:
     """A recurrent network trained by backpropagation through time."""
 
     reader: StreamScaler
-    network: Any
+    network: recurrent.Recurrent
 
     @classmethod
     def learned(
-        cls,
-        episodes: Sequence[Episode],
-        cell: str,
-        hidden: int,
-        rng: np.random.Generator,
-        updates: int,
-        noise: float = 0.3,
-        rate: float = 1e-2,
+        cls, episodes: Sequence[Episode], cell: str, hidden: int, rng: np.random.Generator, updates: int, **how: float
     ) -> Backpropagated:
-        """Learn from whole episodes; the other arguments are those of ``recurrent.train``."""
+        """Learn from whole episodes; the arguments are those of ``recurrent.train``."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        taught = trajectories(reader, episodes)
-        return cls(reader, recurrent.train(taught, cell, hidden, updates, rng, noise, rate))
+        return cls(reader, recurrent.train(trajectories(reader, episodes), cell, hidden, updates, rng, **how))
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
         return to_rows(self.reader, Recalled(senses, commands, commands, commands[-1]))
 
 
-@dataclass(frozen=True)
-class Hopfield:
+class Hopfield(NamedTuple):
     """A modern continuous Hopfield network that keeps every window of rows.
 
         ξ = Σ_i softmax_i(-½ β ‖q - k_i‖²) v_i      q the last rows, k_i those of a window, v_i the row that followed
@@ -141,8 +129,8 @@ class Hopfield:
     """
 
     reader: StreamScaler
-    keys: NDArray[np.float64]  # (N, window · D)
-    values: NDArray[np.float64]  # (N, D)
+    keys: Rows  # (N, window · D)
+    values: Rows  # (N, D)
     window: int
     beta: float
 
@@ -158,51 +146,40 @@ class Hopfield:
             values += list(rows[1:])
         return cls(reader, np.array(keys), np.array(values), window, beta)
 
-    @cached_property
-    def _lengths(self) -> NDArray[np.float64]:
-        """‖k_i‖² (N,)."""
-        squared: NDArray[np.float64] = np.einsum("ij,ij->i", self.keys, self.keys)
-        return squared
-
-    def retrieve(self, query: NDArray[np.float64]) -> NDArray[np.float64]:
+    def retrieve(self, query: Rows) -> Rows:
         """Return the rows (B, D) after windows (B, window · D)."""
-        size = self.values.shape[1]  # a mean over channels gives β one meaning for every stream
-        distance = np.sum(query**2, 1)[:, None] + self._lengths - 2 * query @ self.keys.T
-        drive = -0.5 * self.beta * distance / size
-        share = np.exp(drive - drive.max(axis=1, keepdims=True))
-        found: NDArray[np.float64] = share @ self.values / share.sum(axis=1, keepdims=True)
-        return found
+        distance = cdist(query, self.keys, "sqeuclidean") / self.values.shape[1]  # β means the same for every stream
+        return np.asarray(softmax(-0.5 * self.beta * distance, axis=1) @ self.values)
 
     def express(self, streams: Rows, cue: int) -> Rows:
         rows = (streams - self.reader.mean) / self.reader.spread  # (T, B, D)
-        past = np.zeros((self.window, *rows.shape[1:]))
-        made = np.zeros_like(rows)
+        past, made = np.zeros((self.window, *rows.shape[1:])), np.zeros_like(rows)
         for t in range(len(rows)):
             made[t] = self.retrieve(past.transpose(1, 0, 2).reshape(rows.shape[1], -1)) if t else 0.0
-            past = np.concatenate([past[1:], rows[t][None] if t < cue else made[t][None]])
+            past = np.concatenate([past[1:], rows[t : t + 1] if t < cue else made[t : t + 1]])
         return np.asarray(self.reader.mean + self.reader.spread * made)
 
 
-def mean_demonstrations(train: Sequence[Episode], dims: int) -> NDArray[np.float64]:
-    """Return the mean path (K, T, P) of each skill, in order of name."""
+def mean_demonstrations(train: Sequence[Episode]) -> Rows:
+    """Return the mean path (K, T, 2) of the pen in each skill, in order of name."""
     names = sorted({str(e.info["skill"]) for e in train})
-    return np.stack([np.mean([e.stream[:, :dims] for e in train if e.info["skill"] == n], axis=0) for n in names])
+    return np.stack([np.mean([e.stream[:, :2] for e in train if e.info["skill"] == n], axis=0) for n in names])
 
 
-def recalled(model: Expresser, tests: Sequence[Episode], means: NDArray[np.float64], cue: int) -> tuple[float, float]:
-    """Return the mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
+def recalled(model: Expresser, tests: Sequence[Episode], means: Rows, cue: int) -> tuple[float, float]:
+    """Return the pen's mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
     Args:
         model: expresses the skills.
         tests: of one length.
-        means: (K, T, P) mean path of each skill, in order of name.
+        means: (K, T, 2) mean path of each skill, in order of name.
         cue: rows to read; the whole length for online recall.
     """
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    dims, names = means.shape[2], sorted({str(e.info["skill"]) for e in tests})
+    names = sorted({str(e.info["skill"]) for e in tests})
     first = cue if cue < len(streams) else 1
-    hand = model.express(streams, cue)[first:, :, :dims]  # (T', B, P)
-    error = np.linalg.norm(hand - streams[first:, :, :dims], axis=2).mean()
-    distance = np.linalg.norm(hand[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
+    pen = model.express(streams, cue)[first:, :, :2]  # (T', B, 2)
+    error = np.linalg.norm(pen - streams[first:, :, :2], axis=2).mean()
+    distance = np.linalg.norm(pen[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
     right = [names[k] == e.info["skill"] for k, e in zip(distance.argmin(axis=1), tests, strict=True)]
     return float(error), float(np.mean(right))

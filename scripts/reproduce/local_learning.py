@@ -188,8 +188,8 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     """Measure angles during learning, and the error that each way of learning reaches."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
-    letters = repertoire(config.skills, 2, rng)
-    train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, 2, 2, rng)
+    letters = repertoire(config.skills, rng)
+    train, tests = copybook(letters, config.writings, rng), copybook(letters, 2, rng)
     reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
     taught, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
     weights = initial_weights(config.hidden, reader.size, 2, rng)
@@ -236,7 +236,7 @@ def backpropagated(
             records.append(_reached("backpropagation", weights, judged, epoch))
         for group in adam.param_groups:
             group["lr"] = cosine_decay(RATES["backpropagation"], epoch / config.epochs)
-        for batch in batches(taught, 16, rng) if epoch < config.epochs else ():
+        for batch in batches(taught, rng) if epoch < config.epochs else ():
             gradient = exact(weights, batch, ITERATIONS, "error").arrays
             for name, w in W.items():
                 w.grad = torch.from_numpy(-gradient[name].astype(np.float32))

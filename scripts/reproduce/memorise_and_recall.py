@@ -12,14 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure
-from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import SETTLING
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
@@ -42,25 +41,22 @@ MODELS = {
     "lstm": "LSTM, BPTT",
     "hopfield": "modern Hopfield",
 }
-
 UNITS = {"memory_wide": 4.0, "settling": 1.75, "lstm": 0.86}
 """Units for each of a GRU's. A GRU of 64 has 13,700 weights; these then have 11,400, 13,300 and 13,600."""
-
-CHOSEN: dict[str, dict[str, float]] = {
+CHOSEN: dict[str, dict[str, Any]] = {
     "memory": {"rate": 1e-2, "gain": 4.0},
     "memory_wide": {"rate": 6e-3, "gain": 8.0},
-    "settling": {"rate": 3e-3},
+    "settling": {"rate": 3e-3, "dynamics": SETTLING},
     "gru": {"rate": 6e-2, "noise": 0.3},
     "lstm": {"rate": 6e-2, "noise": 0.3},
     "hopfield": {"window": 8, "beta": 100.0},
 }
 
-LARGE, LARGE_RATE = 256, 3e-2
-"""From so many units on a GRU diverges by its rate, and learns by this."""
 
-
-LABELS = ("offline error [cm]", "online error [cm]", "offline error [cm]", "share of right skills")
-"""Of the figure's panels."""
+def check_cue(cue: int) -> None:
+    """Raise ValueError for a cue that leaves nothing to recall."""
+    if not 1 <= cue < STEPS:
+        raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
 
 
 @dataclass(frozen=True)
@@ -69,9 +65,7 @@ class Config(kit.Config):
 
     repertoires: tuple[int, ...] = option((1, 2, 4, 8, 16, 32), quick=(1, 4), least=1, check=check_letters)
     """Letters that one network learns."""
-    widths: tuple[int, ...] = option((), quick=(), check=partial(wide_enough, channels=4))
-    """Other numbers of hidden units, for a repertoire of eight."""
-    cues: tuple[int, ...] = option((1, 2, 5, 10, 20, 30), least=1)
+    cues: tuple[int, ...] = option((1, 2, 5, 10, 20, 30), least=1, check=check_cue)
     """Rows that are read before recall begins."""
     models: tuple[str, ...] = option(tuple(MODELS), least=1, known=MODELS)
     """Models to compare."""
@@ -84,105 +78,63 @@ class Config(kit.Config):
     writings: int = option(8, quick=4, least=1)
     """Writings of each letter to learn from."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for cue in self.cues:
-            if not 1 <= cue < STEPS:
-                raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
+    @property
+    def middle(self) -> int:
+        """The repertoire for which cues are drawn."""
+        return 8 if 8 in self.repertoires else max(self.repertoires)
 
 
-Condition = tuple[int, int, int]
-"""Seed, letters, hidden units of a GRU."""
+def run(config: Config) -> Findings:
+    """Measure every model on every repertoire."""
+    jobs = list(product(config.repetitions, config.repertoires))
+    records = kit.together(kit.each("learning", partial(recall, config=config), jobs, config))
+    models, longest = {MODELS[m]: {"model": m} for m in config.models}, max(config.cues)
+    sizes, cues = kit.by("skills", config.repertoires), kit.by("cue", config.cues)
+    cued = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds"
+    tables = [
+        kit.grid(f"Offline error [cm] by letters, {cued}", records, "error_cm", models, sizes, cue=longest),
+        kit.grid("Share of right skills by letters, offline", records, "right", models, sizes, cue=longest),
+        kit.grid("Online error [cm] by letters", records, "error_cm", models, sizes, cue=STEPS),
+    ]
+    for n in [n for n in config.repertoires if n >= config.middle]:
+        for value, label in (("error_cm", "Offline error [cm]"), ("right", "Share of right skills")):
+            tables.append(kit.grid(f"{label} by cue, {n} letters", records, value, models, cues, skills=n))
+    with figure(height=3.4, width=11) as fig:
+        axes = fig.subplots(1, 4)
+        for ax, cue, label in zip(axes, (longest, STEPS), ("offline error [cm]", "online error [cm]"), strict=False):
+            curves(ax, records, "error_cm", ("skills", config.repertoires), models, cue=cue)
+            ax.set(xlabel="skills in the repertoire", xscale="log", ylabel=label, ylim=0)
+            ax.set_xticks(config.repertoires, [str(n) for n in config.repertoires])
+        for ax, value in zip(axes[2:], ("error_cm", "right"), strict=True):
+            curves(ax, records, value, ("cue", config.cues), models, skills=config.middle)
+            label = "offline error [cm]" if value == "error_cm" else "share of right skills"
+            ax.set(xlabel="cue [rows]", ylabel=label, ylim=0)
+        fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)
+    return Findings(records, tables, fig)
 
 
-def conditions(config: Config) -> list[Condition]:
-    """Return every repertoire for every seed, and other widths for one repertoire."""
-    every = [(s, n, config.hidden) for s in config.repetitions for n in config.repertoires]
-    wide = [(s, middle(config), h) for s in config.repetitions for h in config.widths]
-    return list(dict.fromkeys(every + wide))
-
-
-def middle(config: Config) -> int:
-    """Return the repertoire for which widths and cues are compared."""
-    return 8 if 8 in config.repertoires else max(config.repertoires)
-
-
-def recall(condition: Condition, config: Config) -> list[Record]:
-    """Measure every model on one repertoire."""
-    seed, skills, hidden = condition
+def recall(job: tuple[int, int], config: Config) -> list[Record]:
+    """Measure every model with one seed and number of letters."""
+    seed, skills = job
     rng = np.random.default_rng([seed, 2])
-    letters = repertoire(len(NAMES), 2, rng)[:skills]
-    train, tests = copybook(letters, config.writings, 2, rng), copybook(letters, 4, 2, rng)
-    means = mean_demonstrations(train, 2)
+    letters = repertoire(len(NAMES), rng)[:skills]
+    train, tests = copybook(letters, config.writings, rng), copybook(letters, 4, rng)
+    means = mean_demonstrations(train)
     records: list[Record] = []
     for name in config.models:
-        model = learned(name, train, hidden, config, rng)
+        model = learned(name, train, config, rng)
         for cue in (*config.cues, STEPS):
             error, right = recalled(model, tests, means, cue)
-            where = {"seed": seed, "skills": skills, "hidden": hidden, "model": name, "cue": cue}
+            where = {"seed": seed, "skills": skills, "model": name, "cue": cue}
             records.append({**where, "error_cm": error, "right": right})
     return records
 
 
-def learned(name: str, train: Sequence[Episode], hidden: int, config: Config, rng: np.random.Generator) -> Expresser:
-    """Return one of ``MODELS``, trained; ``hidden`` is the units of a GRU."""
-    how: dict[str, Any] = dict(CHOSEN[name])
-    units = round(hidden * UNITS.get(name, 1.0))
+def learned(name: str, train: Sequence[Episode], config: Config, rng: np.random.Generator) -> Expresser:
+    """Return one of ``MODELS``, trained."""
+    units = round(config.hidden * UNITS.get(name, 1.0))
     if name == "hopfield":
-        return Hopfield.learned(train, **how)
+        return Hopfield.learned(train, **CHOSEN[name])
     if name in ("gru", "lstm"):
-        if name == "gru" and hidden >= LARGE:
-            how["rate"] = LARGE_RATE
-        return Backpropagated.learned(train, name, units, rng, config.updates, **how)
-    if name == "settling":
-        how["dynamics"] = SETTLING
-    return ExpressionMemory.learned(train, units, rng, config.steps, **how)
-
-
-def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Return errors and right skills by repertoire, by cue and by width."""
-    models = {MODELS[m]: {"model": m} for m in config.models}
-    sizes, longest = kit.by("skills", config.repertoires), max(config.cues)
-    own: Record = {"hidden": config.hidden}
-    offline = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds"
-    made = [
-        kit.grid(f"Offline error [cm] by letters, {offline}", records, "error_cm", models, sizes, cue=longest, **own),
-        kit.grid("Share of right skills by letters, offline", records, "right", models, sizes, cue=longest, **own),
-        kit.grid("Online error [cm] by letters", records, "error_cm", models, sizes, cue=STEPS, **own),
-    ]
-    cues = kit.by("cue", config.cues)
-    for n in [n for n in config.repertoires if n >= middle(config)]:
-        for value, label in (("error_cm", "Offline error [cm]"), ("right", "Share of right skills")):
-            made.append(kit.grid(f"{label} by cue, {n} letters", records, value, models, cues, skills=n, **own))
-    if config.widths:
-        widths, where = kit.by("hidden", config.widths), {"skills": middle(config), "cue": longest}
-        caption = f"Offline error [cm] by hidden units, {middle(config)} letters"
-        made.append(kit.grid(caption, records, "error_cm", models, widths, **where))
-    return made
-
-
-def drawn(records: Sequence[Record], config: Config) -> Figure:
-    """Draw errors by repertoire and cue."""
-    models = {MODELS[m]: {"model": m} for m in config.models}
-    sizes, cues = ("skills", config.repertoires), ("cue", config.cues)
-    own: Record = {"hidden": config.hidden}
-    with figure(height=3.4, width=11) as fig:
-        axes = fig.subplots(1, 4)
-        curves(axes[0], records, "error_cm", sizes, models, cue=max(config.cues), **own)
-        curves(axes[1], records, "error_cm", sizes, models, cue=STEPS, **own)
-        for ax, value in zip(axes[2:], ("error_cm", "right"), strict=True):
-            curves(ax, records, value, cues, models, skills=middle(config), **own)
-        for ax, label in zip(axes, LABELS, strict=True):
-            ax.set(ylabel=label, ylim=0, xlabel="cue [rows]")
-        for ax in axes[:2]:
-            ax.set(xlabel="skills in the repertoire", xscale="log")
-            ax.set_xticks(config.repertoires, [str(n) for n in config.repertoires])
-        fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)
-    return fig
-
-
-def run(config: Config) -> Findings:
-    """Run every condition."""
-    work = partial(recall, config=config)
-    records = kit.together(kit.each("learning", work, conditions(config), config))
-    return Findings(records, tables(records, config), drawn(records, config))
+        return Backpropagated.learned(train, name, units, rng, config.updates, **CHOSEN[name])
+    return ExpressionMemory.learned(train, units, rng, config.steps, **CHOSEN[name])

@@ -71,7 +71,7 @@ class Config(kit.Config):
 def one_seed(seed: int, config: Config) -> list[Record]:
     """Measure both questions for both dynamics on one repertoire."""
     rng, records = np.random.default_rng(seed), []
-    letters = repertoire(config.skills, 2, rng)
+    letters = repertoire(config.skills, rng)
     for name in DYNAMICS:
         own = by_iterations(letters, config, rng, name) + by_speed(letters, config, rng, name)
         records += [{"seed": seed, "dynamics": name, **r} for r in own]
@@ -87,9 +87,9 @@ def errors(memory: ExpressionMemory, rows: Rows, cue: int) -> Record:
 
 def by_iterations(letters: Sequence[Letter], config: Config, rng: np.random.Generator, dynamics: str) -> list[Record]:
     """Measure errors by steps of inference and their length."""
-    learned = copybook(letters, config.writings, 2, rng)
+    learned = copybook(letters, config.writings, rng)
     memory = ExpressionMemory.learned(learned, config.hidden, rng, config.steps, dynamics=dynamics)
-    rows = np.stack([e.stream for e in copybook(letters, TESTS, 2, rng)], axis=1).astype(np.float64)
+    rows = np.stack([e.stream for e in copybook(letters, TESTS, rng)], axis=1).astype(np.float64)
     return [
         {"iterations": n, "shorter": shorter, **errors(memory.with_inference(n, shorter), rows, CUE)}
         for n, shorter in product(config.iterations, SHORTER)
@@ -98,11 +98,11 @@ def by_iterations(letters: Sequence[Letter], config: Config, rng: np.random.Gene
 
 def by_speed(letters: Sequence[Letter], config: Config, rng: np.random.Generator, dynamics: str) -> list[Record]:
     """Measure errors by speed of writing, with a cue of a third of the letter."""
-    learned = copybook(letters, max(2, config.writings // 3), 2, rng, config.speeds)
+    learned = copybook(letters, max(2, config.writings // 3), rng, config.speeds)
     memory = ExpressionMemory.learned(learned, config.hidden, rng, config.steps, dynamics=dynamics)
     records = []
     for speed in config.speeds:
-        tests = [written(letter, 2, rng, speed) for letter in letters for _ in range(TESTS)]
+        tests = [written(letter, rng, speed) for letter in letters for _ in range(TESTS)]
         rows = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
         for budget in config.budgets:
             asked = memory.with_inference(iterations_within(budget, DT), SHORTER[0])

@@ -84,7 +84,7 @@ def measured(q: Floats, u: Floats, rng: np.random.Generator) -> Floats:
 
 def demonstrated(letter: Letter, rng: np.random.Generator) -> Episode:
     """Write the letter once, a little differently each time."""
-    path = START + np.cumsum(PEN_DT * written(letter, 2, rng).stream[:, 2:].astype(np.float64), axis=0)
+    path = START + np.cumsum(PEN_DT * written(letter, rng).stream[:, 2:].astype(np.float64), axis=0)
     q = joints(np.concatenate([START[None], path]))
     return Episode.from_stream(measured(q[1:], np.diff(q, axis=0) / DT, rng), SPEC, info={"skill": letter.name})
 
