@@ -39,6 +39,7 @@ from asm_gym.scripts.reproduce.two_links import (
     DT,
     EVENT,
     HAND,
+    JUDGED,
     SPEC,
     WAYS,
     WINDOW,
@@ -58,6 +59,7 @@ GRU: dict[str, Any] = {"hidden": 64, "rate": 3e-2}
 RATE = 0.05
 """False alarms asked for."""
 
+EVENTS = ("pushed", "stuck")
 AROUND = slice(EVENT, EVENT + WINDOW)
 
 
@@ -124,7 +126,7 @@ def noticed(courses: Mapping[str, Course], threshold: float) -> Record:
     """Return what surprise and F tell of both events, against the same rows left alone."""
     found: Record = {}
     nominal = courses["left alone"]
-    for event in ("pushed", "stuck"):
+    for event in EVENTS:
         for what in ("surprise", "energy"):
             good, bad = (getattr(c, what)[AROUND].max(axis=0) for c in (nominal, courses[event]))
             found[f"{event}, {what}"] = auroc(bad, good)
@@ -176,25 +178,27 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
 def tables(records: Sequence[Record], skills: int) -> list[Table]:
     """Return what was expressed, noticed and named, and the difference from the GRU."""
 
-    def cells(value: str, models: Sequence[str] = tuple(TITLES), **where: Any) -> list[str]:
-        return [shown(records, value, model=m, **where) for m in models]
+    def rows(value: str, labels: Mapping[str, Record], models: Sequence[str]) -> list[tuple[str, ...]]:
+        return [(label, *(shown(records, value, model=m, **own) for m in models)) for label, own in labels.items()]
 
-    memories, head = tuple(UNITS), ("", *TITLES.values())
-    lines = [(f"{m} [cm]", *cells("cm", measure=m)) for m in ("next row", "recalled")]
-    lines += [(f"written, {way} [cm]", *cells("cm", measure=way)) for way in WAYS]
-    lines += [(f"written, {way}: share of right letters", *cells("right", measure=way)) for way in WAYS]
-    lines += [(f"{way}, from half a second after the event [cm]", *cells("late_cm", measure=way)) for way in WAYS]
-    labels = {"surprise": "AUROC of surprise", "energy": "AUROC of F", "found": "found within a second"}
-    keys = {f"{e}, {w}": f"{e}, {label}" for e in ("pushed", "stuck") for w, label in labels.items()}
+    every, memories, head = tuple(TITLES), tuple(UNITS), ("", *TITLES.values())
+    written = {f"written, {way}": {"measure": way} for way in WAYS}
+    known = {m: {"measure": m} for m in ("next row", "recalled")}
+    late = {f"{way}, from half a second after the event": {"measure": way} for way in WAYS}
+    expressed = [*rows("cm", known | written, every), *rows("late_cm", late, every)]
+    right = rows("right", written, every)
+    names = {r: {"measure": "named", "row": r} for r in (CUE, EVENT, STEPS - 1)}
+    named = rows("right", {f"after {r + 1} rows": own for r, own in names.items()}, memories)
+    words = {"surprise": "AUROC of surprise", "energy": "AUROC of F", "found": "found within a second"}
+    keys = {f"{event}, {what}": f"{event}, {label}" for event in EVENTS for what, label in words.items()}
     keys |= {"attributed": "stuck: the encoders have the largest share", "alarms": "left alone: letters with an alarm"}
-    alarms = [(label, *cells(key, memories, measure="surprise")) for key, label in keys.items()]
-    rows = (CUE, EVENT, STEPS - 1)
-    named = [(f"after {r + 1} rows", *cells("right", memories, measure="named", row=r)) for r in rows]
+    noticed = [row for key, label in keys.items() for row in rows(key, {label: {"measure": "surprise"}}, memories)]
     asked = f"{skills} letters, cue of {CUE} rows; mean ± SD over seeds"
     return [
-        Table(f"Expected, and written in closed loop: {asked}", head, lines),
+        Table(f"Expected, and written in closed loop, off by [cm]: {asked}", head, expressed),
+        Table("Share of right letters", head, right),
         behind(records),
-        Table("What is noticed", head[:3], alarms),
+        Table("What is noticed", head[:3], noticed),
         Table("Share of letters that the state names rightly", head[:3], named),
     ]
 
@@ -226,13 +230,12 @@ def drawn(courses: Mapping[str, Mapping[str, Course]], truth: Floats) -> Figure:
                 ax.plot(*own[WAYS[0]].path[EVENT, 0], "k.", markersize=6, label="the event")
                 ax.set(title=name, xlabel="x [cm]", ylabel="y [cm]", aspect="equal", adjustable="datalim")
                 ax.legend(fontsize=6)
-            for way in (WAYS[0], WAYS[1], WAYS[3]):
-                colour, line, _ = look(WAYS.index(way))
-                for ax, values in zip(axes[2:], (own[way].surprise, own[way].energy), strict=True):
-                    ax.plot(DT * np.arange(STEPS), values[:, 0], color=colour, linestyle=line)
+            for ax, value, label in zip(axes[2:], ("surprise", "energy"), ("surprise", "F [nats]"), strict=True):
+                for way in JUDGED:
+                    colour, line, _ = look(WAYS.index(way))
+                    ax.plot(DT * np.arange(STEPS), getattr(own[way], value)[:, 0], color=colour, linestyle=line)
+                ax.set(title=name, xlabel="time [s]", ylabel=label, yscale="symlog")
             axes[2].axhline(own[WAYS[0]].threshold, color="#888888", linewidth=1)
-            axes[2].set(title=f"{name}; line: threshold", xlabel="time [s]", ylabel="surprise", yscale="symlog")
-            axes[3].set(title=name, xlabel="time [s]", ylabel="F [nats]", yscale="symlog")
     return fig
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -82,16 +82,15 @@ def measured(q: Floats, u: Floats, rng: np.random.Generator) -> Floats:
     return np.concatenate([encoders, hand(q) + NOISE * rng.standard_normal(q.shape), u], axis=-1)
 
 
-def demonstrated(letter: Letter, rng: np.random.Generator) -> Episode:
-    """Write the letter once, a little differently each time."""
-    path = START + np.cumsum(PEN_DT * written(letter, rng).stream[:, 2:].astype(np.float64), axis=0)
-    q = joints(np.concatenate([START[None], path]))
-    return Episode.from_stream(measured(q[1:], np.diff(q, axis=0) / DT, rng), SPEC, info={"skill": letter.name})
-
-
 def demonstrations(letters: Sequence[Letter], each: int, rng: np.random.Generator) -> list[Episode]:
-    """Write every letter ``each`` times."""
-    return [demonstrated(letter, rng) for letter in letters for _ in range(each)]
+    """Write every letter ``each`` times, a little differently each time."""
+    made = []
+    for letter in [letter for letter in letters for _ in range(each)]:
+        path = START + np.cumsum(PEN_DT * written(letter, rng).stream[:, 2:].astype(np.float64), axis=0)
+        q = joints(np.concatenate([START[None], path]))
+        rows = measured(q[1:], np.diff(q, axis=0) / DT, rng)
+        made.append(Episode.from_stream(rows, SPEC, info={"skill": letter.name}))
+    return made
 
 
 @dataclass
@@ -106,36 +105,30 @@ class Course:
     threshold: float  # of surprise
 
 
-class Driver(Protocol):
-    """A model that commands the arm."""
-
-    attribution: Floats  # (B, 6) of the last rows
-
-    def command(self) -> Floats:
-        """Return the next joint velocities (B, 2) [rad/s]."""
-
-    def read(self, rows: Floats) -> Floats:
-        """Read rows (B, 6), and return their surprise (B,)."""
-
-
 class MemoryDriver:
-    """A memory that acts by its own motor prediction."""
+    """A memory that commands the arm by its own motor prediction.
+
+    Attributes:
+        attribution: (B, 6) of the last rows.
+    """
 
     def __init__(self, asm: NeuralASM, batch: int) -> None:
         self.asm, self.state = asm, asm.initial_state(batch)
         self.attribution = np.zeros((batch, SPEC.size))
 
     def command(self) -> Floats:
+        """Return the next joint velocities (B, 2) [rad/s]."""
         return self.asm.expected_action(self.state).astype(np.float64)
 
     def read(self, rows: Floats) -> Floats:
+        """Read rows (B, 6), and return their surprise (B,)."""
         self.state, surprise = self.asm.observe(self.state, rows)
         self.attribution = surprise.attribution
         return surprise.value
 
 
 class RecurrentDriver:
-    """A GRU that acts, and has no surprise."""
+    """A GRU that commands the arm, and has no surprise."""
 
     def __init__(self, gru: Backpropagated, batch: int) -> None:
         self.gru, self.h = gru, torch.zeros(1, batch, gru.network.cell.hidden_size)
@@ -143,11 +136,13 @@ class RecurrentDriver:
         self.rows: list[Floats] = []
 
     def command(self) -> Floats:
+        """Return the next joint velocities (B, 2) [rad/s]."""
         reader, motor = self.gru.reader, SPEC.motor
         action = self.gru.network.act(self.h[0]).numpy().astype(np.float64)
         return np.asarray(reader.mean[motor] + reader.spread[motor] * action)
 
     def read(self, rows: Floats) -> Floats:
+        """Read rows (B, 6), and return zeros (B,)."""
         self.rows = [*self.rows[-2:], rows]
         before = self.rows[max(0, len(self.rows) - 2)]
         seen = self.gru.reader.read(rows, before, self.rows[0])
@@ -157,12 +152,12 @@ class RecurrentDriver:
 
 
 def closed_loop(
-    driver: Driver, cues: Floats, way: str, seed: int, energy: FreeEnergy | None = None, threshold: float = np.inf
+    driver: Any, cues: Floats, way: str, seed: int, energy: FreeEnergy | None = None, threshold: float = np.inf
 ) -> Course:
     """Write letters after cues (T, B, 6), in one of ``WAYS``; all draw the same noise.
 
     Args:
-        driver: commands the arm.
+        driver: commands the arm, as ``MemoryDriver`` does.
         cues: demonstrations, of which the first rows are read.
         way: what happens.
         seed: of noise and pushes.
@@ -179,7 +174,7 @@ def closed_loop(
             q = rows[:, ENCODERS].copy()
         else:
             u = driver.command()
-            if way == "pushed, lowest F" and energy is not None and isinstance(driver, MemoryDriver):
+            if way == "pushed, lowest F" and energy is not None:
                 for n in np.flatnonzero(found.alarm < t):
                     u[n] = energy.reaction(moment(driver.state, n))
             q = q + DT * u + pushes / 2 * (way.startswith("pushed") and EVENT <= t < EVENT + 2)
@@ -191,12 +186,7 @@ def closed_loop(
         if way == "stuck, left out":
             for n in np.flatnonzero(found.alarm < t):
                 rows[n, SPEC.slices[found.attributed[n]]] = np.nan
-        if (
-            energy is not None
-            and isinstance(driver, MemoryDriver)
-            and way in JUDGED
-            and EVENT - 5 <= t < EVENT + WINDOW
-        ):
+        if energy is not None and way in JUDGED and EVENT - 5 <= t < EVENT + WINDOW:
             for n in range(B):
                 before = moment(driver.state, n)
                 found.energy[t, n] = energy.terms(before, rows[n], energy.inferred(before, rows[n])).total
