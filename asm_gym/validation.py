@@ -18,7 +18,7 @@ import difflib
 import inspect
 import math
 import typing
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import SimpleNamespace, UnionType
@@ -95,6 +95,14 @@ def check_numbers(name: str, values: ArrayLike, *shape: int, **bounds: Unpack[Bo
     if bad:
         raise ValueError(f"{name} must be {wanted}, got {short_repr(bad[0])} among them")
     return array
+
+
+def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ValueError naming an array that is missing or of another shape."""
+    for name, shape in shapes.items():
+        if name not in arrays or arrays[name].shape != shape:
+            found = arrays[name].shape if name in arrays else "none"
+            raise ValueError(f"{name} should be of shape {shape}, found {found}")
 
 
 def check_text(name: str, value: object) -> str:

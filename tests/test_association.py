@@ -10,10 +10,9 @@ import pytest
 from asm_gym.detection import Promise, conformal_threshold
 from asm_gym.episode import Episode
 from asm_gym.memory import association_learning
-from asm_gym.memory.adaptation import followed, specialise
 from asm_gym.memory.association import (
     complete,
-    existing,
+    follow_drift,
     hidden_units,
     log_variance,
     normalised_errors,
@@ -35,6 +34,7 @@ from asm_gym.memory.linear import (
     conditional,
     learn_linear,
     moments,
+    specialise,
 )
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -197,7 +197,7 @@ def test_following_removes_the_share_of_an_error_that_was_asked_for():
     def error(w):
         return delta - complete(hidden_units(a, w.V), a, w.U, w.D)
 
-    np.testing.assert_allclose(error(followed(w, existing(w), a, delta, 0.25)), 0.75 * error(w), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(error(follow_drift(w, a, delta, 0.25)), 0.75 * error(w), rtol=1e-3, atol=1e-4)
 
 
 SIZES = {"hidden_size": 8, "association_size": 24, "epochs": 2}

@@ -19,7 +19,7 @@ from asm_gym.detection.evidence import TINY, Evidence, pool
 from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps, repeated
 from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, ceilings
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_flag, check_number, short_repr, typed
+from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
 
 
 class EvidenceState(NamedTuple):
@@ -93,9 +93,7 @@ class EvidenceDetection:
         """Take over what another has learned. Raises ValueError where it does not fit."""
         found = {name: learned[name] for name in self.arrays[:-1]}
         X = len(found["whitening"])
-        for name, shape in {"whitening": (X, X), **dict.fromkeys(("ceiling", "tail"), (len(self.gains), X))}.items():
-            if found[name].shape != shape:
-                raise ValueError(f"the {name} of evidence should be of shape {shape}, found {found[name].shape}")
+        check_shapes(found, {"whitening": (X, X), "ceiling": (len(self.gains), X), "tail": (len(self.gains), X)})
         for name, most in (("ceiling", math.inf), ("tail", 1.0)):
             if not ((found[name] > 0.0) & (found[name] <= most)).all():
                 raise ValueError(f"the {name} of evidence must be in (0, {most:g}]")

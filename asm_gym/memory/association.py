@@ -5,13 +5,15 @@
     Δ̂_t = D a_t + U f(h_t)                         group g is predicted by its own units only
     log σ²_t = W_S f(h_t) + b_S, within span_S     expected variance of the error
     ε_t = (Δ_t - Δ̂_t) / (s σ_t)                    normalised error; s is the spread that D alone leaves
+    ΔU = η ψ(ε_t) σ_t f(h_t)ᵀ / n_t                follows slow drift, as ΔD does; n_t = ‖f(h_t)‖² + ‖a_t‖²
 
 A joint that moves while the hand does not, or a commanded motion without a torque, is an error in any skill. The linear
 part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``). span_S are the
 limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
-2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest.
+2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Nagumo and Noda 1967
+(IEEE Trans. Automatic Control 12(3)) for the normalised delta rule.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, kernel, outward
+from asm_gym.memory.learning import coincidence
 
 SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
 """Bounds of log σ²: errors of 0.25 % of a channel's spread, and of 55 times its spread."""
@@ -77,11 +80,6 @@ def spans(U: Array) -> NDArray[np.intp]:
     exists = U != 0
     begins, ends = exists.argmax(axis=1), U.shape[1] - exists[:, ::-1].argmax(axis=1)
     return np.where(exists.any(axis=1)[:, None], np.stack([begins, ends], axis=1), 0).astype(np.intp)
-
-
-def existing(association: Association) -> Change:
-    """Return the masks of the synapses that are not 0."""
-    return Change(*((W != 0).astype(np.float32) for W in (association.V, association.U, association.D)))
 
 
 @kernel
@@ -147,3 +145,14 @@ def normalised_errors(
             error = (changes[n, i] - out[n, i]) / remainder[i]
             out[n, i] = whole[n, 0] * error * np.exp(np.float32(-0.5) * spread[n, i])
     return out, f
+
+
+def follow_drift(association: Association, a: Array, delta: Array, rate: float) -> Association:
+    """Return the association after a batch of inputs (B, I) and changes (B, X), ``rate`` being η in (0, 1]."""
+    _, U, D, W_S, b_S, span_S, remainder = association
+    f = hidden_units(a, association.V)
+    spread = remainder * np.exp(np.float32(0.5) * log_variance(f, W_S, b_S, span_S))
+    error = np.clip(delta - complete(f, a, U, D), -spread, spread)
+    error *= np.float32(rate) / (np.sum(f * f, axis=1) + np.sum(a * a, axis=1))[:, None]
+    exists_U, exists_D = ((W != 0).astype(np.float32) for W in (U, D))
+    return association._replace(U=U + coincidence(error, f) * exists_U, D=D + coincidence(error, a) * exists_D)

@@ -23,17 +23,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import (
-    LARGEST,
-    SMALLEST,
-    Association,
-    Change,
-    complete,
-    hidden_units,
-    log_variance,
-    synapses,
-    unbounded,
-)
+from asm_gym.memory.association import Association, Change, complete, hidden_units, log_variance, synapses, unbounded
 from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, Tick, coincidence, cosine_decay, shuffled
 from asm_gym.memory.linear import learn_from_past, learn_linear
@@ -230,8 +220,7 @@ def precision_change(f: Array, error: Array, W_S: Array, b_S: Array) -> tuple[Ar
 def learn_precision(f: Array, error: Array, rng: np.random.Generator, tick: Tick = lambda: None) -> tuple[Array, Array]:
     """Return ``W_S`` (X, M) and ``b_S`` (X,) learned from contexts ``f`` (N, M) and the errors (N, X) in them."""
     W_S = np.zeros((error.shape[1], f.shape[1]), np.float32)
-    b_S = np.zeros(len(W_S), np.float32)
-    b_S[:] = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), SMALLEST, LARGEST)
+    b_S: Array = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), *unbounded(len(W_S))).astype(np.float32)
     context, bias = Synapse(W_S), Synapse(b_S)
     for epoch in range(PRECISION_EPOCHS):
         order: NDArray[np.intp] = rng.permutation(len(f))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.linear import along, gram
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_shapes
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -85,10 +86,7 @@ class Completion:
         products, covariance, centre, error = (np.asarray(learned[name], np.float64) for name in ARRAYS)
         spec, P = senses.spec, len(products)
         Y = 2 * len(spec.sensory) + len(spec.motor) + P
-        shapes = (P, 2), (Y, Y), (Y,), (spec.size,)
-        for name, array, shape in zip(ARRAYS, (products, covariance, centre, error), shapes, strict=True):
-            if array.shape != shape:
-                raise ValueError(f"{name} should be of shape {shape}, found {array.shape}")
+        check_shapes(learned, dict(zip(ARRAYS, ((P, 2), (Y, Y), (Y,), (spec.size,)), strict=True)))
         if P and not (products.min() >= 0 and products.max() < spec.size):
             raise ValueError("completion_products should be columns of the stream")
         return cls(senses, products.astype(np.intp), covariance, centre, error)

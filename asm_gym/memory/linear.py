@@ -4,7 +4,10 @@
     Δ̂_g = m_g + D_g (a_t - m),     D_g = -P_gg⁻¹ P_g·      0 from g itself
 
 One inverse serves every group: D_g is the ridge regression of group g on everything else. λ is chosen for each sense by
-its error on held-out rows; D is then computed from all rows.
+its error on held-out rows; D is then computed from all rows. ``specialise`` learns a policy's few episodes on top of a
+memory of the body:
+
+    ΔD, ΔU = argmin Σ (r_t - ΔD a_t - ΔU f(h_t))² + λ (‖ΔD‖² + ‖ΔU‖²),   r_t = (Δ_t - Δ̂_t)/s
 
 Sources: Besag 1975 and Lauritzen 1996 for conditionals of a Gaussian; Hoerl and Kennard 1970 for ridge regression.
 """
@@ -17,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 
+from asm_gym.memory.association import LARGEST, SMALLEST, Association, complete, hidden_units, log_variance, synapses
 from asm_gym.memory.energy import Array
 
 Floats = NDArray[np.float64]
@@ -26,6 +30,7 @@ EXACT = 1e-8  # mean squared errors below this are equally good
 MOST_INPUTS = 8192  # C of these takes 0.5 GiB, and its eigenvectors minutes
 FEW_PENALTY = 1e-4  # λ where rows are too few to choose it
 HELD_OUT = 5  # the last one in so many rows is held out
+LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped when penalties of ``specialise`` are compared
 
 
 class Moments(NamedTuple):
@@ -110,3 +115,46 @@ def learn_from_past(a: Array, changes: slice) -> NDArray[np.float32]:
 def held_out(a: Array) -> Array:
     """Return the last fifth of the rows; all of fewer than five."""
     return a[len(a) - len(a) // HELD_OUT :] if len(a) >= HELD_OUT else a
+
+
+def specialise(
+    known: Association, a: Array, delta: Array, groups: NDArray[np.intp], changes: slice, size: int
+) -> Association:
+    """Return the association that has also learned inputs (N, I) and changes (N, X); the rest as in ``synapses``."""
+    exists = synapses(groups, changes, a.shape[1], size)
+    f = hidden_units(a, known.V)
+    left = (delta - complete(f, a, known.U, known.D)) / known.remainder
+    D, U = known.D.copy(), known.U.copy()
+    for g in range(int(groups.max()) + 1):
+        own = groups == g
+        read, units = exists.D[own][0] > 0, exists.U[own][0] > 0
+        found = _ridge_towards_known(np.hstack([a[:, read], f[:, units]]), left[:, own]) * known.remainder[own, None]
+        D[np.ix_(own, read)] += found[:, : int(read.sum())]
+        U[np.ix_(own, units)] += found[:, int(read.sum()) :]
+    fresh = len(held_out(a))
+    f, a, delta = f[-fresh:], a[-fresh:], delta[-fresh:]
+    error = (delta - complete(f, a, U, D)) / known.remainder
+    # The body's memory knows how errors differ between contexts; the policy's rows tell how large they are overall.
+    scale = np.mean(error**2 * np.exp(-log_variance(f, known.W_S, known.b_S, known.span_S)), axis=0)
+    larger = np.log(np.maximum(scale, 1e-6)).astype(np.float32)
+    span_S = np.clip(known.span_S + larger, SMALLEST, LARGEST)
+    return known._replace(D=D, U=U, b_S=known.b_S + larger, span_S=span_S)
+
+
+def _ridge_towards_known(inputs: Array, left: Array) -> NDArray[np.float32]:
+    """Return (X, J) to add to the weights of inputs (N, J), which leave (N, X); 0 where held-out rows ask for none."""
+    exact, target = np.asarray(inputs, np.float64), np.asarray(left, np.float64)
+    fresh = len(held_out(inputs))
+    shown = max(len(inputs) - fresh, 1)
+    tried = [np.zeros((target.shape[1], exact.shape[1])), *_ridges(exact[:shown], target[:shown])]
+    errors = (np.clip(target[-fresh:] - exact[-fresh:] @ w.T, -LARGEST_ERROR, LARGEST_ERROR) for w in tried)
+    best = np.argmin(np.array([np.mean(error**2, axis=0) for error in errors]), axis=0)  # (X,)
+    final = [tried[0], *_ridges(exact, target)]
+    return np.array([final[n][x] for x, n in enumerate(best)], np.float32)
+
+
+def _ridges(inputs: NDArray[np.float64], target: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the weights (X, J) for each penalty."""
+    values, vectors = np.linalg.eigh(inputs.T @ inputs / len(inputs))
+    seen = vectors.T @ (inputs.T @ target) / len(inputs)  # (J, X)
+    return [(vectors @ (seen / (np.maximum(values, 0.0) + penalty)[:, None])).T for penalty in PENALTIES]

@@ -30,6 +30,7 @@ from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, StreamSpec
+from asm_gym.validation import check_shapes
 
 UPDATES, PASSES, BATCH = 12_000, 100, 256  # largest number of batches, and of passes over the rows; rows of a batch
 RATE, FORGETTING = 3e-3, 0.3  # step size, and λ
@@ -94,10 +95,7 @@ class Motor(NamedTuple):
         inputs = int(np.count_nonzero(kappa)) + 1
         shapes: dict[str, tuple[int, ...]] = {"V": (units, inputs), "U": (motor, units), "D": (motor, inputs)}
         shapes |= {"mean": (motor,), "spread": (motor,)}
-        for name, shape in shapes.items():
-            array = learned.get(f"motor_{name}")
-            if array is None or array.shape != shape:
-                raise ValueError(f"motor_{name} should be of shape {shape}, found {array is not None and array.shape}")
+        check_shapes(learned, {f"motor_{name}": shape for name, shape in shapes.items()})
         return cls(**{name: learned[f"motor_{name}"] for name in shapes})
 
 

@@ -11,8 +11,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.temporal import TemporalNetwork
-
 Rows = NDArray[np.float64]
 
 UNSURE = np.float32(0.1)  # weight of an error while only one earlier row is known, and with it no speed
@@ -58,9 +56,3 @@ class MemoryState(NamedTuple):
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
     history: RowHistory
     skill: NDArray[np.float32]  # (B, K) L, evidence for each skill; K is 0 where none has a name
-
-
-def at_start(batch: int, network: TemporalNetwork, lag: int, size: int, skills: int) -> MemoryState:
-    """Return the state before the first row of ``size`` numbers."""
-    state, named = np.zeros((batch, network.hidden_size), np.float32), np.zeros((batch, skills), np.float32)
-    return MemoryState(network.at_rest(batch), state, RowHistory.empty(batch, lag, size), named)

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.memory.adaptation import followed, specialise
-from asm_gym.memory.association import Association, association_shapes, existing
+from asm_gym.memory.association import Association, association_shapes, follow_drift
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.linear import check_inputs
+from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
-from asm_gym.memory.state import MemoryState, at_start
+from asm_gym.memory.state import MemoryState, RowHistory
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.row_kernel import LearnedMemory, expect_rows, uninitialised
 from asm_gym.monitors.stream_model import StreamModel
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_shapes
 
 
 class MemoryModel(StreamModel):
@@ -124,9 +124,7 @@ class MemoryModel(StreamModel):
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         if missing := [name for name in shapes if name not in learned]:
             raise ValueError(f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble")
-        for name, shape in shapes.items():
-            if learned[name].shape != shape:
-                raise ValueError(f"{name} should be of shape {shape}, found {learned[name].shape}")
+        check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
         association = Association(**{n: arrays[n] for n in Association._fields})
         how = self.schedule.iterations, self.schedule.prior_precision, self.schedule.sensory_precision
@@ -137,7 +135,9 @@ class MemoryModel(StreamModel):
         return self
 
     def start(self, batch: int) -> MemoryState:
-        return at_start(batch, self.network, self.lag, self.spec.size, len(self.skills_))
+        state, named = (np.zeros((batch, n), np.float32) for n in (self.network.hidden_size, len(self.skills_)))
+        history = RowHistory.empty(batch, self.lag, self.spec.size)
+        return MemoryState(self.network.at_rest(batch), state, history, named)
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
         new = uninitialised(state)
@@ -160,8 +160,8 @@ class MemoryModel(StreamModel):
         reading = self.senses_.read(rows, history.before[:, 0], history.earlier[:, 0])
         learned: NDArray[np.bool_] = normal & (history.steps >= 2 * self.lag) & (reading.whole[:, 0] > 0)
         if learned.any():
-            association = self.network.association
-            now = followed(association, existing(association), reading.inputs[learned], reading.changes[learned], rate)
+            read = reading.inputs[learned], reading.changes[learned]
+            now = follow_drift(self.network.association, *read, rate)
             self.learned_ = {**self.learned_, "U": now.U, "D": now.D}
             self.network_ = self.network.with_association(now)
         return learned
