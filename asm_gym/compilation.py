@@ -1,16 +1,13 @@
 """Compile functions, cached on disk for the whole folder they belong to.
 
-The cache lies beside the code, else in the user's cache, else in a folder of this user's under the temporary one.
-``NUMBA_CACHE_DIR`` names another.
+The cache lies beside the code, else in the user's cache; ``NUMBA_CACHE_DIR`` names another place. Where none can be
+written to, each process compiles anew.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,8 +33,7 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
     try:
         dispatcher: Any = numba.njit(cache=True, **how)(function)
     except RuntimeError:  # numba found no folder that it may write to
-        with _cached_in(private_folder()) as kept:
-            dispatcher = numba.njit(cache=kept, **how)(function)
+        dispatcher = numba.njit(**how)(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
@@ -68,32 +64,6 @@ def kept_in(function: Any) -> Path | None:
     """Return the folder that holds the compiled code of a function; None where nothing keeps it."""
     cache = _cache_of(function)
     return None if cache is None else Path(cache._cache_path)
-
-
-@lru_cache
-def private_folder() -> Path | None:
-    """Return a folder for compiled code that only this user can write to, as the code is run; None without one."""
-    user = os.getuid() if hasattr(os, "getuid") else 0
-    path = Path(tempfile.gettempdir()) / f"asm-gym-{user}"
-    try:
-        path.mkdir(mode=0o700, exist_ok=True)
-        about = path.lstat()
-        private = not path.is_symlink() and about.st_uid == user and not about.st_mode & 0o022
-        return path if private else Path(tempfile.mkdtemp(prefix="asm-gym-"))
-    except OSError:
-        return None
-
-
-@contextmanager
-def _cached_in(folder: Path | None) -> Iterator[bool]:
-    """Let numba cache in a folder what the block decorates; yield whether there is one."""
-    config: Any = numba.config
-    before = config.CACHE_DIR
-    config.CACHE_DIR = before if folder is None else str(folder)
-    try:
-        yield folder is not None
-    finally:
-        config.CACHE_DIR = before
 
 
 def _cache_of(dispatcher: Any) -> Any:

@@ -142,28 +142,22 @@ class StreamSpec:
     @cached_property
     def noise(self) -> NDArray[np.float64]:
         """(D,) standard deviation of the sensor noise [unit of each channel]."""
-        return np.concatenate([np.full(c.size, c.noise) for c in self.channels])
+        return np.array([c.noise for c in self.channels for _ in c.labels], np.float64)
 
     @cached_property
     def resolution(self) -> NDArray[np.float64]:
         """(D,) smallest difference of two readings [unit of each channel]; 0 where unknown."""
-        return np.concatenate([np.full(c.size, c.resolution) for c in self.channels])
+        return np.array([c.resolution for c in self.channels for _ in c.labels], np.float64)
 
     @cached_property
     def motor(self) -> NDArray[np.intp]:
         """Indices of the commanded action."""
-        return self._indices(motor=True)
+        return np.flatnonzero([c.group == MOTOR for c in self.channels for _ in c.labels])
 
     @cached_property
     def sensory(self) -> NDArray[np.intp]:
         """Indices of everything that is sensed."""
-        return self._indices(motor=False)
-
-    def _indices(self, motor: bool) -> NDArray[np.intp]:
-        return np.array(
-            [i for c in self.channels if (c.group == MOTOR) is motor for i in range(self.size)[self.slices[c.name]]],
-            dtype=np.intp,
-        )
+        return np.flatnonzero([c.group != MOTOR for c in self.channels for _ in c.labels])
 
     def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
         """Raise ValueError unless the last axis of ``stream`` is D long."""

@@ -65,8 +65,7 @@ class Completion:
         Y = 2 * len(spec.sensory) + len(spec.motor) + len(products)
         if Y > MOST_ENTRIES:
             return None
-        blank = cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(D))
-        rows = sum(map(len, streams))
+        blank, rows = cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(D)), sum(map(len, streams))
 
         def mean(part: Callable[[Floats], Floats]) -> Floats:
             return np.asarray(sum(part(blank.lift(s)) for s in streams)) / rows

@@ -53,13 +53,6 @@ class Terms(NamedTuple):
         return self.time + self.association + self.motor
 
 
-class Slope(NamedTuple):
-    """The gradient of F."""
-
-    row: Floats  # (D,) by (x, u), for each standard deviation of a number
-    z: Floats  # (H,)
-
-
 class Before(NamedTuple):
     """State and rows before a row."""
 
@@ -77,8 +70,7 @@ class _Given(NamedTuple):
     command: Floats  # (A,) û, in spreads of the stream
 
 
-Through = tuple[float, Floats, Floats, Floats]
-"""The sum through time, and its gradients by x (S,), u (A,) and z (H,)."""
+Through = tuple[float, Floats, Floats, Floats]  # the sum through time, and its gradients by x, u (A,) and z
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +137,6 @@ class FreeEnergy:
         """Return the parts of F for a row (D,) and a state (H,)."""
         return self._of(self._given(moment), row, z)[0]
 
-    def slope(self, moment: Before, row: Floats, z: Floats) -> Slope:
-        """Return the gradient of F for a row (D,) and a state (H,)."""
-        return self._of(self._given(moment), row, z)[1]
-
     def settled(self, moment: Before, row: Floats, free: NDArray[np.bool_]) -> tuple[Floats, Terms]:
         """Return the row (D,) of lowest F over its ``free`` (D,) numbers, which begin near it, and F there."""
         from scipy.optimize import minimize  # takes a third of a second to import
@@ -159,8 +147,8 @@ class FreeEnergy:
         def at(offset: Floats) -> tuple[float, Floats]:
             tried = row.copy()
             tried[free] += spread[free] * offset[:count]
-            terms, slope = self._of(given, tried, offset[count:])
-            return terms.total, np.concatenate([slope.row[free], slope.z])
+            terms, by_row, by_z = self._of(given, tried, offset[count:])
+            return terms.total, np.concatenate([by_row[free], by_z])
 
         found = minimize(at, start, jac=True, method="L-BFGS-B", options={"maxiter": STEPS, "maxcor": 20})
         settled = row.copy()
@@ -215,7 +203,8 @@ class FreeEnergy:
         """Return u - û (A,) in spreads of the stream; 0 without a motor association."""
         return np.zeros(len(u)) if self.motor is None else u - given.command
 
-    def _of(self, given: _Given, row: Floats, z: Floats) -> tuple[Terms, Slope]:
+    def _of(self, given: _Given, row: Floats, z: Floats) -> tuple[Terms, Floats, Floats]:
+        """Return F, and its gradients by (x, u) (D,), for each spread of a number, and by z (H,)."""
         senses, spec, (w, association) = self.senses, self.senses.spec, self._weights
         x, u, a, changes = self._read(given.moment, row)
         precisions = float(self.network.prior_precision), float(self.network.sensory_precision)
@@ -235,7 +224,7 @@ class FreeEnergy:
         slope[spec.motor] += scale * of_u + of_a[D + X + L : D + X + L + A]
         if self.motor is not None:
             slope[spec.motor] += off / self.tau_motor**2
-        return Terms(time, between, motor), Slope(slope, scale * of_z)
+        return Terms(time, between, motor), slope, scale * of_z
 
 
 def _between(association: Association, a: Floats, changes: Floats) -> tuple[float, Floats, Floats]:
