@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.detection import Promise, conformal_threshold
 from asm_gym.episode import Episode
 from asm_gym.memory import association_learning
 from asm_gym.memory.association import (
@@ -166,17 +165,6 @@ def mixed_rows(N: int = 500) -> np.ndarray:
     return np.hstack([mixed, np.ones((N, 1))]).astype(np.float32)
 
 
-def test_each_sense_gets_the_penalty_that_held_out_rows_choose():
-    rng = np.random.default_rng(1)
-    N = 60
-    noise = rng.normal(size=(N, 40))
-    exact = noise[:, :3] @ [0.5, -1.0, 2.0]
-    a = np.column_stack([noise, exact, rng.normal(size=N), np.ones(N)]).astype(np.float32)
-    D = learn_linear(a, np.array([0, 1]), slice(40, 42))
-    np.testing.assert_allclose(D[0, :3], [0.5, -1.0, 2.0], atol=1e-3)
-    assert np.abs(D[1, :-1]).max() < 0.02  # by least squares it would be 0.5 and more
-
-
 def test_few_rows_constants_and_copies_stay_finite():
     for N in (1, 2, 4, 5, 30):
         a = mixed_rows(N)
@@ -266,16 +254,3 @@ def test_a_warm_start_needs_a_memory_that_has_learned(body):
         kalman.fit(sine_episodes(4), warm_start=True)
     with pytest.raises(ValueError, match="at least one episode"):
         body.fit([], warm_start=True)
-
-
-def test_a_promise_holds_on_average_and_nearly_always_below_its_bound():
-    rng, n, rate = np.random.default_rng(0), 40, 0.05
-    shares, promises = [], []
-    for _ in range(4000):
-        maxima = rng.random(n)
-        threshold = conformal_threshold(maxima, rate)
-        shares.append(1.0 - threshold)  # of fresh episodes, whose maxima are uniform too
-        promises.append(Promise.of(maxima, threshold))
-    assert np.mean(shares) == pytest.approx(promises[0].rate, abs=0.002)
-    assert promises[0].rate <= rate
-    assert np.mean(np.array(shares) <= promises[0].at_most) == pytest.approx(0.95, abs=0.015)

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from asm_gym.detection import (
     AdaptiveThreshold,
     Blocks,
     Detector,
     ModelOutput,
-    Promise,
     alarms_in,
     conformal_episodes,
     conformal_threshold,
@@ -29,7 +27,6 @@ from asm_gym.detection.hourly import MINUTE
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
-    STUCK,
     Repetition,
     count_repetitions,
     evidence_steps,
@@ -256,13 +253,6 @@ def test_fresh_operation_alarms_no_more_an_hour_than_was_promised(rate, hours):
     assert np.mean(np.array(realised) <= promised) >= 0.85  # 95 %, of 60
 
 
-def test_a_promise_by_the_hour_bounds_the_blocks_in_alarm():
-    blocks = Blocks(np.arange(40.0), np.full(40, 0.1))  # 4 hours
-    promise = hourly_promise(blocks, 38.0, 12)
-    assert promise == Promise(12, pytest.approx(2 / 4), promise.at_most, "hour", pytest.approx(4))
-    assert stats.binom.cdf(1, 40, promise.at_most / 10) == pytest.approx(0.05)  # one block is above, of 10 an hour
-
-
 @pytest.mark.parametrize(
     ("rate", "hours", "message"),
     [
@@ -295,19 +285,6 @@ def test_no_sequence_of_episodes_has_more_alarms_than_the_bound(maxima, rate, st
     assert alarms_of(how, np.array(maxima)).sum() <= rate * len(maxima) + math.log(4.0) / step + 1 + 1e-9
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.1])
-def test_an_adaptive_threshold_keeps_its_rate_while_a_policy_changes(rate):
-    rng = np.random.default_rng(0)
-    nominal = rng.lognormal(0.0, 0.3, size=4000)
-    step = nominal * np.where(np.arange(4000) < 2000, 1.0, 2.5)
-    slow, calmer = nominal * np.exp(np.linspace(0.0, math.log(2.5), 4000)), 0.4 * nominal
-    start = float(np.quantile(nominal, 1 - rate))
-    assert (step[2000:] > start).mean() > 5 * rate  # by the calibrated threshold
-    for maxima in (nominal, step, slow, calmer):
-        alarms = alarms_of(AdaptiveThreshold(rate, 0.1, ceiling=10.0), maxima, start)
-        assert alarms[1500:].mean() == pytest.approx(rate, rel=0.45)
-
-
 def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
     running = AdaptiveThreshold(0.01, 0.5, ceiling=3.0).start(1.0)
     for largest in (*[3.1] * 1000, math.inf, math.nan):
@@ -327,12 +304,6 @@ def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
     assert side_by_side.level == 1.0
 
 
-@pytest.mark.parametrize("wrong", [{"rate": 0.0}, {"rate": 1.0}, {"step": 0.0}, {"ceiling": 1.0}, {"step": math.nan}])
-def test_adaptive_settings_that_mean_nothing_are_refused_by_name(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        AdaptiveThreshold(**wrong)
-
-
 def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
     state, states = Repetition.start(1, rows.shape[1]), []
     for row in rows:
@@ -346,18 +317,6 @@ def test_repetitions_are_counted_after_a_change_and_after_a_repetition():
     found = count_repetitions([np.array([1.0, 2, 3, 3, 3, 4, 5])[:, None]], np.array([True]))
     first = (1 + 0.5) / (3 + 1)
     np.testing.assert_allclose(np.exp(-found[:2, 0]), [first, (1 + first) / (2 + 1)])
-
-
-def test_evidence_for_a_stuck_sense_is_that_of_pages_test():
-    p = np.array([[1e-4], [1e-2]])  # of a repetition after a change, and after a repetition
-    states = repetitions(np.array([[1.0], [1.0], [1.0], [2.0], [np.nan], [np.nan]]), -np.log(p))
-    one, two = np.log(STUCK / p[0, 0]), np.log(STUCK / p[1, 0])
-    change = np.log((1 - STUCK) / (1 - p[:, 0]))
-    rest = np.cumsum([one + two, change[1], change[0], change[0]])
-    np.testing.assert_allclose([s.unlikely[0, 0] for s in states], [0.0, one, *rest])
-    ratio = states[2].ratios(np.array([REPETITION_OFFSET]))
-    np.testing.assert_allclose(ratio, np.exp(TAIL_INDEX * (one + two - REPETITION_OFFSET)))
-    assert states[0].ratios(np.array([REPETITION_OFFSET])) == 0.0
 
 
 def quantised(steps: int, seed: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from asm_gym import faults
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults import Push, Snatch, Teleport
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, SurpriseOverlay, VectorNeuralASMSafety
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 
@@ -135,42 +134,6 @@ def test_an_environment_is_made_or_refused(data):
                 return None  # every argument that is looked at before was fine
 
     assert_fine_or_refused(checked, {name: data.draw(nasty)})
-
-
-@quickly
-@given(value=nasty)
-def test_options_and_actions_are_taken_or_refused(lift, value):
-    inner = lift.unwrapped
-    if assert_fine_or_refused(
-        lambda qpos_noise: inner.reset(options={"qpos_noise": qpos_noise}), {"qpos_noise": value}
-    ):
-        assert np.isfinite(inner.simulation.data.qpos).all()
-    else:
-        with pytest.raises(gym.error.ResetNeeded):
-            inner.step(np.zeros(7, np.float32))
-
-
-# ---------------------------------------------------------------- each found once
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Snatch(direction=0), "direction"),
-        (lambda: Snatch(direction=(0, 0, 0)), "direction"),
-        (lambda: Teleport(offset=float("nan")), "offset"),
-        (lambda: faults.Scale(factor=-1), "factor"),
-        (lambda: faults.ObjectMass(factor=-0.5), "factor"),
-        (lambda: Push(newtons=1e300), "newtons"),
-        (lambda: Push(seed=-1), "seed"),
-        (lambda: faults.Delay(steps=10**9), "steps"),
-        (lambda: Push(newtons=True), "newtons"),
-        (lambda: faults.Noise(std=-1), "std"),
-    ],
-)
-def test_what_breaks_the_simulator_is_refused_in_the_constructor(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
 
 
 @pytest.mark.parametrize("how", [copy.deepcopy, pickle.dumps], ids=["copied", "pickled"])

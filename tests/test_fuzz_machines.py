@@ -12,7 +12,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -375,23 +375,3 @@ class Archive(RuleBasedStateMachine):
 
 TestArchive = Archive.TestCase
 TestArchive.settings = runs(60, 20)
-
-
-@quiet
-def test_the_models_would_notice():
-    """A robot that is told what is no number fails the machine of the guard."""
-    from hypothesis.stateful import run_state_machine_as_test
-
-    class Asleep(Guard):
-        @initialize()
-        def broken(self):
-            pass
-
-        @rule()
-        def acts_nonsense(self):
-            if self.running:
-                self.robot.actions.append(np.full(3, np.nan, np.float32))
-
-    once = settings(runs(100, 10), database=None, phases=[Phase.generate], report_multiple_bugs=False)
-    with pytest.raises(AssertionError):
-        run_state_machine_as_test(Asleep, settings=once)

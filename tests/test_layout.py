@@ -68,19 +68,6 @@ def offences(within: str, *roots: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "line", "what"),
-    [
-        ("asm_gym.envs.a", "from ..spec import Channel", "asm_gym.spec.Channel"),
-        ("asm_gym.envs.__init__", "from . import b", "asm_gym.envs.b"),
-        ("asm_gym.memory.a", "from asm_gym import wrappers", "asm_gym.wrappers"),
-        ("asm_gym.a", "def f():\n  import asm_gym.scripts.cli as c", "asm_gym.scripts.cli"),
-    ],
-)
-def test_an_import_is_resolved_to_its_long_name(name: str, line: str, what: str) -> None:
-    assert list(imports(name, ast.parse(line))) == [what]
-
-
 @pytest.mark.parametrize("name", sorted(MODULES.keys() - {FACADE}))
 def test_imports_point_one_way(name: str) -> None:
     allowed = LAYERS[: LAYERS.index(layer(name)) + 1]

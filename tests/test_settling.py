@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory.energy import infer
-from asm_gym.memory.learning import LONGEST_CUE, Practice, Schedule, Trajectory, one_after_another
-from asm_gym.memory.recall import follow, run_on
+from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.settling import (
-    SettlingLearner,
     SettlingNetwork,
     SettlingWeights,
     initial_settling_weights,
@@ -117,11 +113,6 @@ def test_a_sense_that_is_not_seen_does_not_move_the_state():
     np.testing.assert_array_equal(a, b)
 
 
-def some_trajectories(count: int) -> list[Trajectory]:
-    senses, commands = rows(40, count)
-    return [Trajectory(senses[: 30 + n, n], commands[: 30 + n, n], senses[: 30 + n, n]) for n in range(count)]
-
-
 def test_learning_lowers_the_energy_and_is_reproducible():
     time = np.arange(30)[:, None] * np.array([0.1, 0.17, 0.23, 0.3])
     episodes = [
@@ -133,27 +124,6 @@ def test_learning_lowers_the_energy_and_is_reproducible():
     assert first.energy[-1] < 0.2 * first.energy[0]
     for a, b in zip(first.network.weights, again.network.weights, strict=True):
         assert a.tobytes() == b.tobytes()
-
-
-@pytest.mark.parametrize("free", [0.0, 1.0])
-def test_after_the_cue_the_state_that_was_expected_is_carried_on(free):
-    episode, net = some_trajectories(1)[0], network()
-    rng = np.random.default_rng(0)
-    streams = Practice(SettlingLearner(net.weights, SCHEDULE, rng), 1, rng)
-    moments = one_after_another([episode], 1, np.random.default_rng(0))
-    first = next(m for m in moments if m.begins.all())
-    streams.run([first], 0.0, free)
-    length = int(streams.cue[0, 0])
-    assert 1 <= length < LONGEST_CUE
-    streams.run(itertools.islice(moments, len(episode.senses) - 1), 0.0, free)
-    T = len(episode.senses)
-    if free == 0.0:
-        z = follow(net, net.at_rest(1), episode.senses[:, None], episode.commands[:, None]).traces
-    else:  # the last row of the cue is inferred, and what is handed on is what was expected of it
-        z = follow(net, net.at_rest(1), episode.senses[: length - 1, None], episode.commands[: length - 1, None]).traces
-        z = net.follow(z, episode.commands[length - 1 : length], np.zeros((1, S), np.float32), np.zeros((1, S))).mu
-        z = run_on(net, z, T - length).traces if length < T else z
-    np.testing.assert_allclose(streams.state, z, rtol=1e-3, atol=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,6 @@ from asm_gym.memory.traces import (
     carry,
     direct,
     direct_synapses,
-    fit_gains,
-    hebbian_change,
     initial_weights,
     learn_traces,
 )
@@ -114,32 +112,6 @@ def test_a_trace_is_the_exponentially_weighted_sum_of_all_rows():
     weights = DECAYS[:, None].astype(float) ** np.arange(len(rows))[::-1]  # (K, T); 0⁰ is 1
     expected = np.einsum("kt,tbr->bkr", weights, rows) * gains[:, None]
     np.testing.assert_allclose(traces, expected.reshape(2, -1), atol=1e-4)
-
-
-def test_gains_give_every_trace_a_mean_square_of_one():
-    rng = np.random.default_rng(1)
-    episodes = [np.cumsum(rng.normal(size=(T, 4)), axis=0).astype(np.float32) for T in (60, 20, 90)]
-    gains, squares = fit_gains(episodes), []
-    for rows in episodes:
-        traces = at_rest(1, 4)
-        for row in rows:
-            traces = advance(traces, row[None], gains)
-            squares.append(traces.reshape(len(DECAYS), 4) ** 2)
-    np.testing.assert_allclose(np.mean(squares, axis=(0, 2)), 1.0, rtol=1e-3)
-    assert np.isfinite(fit_gains([np.zeros((5, 2), np.float32)])).all()
-
-
-def test_with_a_firm_prior_the_local_change_is_the_gradient_of_the_prediction_error():
-    # Whittington and Bogacz 2017: with Π_z large, Π_z (z - μ) is what backpropagation sends to the state.
-    rng = np.random.default_rng(1)
-    W_C, W_F = rng.normal(size=(8, len(DECAYS) * 6)) / 7, rng.normal(size=(5, 8))
-    c, x, pi_z = rng.normal(size=(3, len(DECAYS) * 6)), rng.normal(size=(3, 5)), 1e4
-    mu = c @ W_C.T
-    z = infer(mu, x, W_F, pi_z, np.ones_like(x), pi_z + np.linalg.norm(W_F, 2) ** 2, 50)
-    change = hebbian_change(c, np.ones((3, 1)), mu, z, x - np.tanh(z) @ W_F.T, pi_z)
-    f = np.tanh(mu)
-    upstream = (1 - f**2) * ((x - f @ W_F.T) @ W_F)
-    np.testing.assert_allclose(change.W_C, upstream.T @ c / 3, rtol=0.02, atol=0.01)
 
 
 def test_a_synapse_steps_as_adam_does_along_a_cosine():
