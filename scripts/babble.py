@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 
 from asm_gym.detection import check_per_hour
-from asm_gym.detection.hourly import check_hours
+from asm_gym.detection.conformal import check_hours
 from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.recordings import NOMINAL_ROLES

@@ -21,9 +21,9 @@ from asm_gym.detection import (
     hourly_promise,
     hourly_threshold,
 )
+from asm_gym.detection.conformal import MINUTE
 from asm_gym.detection.detector import USUAL, habituate, usual_levels
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, Evidence, accumulated, no_evidence, pool, strength
-from asm_gym.detection.hourly import MINUTE
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,

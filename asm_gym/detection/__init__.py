@@ -2,10 +2,18 @@
 
 from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
 from asm_gym.detection.base import Detection, ModelOutput, Nominal
-from asm_gym.detection.conformal import Promise, conformal_episodes, conformal_threshold
+from asm_gym.detection.conformal import (
+    Blocks,
+    Promise,
+    alarms_in,
+    check_per_hour,
+    conformal_episodes,
+    conformal_threshold,
+    hourly_promise,
+    hourly_threshold,
+)
 from asm_gym.detection.detector import Detector
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
-from asm_gym.detection.hourly import Blocks, alarms_in, check_per_hour, hourly_promise, hourly_threshold
 
 __all__ = [
     "AdaptiveThreshold",

@@ -1,26 +1,38 @@
-"""Conformal calibration by the episode: a threshold that nominal episodes exceed no more often than promised.
+"""Conformal calibration: a threshold that healthy operation exceeds no more often than promised.
 
-    alarm      value > the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes
+By the episode
+    threshold    the ⌈(n + 1)(1 - rate)⌉-th smallest of the maxima of n nominal episodes; a value above it is an alarm
+By the hour
+    block        an episode; a longer one is cut into minutes, with a rest; an alarm counts once a block
+    threshold    the least maximum q of n healthy blocks with   #{i: m_i > q} + 1 <= r (T_1 + … + T_n)
 
-Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction).
+m_i is the largest value in block i, T_i its duration [h], and r the rate [1/h]. The loss of a block,
+[m_i > q] - r T_i, falls with q and is at most 1, so conformal risk control bounds the mean loss of the next block by 0:
+E[m > q] <= r E[T], at most r alarms an hour. Rows of a block may depend on each other; blocks must be exchangeable.
+
+Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction); Angelopoulos et al. 2024 (ICLR,
+conformal risk control), Theorem 1.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import betaincinv
 
 from asm_gym.detection.base import Array
 from asm_gym.validation import check_number, short_repr
 
-EPISODE, HOUR = "episode", "hour"
-"""Units of a rate of false alarms."""
-
+EPISODE, HOUR = "episode", "hour"  # units of a rate of false alarms
 LEAST_RATE = 1e-15  # rates are not taken to be smaller, as the inverse of the smallest floats is infinite
 CONFIDENCE = 0.95  # share of calibrations in which ``Promise.at_most`` holds
+MINUTE = 60.0  # longest block, and time below the threshold before another alarm counts [s]
+LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 1e6  # limits of a rate
+ROUNDING = 1e-9
 
 
 def conformal_episodes(rate: float) -> int:
@@ -80,3 +92,102 @@ class Promise(NamedTuple):
 def surely_below(beyond: int, n: int) -> float:
     """Return the bound on the share of fresh maxima above a threshold that ``beyond`` of n exceed."""
     return float(betaincinv(beyond + 1, n - beyond, CONFIDENCE)) if beyond < n else 1.0
+
+
+class Blocks(NamedTuple):
+    """Healthy operation in blocks."""
+
+    maxima: NDArray[np.float64]  # (n,) the largest value in each
+    hours: NDArray[np.float64]  # (n,) duration of each
+    group: NDArray[np.float64] = np.zeros(0)  # (n,) number of its task; empty for one group
+
+    @classmethod
+    def of(cls, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> Blocks:
+        """Cut the values (T,) of whole episodes, a row each ``dt`` [s]; ``each`` names the group of every episode."""
+        rows, number = _rows(dt), {name: n for n, name in enumerate(dict.fromkeys(each))}
+        named = zip(values, each or [""] * len(values), strict=True)
+        cut = [(v[at : at + rows], number.get(name, 0)) for v, name in named for at in range(0, len(v), rows)]
+        kept = [(float(v.max()), len(v) * dt / 3600, group) for v, group in cut]
+        maxima, hours, group = np.array(kept, float).reshape(-1, 3).T
+        return cls(maxima, hours, group) if len(number) > 1 else cls(maxima, hours)
+
+    @classmethod
+    def restored(cls, kept: NDArray[np.float64]) -> Blocks:
+        """Read an ``array``. Raises ValueError where that is no maxima and hours."""
+        if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
+            raise ValueError(
+                f"blocks should be maxima and hours in the shape (2, n) or (3, n), found {short_repr(kept)}"
+            )
+        return cls(*kept)
+
+    @property
+    def array(self) -> NDArray[np.float64]:
+        """As a file keeps them: (3, n), or (2, n) for one group."""
+        return np.stack([part for part in self if part.size])
+
+    @property
+    def groups(self) -> list[Blocks]:
+        """The blocks of each group."""
+        if not self.group.size:
+            return [self]
+        return [Blocks(*(part[self.group == group] for part in self[:2])) for group in np.unique(self.group)]
+
+    @property
+    def total(self) -> float:
+        """Total duration [h]."""
+        return float(self.hours.sum())
+
+
+def alarms_in(value: Array, threshold: float, dt: float) -> int:
+    """Count the alarms in an episode's values (T,); one that persists, or returns within a minute, is one."""
+    over = np.flatnonzero(np.asarray(value) > threshold)
+    return int(1 + (np.diff(over) > _rows(dt)).sum()) if len(over) else 0
+
+
+def check_per_hour(rate: float) -> float:
+    """Return a rate [1/h]. Raises ValueError or TypeError unless it can be promised."""
+    return check_number("false_alarms_per_hour", rate, low=LEAST_PER_HOUR, high=MOST_PER_HOUR)
+
+
+def check_hours(rate: float, hours: float) -> None:
+    """Raise ValueError, naming the missing hours, where ``hours`` are too few for this rate."""
+    if math.floor(rate * hours + ROUNDING) < 1:
+        raise ValueError(
+            f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
+            f"record {math.ceil(100 * (1.0 / rate - hours)) / 100:.4g} hours more, "
+            f"or promise {least_per_hour(hours):.4g}"
+        )
+
+
+def hourly_threshold(blocks: Blocks, rate: float) -> float:
+    """Return the q that healthy operation exceeds in at most ``rate`` blocks an hour, on average over calibrations.
+
+    The rate holds in each group. Raises ValueError where there are too few hours for it.
+    """
+    check_per_hour(rate)
+    if len(groups := blocks.groups) > 1:
+        return max(hourly_threshold(own, rate) for own in groups)
+    check_hours(rate, blocks.total)
+    allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
+    maxima = np.sort(blocks.maxima)
+    return float(maxima[max(len(maxima) - 1 - allowed, 0)])
+
+
+def least_per_hour(hours: float) -> float:
+    """Return the least rate that so many hours can promise, rounded up to three digits."""
+    unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
+    return math.ceil(1.0 / hours / unit) * unit
+
+
+def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:
+    """Return the promise of a threshold, in the group with most alarms; ``episodes`` were cut into the blocks."""
+    if len(groups := blocks.groups) > 1:
+        worst = max((hourly_promise(own, threshold, episodes) for own in groups), key=lambda each: each.rate)
+        return worst._replace(hours=blocks.total)
+    n, hours, beyond = len(blocks.maxima), blocks.total, int((blocks.maxima > threshold).sum())
+    return Promise(episodes, (beyond + 1) / hours, surely_below(beyond, n) * n / hours, HOUR, hours)
+
+
+def _rows(dt: float) -> int:
+    """Return the rows of a minute."""
+    return max(1, round(MINUTE / dt))

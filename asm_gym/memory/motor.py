@@ -76,9 +76,9 @@ class Motor(NamedTuple):
         expected = complete(hidden_units(m, self.V), m, self.U, self.D)
         return (self.mean + self.spread * expected).astype(np.float32)
 
-    def named(self, senses: StreamScaler) -> dict[str, NDArray[Any]]:
-        """Return the arrays of a checkpoint, with κ."""
-        return {f"motor_{n}": a for n, a in {**self._asdict(), "kappa": fineness(senses.spec)}.items()}
+    def named(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a checkpoint."""
+        return {f"motor_{name}": array for name, array in self._asdict().items()}
 
     @classmethod
     def found(cls, learned: Mapping[str, NDArray[Any]], senses: StreamScaler) -> Self | None:
@@ -86,13 +86,7 @@ class Motor(NamedTuple):
         if "motor_U" not in learned:
             return None
         units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
-        kappa = fineness(senses.spec)
-        if not np.array_equal(learned.get("motor_kappa", ()), kappa):
-            raise ValueError(
-                "the motor association was learned by a version that reads the senses less or more finely: "
-                "fit the memory and call learn_to_act with this one"
-            )
-        inputs = int(np.count_nonzero(kappa)) + 1
+        inputs = int(np.count_nonzero(fineness(senses.spec))) + 1
         shapes: dict[str, tuple[int, ...]] = {"V": (units, inputs), "U": (motor, units), "D": (motor, inputs)}
         shapes |= {"mean": (motor,), "spread": (motor,)}
         check_shapes(learned, {f"motor_{name}": shape for name, shape in shapes.items()})

@@ -20,9 +20,8 @@ from asm_gym.detection import (
     hourly_threshold,
 )
 from asm_gym.detection.base import Array
-from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.conformal import EPISODE, HOUR, check_hours
 from asm_gym.detection.contact_limits import FamiliarSpeed
-from asm_gym.detection.hourly import check_hours
 from asm_gym.episode import Episode
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
@@ -94,7 +93,7 @@ class Calibrated:
     Attributes:
         threshold_: surprise above which a row is an alarm; None before it is set.
         maxima_: (n,) largest surprise in each episode that it was set by; None before.
-        blocks_: the same by the hour, as ``detection.hourly`` counts it; None before.
+        blocks_: the same by the hour, as ``detection.conformal`` counts it; None before.
         promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
         healthy_: (N,) largest force of each of ``felt_channels`` in the calibration episodes [N m], [N]; contact limits
             are no less. Empty before, and where the stream has no such channels.
