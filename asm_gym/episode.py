@@ -139,8 +139,7 @@ class Episode:
             fields: other arguments of ``Episode``.
 
         Raises:
-            ValueError: columns are missing, doubled, of several lengths or no numbers; the rate is unknown or differs
-                from the spec's; time runs backwards.
+            ValueError: bad columns; the rate is unknown or differs from the spec's; time runs backwards.
         """
         found = read_recorded(frame, channels, rate, action, labels)
         return cls(found.stream, found.spec, **{"faults": found.faults} | fields)

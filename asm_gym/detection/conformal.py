@@ -44,14 +44,8 @@ def conformal_episodes(rate: float) -> int:
 def conformal_threshold(maxima: Array, rate: float) -> float:
     """Return the q that the maximum of a fresh nominal episode exceeds with a probability of at most ``rate``.
 
-    The guarantee is over the draw of the calibration episodes and the fresh one, which must be exchangeable.
-
-    Args:
-        maxima: (n,) the largest value in each nominal episode.
-        rate: P(any alarm in a nominal episode).
-
-    Raises:
-        ValueError: no numbers, or too few for this rate.
+    The guarantee is over the draw of n calibration episodes, of ``maxima`` (n,), and the fresh one, which must be
+    exchangeable. Raises ValueError where there are too few.
     """
     try:
         found = np.asarray(maxima)

@@ -91,9 +91,7 @@ def event_of(value: float, raw: float, kind: int, threshold: float) -> str:
 
 def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.intp]:
     """Return the columns (N,) of the channels that ``which`` selects."""
-    found = [np.arange(spec.size)[spec.slices[c.name]] for c in spec.channels if which(c)]
-    columns: NDArray[np.intp] = np.concatenate([np.zeros(0, np.intp), *found])
-    return columns
+    return np.flatnonzero([which(c) for c in spec.channels for _ in c.labels])
 
 
 @compiled

@@ -32,11 +32,7 @@ REFERENCE_WIDTH = 256  # hidden units up to which ``learning_rate`` is used as i
 
 
 class Trajectory(NamedTuple):
-    """One episode as the memory reads it; float32, standardised.
-
-    ``senses`` and ``commands`` have a row for each of the T steps of the temporal network. At rates above the control
-    rate association has more rows, N > T.
-    """
+    """One episode as the memory reads it; float32, standardised. Above the control rate association has N > T rows."""
 
     senses: Array  # (T, S)
     commands: Array  # (T, A + 1), the last one a constant 1
@@ -215,13 +211,7 @@ def practise(
     rng: np.random.Generator,
     tick: Tick,
 ) -> NDArray[np.float64]:
-    """Pass over the episodes with a decaying rate, more and more alone; return the mean energy of each pass.
-
-    Args:
-        learner: changes its synapses.
-        hidden: H, its hidden units.
-        tick: called after each pass.
-    """
+    """Pass over the episodes with a decaying rate, more and more alone; return the mean energy of each pass."""
     streams = Practice(learner, schedule.batch_size, rng)
     epochs, widest = passes(trajectories, schedule), schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden)
     moments = one_after_another(trajectories, schedule.batch_size, rng)

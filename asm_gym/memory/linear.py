@@ -62,13 +62,9 @@ def moments(a: Array) -> Moments:
 
 
 def conditional(found: Moments, penalty: float, groups: NDArray[np.intp], changes: slice) -> Floats:
-    """Return D (X, I); its last column makes the means agree.
+    """Return D (X, I) for a penalty λ; its last column, of the constant 1, makes the means agree.
 
-    Args:
-        found: moments of the inputs, the last of which is a constant 1.
-        penalty: λ > 0.
-        groups: (X,) group number of each change, from 0.
-        changes: columns of the changes among the inputs.
+    ``groups`` (X,) and ``changes`` are as in ``association.synapses``.
     """
     places = np.arange(len(found.mean))[changes]  # (X,)
     P = (found.vectors / (np.maximum(found.values, 0.0) + penalty)) @ found.vectors.T

@@ -97,10 +97,7 @@ def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[
     """Return situations (N, I), and the next command in each (N, A).
 
     The command is that of ``episode.actions``, the intended one where noise was added to the executed one (DART: Laskey
-    et al. 2017, CoRL); without actions, that of the stream.
-
-    Raises:
-        ValueError: the streams have no commands.
+    et al. 2017, CoRL); without actions, that of the stream. Raises ValueError where there are no commands.
     """
     motor = senses.spec.motor
     if not len(motor):

@@ -53,13 +53,9 @@ def learn_readout(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return W_K (K, M) and b_K (K,) learned from N rows whose skill is known.
+    """Return W_K (K, M) and b_K (K,) learned from N rows whose ``skill`` (N,), each below ``count``, is known.
 
-    Args:
-        rates: returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
-        skill: (N,) each below ``count``.
-        count: K.
-        rng: draws the order of rows.
+    ``rates`` returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
     """
     W_K, b_K = np.zeros((count, rates(np.arange(1)).shape[1]), np.float32), np.zeros(count, np.float32)
     weights, bias = Synapse(W_K), Synapse(b_K)
