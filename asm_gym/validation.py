@@ -224,7 +224,7 @@ def _is_sequence(value: Any) -> bool:
 
 
 def _within(number: float, **bounds: Unpack[Bounds]) -> bool:
-    low, high, above, below = (bounds.get(name) for name in ("low", "high", "above", "below"))
+    low, high, above, below = bounds.get("low"), bounds.get("high"), bounds.get("above"), bounds.get("below")
     return (
         (low is None or number >= low)
         and (high is None or number <= high)
@@ -235,7 +235,7 @@ def _within(number: float, **bounds: Unpack[Bounds]) -> bool:
 
 def _described(what: str, **bounds: Unpack[Bounds]) -> str:
     """Return for example ``whole number of at least 1``, or ``number in (0, 1]``."""
-    low, high, above, below = (bounds.get(name) for name in ("low", "high", "above", "below"))
+    low, high, above, below = bounds.get("low"), bounds.get("high"), bounds.get("above"), bounds.get("below")
     least, greatest = low if above is None else above, high if below is None else below
     if least is not None and greatest is not None:
         brackets = ("[" if above is None else "(", "]" if below is None else ")")

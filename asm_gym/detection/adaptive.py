@@ -61,7 +61,7 @@ class RunningThreshold:
         return self._alarms / self._episodes if self._episodes else math.nan
 
     def follow(self, largest: float, judged_by: float | None = None, confirmed: bool = False) -> None:
-        """Move after an episode of this greatest surprise, ``judged_by`` another threshold; ignore ``confirmed`` alarms."""
+        """Move after an episode of this greatest surprise, unless an alarm in it was ``confirmed`` as true."""
         alarm = not largest <= (self.value if judged_by is None else judged_by)
         if alarm and (confirmed or not largest <= self.ceiling):
             return
