@@ -139,36 +139,20 @@ class SettlingLearner(Learner):
     def practise(
         self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
     ) -> tuple[Array, float]:
-        w, taken = self.weights, now.commands
-        if own.any():
-            action = outward(activate(outward(activate(state), w.W_H) + w.W_U[:, -1]), w.W_A)
-            taken = np.hstack([np.where(own, action, taken[:, :-1]), taken[:, -1:]])
-        mu, z, energy = self.step(state, now.commands, now.senses, rate, taken)
-        return np.where(alone, mu, z), energy
-
-    def step(
-        self, before: Array, u: Array, x: Array, rate: float, taken: Array | None = None
-    ) -> tuple[Array, Array, float]:
-        """Learn from one row; return μ_t and z_t (B, H), and F summed over the batch.
-
-        Args:
-            before: (B, H) z_{t-1}.
-            u, x: (B, A + 1) the action as commanded, and a constant 1; (B, S) what is sensed.
-            rate: of the synapses.
-            taken: (B, A + 1) the action that μ uses; ``u`` where None.
-        """
-        w, how = self.weights, self.schedule
+        w, how, x, u, taken = self.weights, self.schedule, now.senses, now.commands, now.commands
         pi_z, pi_x = np.float32(how.prior_precision), np.float32(how.sensory_precision)
-        taken = u if taken is None else taken
-        carried = outward(activate(before), w.W_H)
-        mu, h = carried + outward(taken, w.W_U), carried + w.W_U[:, -1]
-        left, curvature = x - w.b_F, np.float32(pi_z + pi_x * self.norm)
+        carried = outward(activate(state), w.W_H)
+        h = carried + w.W_U[:, -1]
+        if own.any():
+            taken = np.hstack([np.where(own, outward(activate(h), w.W_A), u[:, :-1]), u[:, -1:]])
+        mu, left, curvature = carried + outward(taken, w.W_U), x - w.b_F, np.float32(pi_z + pi_x * self.norm)
         z = infer(mu, left, w.W_F, pi_z, np.full_like(x, pi_x), curvature, how.iterations)
-        state, senses = z - mu, left - outward(activate(z), w.W_F)
-        action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
-        energy = 0.5 * float(pi_z * np.sum(state**2) + pi_x * np.sum(senses**2) + np.sum(action**2))
-        self.learn(settling_change(before, taken, h, (pi_z * state, pi_x * senses, action), z, w.W_A), rate)
-        return mu, z, energy
+        of_state, of_senses = z - mu, left - outward(activate(z), w.W_F)
+        of_action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
+        energy = 0.5 * float(pi_z * np.sum(of_state**2) + pi_x * np.sum(of_senses**2) + np.sum(of_action**2))
+        errors = pi_z * of_state, pi_x * of_senses, of_action
+        self.learn(settling_change(state, taken, h, errors, z, w.W_A), rate)
+        return np.where(alone, mu, z), energy
 
 
 def learn_settling(

@@ -230,37 +230,22 @@ class TracesLearner(Learner):
     def practise(
         self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
     ) -> tuple[Array, float]:
-        taken, S = now.commands, now.senses.shape[1]
-        if own.any():
-            w = self.weights
-            action = (direct(state, taken, w.W_D) + sense(expect(state, w.W_C), w.W_F))[:, S:]
-            taken = np.hstack([np.where(own, action, taken[:, :-1]), taken[:, -1:]])
-        expected, energy = self.step(state, now.commands, now.senses, rate, taken)
-        senses = np.where(alone, expected[:, :S], now.senses)
-        return advance(state, np.hstack([senses, taken]), self.weights.gains), energy
-
-    def step(self, c: Array, u: Array, x: Array, rate: float, taken: Array | None = None) -> tuple[Array, float]:
-        """Learn from one row; return [x̂_t, â_t] (B, S + A) as expected before it, and the energy of the batch.
-
-        Args:
-            c: (B, I) the traces before.
-            u, x: (B, A + 1) the action as commanded, and a constant 1; (B, S) what is sensed.
-            rate: of the synapses.
-            taken: (B, A + 1) the action that the prediction of the senses uses; ``u`` where None.
-        """
         w, pi_z, pi_x = self.weights, self.schedule.prior_precision, self.schedule.sensory_precision
-        taken = u if taken is None else taken
-        past = direct(c, taken, w.W_D)
+        x, u, taken, S = now.senses, now.commands, now.commands, now.senses.shape[1]
+        mu = expect(state, w.W_C)
+        if own.any():
+            action = (direct(state, u, w.W_D) + sense(mu, w.W_F))[:, S:]
+            taken = np.hstack([np.where(own, action, u[:, :-1]), u[:, -1:]])
+        past = direct(state, taken, w.W_D)
         left = np.hstack([x, u[:, :-1]]) - past  # (B, S + A)
         precision = np.full_like(left, pi_x)
-        mu = expect(c, w.W_C)
         z = infer(mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self.norm, self.schedule.iterations)
         error = np.float32(pi_x) * (left - sense(z, w.W_F))
-        change = hebbian_change(c, taken, mu, z, error, pi_z, self._direct)
+        change = hebbian_change(state, taken, mu, z, error, pi_z, self._direct)
         energy = 0.5 * (pi_z * float(np.sum((z - mu) ** 2)) + float(np.sum(error**2)) / pi_x)
-        expected = past + sense(mu, w.W_F)
+        senses = np.where(alone, (past + sense(mu, w.W_F))[:, :S], x)
         self.learn(change, rate)
-        return expected, energy
+        return advance(state, np.hstack([senses, taken]), w.gains), energy
 
 
 def learn_traces(
