@@ -187,22 +187,9 @@ class Watching(RuleBasedStateMachine):
         np.testing.assert_allclose(surprise.attribution.sum(axis=1)[finite], surprise.value[finite])
         self.state = state
 
-    @rule(shape=st.sampled_from([(0,), (1,), (1, 2), (7, 5), (1, 5, 1)]))
-    def other_shapes_are_refused(self, shape):
-        with pytest.raises(ValueError, match=r"shape|numbers"):
-            self.mine.observe(self.state, np.zeros(shape))
-
     @rule()
     def forget(self):
         self.state = self.mine.reset_evidence(self.state)
-
-    @rule(rate=st.one_of(st.floats(-1, 2), st.sampled_from([np.nan, 5e-324, 1e-310, True, None, "0.1"])))
-    def threshold(self, rate):
-        if isinstance(rate, float) and 0.1 <= rate < 1.0:  # ten episodes promise no less
-            assert self.mine.threshold_at(rate) in self.mine.maxima_
-        else:
-            with pytest.raises(ValueError, match="rate"):
-                self.mine.threshold_at(rate)
 
     @rule()
     def saved_and_loaded(self):
@@ -284,13 +271,6 @@ class World(RuleBasedStateMachine):
             self.outer = self.env
         assert not len(self.inner.edits)
         assert not [*self.inner.corruptions, *self.inner.deliveries, *self.inner.substep_hooks]
-
-    @precondition(lambda self: self.running is None)
-    @rule(rate=st.sampled_from([30, 0, -1, True, None, "20", np.nan]))
-    def stream_rate_that_does_not_fit(self, rate):
-        with pytest.raises(ValueError, match="stream_freq"):
-            self.inner.stream_freq = rate
-        assert self.inner.stream_freq == 20
 
     def teardown(self):
         if hasattr(self, "outer"):

@@ -8,12 +8,11 @@ import pytest
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
 from asm_gym.memory.energy import infer
-from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.learning import Schedule
 from asm_gym.memory.settling import (
     SettlingNetwork,
     SettlingWeights,
     initial_settling_weights,
-    learn_settling,
     settling_change,
 )
 from asm_gym.memory.temporal import unassociated
@@ -103,27 +102,6 @@ def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
         mu = state @ w.W_H.T + u @ w.W_U.T
         state = mu + (x - mu @ C.T) @ K.T
         np.testing.assert_allclose(z, state, atol=1e-3 * small)
-
-
-def test_a_sense_that_is_not_seen_does_not_move_the_state():
-    net, (senses, commands) = network(), rows(3)
-    seen, other = np.array([[1, 0, 1, 1]] * 3, np.float32), senses[0].copy()
-    other[:, 1] += 10.0
-    a, b = (net.follow(net.at_rest(3), commands[0], x, seen).z for x in (senses[0], other))
-    np.testing.assert_array_equal(a, b)
-
-
-def test_learning_lowers_the_energy_and_is_reproducible():
-    time = np.arange(30)[:, None] * np.array([0.1, 0.17, 0.23, 0.3])
-    episodes = [
-        Trajectory(np.sin(time + n).astype(np.float32), np.ones((30, 1), np.float32), time.astype(np.float32))
-        for n in range(8)
-    ]
-    how = SCHEDULE._replace(epochs=40)
-    first, again = (learn_settling(episodes, 16, how, np.random.default_rng(7), lambda: None) for _ in range(2))
-    assert first.energy[-1] < 0.2 * first.energy[0]
-    for a, b in zip(first.network.weights, again.network.weights, strict=True):
-        assert a.tobytes() == b.tobytes()
 
 
 @pytest.fixture(scope="module")

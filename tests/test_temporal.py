@@ -18,7 +18,6 @@ from asm_gym.memory.learning import (
     Trajectory,
     cosine_decay,
     one_after_another,
-    power_iteration,
 )
 from asm_gym.memory.readout import KEPT, add_up, certainty
 from asm_gym.memory.recall import follow, run_on
@@ -124,13 +123,6 @@ def test_a_synapse_steps_as_adam_does_along_a_cosine():
         W = W + 0.01 * (m / (1 - 0.9**t)) / (np.sqrt(s / (1 - 0.999**t)) + 1e-8)
     np.testing.assert_allclose(synapse.W, W, rtol=1e-5)
     assert [cosine_decay(2.0, p) for p in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 1.0, 0.0])
-
-
-def test_power_iteration_finds_the_spectral_norm():
-    W, v = np.random.default_rng(0).normal(size=(5, 9)).astype(np.float32), np.ones(9, np.float32)
-    for _ in range(200):
-        squared, v = power_iteration(W, v)
-    assert squared == pytest.approx(np.linalg.norm(W, 2) ** 2, rel=1e-4)
 
 
 def sines(count: int, motor: int = 2) -> list[Trajectory]:
