@@ -149,9 +149,8 @@ def check_recorded(episode: Episode) -> None:
     """Raise ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
     rows, steps = len(episode), len(episode.actions)
     for name, length in (("observations", steps + 1), ("rewards", steps), ("contact_force", steps)):
-        found = len(getattr(episode, name))
-        if steps and found not in (0, length):
-            raise ValueError(f"{steps} actions need {length} {name}, got {found}")
+        if steps and len(getattr(episode, name)) not in (0, length):
+            raise ValueError(f"{steps} actions need {length} {name}, got {len(getattr(episode, name))}")
     for name in ("rewards", "faults", "contact_force"):
         if getattr(episode, name).ndim != 1:
             raise ValueError(f"{name} must have one dimension, got the shape {getattr(episode, name).shape}")

@@ -105,7 +105,7 @@ class FreeEnergy:
                 rows += 1
         if not rows:
             raise ValueError("no healthy row is long enough to learn the spreads of")
-        tau = max(SMALLEST_SPREAD, float(np.sqrt(2.0 * time / (rows * raw._numbers))))
+        tau = max(SMALLEST_SPREAD, float(np.sqrt(2.0 * time / (rows * (senses.size + len(commands))))))
         return replace(raw, tau=tau, tau_motor=np.maximum(np.sqrt(commands / rows), SMALLEST_SPREAD))
 
     def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Before, Floats]]:
@@ -172,15 +172,8 @@ class FreeEnergy:
     @cached_property
     def _weights(self) -> tuple[Any, Association]:
         """All synapses in double precision, as differences of F are small."""
-        w, association = self.network.weights, self.network.association
-        return type(w)(*(np.asarray(W, np.float64) for W in w)), Association(
-            *(np.asarray(W, np.float64) for W in association)
-        )
-
-    @property
-    def _numbers(self) -> int:
-        """N, the numbers that the temporal network predicts."""
-        return self.senses.size + len(self.senses.spec.motor)
+        exact = [[np.asarray(W, np.float64) for W in w] for w in (self.network.weights, self.network.association)]
+        return type(self.network.weights)(*exact[0]), Association(*exact[1])
 
     def _read(self, moment: Before, row: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return senses (S,), command (A + 1,), inputs (I,) and changes (X,) of a row, unrounded for L-BFGS."""
@@ -210,7 +203,8 @@ class FreeEnergy:
         precisions = float(self.network.prior_precision), float(self.network.sensory_precision)
         through = _by_settling if isinstance(w, SettlingWeights) else _by_traces
         raw, of_x, of_u, of_z = through(w, given.carried, u, x, z, *precisions)
-        time, scale = raw / self.tau**2 + self._numbers * np.log(self.tau), 1.0 / self.tau**2
+        numbers, scale = senses.size + len(spec.motor), 1.0 / self.tau**2
+        time = raw / self.tau**2 + numbers * np.log(self.tau)
         between, of_a, of_changes = _between(association, a, changes)
         off = self._unexpected(given, u[:-1])
         motor = float(np.sum(0.5 * (off / self.tau_motor) ** 2 + np.log(self.tau_motor))) if self.motor else 0.0
