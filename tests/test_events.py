@@ -19,8 +19,8 @@ def excused(rows, spec=ARM):
     excuses = Excuses(spec)
     state, found = excuses.start(1), []
     for row in rows:
-        state, by = excuses.step(state, np.asarray(row, np.float64)[None])
-        found.append((EVENTS[by.kind[0]], by.divisor[0]))
+        state, kind, divisor = excuses.step(state, np.asarray(row, np.float64)[None])
+        found.append((EVENTS[kind[0]], divisor[0]))
     return found
 
 
@@ -77,9 +77,9 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
 
 def test_what_is_left_of_an_excused_surprise_adds_up_and_hides_nothing():
     excuses = Excuses(ARM)
-    _, by = excuses.step(excuses.start(1), changed(5, 80.0)[None])
+    _, kind, divisor = excuses.step(excuses.start(1), changed(5, 80.0)[None])
     value, shares = np.array([60.0]), np.array([[20.0, 40.0]])
-    left = Surprise(value / by.divisor, shares / by.divisor, raw=value, excuse=by.kind)
+    left = Surprise(value / divisor, shares / divisor, raw=value, excuse=kind)
     assert left.value == pytest.approx(60.0 / EXCUSED)
     assert [left.event(q) for q in (5.9, 6.1, 61.0)] == ["fault", "knock", ""]
     assert event_of(np.nan, np.nan, 0, 1.0) == event_of(np.inf, np.inf, 1, 1.0) == "fault"

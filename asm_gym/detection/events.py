@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,13 +34,6 @@ EXCUSED, SLIPPED = 10.0, 3.0  # divisors of surprise at a knock or a stop, and w
 FADE = (1.0 - min(GAINS)) ** 2  # share of the slowest evidence left after a row
 FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))  # rows in which it, and the excuse, falls to a tenth
 MOVING, MOVED_S = 0.01, 0.1  # speed of a sliding finger [m/s], and duration of its excuse [s]
-
-
-class Excused(NamedTuple):
-    """The events in rows."""
-
-    kind: NDArray[np.int8]  # (B,) place in ``EVENTS``: 1 for a knock, 2 for a stop, 0 for neither
-    divisor: NDArray[np.float64]  # (B,) of the surprise
 
 
 class Excuses:
@@ -67,18 +60,17 @@ class Excuses:
         left[:, :3] = 0
         return left
 
-    def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[np.int64], Excused]:
-        """Return the new state, and the events in the next rows (B, D), which may not be finite."""
+    def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[Any], ...]:
+        """Return the new state, the place of each event of rows (B, D) in ``EVENTS``, and its divisor of surprise."""
         senses = self._wrist, self._joints, self._ends, self._fingers
-        after, kind, divisor = _step(left, rows, *senses, self._rows, self.on_its_way)
-        return after, Excused(kind, divisor)
+        found: tuple[NDArray[Any], ...] = _step(left, rows, *senses, self._rows, self.on_its_way)
+        return found
 
     def divisors(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Return the divisor of surprise (T,) in each row of a whole stream (T, D)."""
         left, found = self.start(1), np.ones(len(stream))
         for t, row in enumerate(np.asarray(stream, np.float64)):
-            left, excused = self.step(left, row[None])
-            found[t] = excused.divisor[0]
+            left, _, (found[t],) = self.step(left, row[None])
         return found
 
 
@@ -98,7 +90,7 @@ def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.i
 def _step(
     left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, lasting: Any, on_its_way: float
 ) -> Any:
-    """Return the new state (B, 3 + J), and the fields of ``Excused``."""
+    """Return the new state (B, 3 + J), and the events (B,) and divisors (B,)."""
     B = len(rows)
     after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
     for n in range(B):
