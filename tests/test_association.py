@@ -14,8 +14,6 @@ from asm_gym.memory.association import (
     follow_drift,
     hidden_units,
     log_variance,
-    normalised_errors,
-    spans,
     synapses,
     unbounded,
 )
@@ -27,13 +25,11 @@ from asm_gym.memory.association_learning import (
     learn_association,
     learn_precision,
     thirds,
-    trust,
 )
 from asm_gym.memory.linear import (
     conditional,
     learn_linear,
     moments,
-    specialise,
 )
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -55,18 +51,6 @@ def test_precision_recovers_noise_that_depends_on_context(rows, monkeypatch):
     learned = log_variance(f, W_S, b_S, unbounded(2))
     np.testing.assert_allclose(learned.mean(axis=0), truth.mean(axis=0), atol=0.1)
     assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
-
-
-def test_the_network_normalises_errors_of_association_by_their_expected_spread():
-    rng = np.random.default_rng(0)
-    association = some_association(rng, 13, 6, 5)
-    inputs, whole = rng.normal(size=(2, 13)).astype(np.float32), np.array([[1.0], [0.0]], np.float32)
-    found, units = normalised_errors(inputs, inputs[:, CHANGES].copy(), whole, *association, spans(association.U))
-    V, U, D, W_S, b_S, _, remainder = association
-    f = np.tanh(inputs @ V.T)
-    error = (inputs[:, CHANGES] - f @ U.T - inputs @ D.T) / remainder
-    np.testing.assert_allclose(units, f, atol=1e-5)
-    np.testing.assert_allclose(found, whole * error * np.exp(-0.5 * (f @ W_S.T + b_S)), atol=1e-4)
 
 
 def test_no_group_predicts_itself():
@@ -136,14 +120,6 @@ def test_crossfit_predicts_every_row_without_it():
     np.testing.assert_allclose(crossfit(mean, third, 2), by_hand, atol=1e-6)
 
 
-def test_trust_is_the_share_of_predictions_that_fresh_rows_confirm():
-    rng = np.random.default_rng(4)
-    expected = rng.normal(size=(4000, 4)).astype(np.float32)
-    left = expected * np.array([1.0, 0.5, 0.0, -1.0], np.float32) + 0.1 * rng.normal(size=expected.shape)
-    np.testing.assert_allclose(trust(left, expected), [1.0, 0.5, 0.0, 0.0], atol=0.02)
-    assert np.array_equal(trust(left, np.zeros_like(expected)), np.zeros(4))
-
-
 @pytest.mark.parametrize("penalty", [1e-6, 0.1, 10.0])
 def test_one_inverse_gives_the_ridge_regression_of_every_group_on_all_else(penalty):
     a = mixed_rows().astype(np.float64)
@@ -203,30 +179,6 @@ def worn(episodes: list[Episode], gain: float = 0.6) -> list[Episode]:
     """The same with a sense of smaller gain."""
     gains = np.where(np.arange(sine_spec().size) == 3, gain, 1.0).astype(np.float32)
     return [replace(e, stream=e.stream * gains) for e in episodes]
-
-
-@pytest.mark.parametrize("changed", [False, True])
-def test_specialising_learns_what_changed_and_forgets_nothing(body, changed):
-    def rows(episodes):
-        episodes = worn(episodes) if changed else episodes
-        inputs = np.concatenate([senses.read_episode(e.stream).inputs[1:] for e in episodes])
-        return inputs, inputs[:, senses.changes]
-
-    senses, known = body.senses_, body.network_.association
-    before = [array.copy() for array in known]
-    layout = senses.groups, senses.changes, body.association_size // (int(senses.groups.max()) + 1)
-    now = specialise(known, *rows(sine_episodes(10, seed=2)), *layout)
-    for array, old in zip(known, before, strict=True):
-        np.testing.assert_array_equal(array, old)
-    a, delta = rows(sine_episodes(20, seed=3))
-
-    def left(w):
-        return np.mean((delta - complete(hidden_units(a, w.V), a, w.U, w.D)) ** 2, axis=0)
-
-    assert left(now).sum() < (0.5 if changed else 1.1) * left(known).sum()
-    exists = synapses(senses.groups, senses.changes, senses.inputs, layout[2])
-    assert not (now.D * (1 - exists.D)).any()
-    assert not (now.U * (1 - exists.U)).any()
 
 
 def test_a_specialised_memory_is_calm_where_the_body_alarms_and_finds_what_freezes(body):

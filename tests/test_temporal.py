@@ -28,8 +28,6 @@ from asm_gym.memory.traces import (
     TracesLearner,
     advance,
     at_rest,
-    carry,
-    direct,
     direct_synapses,
     initial_weights,
     learn_traces,
@@ -90,15 +88,6 @@ def test_inference_is_gradient_descent_that_unseen_senses_do_not_move():
     seen[:, 1], other[:, 1] = 0, 77.0
     a, b = (infer(mu, v, W_F, pi_z, seen, 20.0, 5) for v in (x, other))
     assert a.tobytes() == b.tobytes()
-
-
-def test_no_action_predicts_itself():
-    exists = direct_synapses(5, 2)
-    W_D = np.ones_like(exists) * exists
-    c = np.zeros((1, W_D.shape[1] - 3), np.float32)
-    still, moving = (direct(c, np.array([[a, a, 1.0]], np.float32), W_D) for a in (0.0, 7.0))
-    np.testing.assert_array_equal(still[:, 5:], moving[:, 5:])
-    assert (still[:, :5] != moving[:, :5]).all()
 
 
 def test_a_trace_is_the_exponentially_weighted_sum_of_all_rows():
@@ -187,15 +176,6 @@ def network(scale: float = 1.0, iterations: int = 20) -> Network:
     weights.W_F[:] = scale * rng.normal(size=weights.W_F.shape)
     weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(S, A)
     return Network(weights, unassociated(), iterations, 1.0, 1.0)
-
-
-def test_the_compiled_row_carries_on_what_the_network_follows():
-    net, (senses, commands) = network(), some_rows(3, 3, S, A)
-    for seen in (np.ones((3, S), np.float32), np.array([[1, 0, 1, 1]] * 3, np.float32)):
-        row = net.at_rest(3), commands[0], senses[0], seen
-        step, (expected, traces) = net.follow(*row), carry(*row, *net.weights, *net.inference, True)
-        np.testing.assert_allclose(expected, np.tanh(step.mu), atol=1e-6)
-        np.testing.assert_array_equal(traces, step.traces)
 
 
 def test_running_on_is_following_the_own_predictions():
