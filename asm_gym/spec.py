@@ -54,21 +54,17 @@ class Channel:
     stops: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        check_number(f"channel {self.name!r}: size", self.size, low=1, whole=True)
-        check_number(f"channel {self.name!r}: noise", self.noise, low=0.0, infinite=True)
-        check_number(f"channel {self.name!r}: resolution", self.resolution, low=0.0)
+        who = f"channel {self.name!r}"
+        check_number(f"{who}: size", self.size, low=1, whole=True)
+        check_number(f"{who}: noise", self.noise, low=0.0, infinite=True)
+        check_number(f"{who}: resolution", self.resolution, low=0.0)
         if not isinstance(self.elements, tuple):
-            raise TypeError(
-                f"channel {self.name!r}: elements must be a tuple of names, got {short_repr(self.elements)}"
-            )
-        if self.elements and len(self.elements) != self.size:
-            raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.elements)} element names")
+            raise TypeError(f"{who}: elements must be a tuple of names, got {short_repr(self.elements)}")
         if not isinstance(self.stops, tuple) or not all(map(_is_pair, self.stops)):
-            raise TypeError(
-                f"channel {self.name!r}: stops must be a tuple of pairs (least, most), got {short_repr(self.stops)}"
-            )
-        if self.stops and len(self.stops) != self.size:
-            raise ValueError(f"channel {self.name!r} has size {self.size} but {len(self.stops)} pairs of stops")
+            raise TypeError(f"{who}: stops must be a tuple of pairs (least, most), got {short_repr(self.stops)}")
+        for what, values in (("element names", self.elements), ("pairs of stops", self.stops)):
+            if values and len(values) != self.size:
+                raise ValueError(f"{who} has size {self.size} but {len(values)} {what}")
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """From a model's errors to surprise, and from surprise to an alarm."""
 
-from asm_gym.detection.adaptive import AdaptiveThreshold, RunningThreshold
+from asm_gym.detection.adaptive import AdaptiveThreshold
 from asm_gym.detection.base import Detection, ModelOutput, Nominal
 from asm_gym.detection.conformal import (
     Blocks,
@@ -13,7 +13,7 @@ from asm_gym.detection.conformal import (
     hourly_threshold,
 )
 from asm_gym.detection.detector import Detector
-from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
+from asm_gym.detection.evidence_detection import EvidenceDetection
 
 __all__ = [
     "AdaptiveThreshold",
@@ -21,11 +21,9 @@ __all__ = [
     "Detection",
     "Detector",
     "EvidenceDetection",
-    "EvidenceState",
     "ModelOutput",
     "Nominal",
     "Promise",
-    "RunningThreshold",
     "alarms_in",
     "check_per_hour",
     "conformal_episodes",

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 
 Array = NDArray[np.floating[Any]]
+Floats = NDArray[np.float64]
 Arrays = Mapping[str, NDArray[Any]]
 State = Any
-Place = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Place = Callable[[Floats], Floats]
 """Maps each error's share (B, X) to each number's in the stream (B, D)."""
 
 
@@ -61,9 +62,7 @@ class Detection(Protocol):
     def start(self, batch: int, errors: int) -> State:
         """Return the state before the first row of ``batch`` streams: arrays with a first axis B, or tuples of them."""
 
-    def attribute_step(
-        self, state: State, output: ModelOutput, rows: NDArray[np.float64], place: Place
-    ) -> tuple[State, NDArray[np.float64]]:
+    def attribute_step(self, state: State, output: ModelOutput, rows: Floats, place: Place) -> tuple[State, Floats]:
         """Return the new state, and each number's share (B, D), perhaps not finite, of the surprise at rows (B, D)."""
 
     def reset(self, state: State) -> State:

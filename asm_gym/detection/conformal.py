@@ -21,10 +21,9 @@ from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import betaincinv
 
-from asm_gym.detection.base import Array
+from asm_gym.detection.base import Array, Floats
 from asm_gym.validation import check_number, short_repr
 
 EPISODE, HOUR = "episode", "hour"  # units of a rate of false alarms
@@ -91,9 +90,9 @@ def surely_below(beyond: int, n: int) -> float:
 class Blocks(NamedTuple):
     """Healthy operation in blocks."""
 
-    maxima: NDArray[np.float64]  # (n,) the largest value in each
-    hours: NDArray[np.float64]  # (n,) duration of each
-    group: NDArray[np.float64] = np.zeros(0)  # (n,) number of its task; empty for one group
+    maxima: Floats  # (n,) the largest value in each
+    hours: Floats  # (n,) duration of each
+    group: Floats = np.zeros(0)  # (n,) number of its task; empty for one group
 
     @classmethod
     def of(cls, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> Blocks:
@@ -106,7 +105,7 @@ class Blocks(NamedTuple):
         return cls(maxima, hours, group) if len(number) > 1 else cls(maxima, hours)
 
     @classmethod
-    def restored(cls, kept: NDArray[np.float64]) -> Blocks:
+    def restored(cls, kept: Floats) -> Blocks:
         """Read an ``array``. Raises ValueError where that is no maxima and hours."""
         if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
             raise ValueError(
@@ -115,7 +114,7 @@ class Blocks(NamedTuple):
         return cls(*kept)
 
     @property
-    def array(self) -> NDArray[np.float64]:
+    def array(self) -> Floats:
         """As a file keeps them: (3, n), or (2, n) for one group."""
         return np.stack([part for part in self if part.size])
 

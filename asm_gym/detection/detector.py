@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
-from asm_gym.detection.base import Array, ModelOutput
+from asm_gym.detection.base import Array, Floats, ModelOutput
 from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulated, no_evidence, pool, strength
 from asm_gym.detection.tails import TAIL_INDEX, worst_case
 from asm_gym.detection.whitening import bounded, whitening
@@ -98,12 +98,12 @@ def _step(
 class Detector:
     """Turns errors into one number."""
 
-    whitening: NDArray[np.float64]  # (X, X) M
-    ceiling: NDArray[np.float64]  # (G, X) q
-    tail: NDArray[np.float64]  # (G, X) κ, in (0, 1]
-    context_quantile: NDArray[np.float64]  # (2 C + 1,) weights of log ŝ on the context and its running mean, and a bias
-    context_range: NDArray[np.float64]  # (2,) limits of log ŝ
-    gains: NDArray[np.float64]  # (G,) a, each in (0, 1]
+    whitening: Floats  # (X, X) M
+    ceiling: Floats  # (G, X) q
+    tail: Floats  # (G, X) κ, in (0, 1]
+    context_quantile: Floats  # (2 C + 1,) weights of log ŝ on the context and its running mean, and a bias
+    context_range: Floats  # (2,) limits of log ŝ
+    gains: Floats  # (G,) a, each in (0, 1]
     bound: float  # ν > 0
 
     @classmethod
@@ -149,13 +149,13 @@ class Detector:
             return float(pool(ratios.reshape(1, -1))[0][0] / np.exp(self.context_quantile[-1]))
 
     @property
-    def reach_of_errors(self) -> NDArray[np.float64]:
+    def reach_of_errors(self) -> Floats:
         """Largest value (X,) in the context of the least surprise, one error alone at ν for ever, the others at 0."""
         most = (self.bound * self.whitening) ** 2  # (X of the error, X)
         with np.errstate(over="ignore", divide="ignore"):
             ratios = (most[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None] / self.ceiling) ** self.tail
             pooled = pool(ratios.reshape(len(most), -1))[0]
-            found: NDArray[np.float64] = pooled / np.exp(min(self.context_quantile[-1], self.context_range[0]))
+            found: Floats = pooled / np.exp(min(self.context_quantile[-1], self.context_range[0]))
         return found
 
     def start(self, batch: int) -> Evidence:
@@ -163,16 +163,14 @@ class Detector:
         gains, size = self.ceiling.shape
         return no_evidence(batch, gains, size, (len(self.context_quantile) - 1) // 2)
 
-    def step(
-        self, evidence: Evidence, errors: Array, context: Array
-    ) -> tuple[Evidence, NDArray[np.float64], NDArray[np.float64]]:
+    def step(self, evidence: Evidence, errors: Array, context: Array) -> tuple[Evidence, Floats, Floats]:
         """Return the new evidence, the value (B,), and each error's share of it (B, X); ``context`` is (B, C)."""
         learned = self.whitening, self.ceiling, self.tail, self.context_quantile, self.context_range
         row = np.asarray(errors, np.float64), np.asarray(context, np.float64)
         new, value, shares = _step(*evidence, *row, *learned, self.gains, self.bound)
         return Evidence(*new), value, shares
 
-    def strengths(self, run: ModelOutput) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:
         """Return v (T, G, X), and the running mean of the contexts (T, C), of a whole episode."""
         whitened = bounded(run.errors, self.bound) @ self.whitening
         vectors, running = accumulated(whitened, np.asarray(run.contexts, np.float64), self.gains)
@@ -180,9 +178,7 @@ class Detector:
         return strength(whole, self.gains), whole.context
 
 
-def usual_levels(
-    contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def usual_levels(contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Return w and b (C + 1,), and l and h (2,), from contexts (T, C) and log s (T,) of nominal episodes."""
     context, level = np.concatenate(contexts), np.concatenate(levels)
     w, _ = np.split(habituate(context, level, rng), [-1])

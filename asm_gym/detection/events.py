@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.detection.base import Floats
 from asm_gym.detection.detector import GAINS
 from asm_gym.spec import Channel, StreamSpec
 
@@ -49,7 +50,7 @@ class Excuses:
         self._rows = np.array([*(max(1, round(seconds / spec.dt)) for seconds in (KNOCKED_S, MOVED_S)), FADING])
 
     @property
-    def arrays(self) -> tuple[list[NDArray[Any]], NDArray[np.float64]]:
+    def arrays(self) -> tuple[list[NDArray[Any]], Floats]:
         """Columns of wrists, joints and fingers, rows of their excuses, and the stops (J, 2)."""
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
 
@@ -60,13 +61,13 @@ class Excuses:
         left[:, :3] = 0
         return left
 
-    def step(self, left: NDArray[np.int64], rows: NDArray[np.float64]) -> tuple[NDArray[Any], ...]:
+    def step(self, left: NDArray[np.int64], rows: Floats) -> tuple[NDArray[Any], ...]:
         """Return the new state, the place of each event of rows (B, D) in ``EVENTS``, and its divisor of surprise."""
         senses = self._wrist, self._joints, self._ends, self._fingers
         found: tuple[NDArray[Any], ...] = _step(left, rows, *senses, self._rows, self.on_its_way)
         return found
 
-    def divisors(self, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    def divisors(self, stream: NDArray[np.floating[Any]]) -> Floats:
         """Return the divisor of surprise (T,) in each row of a whole stream (T, D)."""
         left, found = self.start(1), np.ones(len(stream))
         for t, row in enumerate(np.asarray(stream, np.float64)):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
-from asm_gym.detection.base import Array
+from asm_gym.detection.base import Array, Floats
 
 POWER = 8  # p
 CONTEXT_GAIN = 0.2  # weight of the newest row in the running mean of the context
@@ -28,8 +28,8 @@ TINY = float(np.finfo(np.float64).tiny)
 class Evidence(NamedTuple):
     """Evidence of B streams; never changed in place."""
 
-    vector: NDArray[np.float64]  # (B, G, X) w_t, for each of G gains
-    context: NDArray[np.float64]  # (B, C) running mean of the contexts
+    vector: Floats  # (B, G, X) w_t, for each of G gains
+    context: Floats  # (B, C) running mean of the contexts
     steps: NDArray[np.int64]  # (B,) t, rows so far
 
 
@@ -39,7 +39,7 @@ def no_evidence(batch: int, gains: int, size: int, context: int = 0) -> Evidence
 
 
 @compiled
-def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats, Floats]:
     """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
     T, X = whitened.shape
     vectors, running = np.zeros((T, len(gains), X)), np.zeros(contexts.shape)
@@ -54,14 +54,14 @@ def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[NDArray
     return vectors, running
 
 
-def strength(evidence: Evidence, gains: Array) -> NDArray[np.float64]:
+def strength(evidence: Evidence, gains: Array) -> Floats:
     """Return v (B, G, X), the squared evidence in each error."""
     variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * evidence.steps[:, None]))  # (B, G) of each w_t,i
-    squared: NDArray[np.float64] = evidence.vector**2 / variance[:, :, None]
+    squared: Floats = evidence.vector**2 / variance[:, :, None]
     return squared
 
 
-def pool(ratios: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pool(ratios: Array) -> tuple[Floats, Floats]:
     """Return (Σ_i r_i^p)^(1/p) (B,), and each ratio's part of it (B, X), which add up to it; r >= 0."""
     greatest = np.maximum(ratios.max(axis=1, keepdims=True), TINY)
     powers = (ratios / greatest) ** POWER

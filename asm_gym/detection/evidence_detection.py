@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place
+from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
 from asm_gym.detection.evidence import TINY, Evidence, pool
 from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps, repeated
@@ -120,7 +120,7 @@ class EvidenceDetection:
         """Largest surprise by errors in a context of 0; repetitions may add to it."""
         return self.fitted_detector.reach
 
-    def reach_of(self, errors: NDArray[np.intp]) -> NDArray[np.float64]:
+    def reach_of(self, errors: NDArray[np.intp]) -> Floats:
         """Return the largest surprise (N,) by each of the errors (N,) alone."""
         return self.fitted_detector.reach_of_errors[errors]
 
@@ -129,8 +129,8 @@ class EvidenceDetection:
         return EvidenceState(self.fitted_detector.start(batch), Repetition.start(batch, len(self.spec.sensory)))
 
     def attribute_step(
-        self, state: EvidenceState, output: ModelOutput, rows: NDArray[np.float64], place: Place
-    ) -> tuple[EvidenceState, NDArray[np.float64]]:
+        self, state: EvidenceState, output: ModelOutput, rows: Floats, place: Place
+    ) -> tuple[EvidenceState, Floats]:
         """Return the new state, and each number's share (B, D) of the surprise at the next rows (B, D)."""
         evidence, _, parts = self.fitted_detector.step(state.evidence, *output)
         senses, (steps, most, offset) = self.spec.sensory, self.repeating
@@ -150,9 +150,9 @@ class EvidenceDetection:
         )
 
 
-def _joined(found: NDArray[np.float64], ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+def _joined(found: Floats, ratios: Floats) -> Floats:
     """Return each number's share (B, D) of its surprise so far pooled with further ratios."""
     value = found.sum(axis=1, keepdims=True)
     _, parts = pool(np.hstack([value, ratios]))
-    shared: NDArray[np.float64] = found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]
+    shared: Floats = found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]
     return shared

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
+from asm_gym.detection.base import Floats
 from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
@@ -38,9 +39,9 @@ MOST_READ = 20_000  # largest number of rows from which noise and resolution are
 class Repetition(NamedTuple):
     """State of B streams; never changed in place."""
 
-    row: NDArray[np.float64]  # (B, X) the last readings; NaN before the first
+    row: Floats  # (B, X) the last readings; NaN before the first
     again: NDArray[np.bool_]  # (B, X) whether they were repetitions
-    unlikely: NDArray[np.float64]  # (B, X) n
+    unlikely: Floats  # (B, X) n
 
     @classmethod
     def start(cls, batch: int, size: int) -> Self:
@@ -48,7 +49,7 @@ class Repetition(NamedTuple):
         shape = batch, size
         return cls(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
 
-    def ratios(self, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    def ratios(self, offset: Floats) -> Floats:
         """Return r (B, X), with n_0 ``offset`` (X,)."""
         return np.where(self.unlikely > 0, np.exp(TAIL_INDEX * (self.unlikely - offset)), 0.0)
 
@@ -67,7 +68,7 @@ def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.boo
     return found
 
 
-def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> NDArray[np.float64]:
+def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> Floats:
     """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0.
 
     ``streams`` are the senses (T, X) in nominal episodes, ``noisy`` (X,) those with declared noise.
@@ -96,12 +97,12 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     return np.concatenate([counted, offset[None]])
 
 
-def evidence_steps(surprise: NDArray[np.float64]) -> NDArray[np.float64]:
+def evidence_steps(surprise: Floats) -> Floats:
     """Return (2, 2, X) from -log p (2, X): what a change and a repetition add to n, after a change and a repetition."""
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
         steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
-    found: NDArray[np.float64] = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
+    found: Floats = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
     return np.ascontiguousarray(found)
 
 

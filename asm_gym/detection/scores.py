@@ -16,12 +16,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.base import Array, Arrays, ModelOutput, Nominal, Place, State
+from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place, State
 from asm_gym.detection.whitening import whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
-
-Floats = NDArray[np.float64]
 
 WINDOW = 5  # rows of the moving mean
 

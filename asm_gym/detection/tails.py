@@ -12,9 +12,8 @@ Source: Hill 1975 for the index of a tail.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.detection.base import Array
+from asm_gym.detection.base import Array, Floats
 
 TAIL_INDEX = 0.3  # ξ_0: a ratio falls off as probability to this power
 NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays below q
@@ -25,7 +24,7 @@ SMALLEST = 1e-9  # lower bound of q
 LEAST_SHARE = 1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
 
 
-def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[Floats, Floats]:
     """Return q and κ (…) by ξ_0 from the maxima of N nominal episodes (N, …)."""
     ceiling = ceilings(maxima, NOMINAL_QUANTILE)
     beyond = np.log(np.maximum(maxima / ceiling, 1.0))
@@ -35,8 +34,8 @@ def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[NDArray[n
     return ceiling, tail_index / np.maximum(index, tail_index)
 
 
-def ceilings(maxima: Array, quantile: float) -> NDArray[np.float64]:
+def ceilings(maxima: Array, quantile: float) -> Floats:
     """Return q (…): a quantile of the maxima of N nominal episodes (N, …)."""
     found = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
-    least: NDArray[np.float64] = np.maximum(found, LEAST_SHARE * np.median(found))
+    least: Floats = np.maximum(found, LEAST_SHARE * np.median(found))
     return least

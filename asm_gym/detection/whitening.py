@@ -9,15 +9,14 @@ Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from asm_gym.detection.base import Array
+from asm_gym.detection.base import Array, Floats
 from asm_gym.memory.linear import gram
 
 MOST_ERRORS = 8192  # their covariance takes 0.5 GiB, and its eigenvectors minutes
 
 
-def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
+def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
     """Return the symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white and turns them least.
 
     Args:
@@ -39,12 +38,12 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> NDArray[np.float64]:
     scale = float(np.trace(covariance)) / len(covariance)
     target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
     values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
-    matrix: NDArray[np.float64] = (vectors / np.sqrt(values)) @ vectors.T
+    matrix: Floats = (vectors / np.sqrt(values)) @ vectors.T
     return matrix
 
 
-def bounded(errors: Array, bound: float) -> NDArray[np.float64]:
+def bounded(errors: Array, bound: float) -> Floats:
     """Return the errors, none beyond ν = ``bound`` standard deviations."""
     exact = np.asarray(errors, np.float64)
-    pulled: NDArray[np.float64] = exact / np.sqrt(1.0 + (exact / bound) ** 2)
+    pulled: Floats = exact / np.sqrt(1.0 + (exact / bound) ** 2)
     return pulled

@@ -61,14 +61,7 @@ def inward(pulled: Array, f: Array, back: Array) -> Array:
 
 
 def association_change(
-    a: Array,
-    delta: Array,
-    spread: Array,
-    V: Array,
-    U: Array,
-    D: Array,
-    bound: float = 1.0,
-    back: Array | None = None,
+    a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array, bound: float = 1.0, back: Array | None = None
 ) -> tuple[Change, Array]:
     """Return the change of each synapse, as if all existed, and the errors (B, X).
 

@@ -72,7 +72,7 @@ class Motor(NamedTuple):
     spread: NDArray[np.float64]  # (A,)
 
     def command(self, m: Array) -> NDArray[np.float32]:
-        """Return â (B, A), in the units of the action, in the situations ``m`` (B, I)."""
+        """Return â (B, A), in the units of the action, in situations (B, I)."""
         expected = complete(hidden_units(m, self.V), m, self.U, self.D)
         return (self.mean + self.spread * expected).astype(np.float32)
 

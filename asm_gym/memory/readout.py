@@ -48,10 +48,7 @@ def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Arra
 
 
 def learn_readout(
-    rates: Callable[[NDArray[np.intp]], Array],
-    skill: NDArray[np.intp],
-    count: int,
-    rng: np.random.Generator,
+    rates: Callable[[NDArray[np.intp]], Array], skill: NDArray[np.intp], count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return W_K (K, M) and b_K (K,) learned from N rows whose ``skill`` (N,), each below ``count``, is known.
 

@@ -30,7 +30,6 @@ class Recalled(NamedTuple):
 
     senses: Array  # (T, B, S) x̂_t, before x_t was sensed
     commands: Array  # (T, B, A) â_t, before a_t was commanded
-    hidden: Array  # (T, B, H) z_t, the inferred state
     traces: Array  # (B, I) c_T, to carry on with
 
 
@@ -99,4 +98,4 @@ def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) 
 def _stacked(steps: Sequence[Step], network: TemporalNetwork) -> Recalled:
     expected = np.stack([s.expected for s in steps])
     S = expected.shape[2] - network.motor
-    return Recalled(expected[:, :, :S], expected[:, :, S:], np.stack([s.z for s in steps]), steps[-1].traces)
+    return Recalled(expected[:, :, :S], expected[:, :, S:], steps[-1].traces)
