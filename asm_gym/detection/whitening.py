@@ -11,28 +11,16 @@ from __future__ import annotations
 import numpy as np
 
 from asm_gym.detection.base import Array, Floats
-from asm_gym.memory.linear import gram
-
-MOST_ERRORS = 8192  # their covariance takes 0.5 GiB, and its eigenvectors minutes
+from asm_gym.memory.linear import check_inputs, gram
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
-    """Return the symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) white and turns them least.
+    """Return the symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) of nominal rows white.
 
-    Args:
-        errors: normalised errors of nominal rows, of mean 0.
-        shrinkage: λ in [0, 1]. Above 0 constant channels and copies of channels are no trouble.
-
-    Raises:
-        ValueError: too many errors, or shrinkage out of range.
+    Above a ``shrinkage`` λ of 0 constant channels and copies of channels are no trouble. Raises ValueError where X is
+    too large.
     """
-    if errors.shape[1] > MOST_ERRORS:
-        raise ValueError(
-            f"every error is weighed against every other in whitening, at most {MOST_ERRORS} of them, but this stream "
-            f"makes {errors.shape[1]}: leave channels out, or reduce them before"
-        )
-    if not 0.0 <= shrinkage <= 1.0:
-        raise ValueError(f"shrinkage must be in [0, 1], got {shrinkage}")
+    check_inputs(errors.shape[1])
     exact = np.asarray(errors, np.float64)
     covariance = gram(exact) / len(exact)  # (X, X)
     scale = float(np.trace(covariance)) / len(covariance)
