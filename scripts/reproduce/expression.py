@@ -117,7 +117,7 @@ class Backpropagated:
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
-        return to_rows(self.reader, Recalled(senses, commands, commands, commands[-1]))
+        return to_rows(self.reader, Recalled(senses, commands, commands[-1]))
 
 
 class Hopfield(NamedTuple):
