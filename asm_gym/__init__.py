@@ -60,13 +60,8 @@ _HOME = {
 """Which room a name comes from."""
 
 for _task in TASKS.values():
-    gymnasium.register(
-        id=_task.id,
-        entry_point=f"asm_gym.envs:{_task.name}",
-        kwargs={"task": _task.name},
-        # The environment truncates itself, so that `horizon` is an argument like any other.
-        max_episode_steps=None,
-    )
+    # Without max_episode_steps: the environment truncates itself, so that `horizon` is an argument like any other.
+    gymnasium.register(_task.id, f"asm_gym.envs:{_task.name}", kwargs={"task": _task.name})
 
 gymnasium.register(id="asm_gym/SyntheticArm-v0", entry_point="asm_gym.synthetic_arm:SyntheticArm")
 
