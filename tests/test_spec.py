@@ -95,7 +95,7 @@ def test_the_spec_of_plain_spaces_is_observation_then_action():
     ],
 )
 def test_what_makes_no_sense_is_refused(make):
-    with pytest.raises(ValueError, match=r"got|must|needs|names"):
+    with pytest.raises(ValueError, match=r"got|must|needs|names|but"):
         make()
 
 
