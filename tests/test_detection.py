@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from asm_gym.detection import (
     AdaptiveThreshold,
     Blocks,
-    Detector,
-    ModelOutput,
     alarms_in,
     conformal_episodes,
     conformal_threshold,
@@ -23,7 +21,7 @@ from asm_gym.detection import (
 )
 from asm_gym.detection.conformal import MINUTE
 from asm_gym.detection.detector import USUAL, habituate, usual_levels
-from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, Evidence, accumulated, no_evidence, pool, strength
+from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, Evidence, accumulated, no_evidence, pool
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
@@ -33,7 +31,7 @@ from asm_gym.detection.repetition import (
     repeated,
 )
 from asm_gym.detection.tails import TAIL_INDEX, worst_case
-from asm_gym.detection.whitening import bounded, whitening
+from asm_gym.detection.whitening import whitening
 from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -115,34 +113,6 @@ def test_habituation_finds_the_quantile_of_each_context_and_no_more_than_nominal
     nominal, wild = usual(limited, np.concatenate(contexts)), usual(limited, 1e3 * contexts[0])
     assert (wild.min(), wild.max()) == (nominal.min(), nominal.max())
     assert nominal.max() < 2.0 * 3.5 + 2.0
-
-
-def runs(rng: np.random.Generator, count: int, steps: int = 200) -> list[ModelOutput]:
-    """Errors four times as large in one of two contexts, between which an episode alternates."""
-    made = []
-    for _ in range(count):
-        rough = (np.arange(steps) // 50 + rng.integers(2)) % 2
-        errors = rng.normal(size=(steps, 3)) * np.where(rough, 4.0, 1.0)[:, None]
-        made.append(ModelOutput(errors, np.stack([rough, 1 - rough], axis=1).astype(np.float32)))
-    return made
-
-
-def test_the_compiled_step_is_the_same_equations_put_together():
-    rng = np.random.default_rng(2)
-    detector = Detector.fit(runs(rng, 8), runs(rng, 8), [0.8, 0.2], 5.0, 1e-3, rng)
-    gains, evidence, plain = detector.gains, detector.start(2), no_evidence(2, 2, 3, 2)
-    habituation = (detector.context_quantile, detector.context_range)
-    for _ in range(30):
-        errors, context = 4.0 * rng.normal(size=(2, 3)), rng.random((2, 2))
-        evidence, value, parts = detector.step(evidence, errors, context)
-        plain = accumulate(plain, bounded(errors, 5.0) @ detector.whitening, context, gains)
-        ratios = (strength(plain, gains) / detector.ceiling) ** detector.tail
-        pooled, _ = pool(ratios.reshape(2, -1))
-        log_usual = usual(habituation, np.hstack([context, plain.context]))
-        np.testing.assert_allclose(value, pooled / np.exp(log_usual), rtol=1e-9)
-        np.testing.assert_allclose(parts.sum(axis=1), value, rtol=1e-9)
-        for a, b in zip(evidence, plain, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("rate", "episodes"), [(0.5, 1), (0.1, 9), (0.05, 19), (0.01, 99), (0.07, 14), (0.001, 999)])
@@ -281,22 +251,6 @@ def test_repetitions_are_counted_after_a_change_and_after_a_repetition():
     found = count_repetitions([np.array([1.0, 2, 3, 3, 3, 4, 5])[:, None]], np.array([True]))
     first = (1 + 0.5) / (3 + 1)
     np.testing.assert_allclose(np.exp(-found[:2, 0]), [first, (1 + first) / (2 + 1)])
-
-
-def quantised(steps: int, seed: int) -> np.ndarray:
-    """(steps, 1) of a sensor at rest, whose noise is a bit more than its resolution: one reading of four repeats."""
-    return np.rint(np.random.default_rng(seed).normal(scale=1.14, size=(steps, 1)))
-
-
-def test_a_sensor_at_rest_repeats_itself_by_chance_and_is_found_once_it_sticks():
-    counted = count_repetitions([quantised(100, seed) for seed in range(60)], np.array([True]))
-    np.testing.assert_allclose(np.exp(-counted[:2, 0]), 0.24, atol=0.03)
-    fresh = [max(s.unlikely[0, 0] for s in repetitions(quantised(100, seed), counted)) for seed in range(100, 400)]
-    for n in (6.0, 8.0):  # Page's bound: e^-n from each of 100 beginnings
-        assert np.mean(np.array(fresh) >= n) <= 100 * np.exp(-n) + 0.02
-    assert max(fresh) < REPETITION_OFFSET
-    stuck = np.array([s.unlikely[0, 0] for s in repetitions(np.ones((20, 1)), counted)])
-    assert np.argmax(stuck > REPETITION_OFFSET) == pytest.approx(10, abs=1)
 
 
 def test_a_sense_that_was_stuck_for_long_is_believed_again_soon():

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asm_gym.memory.dynamics import train
 from asm_gym.memory.energy import STRIDE, activate, energy_gradient, feedback, infer, outward
 from asm_gym.memory.learning import (
     LONGEST_CUE,
@@ -19,7 +18,6 @@ from asm_gym.memory.learning import (
     cosine_decay,
     one_after_another,
 )
-from asm_gym.memory.readout import KEPT, add_up, certainty
 from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.temporal import unassociated
 from asm_gym.memory.traces import (
@@ -34,7 +32,7 @@ from asm_gym.memory.traces import (
 )
 from asm_gym.monitors import MemoryConfig, NeuralASM
 from asm_gym.monitors.acting import recall
-from tests.problems import CHANGES, energy, problem, schedule, some_rows, trajectory
+from tests.problems import energy, problem, schedule, some_rows, trajectory
 from tests.streams import sine_episodes, sine_spec
 
 H, S, A = 7, 4, 2
@@ -133,25 +131,6 @@ def test_learning_lowers_the_energy_and_is_reproducible():
     assert first.energy[-1] < 0.6 * first.energy[0]  # two of seven numbers are noise
     pairs = zip(first.network.weights, again.network.weights, strict=True)
     assert all(a.tobytes() == b.tobytes() for a, b in pairs)
-
-
-@pytest.mark.parametrize("motor", [0, 2])
-def test_the_motor_prediction_learns_a_repeated_action(motor):
-    episodes = sines(13, motor)
-    for t in episodes if motor else ():
-        t.commands[:, 0] = np.sin(0.4 * np.arange(len(t.commands)))
-    how, rng = schedule(epochs=30, iterations=20), np.random.default_rng(0)
-    trained = train(episodes[:12], np.arange(5), CHANGES, 32, 20, how, rng)
-    network, (episode, c, predicted) = trained.network, (episodes[12], trained.network.at_rest(1), [])
-    assert network.motor == motor
-    for x, u in zip(episode.senses, episode.commands, strict=True):
-        step = network.follow(c, u[None], x[None], np.ones((1, len(x)), np.float32))
-        c = step.traces
-        predicted.append(step.expected[0, 5:])
-    if motor:
-        told = episode.commands[:, :2]
-        error = np.mean((np.array(predicted) - told) ** 2, axis=0) / told.var(axis=0)
-        assert error[0] < 0.5 < 0.8 < error[1]  # the second action is noise
 
 
 def test_a_bit_that_was_seen_long_ago_is_recalled():
@@ -253,15 +232,3 @@ def test_recall_is_in_the_units_of_the_stream_and_better_than_standing_still(asm
 def test_a_cue_that_cannot_be_recalled_from_is_refused(asm, rows, steps, message):
     with pytest.raises(ValueError, match=message):
         recall(asm, rows, steps)
-
-
-def test_evidence_for_a_skill_adds_up_and_is_forgotten():
-    rng = np.random.default_rng(0)
-    L, units, state = (rng.normal(size=(4, n)).astype(np.float32) for n in (2, 3, 5))
-    W_K, b_K = rng.normal(size=(2, 8)).astype(np.float32), rng.normal(size=2).astype(np.float32)
-    p = certainty(np.hstack([units, state]), W_K, b_K)
-    drive = np.hstack([units, state]) @ W_K.T + b_K
-    np.testing.assert_allclose(p, np.exp(drive) / np.exp(drive).sum(axis=1, keepdims=True), atol=1e-5)
-    np.testing.assert_allclose(add_up(L, units, state, W_K, b_K), KEPT * L + np.log(p + 1e-6), atol=1e-4)
-    alone = [add_up(L, units, s, W_K[:, :3].copy(), b_K) for s in (state, -state)]
-    np.testing.assert_array_equal(*alone)
