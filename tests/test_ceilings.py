@@ -9,8 +9,8 @@ import pytest
 
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.events import EXCUSED, Excuses
+from asm_gym.detection.evidence import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.detection.evidence_detection import EvidenceDetection
-from asm_gym.detection.tails import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.episode import EpisodeLabel
 from asm_gym.monitors import ceilings, make_monitor
 from asm_gym.monitors.ceilings import learn_ceilings

@@ -21,7 +21,17 @@ from asm_gym.detection import (
 )
 from asm_gym.detection.conformal import MINUTE
 from asm_gym.detection.detector import USUAL, habituate, usual_levels
-from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, Evidence, accumulated, no_evidence, pool
+from asm_gym.detection.evidence import (
+    CONTEXT_GAIN,
+    POWER,
+    TAIL_INDEX,
+    Evidence,
+    accumulated,
+    no_evidence,
+    pool,
+    whitening,
+    worst_case,
+)
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
@@ -30,8 +40,6 @@ from asm_gym.detection.repetition import (
     evidence_steps,
     repeated,
 )
-from asm_gym.detection.tails import TAIL_INDEX, worst_case
-from asm_gym.detection.whitening import whitening
 from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
 

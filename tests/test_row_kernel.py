@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, pool, strength
+from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, bounded, pool, strength
 from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps
-from asm_gym.detection.whitening import bounded
 from asm_gym.memory.energy import activate
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
 from asm_gym.memory.state import UNSURE, MemoryState

@@ -1,6 +1,6 @@
 """The detector: from a model's errors to one number that a threshold can be set on.
 
-    ε_t/σ_t → whitened, bounded → evidence → ratios → pooled s_t      see ``whitening``, ``evidence``, ``tails``
+    ε_t/σ_t → whitened, bounded → evidence → ratios → pooled s_t      see ``evidence``
     value      s_t / ŝ(c_t)
     log ŝ_t = min(max(w c_t + b, l), h)          Δw ∝ (τ - [log s_t < w c_t + b]) c_tᵀ
 
@@ -24,9 +24,20 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Floats, ModelOutput
-from asm_gym.detection.evidence import CONTEXT_GAIN, POWER, TINY, Evidence, accumulated, no_evidence, pool, strength
-from asm_gym.detection.tails import TAIL_INDEX, worst_case
-from asm_gym.detection.whitening import bounded, whitening
+from asm_gym.detection.evidence import (
+    CONTEXT_GAIN,
+    POWER,
+    TAIL_INDEX,
+    TINY,
+    Evidence,
+    accumulated,
+    bounded,
+    no_evidence,
+    pool,
+    strength,
+    whitening,
+    worst_case,
+)
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 GAINS = (0.8, 0.2, 0.05)

@@ -1,13 +1,19 @@
-"""Evidence: whitened errors accumulated over a short while, at several time scales.
+"""Evidence: whitened errors accumulated over a short while, each relative to its worst in nominal episodes.
 
-    evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0
+    whitened   e_t = M ε_t/σ_t,   M = ((1 - λ) C + λ tr(C)/X I)^(-½),   C = E[(ε/σ)(ε/σ)ᵀ] over nominal steps
+    bounded    ẽ_i = e_i / √(1 + e_i²/ν²)                               |ẽ_i| < ν, however large e_i
+    evidence   w_t = (1 - a) w_{t-1} + a ẽ_t,   w_0 = 0                 for each of several gains a
                v_i = w_i² (2 - a) / (a (1 - (1 - a)^{2t}))              nominal mean 1 for white errors, for every t
-    pooled     s_t = (Σ_i r_i^p)^(1/p)                                  r_i: v_i against its worst, see ``tails``
+    ratios     r_i = (v_i/q_i)^κ_i                                      q_i: v_i stays below it in 90 % of episodes
+    pooled     s_t = (Σ_i r_i^p)^(1/p)
 
-A large p lets the most surprising error decide, and several add up. ``accumulated`` serves to fit; in use the compiled
+Beyond q the maxima of episodes fall off as v^(-1/ξ), and κ = min(1, ξ_0/ξ) makes equal ratios equally rare. Where hours
+of healthy operation set q (``ceilings``), it is a quantile of 98 % and κ goes by a smaller ξ_0; ξ stays as learned. A
+large p lets the most surprising error decide, and several add up. ``accumulated`` serves to fit; in use the compiled
 step of ``detector`` does the same.
 
-Source: Lowry et al. 1992 (multivariate EWMA chart, its exact variance at start-up).
+Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a t distribution); Lowry et al.
+1992 (multivariate EWMA chart, its exact variance at start-up); Hill 1975 (index of a tail).
 """
 
 from __future__ import annotations
@@ -19,10 +25,42 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Array, Floats
+from asm_gym.memory.linear import check_inputs, gram
 
 POWER = 8  # p
 CONTEXT_GAIN = 0.2  # weight of the newest row in the running mean of the context
 TINY = float(np.finfo(np.float64).tiny)
+
+TAIL_INDEX = 0.3  # ξ_0: a ratio falls off as probability to this power
+NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays below q
+HOURS_TAIL_INDEX, HOURS_QUANTILE = 0.2, 0.98  # the same two where hours of healthy operation set q
+FEWEST_EPISODES = 100  # that such a quantile needs
+TAIL_PRIOR_COUNT = 10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
+SMALLEST = 1e-9  # lower bound of q
+LEAST_SHARE = 1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
+
+
+def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
+    """Return the symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) of nominal rows white.
+
+    Above a ``shrinkage`` λ of 0 constant channels and copies of channels are no trouble. Raises ValueError where X is
+    too large.
+    """
+    check_inputs(errors.shape[1])
+    exact = np.asarray(errors, np.float64)
+    covariance = gram(exact) / len(exact)  # (X, X)
+    scale = float(np.trace(covariance)) / len(covariance)
+    target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
+    values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
+    matrix: Floats = (vectors / np.sqrt(values)) @ vectors.T
+    return matrix
+
+
+def bounded(errors: Array, bound: float) -> Floats:
+    """Return the errors, none beyond ν = ``bound`` standard deviations."""
+    exact = np.asarray(errors, np.float64)
+    pulled: Floats = exact / np.sqrt(1.0 + (exact / bound) ** 2)
+    return pulled
 
 
 class Evidence(NamedTuple):
@@ -68,3 +106,20 @@ def pool(ratios: Array) -> tuple[Floats, Floats]:
     total = powers.sum(axis=1, keepdims=True)
     pooled = greatest * total ** (1.0 / POWER)
     return pooled[:, 0], pooled * (powers / np.maximum(total, TINY))
+
+
+def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[Floats, Floats]:
+    """Return q and κ (…) by ξ_0 from the maxima of N nominal episodes (N, …)."""
+    ceiling = ceilings(maxima, NOMINAL_QUANTILE)
+    beyond = np.log(np.maximum(maxima / ceiling, 1.0))
+    total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
+    common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count
+    index = (total + TAIL_PRIOR_COUNT * common) / (count + TAIL_PRIOR_COUNT)
+    return ceiling, tail_index / np.maximum(index, tail_index)
+
+
+def ceilings(maxima: Array, quantile: float) -> Floats:
+    """Return q (…): a quantile of the maxima of N nominal episodes (N, …)."""
+    found = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
+    least: Floats = np.maximum(found, LEAST_SHARE * np.median(found))
+    return least

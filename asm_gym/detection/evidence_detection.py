@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
-from asm_gym.detection.evidence import TINY, Evidence, pool
+from asm_gym.detection.evidence import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, TINY, Evidence, ceilings, pool
 from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps, repeated
-from asm_gym.detection.tails import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, ceilings
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
 

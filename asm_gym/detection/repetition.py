@@ -3,7 +3,7 @@
     p_i = P(x_t,i = x_{t-1,i}), counted separately after a repetition and after a change
     n_t = max(0, n_{t-1} + log ρ/p) after a repetition, max(0, n_{t-1} + log (1 - ρ)/(1 - p)) after a change,
           and at most n_0 + 24, so that a sense that works again is believed within about ten rows
-    r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 pooled with the ratios of ``tails``
+    r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 pooled with the ratios of ``evidence``
 
 n_t is the evidence for "it repeats itself with probability ρ" against "with p" (CUSUM). A sense that often repeats
 itself, because it is coarse or slower than the stream, counts for little; none counts for more than it reached in
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Floats
-from asm_gym.detection.tails import TAIL_INDEX
+from asm_gym.detection.evidence import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place, State
-from asm_gym.detection.whitening import whitening
+from asm_gym.detection.evidence import whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
 

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.events import Excuses
-from asm_gym.detection.tails import FEWEST_EPISODES
+from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.episode import Episode
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.neural_asm import NeuralASM

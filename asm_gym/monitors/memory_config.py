@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from asm_gym.detection.detector import BOUND, GAINS
-from asm_gym.detection.tails import TAIL_INDEX
+from asm_gym.detection.evidence import TAIL_INDEX
 from asm_gym.validation import check_number
 
 MOST_ITERATIONS = 1000

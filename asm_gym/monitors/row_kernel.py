@@ -21,10 +21,9 @@ from asm_gym.compilation import compiled, must_compile
 from asm_gym.detection.detector import _step
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.events import _step as _excuse
-from asm_gym.detection.evidence import POWER, TINY, Evidence
+from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, Evidence
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
 from asm_gym.detection.repetition import Repetition, repeated
-from asm_gym.detection.tails import TAIL_INDEX
 from asm_gym.memory.association import Association, normalised_errors
 from asm_gym.memory.energy import activate, infer, outward
 from asm_gym.memory.readout import add_up
