@@ -45,11 +45,7 @@ class Grip(NamedTuple):
 
 
 class CommandReadout:
-    """Makes actions of expected commands: kept in the space, and each gripper at one end of its range.
-
-    Args:
-        env: whose actions they are; its ``gripper_actions`` say which of them are grippers'.
-    """
+    """Makes actions of expected commands: kept in the space of ``env``, and each gripper at one end of its range."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._space: Any = env.action_space
@@ -161,7 +157,7 @@ class NeuralASMPolicy(StatefulPolicy):
 
     @classmethod
     def load(cls, path: str, env: gym.Env[Any, Any]) -> Self:
-        """With the memory in a file; raises as ``NeuralASM.load`` does too."""
+        """Return the policy of the memory in a file."""
         return cls(NeuralASM.load(path), env)
 
     def begin(self, observation: Any) -> ActingState:
@@ -176,7 +172,7 @@ class NeuralASMPolicy(StatefulPolicy):
 
 
 def require_motor(spec: StreamSpec, env: gym.Env[Any, Any]) -> int:
-    """How many numbers are commanded; raises ValueError unless the spec holds the environment's actions."""
+    """Return how many numbers are commanded; raise ValueError unless the spec holds the environment's actions."""
     space = env.action_space
     if not isinstance(space, spaces.Box):
         raise ValueError(f"a memory drives a Box action space, got {space}")

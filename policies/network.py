@@ -2,8 +2,7 @@
 
     a = squash(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s
 
-``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C). Only numpy is
-needed to act, and loading an agent runs no code that the file brings.
+``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C).
 """
 
 from __future__ import annotations
@@ -89,10 +88,8 @@ class NetworkPolicy:
         Raises:
             ValueError: sizes differ, or the agent was trained in another environment; the message names both.
         """
-        for what, size, space in (
-            ("observations", self.observation_size, env.observation_space),
-            ("actions", self.action_size, env.action_space),
-        ):
+        spaces_of = {"observations": env.observation_space, "actions": env.action_space}
+        for (what, space), size in zip(spaces_of.items(), (self.observation_size, self.action_size), strict=True):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
                 raise ValueError(f"{whose} takes {what} of {size} numbers, {env.unwrapped} has {space}")
         here = describe(env)
@@ -122,11 +119,7 @@ class NetworkPolicy:
         return np.clip(out, self._low, self._high).astype(np.float32), state
 
     def save(self, path: str | Path, **about: Any) -> None:
-        """Write the agent.
-
-        Args:
-            about: JSON-serialisable; kept beside the weights.
-        """
+        """Write the agent, with what is said ``about`` it in JSON."""
         arrays = {"mean": self.mean, "scale": self.scale}
         for n, (W, b) in enumerate(self.layers):
             arrays |= {f"W{n}": W, f"b{n}": b}

@@ -31,9 +31,8 @@ class Begun(NamedTuple):
 class Hold:
     """Stay, and keep the grip, so that nothing is dropped.
 
-    An environment that can hold itself, as all of this package can, is told to: it stays under any controller and with
-    any wrapper in between. Each ``predict`` speaks for the next step, whatever action that is then given. In any other
-    environment a zero action is taken to mean "stay".
+    An environment that can hold itself, as all of this package can, is told to before each step, under any controller
+    and wrapper. In any other environment a zero action is taken to mean "stay".
 
     Args:
         env: one with a Box action space.

@@ -91,8 +91,7 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         kwargs: handed to the expert, for example ``style=Style(noise=0.1)``.
 
     Raises:
-        ValueError: an unknown name, a task without an expert, or an agent that was trained in another environment; the
-            message lists what exists, or what differs.
+        ValueError: an unknown name, a task without an expert, or an agent that was trained in another environment.
         FileNotFoundError: there is no such agent.
 
     Example:

@@ -65,11 +65,7 @@ def row_substeps(rate: int, control_freq: int) -> int:
 
 
 def make(task: TaskSpec, robots: tuple[str, ...], controller: str, control_freq: int, reward_shaping: bool) -> Any:
-    """Return robosuite's environment; every limit of an episode is left to the caller.
-
-    Raises:
-        ValueError: an unknown controller, or one that does not know the robot.
-    """
+    """Return robosuite's environment; raise ValueError for a controller that is unknown or does not fit the robot."""
     robosuite = import_robosuite()
     check_choice("controller", check_text("controller", controller), CONTROLLERS)
     unknown = [robot for robot in robots if robot not in IK_ROBOTS]
@@ -104,7 +100,7 @@ def reseed(env: Any, rng: np.random.Generator) -> None:
 
 
 def choose_object(env: Any, task: TaskSpec) -> None:
-    """Draws the object of the next episode, where the task has a choice.
+    """Draw the object of the next episode, where the task has a choice.
 
     Robosuite would draw from the order of a set of strings, which differs from process to process.
     """

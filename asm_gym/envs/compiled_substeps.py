@@ -195,14 +195,11 @@ def run(
 
 @compiled
 def sense(sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Floats, row: Floats) -> None:
-    """Turn standard normal draws into noisy readings, in place.
+    """Turn standard normal draws (M,) in ``row`` into readings with ``noise`` (M,).
 
     Args:
-        sources: arrays that the arms' sensors read.
-        where: (P, 2) of each number of the arms its source and its index there.
+        sources, where: arrays that the arms' sensors read; (P, 2) each number's source and its index there.
         beside: (M - P,) true values of the other numbers.
-        noise: (M,) standard deviations.
-        row: (M,) standard normal draws; overwritten by the readings.
     """
     for n in range(len(row)):
         value = sources[where[n, 0]][where[n, 1]] if n < len(where) else beside[n - len(where)]
@@ -211,17 +208,8 @@ def sense(sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Float
 
 @compiled
 def quantise(row: Floats, steps: Floats, carried: Ints, stream: NDArray[np.float32]) -> tuple[bool, bool]:
-    """Round a row to the sensors' resolution in place, and write its stream.
-
-    Args:
-        row: (M,) readings.
-        steps: (M,) resolutions; 0 for none.
-        carried: (D,) indices of the numbers that the stream carries.
-        stream: (D,) written.
-
-    Returns:
-        Whether the row and the stream are finite in single precision.
-    """
+    """Round a row (M,) in place to resolutions ``steps`` (M,), 0 for none, and write its numbers ``carried`` (D,) into
+    the stream (D,); return whether row and stream are finite in single precision."""
     row_finite = stream_finite = True
     for n in range(len(row)):
         if steps[n] > 0.0:

@@ -27,21 +27,16 @@ class _Entry:
 
 
 class SimulatorEdits:
-    """Nominal values of everything that is edited now.
-
-    Each change recomputes the entry from its nominal value, so that edits of one number compose, whichever begins or
-    ends first, and nothing is left of them, not even rounding.
-    """
+    """Nominal values of everything that is edited now, from which each change recomputes an entry."""
 
     def __init__(self) -> None:
         self._entries: dict[tuple[int, str], _Entry] = {}
 
     @contextmanager
     def edit(self, array: NDArray[Any], *indices: Any) -> Iterator[Callable[[Change], None]]:
-        """Edit entries of an array alike while the block runs; yields a function that sets the change of their values.
+        """Edit entries of an array alike while the block runs; yield a function that sets the change of their values.
 
-        Args:
-            indices: two parties must name one entry in the same way.
+        Two parties must name one entry in the same way.
         """
         keys = [(array.__array_interface__["data"][0], repr(index)) for index in indices]
         party = object()

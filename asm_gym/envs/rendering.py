@@ -23,14 +23,10 @@ _live: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 class OffscreenRenderer:
-    """Pictures without a display; follows a model's replacement.
+    """Pictures of ``width`` by ``height`` pixels without a display; follows a model's replacement.
 
     OpenGL comes from EGL, or from OSMesa where the environment variable ``MUJOCO_GL`` says ``osmesa``. Shadows,
     reflections and multisampling are off: on a CPU they cost three times the rest.
-
-    Args:
-        camera: a camera of the model.
-        width, height: the size of a picture [pixels].
     """
 
     def __init__(self, camera: str, width: int, height: int) -> None:
@@ -43,12 +39,7 @@ class OffscreenRenderer:
         self._options.geomgroup[0] = 0  # collision shapes
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Return a picture (height, width, 3) uint8.
-
-        Raises:
-            ValueError: the model has no such camera.
-            RuntimeError: this machine has no OpenGL.
-        """
+        """Return a picture (height, width, 3) uint8; raise RuntimeError where this machine has no OpenGL."""
         self._camera.fixedcamid = camera_id(model, self.camera)
         if self._model is not model:
             self._open(model)
@@ -85,13 +76,9 @@ class OffscreenRenderer:
 
 
 class Window:
-    """A window that shows a copy of the simulation's state in real time; a model's replacement opens a new one.
+    """A window that shows a copy of the simulation's state every ``dt`` [s]; a model's replacement opens a new one.
 
     Once its user has closed it, it stays closed.
-
-    Args:
-        camera: where it looks from at first.
-        dt: real time between two states [s].
     """
 
     def __init__(self, camera: str, dt: float) -> None:
@@ -101,11 +88,7 @@ class Window:
         self._next = 0.0
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Bring the window up to date, and wait until the next state is due.
-
-        Raises:
-            RuntimeError: there is no display to open a window on.
-        """
+        """Bring the window up to date and wait until the next state is due; raise RuntimeError without a display."""
         if self._model is not model:
             self._open(model, data)
         elif self._viewer.is_running():
@@ -159,11 +142,7 @@ def close_at_exit(renderer: Any) -> None:
 
 
 def camera_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the id of a camera.
-
-    Raises:
-        ValueError: there is none of this name; the message lists those that exist.
-    """
+    """Return the id of a camera; raise ValueError, listing those that exist, where there is none of this name."""
     found = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name))
     if found < 0:
         known = (str(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i)) for i in range(model.ncam))
@@ -172,11 +151,7 @@ def camera_id(model: mujoco.MjModel, name: str) -> int:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """Return an OpenGL context that needs no display.
-
-    Raises:
-        RuntimeError: there is none to be had on this machine.
-    """
+    """Return an OpenGL context that needs no display; raise RuntimeError where this machine has none."""
     # PyTorch's CUDA builds bring triton, whose LLVM ends the process when it is loaded after Mesa's; before it is fine.
     if find_spec("triton") is not None:
         with suppress(ImportError):

@@ -32,13 +32,11 @@ class RobosuiteEnv(SteppedEnv):
     The observation is what the robot's own sensors report of its configuration and motion, noise included, followed by
     the task's objects. ``info`` holds on reset and on every step:
 
-    - ``stream`` (D,) float32: one row of the sensorimotor stream that ``stream_spec`` names;
+    - ``stream`` (D,) float32: one row of the sensorimotor stream that ``stream_spec`` names; where the stream runs
+      faster than control, a step's last row, and ``streams`` (n, D) all of them;
     - ``success``: whether the task is solved now;
     - ``contact_force``: the largest net contact force on an arm within the step [N];
-    - ``streams`` (n, D) float32: where the stream runs faster than control, its rows since the last step; ``stream`` is
-      the last of them (not on reset);
-    - ``unstable``: the simulation diverged, which ends the episode as truncated. Its last stream is then NaN, its last
-      observation 0.
+    - ``unstable``: the simulation diverged: the episode is truncated, its last stream NaN, its last observation 0.
 
     Args:
         task: a name in ``asm_gym.tasks.TASKS``.
@@ -50,16 +48,14 @@ class RobosuiteEnv(SteppedEnv):
         horizon: control steps before truncation; the task's own where None.
         reward_shaping: dense reward where True, for success alone where False.
         terminate_on_success: end the episode (``terminated``) when the task is solved.
-        stream: channel groups that make up the stream, of ``joint torque hand wrench gripper action contact object``;
-            empty for none.
-        stream_freq: rows of the stream a second [Hz]; a multiple of ``control_freq`` that divides 500. Means and peaks
-            are then taken since the last row. None for one row a control step.
+        stream: channel groups of ``joint torque hand wrench gripper action contact object``; empty for no stream.
+        stream_freq: rows of the stream a second [Hz], a multiple of ``control_freq`` that divides 500; None for one row
+            a control step.
         sensor_noise: scales the noise of every channel; 0 for exact readings, in steps of no resolution.
         camera, render_size: what ``render`` shows, and its (height, width) [pixels].
 
     Raises:
-        ValueError: an unknown task, robot, controller, render mode, channel group or camera, the wrong number of
-            robots, or a rate that does not fit.
+        ValueError: an unknown name, the wrong number of robots, or a rate that does not fit.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012
@@ -157,11 +153,7 @@ class RobosuiteEnv(SteppedEnv):
 
     @property
     def stream_freq(self) -> int:
-        """Rows of the stream a second [Hz]; may be set between episodes.
-
-        Raises:
-            ValueError: a rate that does not fit physics or control; the message lists those that do.
-        """
+        """Rows of the stream a second [Hz]; may be set between episodes, to a rate that fits physics and control."""
         return PHYSICS_FREQ // self._row_substeps
 
     @stream_freq.setter
@@ -170,11 +162,7 @@ class RobosuiteEnv(SteppedEnv):
         self._build_spaces()
 
     def stream_spec_at(self, rate: int) -> StreamSpec:
-        """Return ``stream_spec`` as it would be at another rate [Hz]; nothing is changed.
-
-        Raises:
-            ValueError: a rate that does not fit physics or control.
-        """
+        """Return ``stream_spec`` as it would be at another rate [Hz]; raise ValueError for one that does not fit."""
         substeps = backend.row_substeps(rate, PHYSICS_FREQ // self.substeps)
         return replace(self.stream_spec, dt=substeps / PHYSICS_FREQ)
 
@@ -182,9 +170,8 @@ class RobosuiteEnv(SteppedEnv):
         """Start an episode.
 
         Args:
-            seed: makes the episode exact: same seed, same episode to the last bit, whatever ran before. Where a task
-                draws the shapes of its objects, they are drawn anew, which an unseeded reset does not: it goes on with
-                the same generator and keeps the shapes.
+            seed: makes the episode exact, to the last bit and whatever ran before. Without one the generator goes on,
+                and objects keep the shapes that some tasks draw.
             options: none are known.
 
         Raises:
@@ -261,11 +248,7 @@ class RobosuiteEnv(SteppedEnv):
 
     @property
     def stream_spec(self) -> StreamSpec:
-        """Names the numbers in ``info["stream"]``.
-
-        Raises:
-            AttributeError: there is no stream.
-        """
+        """Names the numbers in ``info["stream"]``; raises AttributeError where there is none."""
         if self._senses.stream_spec is None:
             raise AttributeError("this environment was made with stream=(), so it has no stream")
         return self._senses.stream_spec

@@ -24,11 +24,7 @@ Part = tuple[Any, str]
 
 
 def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Return one robot for each of the task's arms; one name stands for as many as the task takes.
-
-    Raises:
-        ValueError: an unknown robot, or the wrong number of them.
-    """
+    """Return one robot for each of the task's arms; one name stands for all. Raise ValueError for any others."""
     if robot is not None and not isinstance(robot, Sequence):
         raise ValueError(f"robot must be a name or a sequence of names, got {short_repr(robot)}")
     names = (robot or "Panda",) * task.arms if robot is None or isinstance(robot, str) else tuple(robot)
@@ -161,11 +157,7 @@ def _padded(rows: list[Ints]) -> Ints:
 
 
 def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[Chain, ...]:
-    """Return the kinematic chain of each arm; an arm on a moving base has none.
-
-    Args:
-        noise: scale of the sensors' noise.
-    """
+    """Return the kinematic chain of each arm, with sensors of ``noise``; an arm on a moving base has none."""
     data, found = mujoco.MjData(model), []
     for robot, _ in parts:
         data.qpos[robot._ref_joint_pos_indexes] = 0.0
@@ -201,8 +193,7 @@ class NominalDynamics:
     Whoever edits masses in the live model edits the world, and not the robot's knowledge of itself.
 
     Args:
-        model: the live one.
-        views: of the model and its data.
+        model, views: the live one, and its arrays.
         robots: (R,) the bodies of the robots.
     """
 
@@ -238,10 +229,7 @@ def force_behind(
     """Return the link on which a force would explain external torques (J,) [N m] best, and that force (3,) [N].
 
     For a force F on link k, τ = J_kᵀ F, and no joint beyond k is loaded: of all links the one that leaves the least.
-
-    Args:
-        motors: (J,) actuators of the arms' joints, from the base on.
-        dofs: (J,) their places among the velocities.
+    The arms' joints are those of actuators ``motors`` (J,), with ``dofs`` (J,) among the velocities.
     """
     best: tuple[float, str, NDArray[np.float64]] = (np.inf, "", np.zeros(3))
     jacobian = np.zeros((3, model.nv))

@@ -82,9 +82,7 @@ class Senses:
     ) -> Reading:
         """Read every sensor once, over the time since the last row of the stream: noise, faults, resolution.
 
-        Args:
-            action: (A,) as commanded.
-            within_step: objects keep their last pose, if the stream does not carry them.
+        Within a step, objects keep their last pose if the stream does not carry them.
         """
         if faults or self._needs_objects or not within_step:
             self._object_poses = np.concatenate([*objects.read(), np.zeros(0)])

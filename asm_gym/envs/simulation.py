@@ -198,12 +198,8 @@ class Simulation:
         return found
 
     def sense(self, beside: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
-        """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began.
-
-        Args:
-            beside: (M - P,) true values of what the arms' P sensors do not read.
-            noise: (M,) standard deviations.
-        """
+        """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began; see
+        ``compiled_substeps.sense``."""
         if self._done > self._row_began:
             self._add_up(self._done - self._row_began)
         row = rng.standard_normal(len(noise))

@@ -81,11 +81,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             self._action = self._actions.resting(self.simulation, self._action)
 
     def command(self, action: NDArray[np.float32]) -> None:
-        """From within a hook: command another action for the rest of the control step, efference copy included.
-
-        Raises:
-            ValueError: a wrong shape, or an action that is not finite.
-        """
+        """From within a hook: command another action (A,) for the rest of the control step, efference copy included."""
         self._command(self._actions.checked(action))
 
     def _command(self, action: NDArray[np.float32]) -> None:
@@ -107,13 +103,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._actions.scaled(action)
 
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """Return the action that moves the arms' joints by ``turns`` from where they are, as nearly as one step can.
-
-        Args:
-            turns: [rad] for every joint of every arm, from the base on.
-
-        Returns:
-            (A,) in [-1, 1]; 0 for grippers.
+        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.
 
         Raises:
             ValueError: the controller is neither OSC_POSE nor JOINT_POSITION.
@@ -121,11 +111,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._actions.turning(self.simulation, np.asarray(turns, np.float64))
 
     def measure(self) -> NDArray[np.float64]:
-        """Read every sensor once, over the time since the last row of the stream: noise, faults, resolution.
-
-        Returns:
-            (M,) as ``measured_spec`` names it.
-        """
+        """Return the readings (M,) of ``measured_spec`` over the time since the last row, with noise and faults."""
         return self._read().row
 
     def _read(self, within_step: bool = False) -> Reading:

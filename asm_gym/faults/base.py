@@ -195,11 +195,7 @@ def along(direction: Vector3) -> Floats:
 
 
 def body_id(env: RobosuiteEnv, name: str) -> int:
-    """Return the body called ``name``.
-
-    Raises:
-        ValueError: there is none; the message lists those that exist.
-    """
+    """Return the body called ``name``; raise ValueError, listing those that exist, where there is none."""
     model = env.simulation.model
     # By a table of our own: asked for what is no string, MuJoCo ends the process.
     bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i): i for i in range(1, model.nbody)}

@@ -116,11 +116,7 @@ KINDS: Registry[Kind] = Registry(
 
 
 def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Return kinds by name, in order; ``development`` and ``test`` stand for those of the group.
-
-    Raises:
-        ValueError: an unknown name; the message lists what exists.
-    """
+    """Return kinds by name, in order; ``development`` and ``test`` stand for those of the group."""
     for name in names:
         if name not in GROUPS:
             check_choice("kind of fault", name, KINDS)
@@ -175,22 +171,14 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
 
 
 def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:
-    """Return the fault of one kind and severity for the episode with this seed.
-
-    Raises:
-        ValueError: an unknown kind or severity; the message lists what exists.
-    """
+    """Return the fault of one kind and severity for the episode with this seed."""
     make = KINDS.find(kind)
     check_choice("severity", severity, SEVERITIES)
     return make(draw(env, onset, seed), SEVERITIES.index(severity))
 
 
 def harmless_variation(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> Fault:
-    """Return one harmless variation for the episode with this seed.
-
-    Raises:
-        ValueError: an unknown kind; the message lists what exists.
-    """
+    """Return one harmless variation for the episode with this seed."""
     check_choice("harmless variation", kind, HARMLESS)
     return HARMLESS[kind](draw(env, onset, seed))
 

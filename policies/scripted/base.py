@@ -22,19 +22,16 @@ _STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 
 @dataclass(frozen=True)
 class Style:
-    """How an expert varies; each is drawn anew for every episode.
-
-    Args:
-        noise: standard deviation of the action noise, in action units; correlated over about 0.2 s, as a hand's is.
-        speed: hand speed relative to the expert's usual one.
-        speed_spread: standard deviation of the speed between episodes.
-        spread: standard deviation of way-points between episodes [m].
-    """
+    """How an expert varies; each is drawn anew for every episode."""
 
     noise: float = 0.05
+    """Standard deviation of the action noise [action units]; correlated over about 0.2 s, as a hand's is."""
     speed: float = 1.0
+    """Hand speed relative to the expert's usual one."""
     speed_spread: float = 0.08
+    """Standard deviation of the speed between episodes."""
     spread: float = 0.01
+    """Standard deviation of way-points between episodes [m]."""
 
     def __post_init__(self) -> None:
         for name in ("noise", "speed_spread", "spread"):
@@ -154,11 +151,8 @@ class Expert(StatefulPolicy):
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:
     """Whether fingers that were told to close or open ``since`` steps ago have done so.
 
-    Args:
-        velocity: of the gripper's joints.
-        since: control steps.
-        usual: how many steps fingers that slide take. Those that turn, in linkages, take several times as long, more
-            where they close on little, and are waited for until they stand still.
+    Those that slide take the ``usual`` steps. Those that turn, in linkages, take several times as long, and are waited
+    for until they stand still.
     """
     if velocity.size <= 2:
         return since >= usual
@@ -166,10 +160,6 @@ def has_settled(velocity: Vector, since: int, usual: int) -> bool:
 
 
 def over_first(position: Vector, target: Vector) -> Vector:
-    """Return how much higher (3,) than its target a careful hand goes beside it, lest a finger comes down on it.
-
-    Args:
-        position, target: (3,) of the hand [m].
-    """
+    """Return how much higher (3,) than its target [m] a careful hand goes beside it, lest a finger comes down on it."""
     astray = float(np.linalg.norm((position - target)[:2]))
     return np.array([0.0, 0.0, np.clip(4 * (astray - _OVER), 0.0, 0.06)])

@@ -70,10 +70,7 @@ class CarryScene(NamedTuple):
 
 
 class CarryExpert(Expert):
-    """An expert that carries objects one after the other; the plan of its state is the task at hand, None at the end.
-
-    The arguments are those of ``Expert``.
-    """
+    """An expert that carries objects one after another; the plan of its state is the present task, None at the end."""
 
     pace = 0.55
 
@@ -175,11 +172,8 @@ class CarryExpert(Expert):
         return np.array([*task.place[:2], max(task.place[2], at[2] - down)])
 
     def at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
-        """Return the task with one of its two grasps and one of its headings: those that leave the last joint room.
-
-        Of a hand that points down, the last joint turns back with the hand and onwards with the arm's bearing. Of
-        grasps that leave room enough, the one is chosen that turns it least.
-        """
+        """Return the task with one of its two grasps and headings: those with room for the last joint, which turns back
+        with a hand that points down and onwards with the arm's bearing; of several, those that turn it least."""
         if task.closing is None:
             return task
         thing = self.read.pose(observation, task.name)
@@ -204,10 +198,7 @@ class CarryExpert(Expert):
         return task._replace(closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ())
 
     def _turning(self, observation: Any, hand: Vector, target: Vector) -> Vector:
-        """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops.
-
-        The shortest turn may lead there where it is nearly half a one.
-        """
+        """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops."""
         down = gripping(hand, None)
         left = wrapped(yaw(target[:, 1]) - yaw(down[:, 1]))
         if abs(left) <= _AHEAD:

@@ -35,11 +35,7 @@ class _Hardware(NamedTuple):
         return grip
 
     def held(self, turned: float) -> Vector:
-        """Return the hand (3, 3) on the handle of the closed door.
-
-        Its y axis points down: pressing the handle turns it back. The other way up it turns further, until the Panda's
-        last joint meets its stop.
-        """
+        """Return the hand (3, 3) on the handle of the closed door, its y axis down: else a joint meets its stop."""
         z, y = -self.normal, np.array([0.0, 0.0, -1.0])
         held: Vector = about(self.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
         return held
@@ -127,10 +123,7 @@ class DoorExpert(Expert):
 
     @staticmethod
     def _rolling(hardware: _Hardware, hand: Vector, facing: Vector) -> Vector:
-        """Return where (3, 3) to turn first on the way to ``facing``: rolled a little, the way back of pressing.
-
-        The shortest turn is nearly half a one, and may lead any way round.
-        """
+        """Return where (3, 3) to turn first on the way to ``facing``, whose shortest way may lead any way round."""
         pressed = hardware.held(_TURNED)
         left = _roll(hand, pressed) + _roll(pressed, facing)
         first: Vector = facing @ about(UP, left - np.clip(left, -_ROLL, _ROLL))
