@@ -19,11 +19,11 @@ from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.options import Options, option
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Options):
     """The recordings that monitors are judged on."""
 
     part: tuple[str, ...] = option(tuple(PARTS), least=1, known=PARTS)
@@ -34,11 +34,9 @@ class Args:
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     out: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of the corpus."""
-    quick: bool = False
-    """To see that everything runs."""
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if self.rounds > ROUNDS:
             raise ValueError(f"rounds must be at most {ROUNDS}, got {self.rounds}")
 
@@ -57,13 +55,12 @@ def contents(corpus: Corpus) -> Table:
 
 def make(args: Args, console: Console) -> None:
     """Record what is missing, part by part, and print the contents."""
-    total = 1 if args.quick else ROUNDS
+    sources, total = (QUICK, 1) if args.quick else (PARTS, ROUNDS)
     with claimed(args.out, "recordings.json", {"corpus": VERSION, "quick": args.quick}):
         for part in args.part:
             for number in range(min(args.rounds, total)):
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
-                    sources = (QUICK if args.quick else PARTS)[part]
-                    record_corpus(args.out, sources, number, total, ParallelConfig.named(args.workers), progress)
+                    record_corpus(args.out, sources[part], number, total, ParallelConfig.named(args.workers), progress)
     console.print(ConsoleTable(contents(Corpus.open(args.out))))
 
 

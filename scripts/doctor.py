@@ -71,34 +71,29 @@ def python() -> Check:
 
 def package(name: str) -> Check:
     """Check the installed version of a package against the range that asm-gym asks for."""
-    extra = BROUGHT_BY.get(name.replace("-", "_"))
+    extra = BROUGHT_BY.get(name.replace("-", "_"), "")
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
         if name in NOT_ON_3_13 and sys.version_info >= (3, 13):
             return Check(name, f"not installed: {NOT_ON_3_13[name]} for Python 3.13", OLDER_PYTHON)
-        remedy = f"python -m pip install 'asm-gym[{extra}]'" if extra else REINSTALL
-        if name == "robosuite":  # it brings evdev, which is compiled
-            remedy = f"{COMPILER}, then {remedy}"
+        compiler = f"{COMPILER}, then " if name == "robosuite" else ""  # it brings evdev, which is compiled
+        remedy = f"{compiler}python -m pip install 'asm-gym[{extra}]'" if extra else REINSTALL
         return Check(name, "not installed", remedy, needed=not extra)
     asked = [r for r in map(Requirement, metadata.requires("asm-gym") or []) if r.name == name]
-    applies = [r for r in asked if not r.marker or r.marker.evaluate({"extra": extra or ""})]
-    wanted = applies[0].specifier if applies else SpecifierSet()
+    wanted = next((r.specifier for r in asked if not r.marker or r.marker.evaluate({"extra": extra})), SpecifierSet())
     if wanted.contains(version, prereleases=True):
         return Check(name, version)
     return Check(name, f"{version}, but needs {wanted}", f"python -m pip install '{name}{wanted}'", needed=True)
 
 
-COMPILED = """
-from asm_gym.compilation import kept_in, must_compile
-from asm_gym.monitors.row_kernel import observe_rows
-print(int(must_compile(observe_rows)), kept_in(observe_rows) or "")
-"""
-
-
 def compiled_code() -> Check:
     """Check whether compiled code is kept, and whether there is some already."""
-    done = subprocess.run([sys.executable, "-c", COMPILED], capture_output=True, text=True, check=False)
+    code = (
+        "from asm_gym.compilation import kept_in, must_compile; from asm_gym.monitors.row_kernel import observe_rows;"
+        "print(int(must_compile(observe_rows)), kept_in(observe_rows) or '')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no error message"])[-1]
         return Check("compiled code", last, REINSTALL, needed=True)

@@ -25,7 +25,7 @@ from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.scoring import benchmark
 from asm_gym.evaluation.tables import ConsoleTable
 from asm_gym.faults import anywhere
-from asm_gym.faults.suite import HARMLESS, KINDS, SEVERITIES, kinds_of
+from asm_gym.faults.suite import HARMLESS, SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.corpus import VERSION, skill_files
@@ -73,7 +73,7 @@ class Args(Options):
         tuple(name for name in MONITORS if name != "memory_skill"), quick=_QUICK, least=1, check=check_monitor_name
     )
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
-    faults: tuple[str, ...] = option((), known=KINDS, metavar="KIND")
+    faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all; development or test for the halves of robosuite's."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """How bad each is."""
@@ -97,8 +97,6 @@ class Args(Options):
     """Folder of the run."""
     corpus: Path | None = option(None, metavar="FOLDER")
     """Judge the recordings of asm-gym corpus, all of its skills, faults and splits; nothing is recorded."""
-    window: float = option(WINDOW_S, check=partial(check_number, "window", above=0))
-    """A fault must be noticed this soon after its onset [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -187,7 +185,7 @@ def evaluate(args: Args, console: Console) -> None:
                 make_missing(make, trials, lambda trial: args.out / trial.label.path, workers, progress)
         with timed("fitting and judging") as progress:
             each = partial(parallel_map, parallel=workers, progress=progress)
-            how = args.false_alarm_rate, args.window, args.seed
+            how = args.false_alarm_rate, WINDOW_S, args.seed
             result = benchmark(args.out, files, args.monitors, *how, each)
         with timed("drawing"):
             details = json.loads(json.dumps(asdict(args), default=str))

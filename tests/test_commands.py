@@ -71,12 +71,6 @@ def test_an_unknown_option_is_refused(name, capsys):
     assert not refused.out
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_a_command_runs_as_a_module_too(name):
-    module = cli.module_of(name)
-    assert callable(module.main)
-
-
 def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     assert run("--help") == 0
@@ -184,6 +178,13 @@ def test_an_option_that_cannot_be_read_is_named(argv, named, capsys, monkeypatch
     assert named in " ".join(capsys.readouterr().err.split())
 
 
+def test_work_is_handed_the_options_and_returns_the_exit_code():
+    got = []
+    assert run("--count", "7", work=lambda args, console: got.append(args)) == 0
+    assert got == [Options(count=7)]
+    assert run(work=lambda args, console: command.BAD_NEWS) == 1
+
+
 def test_quick_changes_only_what_was_not_typed():
     def typed(*argv: str) -> Options:
         return command.parse("try", Options, argv)
@@ -192,18 +193,8 @@ def test_quick_changes_only_what_was_not_typed():
     quick = typed("x", "--quick", "--count", "100", "--sizes", "6", "8")
     assert (quick.count, quick.sizes, quick.hidden) == (100, (6, 8), 5)
     assert typed("--quick").sizes == (2,)
-
-
-def test_a_value_set_in_python_is_checked_too():
     with pytest.raises(ValueError, match="hidden must be at least 1, got 0"):
         Options(hidden=0)
-
-
-def test_work_is_handed_the_options_and_returns_the_exit_code():
-    got = []
-    assert run("--count", "7", work=lambda args, console: got.append(args)) == 0
-    assert got == [Options(count=7)]
-    assert run(work=lambda args, console: command.BAD_NEWS) == 1
 
 
 def test_the_signal_handler_of_a_caller_is_restored():

@@ -172,12 +172,6 @@ def test_commands_and_options_named_in_a_text_exist(page: Path, options: set[str
             assert set(re.findall(r"--[a-z][\w-]*", code)) <= options, f"{name(page)}: {code}"
 
 
-@pytest.mark.parametrize("wrong", ["asm-gym demo --no-such-option", "asm-gym no-such-command", "make no-such-target"])
-def test_a_wrong_command_is_found(wrong: str, monkeypatch: pytest.MonkeyPatch):
-    with pytest.raises(AssertionError):
-        check_command(wrong, monkeypatch)
-
-
 def anchors(path: Path) -> set[str]:
     """Return the anchors of a page's headings, as GitHub and MyST make them."""
     headings = re.findall(r"^#+ (.*)$", FENCE.sub("", path.read_text(encoding="utf-8")), re.M)

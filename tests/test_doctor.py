@@ -8,7 +8,6 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from importlib import metadata
 from types import SimpleNamespace
 from typing import Any
@@ -86,15 +85,6 @@ def test_the_first_backend_that_draws_is_taken_and_looked_for_once(
     assert dict(os.environ) == before
 
 
-def test_a_driver_that_hangs_or_an_unknown_one_draws_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def hang(*args: Any, **kwargs: Any) -> None:
-        raise subprocess.TimeoutExpired("python", kwargs["timeout"])
-
-    assert not graphics.draws_a_frame("no_such_backend")
-    monkeypatch.setattr(subprocess, "run", hang)
-    assert not graphics.draws_a_frame("egl")
-
-
 @pytest.mark.parametrize(("name", "version"), [("mujoco", "3.10.0"), ("mujoco", "3.2.9"), ("robosuite", "1.4.1")])
 def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name: str, version: str) -> None:
     machine(**{name: version})
@@ -104,16 +94,12 @@ def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name
     assert (check.needed, check.remedy) == (True, f"python -m pip install '{name}{wanted}'")
 
 
-@pytest.mark.parametrize(("version", "ok"), [("3.9.0", True), ("3.10.0", False), ("4.0.0", False)])
-def test_a_mujoco_of_another_package_is_refused_before_it_is_imported(
-    monkeypatch: pytest.MonkeyPatch, version: str, ok: bool
-) -> None:
-    monkeypatch.setattr(extras, "version", lambda name: version)
-    with nullcontext() if ok else pytest.raises(ImportError, match=f"got {version}: pip install 'mujoco<3.10'"):
+def test_a_mujoco_of_another_package_is_refused_before_it_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "version", lambda name: "3.9.0")
+    extras.check_mujoco()
+    monkeypatch.setattr(extras, "version", lambda name: "3.10.0")
+    with pytest.raises(ImportError, match=r"got 3\.10\.0: pip install 'mujoco<3.10'"):
         extras.check_mujoco()
-    bounds = [r for r in metadata.requires("asm-gym") or [] if r.startswith("mujoco")]
-    assert bounds
-    assert all(f"<{extras.MUJOCO_BELOW}" in bound for bound in bounds)
 
 
 def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(machine: Any) -> None:

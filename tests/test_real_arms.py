@@ -1,8 +1,7 @@
-"""The study of real arms, on files of the same shape, and on the recordings where they are."""
+"""The study of real arms, on files of the same shape."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,8 @@ import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.reproduce.real_arms import ARMS, FAULTS, NEWTONS, SLIP, Job, Piece, examined, jacobian, with_fault
+from asm_gym.scripts.reproduce.real_arms import FAULTS, NEWTONS, SLIP, Job, Piece, examined, jacobian, with_fault
 from tests.streams import pendulum_columns
-
-REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
-real = pytest.mark.skipif(not REAL.is_dir(), reason="ASM_GYM_REAL names no folder of recordings of real arms")
 
 
 def tiago(folder: Path, rows: int = 1500) -> Path:
@@ -93,14 +89,3 @@ def test_every_monitor_meets_the_same_faults(tmp_path):
     )
     assert one == other
     assert set(one) == {"step", "frozen", "slipped", "late", ""}
-
-
-@real
-@pytest.mark.parametrize("name", ARMS)
-def test_recordings_of_arms_are_streams_of_position_speed_and_effort(name):
-    if not (REAL / ARMS[name].place).exists():
-        pytest.skip(f"{ARMS[name].place} is not there")
-    episode = ARMS[name].episode(REAL)
-    assert {"position", "effort"} <= set(episode.spec.slices)
-    assert len({s.stop - s.start for s in episode.spec.slices.values()}) == 1
-    assert np.isfinite(episode.stream).all()

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 
 import gymnasium as gym
-import h5py
 import numpy as np
 import pytest
 import torch
@@ -15,14 +14,11 @@ from asm_gym.data.datasets import write_dataset
 from asm_gym.episode import Episode
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training import (
-    ACTOR_SHARE,
     Cloner,
     Plan,
     export,
     fill_buffer,
     make_learner,
-    standard_of,
-    standardised,
     train,
     warm_critic,
 )
@@ -75,17 +71,6 @@ def test_cloning_finds_the_experts_rule_and_an_anchor_keeps_it(env):
     assert np.abs(kept - actions).mean() < 0.3 * np.abs(moved - actions).mean()
 
 
-def test_the_exported_agent_acts_as_the_learner_does_on_standardised_observations(env):
-    learner = make_learner(env, 0)
-    mean, scale = standard_of(np.random.default_rng(0).normal(2.0, 3.0, (100, 3)).astype(np.float32))
-    agent = export(learner, mean, scale, env)
-    seen, _ = standardised(gym.make("Pendulum-v1"), mean, scale).reset(seed=3)
-    plain, _ = gym.make("Pendulum-v1").reset(seed=3)
-    np.testing.assert_allclose(seen, (plain - mean) / scale, rtol=1e-5)
-    np.testing.assert_allclose(agent.predict(plain)[0], learner.predict(seen, deterministic=True)[0], atol=1e-5)
-    assert agent.trained_in["env"] == "Pendulum-v1"
-
-
 def test_the_buffer_holds_the_demonstrations_and_which_of_them_were_cut_short(env):
     learner = make_learner(env, 0)
     (episode,) = linear_expert(1, steps=5)
@@ -107,11 +92,6 @@ def test_warming_the_critic_leaves_the_actor_as_it_is(env):
     warm_critic(learner, 5)
     for name, parameter in learner.policy.named_parameters():
         assert torch.equal(before[name], parameter) == (not name.startswith("critic"))
-    rates = [optimiser.param_groups[0]["lr"] for optimiser in (learner.actor.optimizer, learner.critic.optimizer)]
-    assert rates[0] == pytest.approx(ACTOR_SHARE * rates[1])
-    for q in learner.policy.critic.q_networks:
-        assert [type(layer).__name__ for layer in q] == ["Linear", "LayerNorm", "ReLU"] * 2 + ["Linear"]
-    assert len(learner.policy.critic.optimizer.param_groups[0]["params"]) == 2 * (3 * 2 + 2 * 2)
 
 
 def test_the_buffer_holds_the_action_that_was_executed():
@@ -145,39 +125,21 @@ def test_the_command_clones_an_expert(tmp_path):
     assert NetworkPolicy.load(tmp_path / "agent.npz").trained_in["robots"] == ["Panda"]
 
 
-@pytest.fixture(scope="module")
-def datasets(tmp_path_factory):
-    """Folders of Minari datasets: one of Door, and two that claim to be of Lift but are damaged or hold no streams."""
-    folder = tmp_path_factory.mktemp("datasets")
-    env = gym.make("Pendulum-v1")
+@pytest.mark.parametrize(("made_in", "message"), [("asm_gym/Door-v0", "Door-v0"), ("asm_gym/Lift-v0", "damaged")])
+def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(made_in, message, env, tmp_path, capsys):
     episodes = [replace(e, faults=np.zeros(len(e), bool)) for e in linear_expert(2)]
-    for name, env_id in (("door", "asm_gym/Door-v0"), ("damaged", "asm_gym/Lift-v0"), ("bare", "asm_gym/Lift-v0")):
-        write_dataset(folder / name, "asm_gym/pendulum-v0", episodes, env, {})
-        (data,) = (folder / name).rglob("metadata.json")
-        about = json.loads(data.read_text())
-        if name == "bare":
-            del about["stream_spec"]
-        about["env_spec"] = json.dumps(json.loads(about["env_spec"]) | {"id": env_id})
-        data.write_text(json.dumps(about))
-        data.with_name("SHA256SUMS").unlink()  # changed on purpose
-    env.close()
-    (damaged,) = (folder / "damaged").rglob("main_data.hdf5")
-    damaged.write_bytes(damaged.read_bytes()[:1000])
-    (bare,) = (folder / "bare").rglob("main_data.hdf5")
-    with h5py.File(bare, "a") as file:
-        for episode in file.values():
-            del episode["infos"]
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("name", "message"), [("door", "asm_gym/Door-v0"), ("damaged", "damaged"), ("bare", "holds no streams")]
-)
-def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(name, message, datasets, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert main(["train", "Lift", "--dataset", str(datasets / name), "--out", str(out)]) == 2
+    write_dataset(tmp_path / "data", "asm_gym/pendulum-v0", episodes, env, {})
+    (data,) = (tmp_path / "data").rglob("metadata.json")
+    about = json.loads(data.read_text())
+    about["env_spec"] = json.dumps(json.loads(about["env_spec"]) | {"id": made_in})
+    data.write_text(json.dumps(about))
+    data.with_name("SHA256SUMS").unlink()  # changed on purpose
+    if message == "damaged":
+        (recorded,) = (tmp_path / "data").rglob("main_data.hdf5")
+        recorded.write_bytes(recorded.read_bytes()[:1000])
+    assert main(["train", "Lift", "--dataset", str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
-    assert not out.exists()
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -21,12 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
-from asm_gym.evaluation.tables import Table
 from asm_gym.memory.energy import STEEPEST, STRIDE, infer
 from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
 from asm_gym.memory.traces import (
@@ -250,41 +248,30 @@ def _reached(how: str, weights: Weights, judged: Batch, epoch: int) -> Record:
     return {"epoch": epoch, "learned_by": how, "mse": 2 * local(weights, judged, ITERATIONS).error / numbers}
 
 
-def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Return angles over learning, by array and by inference steps; and errors."""
-    epochs = kit.by("epoch", checkpoints(config.epochs))
+def run(config: Config) -> Findings:
+    """Run every seed."""
+    records = kit.together(kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config))
+    epochs = checkpoints(config.epochs)
+    before, counts = kit.by("epoch", epochs), kit.by("iterations", config.iterations)
     targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
-    learning = {"array": "all", "iterations": ITERATIONS}
-    caption = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
-    arrays = {"target": "error", "iterations": ITERATIONS}
-    after, counts = {"array": "all", "epoch": config.epochs}, kit.by("iterations", config.iterations)
-    ways, error = kit.by("learned_by", RATES), "Mean squared error of the next row [variance], before so many epochs"
-    return [
-        kit.grid(caption, records, "degrees", targets, epochs, 0, **learning),
-        kit.grid("Of each array, to the second", records, "degrees", kit.by("array", COMPARED), epochs, 0, **arrays),
-        kit.grid("By inference steps, after learning", records, "degrees", targets, counts, 0, **after),
-        kit.grid(error, records, "mse", ways, epochs, 3),
+    ways, usual = kit.by("learned_by", RATES), {"array": "all", "iterations": ITERATIONS}
+    arrays, error = kit.by("array", COMPARED), {"target": "error", "iterations": ITERATIONS}
+    angle = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
+    missed = "Mean squared error of the next row [variance], before so many epochs"
+    last: Record = {"array": "all", "epoch": config.epochs}
+    tables = [
+        kit.grid(angle, records, "degrees", targets, before, 0, **usual),
+        kit.grid("Of each array, to the second", records, "degrees", arrays, before, 0, **error),
+        kit.grid("By inference steps, after learning", records, "degrees", targets, counts, 0, **last),
+        kit.grid(missed, records, "mse", ways, before, 3),
     ]
-
-
-def drawn(records: Sequence[Record], config: Config) -> Figure:
-    """Draw angles and errors over learning."""
-    epochs = "epoch", checkpoints(config.epochs)
     with figure(height=3.3, width=8) as fig:
         left, right = fig.subplots(1, 2)
-        targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
-        curves(left, records, "degrees", epochs, targets, array="all", iterations=ITERATIONS)
-        curves(right, records, "mse", epochs, kit.by("learned_by", RATES))
+        curves(left, records, "degrees", ("epoch", epochs), targets, **usual)
+        curves(right, records, "mse", ("epoch", epochs), ways)
         left.axhline(90, color="#999999", linewidth=1)
         left.set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
         right.set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
         for ax in (left, right):
             ax.legend(fontsize=7)
-    return fig
-
-
-def run(config: Config) -> Findings:
-    """Run every seed."""
-    work = partial(one_seed, config=config)
-    records = kit.together(kit.each("learning both ways", work, config.repetitions, config))
-    return Findings(records, tables(records, config), drawn(records, config), {"rates": RATES})
+    return Findings(records, tables, fig, {"rates": RATES})
