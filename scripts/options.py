@@ -75,12 +75,13 @@ def parser(kind: type[Any], quick: bool = False) -> Any:
     import tyro
 
     hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
+    marks: Any = tyro.conf
     made: list[Any] = []
     for each in fields(kind):
         about, hint = each.metadata, hints[each.name]
-        shown = tyro.conf.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
+        shown = marks.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
         hint = _ANNOTATED[hint, shown]
-        hint = tyro.conf.Positional[hint] if about.get("positional") else hint
+        hint = marks.Positional[hint] if about.get("positional") else hint
         default = about["quick"] if quick and about.get("quick", _SAME) is not _SAME else each.default
         made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
     unchecked = {"__post_init__": lambda self: None}

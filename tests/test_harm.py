@@ -70,10 +70,10 @@ def test_every_kind_of_policy_that_is_asked_for_has_its_cases():
 
 
 def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypatch):
-    def measured(case, guards):
-        return [record(guard, case.trial.seed, 9.0) | case.key for guard in guards]
+    def episode(job):
+        return record(job[1], job[0].trial.seed, 9.0) | job[0].key
 
-    monkeypatch.setattr(harm, "measured", measured)
+    monkeypatch.setattr(harm, "episode", episode)
     asked = ["--quick", "--guards", ALONE, "hold", "--against", "hostile", "--workers", "1", "--out", str(tmp_path)]
     assert main(harm, asked) == 0
     text = (tmp_path / "harm.md").read_text()

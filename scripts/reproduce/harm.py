@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -125,22 +124,21 @@ class Untrained:
     """A learner of stable-baselines3 before its first update; it explores as in training, TD3 by noise."""
 
     def __init__(self, env: gym.Env[Any, Any], name: str, seed: int) -> None:
-        import stable_baselines3 as sb3
-        from stable_baselines3.common.noise import NormalActionNoise
+        import stable_baselines3
 
-        self._space: Any = env.action_space
-        noise = NormalActionNoise(np.zeros(self._space.shape), np.full(self._space.shape, 0.1))
+        space: Any = env.action_space
         settings = {"n_steps": 500, "batch_size": 100} if name == "PPO" else {"buffer_size": 1}
-        self._noise = noise if name == "TD3" else None
-        self._model = getattr(sb3, name)("MlpPolicy", env, seed=seed, device="cpu", **settings)
+        self._model = getattr(stable_baselines3, name)("MlpPolicy", env, seed=seed, device="cpu", **settings)
+        self._space, self._rng = space, np.random.default_rng(seed) if name == "TD3" else None
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[Any, Any]:
         """Return the next action (A,) and the state."""
-        noise = self._noise
-        action, state = self._model.predict(observation, state, episode_start, deterministic or noise is not None)
-        return action if noise is None else np.clip(action + noise(), self._space.low, self._space.high), state
+        action, state = self._model.predict(observation, state, episode_start, deterministic=self._rng is not None)
+        if self._rng is not None:
+            action = np.clip(action + self._rng.normal(0.0, 0.1, action.shape), self._space.low, self._space.high)
+        return action, state
 
 
 def cases(config: Config) -> list[tuple[Case, int]]:
@@ -182,13 +180,9 @@ def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]
     return NeuralASMSafety(env, memory, on_overrun="ignore", monitor_freq=case.config.stream_freq, **settings)
 
 
-def measured(case: Case, guards: Sequence[str]) -> list[Record]:
-    """Return a record of one episode for each guard."""
-    return [episode(case, guard) for guard in guards]
-
-
-def episode(case: Case, guard: str) -> Record:
-    """Run one episode and return what the arm felt, as the simulator knows it."""
+def episode(job: tuple[Case, str]) -> Record:
+    """Run one episode of a case under a guard, and return what the arm felt, as the simulator knows it."""
+    case, guard = job
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
     infos: list[dict[str, Any]] = []
     forces: list[NDArray[np.float64]] = []
@@ -235,13 +229,14 @@ def harm_of(force: NDArray[np.float64], substeps: int) -> Record:
 
 def run(config: Config) -> kit.Findings:
     """Run every case on its own scenes, under every guard."""
-    trials = [
-        case._replace(trial=replace(case.trial, seed=10_000 * again + 1000 + n))
+    jobs = [
+        (case._replace(trial=replace(case.trial, seed=10_000 * again + 1000 + n)), guard)
         for again in config.repetitions
         for case, count in cases(config)
         for n in range(count)
+        for guard in config.guards
     ]
-    records = kit.together(kit.each("episodes", partial(measured, guards=config.guards), trials, config))
+    records = kit.each("episodes", episode, jobs, config)
     frame, guards = pd.DataFrame(records), config.guards
     harmful, healthy, faulty = (frame[frame.kind.isin(kinds)] for kinds in (HARMFUL, ("healthy",), ("faulty",)))
     tables = [
