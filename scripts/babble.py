@@ -119,7 +119,7 @@ class Args(Options):
 
 def record_lessons(args: Args, console: Console) -> Lessons:
     """Record the lessons that are missing, and select what is healthy."""
-    wanted = curriculum(args.shown, args.episodes, args.seed, reaching=args.reaching)
+    wanted = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(
@@ -169,7 +169,7 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
         folder = args.out / "exams" / exam.policy
         inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
         kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
-        trials = exam.trials(args.exam_episodes, kinds, args.seed, 0 if exam.known else 3)
+        trials = exam.trials(args.exam_episodes, kinds, args.seed)
         with stage(exam.name, console, {}) as progress:
             recordings = record_missing(trials, config, folder, ParallelConfig.named(args.workers), progress)
             expected = usual.setdefault(exam.task, usual_force(recordings))

@@ -30,11 +30,10 @@ from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.corpus import VERSION, skill_files
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
-from asm_gym.rollouts.plan import evaluation_trials
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.staging import record
-from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial
+from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, evaluation_trials
 from asm_gym.scripts.command import one_line, run
 from asm_gym.scripts.options import Options, option
 from asm_gym.stream_source import StreamSource

@@ -3,9 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import RecordEpisodeStatistics
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -54,31 +51,6 @@ def test_an_off_policy_agent_keeps_what_it_commanded_and_is_told_what_was_done()
     for _ in range(5):
         infos = envs.step(np.full((1, 3), 0.5, np.float32))[3]
     np.testing.assert_array_equal(infos[0]["asm"]["executed_action"], [0.0, 0.0, 0.5])
-
-
-def test_a_loop_in_the_manner_of_cleanrl():
-    def thunk():
-        return RecordEpisodeStatistics(watched())
-
-    envs = SyncVectorEnv([thunk, thunk], autoreset_mode=AutoresetMode.SAME_STEP)
-    actor = torch.nn.Sequential(torch.nn.Linear(2, 8), torch.nn.Tanh(), torch.nn.Linear(8, 3))
-    optimiser = torch.optim.Adam(actor.parameters(), lr=1e-2)
-    observation, _ = envs.reset(seed=1)
-    costs, returns = torch.zeros(3 * LENGTH, 2), []
-    for step in range(3 * LENGTH):
-        normal = torch.distributions.Normal(actor(torch.tensor(observation)), 0.1)
-        action = normal.sample()
-        observation, _, _, _, infos = envs.step(action.numpy())
-        last = infos.get("final_info", infos)
-        costs[step] = torch.tensor(last["cost"])
-        if "final_info" in infos:
-            returns += list(last["episode"]["r"])
-        loss = (costs[step] * normal.log_prob(action).sum(1)).mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    assert costs.sum() == 2 * 3 * len(CUE)
-    assert returns == [LENGTH] * 6
 
 
 class Swaying:

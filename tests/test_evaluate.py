@@ -2,21 +2,12 @@
 
 import json
 import re
-import subprocess
-import sys
-import time
 
-import gymnasium as gym
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.episode import EpisodeLabel, load_episode
-from asm_gym.monitors import registry
-from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
-from asm_gym.rollouts.seeds import draw_onset
-from asm_gym.rollouts.staging import record
-from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts import command
 from asm_gym.scripts.evaluate import Args, main, trials_of
 
@@ -59,14 +50,6 @@ def test_faulty_episodes_are_twins_until_the_onset(run):
         np.testing.assert_array_equal(episode.stream[: label.onset], twin[: label.onset])
         assert episode.faults.argmax() == label.onset
         assert len(episode) == label.onset + 40
-
-
-def test_recordings_say_where_the_cube_was(run):
-    env = gym.make("asm_gym/Lift-v0", robot="Panda", observation="dict")
-    for path in sorted((run / "episodes/Lift").glob("*/*.npz"))[::9]:
-        episode = load_episode(path)
-        seen, _ = env.reset(seed=episode.label.seed)
-        np.testing.assert_array_equal(episode.info["goal"], np.append(seen["cube_pos"], seen["gripper_to_cube_pos"]))
 
 
 def test_it_continues_where_it_was_killed_and_gives_the_same_table(run):
@@ -112,12 +95,6 @@ def test_impossible_arguments_are_refused(arguments, message, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_any_model_may_be_asked_for_under_any_detection():
-    name = "external_torque_limit+evidence"
-    assert name not in registry.MONITORS
-    assert Args(monitors=(name, "neural_asm")).monitors[0] == name
-
-
 def test_quick_is_less_of_everything_that_was_not_asked_for():
     asked = ["--quick", "--monitors", "neural_asm", "gru", "--tasks", "PickPlaceCan", "--fit-episodes", "60"]
     args = command.parse("evaluate", Args, asked)
@@ -130,50 +107,3 @@ def test_a_fault_that_cannot_happen_in_a_task_is_left_out():
     trials = trials_of(args, "Door")
     assert {trial.label.kind for trial in trials} == {"", "push", "touch"}  # nothing could slip from a door
     assert len({trial.label.path for trial in trials}) == len(trials)
-
-
-def test_onsets_leave_room_before_and_after():
-    onsets = [draw_onset(seed, 200) for seed in range(300)]
-    assert min(onsets) >= 10
-    assert max(onsets) < 100
-    assert len(set(onsets)) > 50
-
-
-@pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_makes_the_same_recordings(tmp_path):
-    wanted = nominal_trials("asm_gym/Lift-v0", "fit", list(range(12)))
-    distributed = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
-    file = tmp_path / "scheduler.json"
-    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    scheduler = subprocess.Popen([*distributed, "--scheduler-file", str(file), "--host", "127.0.0.1"], **silent)
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1"]
-    workers = [subprocess.Popen([*worker, "--no-nanny", "--no-dashboard"], **silent) for _ in range(2)]
-    try:
-        while not file.is_file():
-            time.sleep(0.2)
-        address = json.loads(file.read_text())["address"]
-        here, there = tmp_path / "here", tmp_path / "there"
-
-        def kill_one(done, _):
-            if done == 3:
-                workers[0].kill()
-
-        parallel_map(_Recorder(there), wanted, ParallelConfig(2, "dask", address), kill_one)
-        assert workers[0].wait(10) != 0
-        parallel_map(_Recorder(here), wanted, 1)
-        for trial in wanted:
-            a, b = (load_episode(folder / trial.label.path) for folder in (here, there))
-            np.testing.assert_array_equal(a.stream, b.stream)
-    finally:
-        for process in (*workers, scheduler):
-            process.kill()
-
-
-class _Recorder:
-    """Records into a folder; a class, so that it can be sent to a cluster."""
-
-    def __init__(self, folder):
-        self.folder = folder
-
-    def __call__(self, trial):
-        return record(trial, RolloutConfig(), self.folder)

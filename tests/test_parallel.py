@@ -4,13 +4,11 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from loky import get_reusable_executor
 
 from asm_gym.rollouts import ParallelConfig, collect, parallel_map
 from tests.needs import needs
@@ -79,16 +77,6 @@ def test_workers_end_within_seconds_of_their_killed_parent(start, where):
     assert until(lambda: not any(map(is_alive, workers)), 5)
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
-def test_ctrl_c_stops_everybody_and_only_the_parent_complains(start):
-    parent, workers = start("main")
-    os.killpg(parent.pid, signal.SIGINT)  # as a terminal does: to all of them
-    _, said = parent.communicate(timeout=20)
-    assert parent.returncode != 0
-    assert said.count("Traceback") == 1
-    assert until(lambda: not any(map(is_alive, workers)), 5)
-
-
 def test_results_are_in_order_and_progress_is_told():
     seen = []
     assert parallel_map(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [3, 1, 2]
@@ -101,18 +89,6 @@ def test_what_a_task_raises_is_raised_here(workers):
         parallel_map(abs, ["a"], workers)
 
 
-def test_no_more_processes_are_started_than_there_is_work(monkeypatch):
-    started = []
-
-    def executor(workers, **more):
-        started.append(workers)
-        return get_reusable_executor(workers, **more)
-
-    monkeypatch.setattr("loky.get_reusable_executor", executor)
-    assert parallel_map(abs, [-3, 1], 500) == [3, 1]
-    assert started == [2]
-
-
 def test_a_killed_worker_is_an_error_that_says_so_and_the_next_call_works():
     with pytest.raises(ChildProcessError, match="killed"):
         parallel_map(_kill_myself, [signal.SIGKILL], 2)
@@ -121,12 +97,6 @@ def test_a_killed_worker_is_an_error_that_says_so_and_the_next_call_works():
 
 def _kill_myself(how: int) -> None:
     os.kill(os.getpid(), how)
-
-
-def test_what_cannot_be_sent_is_refused_with_a_way_out():
-    lock = threading.Lock()
-    with pytest.raises(TypeError, match=r"cannot be sent.*workers to 1"):
-        parallel_map(lambda item: lock, [1], 2)
 
 
 def test_nothing_to_do_needs_nobody():

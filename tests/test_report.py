@@ -113,13 +113,6 @@ def test_the_most_surprising_channels_come_first(traces):
         figures.attribution_figure(dataclasses.replace(trace, detail=None))
 
 
-def test_nothing_to_draw_is_an_error(traces):
-    with pytest.raises(ValueError, match="no traces to draw"):
-        figures.surprise_figure([])
-    with pytest.raises(ValueError, match="needs nominal traces"):
-        figures.roc_figure(by_condition([t for t in traces if t.condition == "push"], 1.0))
-
-
 class _Page(HTMLParser):
     """The tags and the text of a page."""
 
@@ -163,14 +156,6 @@ def test_whatever_is_written_is_escaped(tmp_path: Path):
     assert page.all("svg")[0]["aria-label"] == evil
     # In <title>, <h1>, <p>, <caption>, two <th>, one <td>, <figcaption>, <dt> and <dd>.
     assert page.text.count(evil) == 10
-
-
-def test_a_report_that_fails_leaves_the_last_one(tmp_path: Path):
-    out = write_report(tmp_path / "r.html", "Good", "", [], {})
-    before = out.read_bytes()
-    with pytest.raises(FileNotFoundError):
-        write_report(out, "Bad", "", [], {}, video=tmp_path / "gone.mp4")
-    assert out.read_bytes() == before
 
 
 def test_a_table_of_conditions_has_the_numbers_of_the_summary(traces):

@@ -21,9 +21,6 @@ NOMINAL = "nominal"
 POLICY_ALONE = "policy alone"
 """``acting`` of an episode in which the monitor only watches."""
 
-IDEAL = "ideal"
-"""``acting`` of an episode in which the reflex knows the fault, and the senses are free of it."""
-
 
 class InterventionOutcome(NamedTuple):
     """How an episode ended.

@@ -173,8 +173,3 @@ class HeldByPerson(ForceField):
             return min(1.0, self.newtons / size) * pull
 
         return hold
-
-
-def touches_body(fault: Fault) -> bool:
-    """Whether a fault acts on the robot's body from outside."""
-    return isinstance(fault, BodyFault)

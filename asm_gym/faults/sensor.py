@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import LONGEST, Clock, Fault, Floats, HookedFault, Interface, JointFault, within
+from asm_gym.faults.base import LONGEST, Clock, Floats, HookedFault, Interface, JointFault, within
 
 
 class SensorFault(HookedFault):
@@ -172,8 +172,3 @@ class NoisySensors(HookedFault):
             row += extra * self.rng(2 + clock.k).standard_normal(len(row))
 
         return add
-
-
-def corrupts_senses(fault: Fault) -> bool:
-    """Whether a fault changes what is measured, and nothing that happens."""
-    return isinstance(fault, SensorFault | FrozenEncoder)

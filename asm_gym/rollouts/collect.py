@@ -12,7 +12,6 @@ from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.episode import Episode, load_episode, save_episode
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
-from asm_gym.rollouts.progress import in_a_notebook
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import environment, play, policy_for, record, staged
@@ -48,7 +47,7 @@ def collect(
         seed: of everything; the same seed gives the same episodes.
         workers: processes, 1 of which is this one; or a ``ParallelConfig`` that names a cluster.
         stage: sets of episodes with the same ``seed`` and different stages are different.
-        progress: is called as (done, total); without it a notebook with widgets shows a bar.
+        progress: is called as (done, total).
         env_kwargs: arguments of ``gym.make``.
 
     Raises:
@@ -64,8 +63,7 @@ def collect(
     check_number("episodes", episodes, low=1, whole=True)
     config = RolloutConfig(policy, env_kwargs=tuple(sorted(env_kwargs.items())))
     task = partial(record_episode, spec=env_spec(env_id), config=config)
-    with in_a_notebook(f"collecting {env_id}", progress) as shown:
-        return parallel_map(task, episode_seeds(seed, episodes, stage), workers, shown)
+    return parallel_map(task, episode_seeds(seed, episodes, stage), workers, progress)
 
 
 def record_episode(seed: int, spec: EnvSpec, config: RolloutConfig) -> Episode:

@@ -207,9 +207,11 @@ def record_corpus(
         wanted = trials(source, number, rounds)
         make = partial(record, config=RolloutConfig(source.policy), folder=folder.resolve() / source.policy)
         places = {trial: folder / source.policy / trial.label.path for trial in wanted}
-        files = make_missing(make, wanted, places.__getitem__, parallel, progress)
-        for trial, file in zip(wanted, files, strict=True):
-            if Path(source.policy) / trial.label.path not in known:
+        for file in (place for place in places.values() if not place.is_file()):
+            known.pop(file.relative_to(folder), None)
+        make_missing(make, wanted, places.__getitem__, parallel, progress)
+        for trial, file in places.items():
+            if file.relative_to(folder) not in known:
                 episode = load_episode(file)
                 seconds = round(len(episode) * episode.spec.dt, 6)
                 entry = Entry(source.policy, trial.label, digest(file), seconds)

@@ -7,10 +7,10 @@ import pickle
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -26,19 +26,14 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Is called as (done, total)."""
-Ended = Generator[tuple[int, Any], None, None]
-"""The number of an item that has ended, and its result."""
+Submit = Callable[[bytes, Any], "Future[Any]"]
+"""Runs a pickled task on an item, as ``concurrent.futures.Executor.submit`` does."""
 
 MOST_WORKERS = 1000
 IDLE_S = 300.0
 """A process without work ends after this time [s]."""
-ONE_THREAD = {
-    f"{library}_THREADS": "1"
-    for library in (
-        *("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "NUMBA_NUM", "NUMEXPR_NUM"),
-        "VECLIB_MAXIMUM",
-    )
-}
+_LIBRARIES = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "NUMBA_NUM", "NUMEXPR_NUM", "VECLIB_MAXIMUM")
+ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 """Environment of each worker: more threads would compete for the same cores."""
 
 
@@ -98,20 +93,19 @@ def parallel_map(
         ChildProcessError: a process was killed.
     """
     parallel = parallel if isinstance(parallel, ParallelConfig) else ParallelConfig(parallel)
-    tell = progress or (lambda done, total: None)
-    if parallel.backend == "loky" and parallel.workers == 1:
-        results = []
-        for item in items:
-            results.append(task(item))
-            tell(len(results), len(items))
-        return results
-    if not items:
-        return []
+    report = progress or (lambda done, total: None)
     found: dict[int, Result] = {}
-    with closing(BACKENDS[parallel.backend](parallel, _pickled(task), items)) as ended:
-        for index, result in ended:
-            found[index] = result
-            tell(len(found), len(items))
+    if parallel.backend == "loky" and parallel.workers == 1:
+        for index, item in enumerate(items):
+            found[index] = task(item)
+            report(len(found), len(items))
+    elif items:
+        pickled = _pickled(task)
+        with BACKENDS[parallel.backend](parallel, len(items)) as submit:
+            index_of = {submit(pickled, item): index for index, item in enumerate(items)}
+            for future in as_completed(index_of):
+                found[index_of[future]] = future.result()
+                report(len(found), len(items))
     return [found[index] for index in range(len(items))]
 
 
@@ -128,7 +122,7 @@ def _pickled(task: Callable[[Any], Any]) -> bytes:
 
 
 def _call(task: bytes, item: Any) -> Any:
-    """Run in a worker on this machine: every item gets the task as the parent pickled it."""
+    """Run in a worker: every item gets the task as the parent pickled it."""
     return pickle.loads(task)(item)
 
 
@@ -141,24 +135,19 @@ def _call_on_cluster(task: bytes, item: Any) -> Any:
         return _call(task, item)
 
 
-def _loky(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
+@contextmanager
+def _loky(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
     get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
-    workers = min(parallel.workers, len(items))  # an executor starts all of them at once
+    workers = min(parallel.workers, items)  # an executor starts all of them at once
     how = {"timeout": IDLE_S, "initializer": _end_with_parent, "initargs": (os.getpid(),), "env": ONE_THREAD}
     executor = get_reusable_executor(workers, **how)
     try:
-        yield from _as_they_end([executor.submit(_call, task, item) for item in items])
+        yield partial(executor.submit, _call)
     except BrokenProcessPool as error:
         raise ChildProcessError(f"a worker process was killed, perhaps for want of memory: {error}") from error
     except BaseException:
         executor.shutdown(wait=True, kill_workers=True)  # after an error or a Ctrl-C nothing runs on
         raise
-
-
-def _as_they_end(futures: Sequence[Future[Any]]) -> Ended:
-    index = {future: k for k, future in enumerate(futures)}
-    for future in as_completed(index):
-        yield index[future], future.result()
 
 
 def _end_with_parent(parent: int) -> None:
@@ -173,31 +162,30 @@ def _end_with_parent(parent: int) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _dask(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
+@contextmanager
+def _dask(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
     distributed = require("distributed", what="backend='dask'")
     try:
         client = distributed.Client(parallel.address, timeout=10)
     except OSError as error:
         raise ConnectionError(f"no dask scheduler answers at {parallel.address}: {error}") from error
     with client:  # closing it cancels what still runs
-        sent = client.map(partial(_call_on_cluster, task), list(items), pure=False)
-        index = {future.key: k for k, future in enumerate(sent)}
-        for future, result in distributed.as_completed(sent, with_results=True):
-            yield index[future.key], result
+        yield partial(client.get_executor(pure=False).submit, _call_on_cluster)
 
 
-def _ray(parallel: ParallelConfig, task: bytes, items: Sequence[Any]) -> Ended:
+@contextmanager
+def _ray(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
     ray = require("ray", what="backend='ray'")
     joined = not ray.is_initialized()
     if joined:
         ray.init(address=parallel.address or "auto", log_to_driver=False, logging_level="ERROR")
     try:
-        remote, kept = ray.remote(_call_on_cluster), ray.put(task)  # sent once to each machine
-        yield from _as_they_end([remote.remote(kept, item).future() for item in items])
+        remote = ray.remote(_call_on_cluster)
+        yield lambda task, item: remote.remote(task, item).future()
     finally:
         if joined:
             ray.shutdown()
 
 
 BACKENDS = {"loky": _loky, "dask": _dask, "ray": _ray}
-"""Each runs a pickled task on every item, and yields the number and the result of each as it ends."""
+"""Each is a context that gives a function to submit a pickled task with an item."""

@@ -17,11 +17,9 @@ from numpy.typing import NDArray
 import asm_gym  # noqa: F401  (registers the environments in every worker)
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.episode import Episode, save_episode
-from asm_gym.evaluation.scored_episode import IDEAL, NOMINAL
+from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
-from asm_gym.faults.body import touches_body
-from asm_gym.faults.sensor import corrupts_senses
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
@@ -29,7 +27,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, PASSING, PolicySource, RolloutConfig, Settings, Trial
 from asm_gym.spec import control_period
 from asm_gym.wrappers import StreamRecorder
-from asm_gym.wrappers.faults import FaultInjection, OracleReflex
+from asm_gym.wrappers.faults import FaultInjection
 
 _CACHE: dict[str, tuple[Any, Any]] = {}
 """What this process made last, by name: what it was made of, and the result."""
@@ -97,15 +95,12 @@ def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = 
     """Yield ``env``, or this process's environment, with the trial's faults; they are undone in the end."""
     base = environment(trial.env_id, config.settings) if env is None else env
     faults = faults_in(trial, base, config)
-    if trial.acting == IDEAL:
-        faults = tuple(fault for fault in faults if not corrupts_senses(fault))
     if not faults:
         yield base
         return
     faulty = FaultInjection(base, faults)
-    touching = [fault for fault in faults if touches_body(fault)] if trial.acting == IDEAL else []
     try:
-        yield OracleReflex(faulty, touching) if touching else faulty
+        yield faulty
     finally:
         faulty.undo_faults()  # the next trial has wrappers of its own around the same environment
 
@@ -159,21 +154,10 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
         faults=recorded.faults,
         contact_force=np.asarray([] if np.isnan(forces).all() else forces, np.float32),
         label=replace(trial.label, affected_channels=affected),
-        info={"skill": trial.task, **_goal(base, recorded)},
+        info={"skill": trial.task},
     )
 
 
 def record(trial: Trial, config: RolloutConfig, folder: Path) -> Path:
     """Record a trial, and write it to its place under ``folder``."""
     return save_episode(folder / trial.label.path, record_stream(trial, config))
-
-
-def _goal(env: gym.Env[Any, Any], recorded: Episode) -> dict[str, list[float]]:
-    """Return ``"goal"``: the objects' positions before the first step [m]; nothing where unknown."""
-    inner = env.unwrapped
-    if not isinstance(inner, RobosuiteEnv) or not len(recorded.observations):
-        return {}
-    objects = {c.name for c in inner.measured_spec.channels if c.group == "object" and c.size == 3}
-    ends = np.cumsum(list(inner.observation_layout.values()))
-    parts = zip(inner.observation_layout, np.split(recorded.observations[0], ends[:-1]), strict=True)
-    return {"goal": [float(number) for name, part in parts if name in objects for number in part]}

@@ -1,19 +1,23 @@
-"""One episode to run: environment, seed, what goes wrong and when, and how to respond."""
+"""One episode to run: environment, seed, what goes wrong and when, how to respond; and the trials of an evaluation."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
+from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.episode import EpisodeLabel
-from asm_gym.evaluation.scored_episode import IDEAL, NOMINAL, POLICY_ALONE
-from asm_gym.faults import Fault
-from asm_gym.policies import Policy
-from asm_gym.rollouts.seeds import draw_onset
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
+from asm_gym.faults import Fault, anywhere
+from asm_gym.faults.anywhere import FaultyInterface
+from asm_gym.faults.suite import KINDS, kinds_of, possible
+from asm_gym.policies import Policy, make_policy
+from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.spec import control_period
 
 Settings = tuple[tuple[str, Any], ...]
@@ -64,7 +68,7 @@ class Trial:
         severity: of a fault of the suite.
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
         faults: what goes wrong, in place of ``kind``.
-        acting: ``"policy alone"``, ``"ideal"`` for a reflex that knows the fault, or a value of ``on_alarm``.
+        acting: ``"policy alone"``, or a value of ``on_alarm``.
         after_s: the episode ends so long after the onset [s]; by default it runs to its end.
         role: what it is recorded for: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"``, ``"harmless"`` or
             ``"babble"``.
@@ -94,7 +98,7 @@ class Trial:
     @property
     def on_alarm(self) -> str:
         """The response of the safety wrapper."""
-        return "monitor" if self.acting in (POLICY_ALONE, IDEAL) else self.acting
+        return "monitor" if self.acting == POLICY_ALONE else self.acting
 
     def begins(self, env: gym.Env[Any, Any]) -> int:
         """Return the onset in ``env`` [steps]."""
@@ -122,3 +126,52 @@ def horizon_of(env: gym.Env[Any, Any]) -> int:
     """Return the control steps of an episode; 0 where unknown."""
     limit = env.spec.max_episode_steps if env.spec else None
     return int(getattr(env.unwrapped, "horizon", limit) or 0)
+
+
+def kinds_in(env: gym.Env[Any, Any], faults: Sequence[str], harmless: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the kinds of fault, and of harmless variation, that are possible in ``env``; all faults for none."""
+    inner = env.unwrapped
+    if not isinstance(inner, RobosuiteEnv):
+        FaultyInterface(env)  # refuses spaces that no fault can act on
+        return list(faults or anywhere.KINDS), []
+    kinds = [k for k in kinds_of(faults or tuple(KINDS)) if possible(k, inner)]
+    return kinds, [k for k in harmless if k in EXECUTIONS or possible(k, inner)]
+
+
+def evaluation_trials(
+    env_id: str,
+    name: str,
+    config: RolloutConfig,
+    episodes: Mapping[str, int],
+    faults: Sequence[str],
+    severities: Sequence[str],
+    harmless: Sequence[str],
+    seed: int,
+) -> list[Trial]:
+    """Return the trials of one task: nominal episodes by role, faulty twins of some, and harmless variations.
+
+    Args:
+        env_id: of the environment.
+        name: of the task; decides the seeds.
+        config: how episodes are made, by a policy of a name or a path.
+        episodes: how many, by role.
+        faults: kinds or splits of the suite; all of them for none.
+        severities: of the faults.
+        harmless: kinds of harmless variations.
+        seed: of the evaluation.
+
+    Raises:
+        ValueError: the policy cannot act in the environment.
+    """
+    with closing(gym.make(env_id, **dict(config.settings))) as env:
+        make_policy(str(config.policy), env, seed=0)
+        kinds, variations = kinds_in(env, faults, harmless)
+        horizon = horizon_of(env)
+    seeds = {role: role_seeds(seed, name, role, count) for role, count in episodes.items() if role != "faulty"}
+    trials = [t for role in ("fit", "calibration", "nominal") for t in nominal_trials(env_id, role, seeds[role])]
+    twins = seeds["nominal"][: episodes["faulty"]]
+    trials += [faulty_trial(env_id, k, severity, s, horizon) for k in kinds for severity in severities for s in twins]
+    others = seeds["harmless"]
+    return trials + [
+        Trial(env_id, s, k, onset=draw_onset(s, horizon), role="harmless") for k in variations for s in others
+    ]

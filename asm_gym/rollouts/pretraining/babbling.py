@@ -9,7 +9,8 @@ agents do once they have done their task. With reaching, one lesson more for eac
 holds against its surroundings. In half of all lessons the arm stops now and then, and in half an object's mass differs.
 The noise is weak enough that most of a lesson is free of impacts: those would teach the memory to expect them.
 
-Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling.
+Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling;
+Rolf et al. 2010 (IEEE TAMD 2(3)) for goals in place of random commands.
 """
 
 from __future__ import annotations
@@ -23,18 +24,19 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from asm_gym.episode import save_episode
 from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
-from asm_gym.policies.registry import trained_in
-from asm_gym.policies.scripted.base import Style
+from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style
+from asm_gym.policies.scripted.geometry import Vector, move
 from asm_gym.rollouts.pretraining.healthy import HELD_OUT, held_out
-from asm_gym.rollouts.pretraining.reaching import Reaching
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment, record_stream
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_number
 
 ALONE, LED, DRIVEN, REACHING = "noise", "expert", "disturbed", "reaching"
 LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
@@ -43,10 +45,8 @@ SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
 NOISE = 0.02, 0.2
 """Range of s, up to about the exploration of a half-trained agent [action units]."""
-SPEED = 0.5, 1.5
-"""Speed of the expert, relative to its usual one."""
-WEIGHT = 0.7, 1.4
-"""Factor of an object's mass."""
+SPEED, WEIGHT = (0.5, 1.5), (0.7, 1.4)
+"""Speed of the expert, relative to its usual one; factor of an object's mass."""
 PAUSE, PAUSED = 0.01, (5, 60)
 """Probability per step that the arm stops, and for how many steps."""
 DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
@@ -56,6 +56,15 @@ PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
+AROUND = (-0.25, -0.4, -0.12), (0.25, 0.4, 0.25)
+"""Range of places, relative to where the hand begins [m]."""
+TURNED = 0.2, 0.2, 0.8
+"""Greatest turn of the hand about the axes of the world [rad]."""
+PACE = 0.45
+"""Speed of the hand [action units]."""
+ARRIVED, GIVEN_UP = 0.02, 60
+"""The hand goes on to the next place this near to one [m], or after so many steps."""
+
 
 class Lesson(NamedTuple):
     """How the arm moves in one episode of babbling.
@@ -64,14 +73,12 @@ class Lesson(NamedTuple):
         task: its name.
         number: among the lessons of its task.
         seed: of the environment, of the guide and of the noise.
-        guide: ``"reaching"``, a policy's name or its file; empty for noise alone.
+        guide: ``"scripted"`` or ``"reaching"``; empty for noise alone.
         noise: s, standard deviation of the noise [action units].
         smoothness: ρ.
-        speed: of a scripted guide, relative to its usual one.
-        pause: probability per step that the arm stops for a while.
+        speed: of the guide, relative to its usual one.
         weight: factor of the mass of the task's object.
-        drift: probability per step that the arm drifts for a while, in one direction.
-        press: probability per step that it presses what it holds for a while.
+        pause, drift, press: probabilities per step that the arm stops, drifts, or presses what it holds for a while.
     """
 
     task: str
@@ -97,53 +104,36 @@ class Lesson(NamedTuple):
         return self.trial.label.path
 
 
-def curriculum(
-    tasks: Sequence[str], episodes: int, seed: int, guides: Sequence[str] = (), reaching: bool = False
-) -> list[Lesson]:
+def curriculum(tasks: Sequence[str], episodes: int, seed: int, reaching: bool = False) -> list[Lesson]:
     """Return the lessons, task by task; all follow from ``seed``, and fewer ``episodes`` are the first of more.
 
     Args:
         tasks: their names.
         episodes: of each task.
         seed: of the curriculum.
-        guides: agents that take turns with the experts in the tasks that each was trained in; names, or files of
-            ``asm-gym train``.
         reaching: the hand reaches for places where noise alone would lead, and one lesson more for each three presses.
-            For arms that no agent leads.
-
-    Raises:
-        ValueError: fewer than one episode.
-        FileNotFoundError: there is no such agent.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
-    homes = {guide: trained_in(guide) for guide in guides}
+    check_number("episodes", episodes, low=1, whole=True)
     lessons = []
     for task in tasks:
-        leaders = ["scripted", *(guide for guide, home in homes.items() if home == task_spec(task).id)]
         for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes)):
-            lessons.append(_lesson(task, number, drawn, leads(number, reaching), leaders))
+            lead = LED if held_out(number) else LEADING[number % len(LEADING)]
+            lessons.append(_lesson(task, number, drawn, REACHING if reaching and lead == ALONE else lead))
     beside = range(0, episodes if reaching else 0, HELD_OUT)
     for task in tasks:
         for number, drawn in zip(beside, role_seeds(seed, task, "press", len(beside)), strict=True):
-            driven = _lesson(task, number, drawn, DRIVEN, ["scripted"])
+            driven = _lesson(task, number, drawn, DRIVEN)
             lessons.append(driven._replace(noise=NOISE[0], pause=0.0, drift=0.0, press=PRESS))
     return lessons
 
 
-def leads(number: int, reaching: bool = False) -> str:
-    """Return what leads the lesson of this number: the expert alone, where the threshold is set on it."""
-    usual = LEADING[number % len(LEADING)]
-    return LED if held_out(number) else REACHING if reaching and usual == ALONE else usual
-
-
-def _lesson(task: str, number: int, seed: int, lead: str, guides: Sequence[str]) -> Lesson:
-    rng, guide = np.random.default_rng([seed, 3]), guides[number // len(LEADING) % len(guides)]
+def _lesson(task: str, number: int, seed: int, lead: str) -> Lesson:
+    rng = np.random.default_rng([seed, 3])
     return Lesson(
         task,
         number,
         seed,
-        guide={ALONE: "", REACHING: REACHING}.get(lead, guide),
+        guide={ALONE: "", REACHING: REACHING}.get(lead, "scripted"),
         noise=0.0 if lead == LED else float(np.exp(rng.uniform(*np.log(NOISE)))),
         smoothness=float(rng.choice(SMOOTHNESS)),
         speed=float(rng.uniform(*SPEED)),
@@ -221,26 +211,64 @@ class Babbler:
         return to
 
 
+class Aim(NamedTuple):
+    """Where a hand began, and where it is going."""
+
+    began: Vector  # (3,) [m]
+    upright: Vector  # (3, 3) its orientation then
+    place: Vector  # (3,) [m]
+    turned: Vector  # (3, 3)
+    grip: float  # as commanded
+    left: int  # steps until it gives up
+
+
+class Reaching:
+    """A policy that reaches.
+
+    Args:
+        env: of one arm under OSC_POSE.
+        seed: of the places.
+        speed: relative to the usual one.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float = 1.0) -> None:
+        self._read, self._rng, self._speed = ObservationReader(env), np.random.default_rng([seed, 2]), PACE * speed
+
+    def predict(
+        self,
+        observation: Any,
+        state: Aim | None = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Aim]:
+        """Return the next action (7,)."""
+        hand = self._read.hand(observation)
+        if state is None:
+            state = self._next(hand.at, hand.turned)
+        elif not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
+            state = self._next(state.began, state.upright)
+        action = move(hand, state.place, state.turned, self._speed)
+        return np.append(action, state.grip).astype(np.float32), state._replace(left=state.left - 1)
+
+    def _next(self, began: Vector, upright: Vector) -> Aim:
+        place = began + self._rng.uniform(*AROUND)
+        turn = Rotation.from_rotvec(self._rng.uniform(-1.0, 1.0, 3) * TURNED).as_matrix()
+        return Aim(began, upright, place, turn @ upright, float(self._rng.choice([OPEN, CLOSE])), GIVEN_UP)
+
+
 def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:
     if lesson.guide == REACHING:
         return Reaching(env, lesson.seed, lesson.speed)
-    style = {"style": Style(speed=lesson.speed)} if lesson.guide == "scripted" else {}
-    return make_policy(lesson.guide, env, seed=lesson.seed, **style) if lesson.guide else None
+    return make_policy(lesson.guide, env, seed=lesson.seed, style=Style(speed=lesson.speed)) if lesson.guide else None
 
 
 def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
-    """Record the episode of a lesson, and write it to its place under ``folder``.
-
-    Args:
-        lesson: how the arm moves.
-        config: of the environment; the lesson tells the policy.
-        folder: of the run.
-    """
+    """Record the episode of a lesson in the environment of ``config``, and write it to its place under ``folder``."""
     trial, config = lesson.trial, replace(config, policy=partial(Babbler, lesson=lesson))
     base: Any = environment(trial.env_id, config.settings).unwrapped
     if lesson.weight != 1.0 and movable(base):
         trial = replace(trial, faults=(ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),))
-    recorded = record_stream(trial, config)
     about = {"skill": lesson.task, "lesson": lesson._asdict()}
-    kept = replace(recorded, faults=np.zeros(0, np.bool_), info=about)
-    return save_episode(folder / lesson.path, kept)
+    return save_episode(
+        folder / lesson.path, replace(record_stream(trial, config), faults=np.zeros(0, np.bool_), info=about)
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,12 +24,8 @@ from asm_gym.tasks import task as task_spec
 
 SEVERITIES = "medium", "strong"
 """Of the faults in an examination; mild ones are hardly detectable."""
-PUSH = "push", "medium"
-"""Kind and severity of a push of 20 N."""
 SCENES = 12
 """Faults happen in the first so many scenes."""
-PROMPT_S = 0.1
-"""A push should be detected this soon [s]."""
 
 
 class Exam(NamedTuple):
@@ -43,18 +38,18 @@ class Exam(NamedTuple):
     @property
     def name(self) -> str:
         """Name for tables."""
-        policy = "expert" if self.policy == "scripted" else "/".join(Path(self.policy).with_suffix("").parts[-2:])
-        return f"{self.task}, {policy}" + ("" if self.known else " (left out)")
+        return f"{self.task}, {'expert' if self.policy == 'scripted' else self.policy}" + " (left out)" * (
+            not self.known
+        )
 
-    def trials(self, episodes: int, kinds: Sequence[str], seed: int, pushes: int = 0) -> list[Trial]:
-        """Return nominal episodes, a twin for each of ``kinds`` and severity, and pushes of 20 N in the last scenes."""
-        every = role_seeds(seed, self.task, "nominal", episodes)
-        seeds, task = every[:SCENES], task_spec(self.task)
+    def trials(self, episodes: int, kinds: Sequence[str], seed: int) -> list[Trial]:
+        """Return nominal episodes, and in the first scenes a twin for each of ``kinds`` and severity."""
+        seeds, task = role_seeds(seed, self.task, "nominal", episodes), task_spec(self.task)
+        scenes = seeds[:SCENES]
         faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
-        pairs = [(fault, seeds[n % len(seeds)]) for n, fault in enumerate(faults)]
-        pairs += [(PUSH, s) for s in seeds[::-1][:pushes] if (PUSH, s) not in pairs]
-        nominal = nominal_trials(task.id, "nominal", every)
-        return nominal + [faulty_trial(task.id, *fault, s, task.horizon) for fault, s in pairs]
+        return nominal_trials(task.id, "nominal", seeds) + [
+            faulty_trial(task.id, *fault, scenes[n % len(scenes)], task.horizon) for n, fault in enumerate(faults)
+        ]
 
 
 class Marks(NamedTuple):
@@ -63,23 +58,19 @@ class Marks(NamedTuple):
     Attributes:
         name: of the exam.
         solved, failed: scored healthy episodes, by whether the task was solved.
-        pushes: scored pushes of 20 N.
-        metrics: on the other visible faults, but for scenes in which the policy crashes by itself.
+        metrics: on visible faults, but for scenes in which the policy crashes by itself.
     """
 
     name: str
     solved: list[ScoredEpisode]
     failed: list[ScoredEpisode]
-    pushes: list[ScoredEpisode]
     metrics: DetectionMetrics
 
     def at(self, threshold: float) -> Marks:
         """Return the result at another threshold."""
-        parts = self.solved, self.failed, self.pushes, self.metrics.faulty
-        solved, failed, pushes, faulty = ([t.at(threshold) for t in traces] for traces in parts)
-        return Marks(
-            self.name, solved, failed, pushes, DetectionMetrics(self.name, faulty, solved, self.metrics.window_s)
-        )
+        parts = self.solved, self.failed, self.metrics.faulty
+        solved, failed, faulty = ([t.at(threshold) for t in traces] for traces in parts)
+        return Marks(self.name, solved, failed, DetectionMetrics(self.name, faulty, solved, self.metrics.window_s))
 
 
 def usual_force(recordings: Sequence[Episode]) -> float:
@@ -97,18 +88,17 @@ def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode],
         name: of the exam.
         recordings: nominal and faulty.
         window: an alarm within this time of the onset is a detection [s].
-        usual: the usual greatest force of the task's expert [N]; an agent that often crashes does not tell it.
+        usual: the usual greatest force of the task's expert [N]; that of an agent that often crashes is no reference.
     """
     traces = traces_of(name, memory, recordings, memory.threshold)
-    hit = {e.labelled.seed for e in recordings if CRASH * usual < usual_force([e]) < np.inf}
+    crashed = {e.labelled.seed for e in recordings if CRASH * usual < usual_force([e]) < np.inf}
     twins = [r for r in recordings if r.labelled.role == "nominal"]
-    faulty = [r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in hit]
+    faulty = [r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in crashed]
     seen = visible_kinds(detectability_of(twins, faulty, window))
-    visible = [t for t in traces if t.onset is not None and t.seed not in hit and seen[t.kind, t.severity]]
-    pushes, faults = ([t for t in visible if ((t.kind, t.severity) == PUSH) is want] for want in (True, False))
+    visible = [t for t in traces if t.onset is not None and t.seed not in crashed and seen[t.kind, t.severity]]
     nominal = [t for t in traces if t.kind == NOMINAL]
     solved, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
-    return Marks(name, solved, failed, pushes, DetectionMetrics(name, faults, solved, window))
+    return Marks(name, solved, failed, DetectionMetrics(name, visible, solved, window))
 
 
 class Alarms(NamedTuple):
@@ -123,11 +113,6 @@ class Alarms(NamedTuple):
         """Count at the threshold of the episodes."""
         return cls(*(hourly_alarms(traces, event) for event in ("", KNOCK, STOP)))
 
-    @property
-    def text(self) -> str:
-        """Format."""
-        return f"{self.fault.text} faults, {self.knock.text} knocks, {self.stop.text} stops an hour"
-
 
 COLUMNS: Sequence[Column[Marks]] = (
     Column("", lambda m: m.name),
@@ -138,31 +123,28 @@ COLUMNS: Sequence[Column[Marks]] = (
     Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
     Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
     Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
-    Column("median [ms]", lambda m: milliseconds(m.metrics.delays, "median_ms") if m.metrics.faulty else ""),
+    Column("median [ms]", lambda m: milliseconds(m.metrics.delays) if m.metrics.faulty else ""),
 )
 
 
 def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Table:
     """Return a row for each exam."""
     about = memory.about
-    return tabulate(
+    caption = (
         f"{about['name']}: learned from {about['lessons']} lessons of {', '.join(about['tasks'])}; threshold "
         f"{memory.threshold:.3g} for {about['false_alarms_per_hour']:g} false alarms per hour, from "
         f"{about['hours']:.2f} other hours. Alarms per hour of solved healthy episodes, with 95 % Poisson intervals; "
-        "one that comes back within a minute is counted once. Failed episodes with an alarm. Visible faults of medium "
-        f"and strong severity, found within {window:g} s.",
-        COLUMNS,
-        marks,
+        "failed episodes with an alarm; visible faults of medium and strong severity, found within "
+        f"{window:g} s."
     )
+    return tabulate(caption, COLUMNS, marks)
 
 
 def summary(marks: Sequence[Marks]) -> str:
-    """Return one line: alarms, and faults and pushes found, in all exams together."""
-    alarms = Alarms.of([t for m in marks for t in m.solved])
+    """Return one line: alarms, and faults found, in all exams together."""
+    fault, knock, stop = Alarms.of([t for m in marks for t in m.solved])
     found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
-    delays = [t.delay for m in marks for t in m.pushes]
-    prompt = Share.of([delay is not None and delay <= PROMPT_S + 1e-9 for delay in delays])
     return (
-        f"In all: {alarms.text} in {alarms.fault.hours:.2f} healthy hours, {count(found)} faults found, "
-        f"{count(prompt)} pushes of 20 N detected within {1e3 * PROMPT_S:.0f} ms."
+        f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops an hour in {fault.hours:.2f} healthy "
+        f"hours, {count(found)} faults found."
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,6 @@ from asm_gym.monitors.base import Progress
 from asm_gym.monitors.ceilings import learn_ceilings
 from asm_gym.spec import StreamSpec
 
-EXPERT = "scripted"
-"""The guide whose forces are usual."""
 HELD_OUT = 3
 """One in so many lessons of a task sets the threshold, and is not learned from."""
 LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
@@ -31,7 +29,8 @@ AROUND_S = 0.2
 SHORTEST = 20
 """Least steps of a stretch that is learned from."""
 PASSES, HIDDEN = 4, 32
-"""Passes of the temporal network over the lessons, and its units: no surprise comes from it."""
+"""Passes of the temporal network over the lessons, and its units: few, as its context would mislead under an unknown
+policy."""
 
 
 class Gentle(NamedTuple):
@@ -80,7 +79,7 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     """
     peaks: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
     for episode in recordings:
-        if _undisturbed(episode) and _lesson(episode)["guide"] == EXPERT:
+        if _undisturbed(episode):
             peaks[episode.labelled.task].append((peak_force(episode), float(peak_torques(episode).max())))
     missing = {e.labelled.task for e in recordings} - set(peaks)
     if missing:
@@ -90,8 +89,8 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     found = Lessons([], [], [])
     for episode in recordings:
         usual = np.median(peaks[episode.labelled.task], axis=0)
-        if not held_out(_lesson(episode)["number"]):
-            share = DISTURBED_UP_TO if _lesson(episode)["noise"] else LEARNED_UP_TO
+        if not held_out(episode.info["lesson"]["number"]):
+            share = DISTURBED_UP_TO if episode.info["lesson"]["noise"] else LEARNED_UP_TO
             found.fit.extend(gentle_pieces(episode, Gentle(*np.maximum(share * usual, KNOWN))))
         elif _undisturbed(episode):
             found.whole.append(episode)
@@ -99,6 +98,10 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     if not all(found):
         raise ValueError(f"{len(recordings)} lessons leave too little that is healthy: record more")
     return found
+
+
+def _undisturbed(episode: Episode) -> bool:
+    return bool(episode.success and episode.info["lesson"]["noise"] == 0.0)
 
 
 def harmless(episodes: Sequence[Episode]) -> list[Episode]:
@@ -142,26 +145,8 @@ def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
     ]
 
 
-def _undisturbed(episode: Episode) -> bool:
-    return episode.success and _lesson(episode)["noise"] == 0.0
-
-
-def _lesson(episode: Episode) -> dict[str, Any]:
-    lesson: dict[str, Any] = episode.info["lesson"]
-    return lesson
-
-
 def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress) -> NeuralASM:
-    """Return the memory, without a threshold.
-
-    The context of the temporal network would mislead under an unknown policy, so it is small and hardly trained.
-
-    Args:
-        lessons: healthy ones.
-        spec: of the stream.
-        seed: of the memory.
-        progress: is called as (done, total).
-    """
+    """Return a memory fitted on healthy lessons, without a threshold."""
     memory = NeuralASM(spec, hidden_size=HIDDEN, epochs=PASSES, habituates=False, excuses=True, seed=seed)
     return memory.fit(lessons.fit, progress).rounded()
 
@@ -169,7 +154,7 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
     """Set the threshold for so many false alarms per hour of healthy episodes, crashes included.
 
-    In an hour of each task, where all have the hours that it takes. Where there are enough episodes, one in
+    By the hours of each task, where all have the hours that it takes. Where there are enough episodes, one in
     ``FOR_CEILINGS`` sets the ceilings of senses, and the others the threshold. The forces of healthy motion are those
     without crashes: a limit raised by a hit would be none.
 
@@ -182,7 +167,12 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     whole, for_ceilings = for_threshold([*lessons.whole, *hours])
     if for_ceilings:
         learn_ceilings(memory, for_ceilings)
-    memory.calibrate(whole, false_alarms_per_hour=per_hour, each=tasks_apart(whole, per_hour))
+    tasks = [episode.labelled.task for episode in whole]
+    duration: defaultdict[str, float] = defaultdict(float)
+    for episode, task in zip(whole, tasks, strict=True):
+        duration[task] += len(episode) * episode.spec.dt / 3600
+    each = tasks if min(duration.values()) * per_hour >= 1.0 else []
+    memory.calibrate(whole, false_alarms_per_hour=per_hour, each=each)
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
     return memory
 
@@ -195,12 +185,3 @@ def for_threshold(whole: Sequence[Episode]) -> tuple[list[Episode], list[Episode
         number[episode.labelled.task] += 1
         parts[number[episode.labelled.task] % FOR_CEILINGS == 0].append(episode)
     return parts if len(parts[1]) >= FEWEST_EPISODES else (list(whole), [])
-
-
-def tasks_apart(episodes: Sequence[Episode], per_hour: float) -> list[str]:
-    """Return the task of each episode, where every task has the hours that this rate takes; else nothing."""
-    tasks = [episode.labelled.task for episode in episodes]
-    hours: defaultdict[str, float] = defaultdict(float)
-    for episode, task in zip(episodes, tasks, strict=True):
-        hours[task] += len(episode) * episode.spec.dt / 3600
-    return tasks if min(hours.values()) * per_hour >= 1.0 else []
