@@ -102,11 +102,6 @@ class Args(Options):
         return RolloutConfig(robot=self.robot, stream_freq=self.stream_freq)
 
     @property
-    def name(self) -> str:
-        """Name of the memory."""
-        return self.robot.lower() + (f"_{self.stream_freq}hz" if self.stream_freq else "")
-
-    @property
     def exams(self) -> list[Exam]:
         """Policies and tasks to examine it on; shipped agents were trained with the Panda."""
         homes = {p: task_spec(trained_in(p)).name for p in agents()} if self.robot == "Panda" else {}
@@ -122,9 +117,8 @@ def record_lessons(args: Args, console: Console) -> Lessons:
     wanted = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
-        files = make_missing(
-            make, wanted, lambda lesson: args.out / lesson.path, ParallelConfig.named(args.workers), progress
-        )
+        workers = ParallelConfig.named(args.workers)
+        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, workers, progress)
     return healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
 
 
@@ -146,8 +140,9 @@ def learn(args: Args, console: Console) -> NeuralASM:
     with stage("learning", console, {}) as progress:
         memory = learn_body(lessons, inner.stream_spec, args.seed, progress)
     calibrate_body(memory, lessons, hours, args.false_alarms_per_hour)
+    name = args.robot.lower() + (f"_{args.stream_freq}hz" if args.stream_freq else "")
     memory.about = {
-        "name": args.name,
+        "name": name,
         "controller": inner.controller,
         "tasks": list(args.shown),
         **{n: getattr(args, n) for n in ("reaching", "episodes", "seed", "false_alarms_per_hour")},
@@ -156,7 +151,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
         "hours": sum(len(e) * e.spec.dt for e in [*lessons.whole, *hours]) / 3600,
         **versions(),
     }
-    memory.save(args.out / f"{args.name}.asm")
+    memory.save(args.out / f"{name}.asm")
     return memory
 
 
@@ -188,7 +183,9 @@ def babble(args: Args, console: Console) -> None:
             (args.out / "card.md").write_text(f"{markdown(table)}\n\n{summary(marks)}\n", encoding="utf-8")
             console.print(ConsoleTable(table))
             console.print(summary(marks))
-    console.print(f"Wrote {args.out / args.name}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it")
+    console.print(
+        f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it"
+    )
 
 
 main = partial(run, "babble", Args, babble)

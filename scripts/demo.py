@@ -43,8 +43,8 @@ from asm_gym.scripts.options import Options, option
 from asm_gym.tasks import TASKS, env_id
 from asm_gym.wrappers import NeuralASMSafety
 
-PUSHED_AT = 40
-"""Step in which the arm is pushed before anything is learned."""
+PUSHED, PUSHED_AT = "robot0_link5", 40
+"""Link that is pushed, and the step in which it is before anything is learned."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,7 @@ def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
         onset = int(rng.integers(10, 46))
         direction = rng.standard_normal(3)
         x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
-        push = Push(body="robot0_link5", newtons=20.0, direction=(x, y, z), onset=onset, duration=10)
-        made["push"].append(push)
+        made["push"].append(Push(body=PUSHED, newtons=20.0, direction=(x, y, z), onset=onset, duration=10))
         made["weak joint"].append(WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset))
         made["frozen encoder"].append(FrozenEncoder(joint=int(rng.integers(7)), onset=onset))
         made["collision"].append(Collision(onset=onset, duration=20))
@@ -106,7 +105,7 @@ def trials(args: Args) -> list[Trial]:
 def shipped_memory(args: Args) -> str:
     """Return what the shipped memory notices of a healthy episode and of a push; where none fits, say so."""
     seed = episode_seeds(args.seed, 1, stage=3)[0]
-    push = Push(body="robot0_link5", newtons=20.0, direction=(0.0, 1.0, 0.0), onset=PUSHED_AT, duration=10)
+    push = Push(body=PUSHED, newtons=20.0, direction=(0.0, 1.0, 0.0), onset=PUSHED_AT, duration=10)
     surprises = []
     for faults in ((), (push,)):
         infos: list[dict[str, Any]] = []
@@ -145,17 +144,9 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
 
 def as_json(m: DetectionMetrics) -> dict[str, Any]:
     """Return the numbers of one condition."""
-    return {
-        "condition": m.name,
-        "episodes": len(m.watched),
-        "false_alarm_episodes": false_alarms(m.watched),
-        "false_alarms_per_hour": hourly_alarms(m.watched).value,
-        "detected": m.detected,
-        "delays": m.delays,
-        "auroc": m.auroc,
-        "top_labels": m.top_channels,
-        "outcomes": m.outcomes,
-    }
+    alarms = {"false_alarm_episodes": false_alarms(m.watched), "false_alarms_per_hour": hourly_alarms(m.watched).value}
+    numbers = {name: getattr(m, name) for name in ("detected", "delays", "auroc", "top_channels", "outcomes")}
+    return {"condition": m.name, "episodes": len(m.watched)} | alarms | numbers
 
 
 def demonstrate(args: Args, console: Console) -> None:

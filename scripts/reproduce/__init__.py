@@ -22,7 +22,7 @@ INDEPENDENT = {
 STUDIES = {
     **INDEPENDENT,
     "hours": "alarms an hour of a shipped memory, as promised?",
-    "one_energy": "surprise and completion by one energy",
+    "one_energy": "faults by the energy that inference descends",
     "real_arms": "faults in recordings of real arms, once downloaded",
 }
 """Every study; all but the independent ones need recordings."""

@@ -1,9 +1,8 @@
-"""One energy: surprise rises with it, and completion descends it; ``abstract`` shows reaction and learning.
+"""One energy: F finds faults; ``abstract`` shows that completion, reaction and learning descend it.
 
 Claim: F, the sum of what is unexpected to the temporal network, to association and to the motor association
-(``asm_gym.memory.free_energy``), finds faults and completes missing senses, on robosuite skills that ``asm-gym
-evaluate`` recorded. Faults: F against the surprise in use. Completion: missing senses by descending F, by the
-correlation memory, and as they were last.
+(``asm_gym.memory.free_energy``), rises at faults of robosuite skills that ``asm-gym evaluate`` recorded. F and each of
+its parts are compared with the surprise in use.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +22,8 @@ from asm_gym.evaluation import defaults
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
 from asm_gym.evaluation.recordings import recorded
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
-from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
-from asm_gym.memory.free_energy import Before, FreeEnergy
+from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.acting import learn_to_act
 from asm_gym.scripts.options import option
@@ -41,8 +38,6 @@ MEAN_ROWS = 4
 """F is judged by its mean over so many rows: 0.2 s in robosuite."""
 
 PARTS = ("F", "time", "association", "motor", "in use")
-LOST = {"one encoder": ("encoder[3]",), "all encoders": tuple(f"encoder[{j}]" for j in range(7)), "wrist": ("wrist",)}
-COMPLETED_BY = ("last value", "correlation memory", "lowest F")
 
 
 @dataclass(frozen=True)
@@ -55,16 +50,14 @@ class Config(kit.Config):
     """Share of nominal episodes that may raise an alarm."""
     window: float = option(defaults.WINDOW_S, check=partial(check_number, "window", above=0))
     """How soon after its onset a fault must be noticed [s]."""
-    completed: int = option(8, quick=1, least=1)
-    """Healthy episodes in which senses go missing."""
 
 
-def in_turn(episodes: Sequence[Episode], seed: int) -> list[Episode]:
-    """Return all episodes, one of each task after another, in an order of the seed."""
+def in_turn(episodes: Sequence[Episode]) -> list[Episode]:
+    """Return all episodes, one of each task after another, in random order."""
     tasks: dict[str, list[Episode]] = {}
     for episode in episodes:
         tasks.setdefault(episode.labelled.task, []).append(episode)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     shuffled = [[own[i] for i in rng.permutation(len(own))] for own in tasks.values()]
     return [e for turn in zip_longest(*shuffled) for e in turn if e is not None]
 
@@ -97,48 +90,6 @@ def faults_by(part: str, courses: dict[str, list[dict[str, Floats]]], roles: Rol
     return made
 
 
-def before(rows: Floats, t: int, c: Any, energy: FreeEnergy) -> Before:
-    """Return what was known before row ``t``."""
-    lag = energy.senses.lag
-    return Before(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
-
-
-def completions(asm: NeuralASM, energy: FreeEnergy, episodes: Sequence[Episode]) -> list[Record]:
-    """Measure root mean square errors of completed senses [rad, N]."""
-    completion = asm.model.completion_
-    assert completion is not None
-    made: list[Record] = []
-    for lost, names in LOST.items():
-        missing = np.zeros(asm.spec.size, bool)
-        for name, columns in completion.sensors:
-            missing[columns] |= name in names
-        first = np.flatnonzero(missing)[: sum(n.startswith("encoder") for n in names) or 3]  # angles, forces
-        for e in episodes:
-            truth, onset = e.stream.astype(np.float64), len(e) // 3
-            filled = (
-                np.repeat(truth[onset - 1 : onset, missing], len(truth), axis=0),
-                completion.complete(completion.filling(missing), completion.lift(truth)),
-                lowest(energy, truth, missing, onset)[:, missing],
-            )
-            own = np.isin(np.flatnonzero(missing), first)
-            for way, values in zip(COMPLETED_BY, filled, strict=True):
-                error = (values - truth[:, missing])[onset:, own]
-                made.append({"lost": lost, "way": way, "rmse": float(np.sqrt(np.mean(error**2)))})
-    return made
-
-
-def lowest(energy: FreeEnergy, truth: Floats, missing: NDArray[np.bool_], onset: int) -> Floats:
-    """Return rows (T, D) whose missing senses, from ``onset`` on, are where F is lowest, row after row."""
-    rows, c = truth.copy(), energy.network.at_rest(1)
-    for t in range(len(rows)):
-        moment = before(rows, t, c, energy)
-        if t >= onset:
-            rows[t, missing] = rows[t - 1, missing]
-            rows[t], _ = energy.settled(moment, rows[t], missing)
-        c = energy.after(moment, rows[t])
-    return rows
-
-
 def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
     """Measure everything for one dynamics and one seed."""
     dynamics, seed = job
@@ -151,27 +102,19 @@ def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
         for found, surprise in zip(courses[name], asm.score_episodes(own), strict=True):
             found["in use"] = surprise.value
     records = [r for part in PARTS for r in faults_by(part, courses, roles, config)]
-    records += completions(asm, energy, in_turn(roles["nominal"], seed)[: config.completed])
     return [{"dynamics": dynamics, "seed": seed, **r} for r in records]
-
-
-def tables(records: Sequence[Record], config: Config) -> list[Table]:
-    """Return faults and completion."""
-    both, parts = kit.by("dynamics", DYNAMICS), kit.by("part", PARTS)
-    rate = f"{100 * config.false_alarm_rate:g} % of nominal episodes may alarm"
-    values = {"auroc": "AUROC", "found": f"Found in {config.window:g} s", "alarm": "Nominal episodes in alarm"}
-    made = [kit.grid(f"{label} by F and its parts; {rate}", records, v, parts, both) for v, label in values.items()]
-    lost: dict[str, Record] = {f"{x} by {way}": {"lost": x, "way": way} for x in LOST for way in COMPLETED_BY}
-    made.append(kit.grid("Error of completed senses [rad, N]", records, "rmse", lost, both, 4))
-    return made
 
 
 def run(config: Config) -> Findings:
     """Run both dynamics and every seed."""
-    roles = dict(recorded(config.run).roles)
+    roles = dict(recorded(config.run, config.tasks).roles)
     roles["faulty"] = [e for e in roles["faulty"] if len(e) > (e.labelled.onset or 0)]
-    healthy = in_turn(roles["calibration"], 0)  # a fifth sets τ, and no threshold
+    healthy = in_turn(roles["calibration"])  # a fifth sets τ, and no threshold
     roles["spreads"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
     jobs = [(d, seed) for d in DYNAMICS for seed in config.repetitions]
     records = kit.together(kit.each("learning and judging", partial(one, roles=roles, config=config), jobs, config))
-    return Findings(records, tables(records, config))
+    both, parts = kit.by("dynamics", DYNAMICS), kit.by("part", PARTS)
+    rate = f"{100 * config.false_alarm_rate:g} % of nominal episodes may alarm"
+    values = {"auroc": "AUROC", "found": f"Found in {config.window:g} s", "alarm": "Nominal episodes in alarm"}
+    tables = [kit.grid(f"{label} by F and its parts; {rate}", records, v, parts, both) for v, label in values.items()]
+    return Findings(records, tables)
