@@ -102,9 +102,7 @@ def test_the_shell_completes_commands_studies_and_options(capsys, tmp_path):
     assert completed("asm-gym", "evaluate", "--mon") == ["--monitors"]
 
 
-@pytest.mark.parametrize(
-    ("typed", "near"), [("docter", "doctor"), ("colect", "collect"), ("reproduce abstrac", "abstract")]
-)
+@pytest.mark.parametrize(("typed", "near"), [("docter", "doctor"), ("reproduce abstrac", "abstract")])
 def test_a_misspelt_command_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2
     assert f"did you mean '{near}'?" in capsys.readouterr().err
@@ -164,25 +162,13 @@ def test_a_value_that_is_not_accepted_is_refused_in_one_line(argv, message, caps
     assert capsys.readouterr().err == f"asm-gym try: {message}\n"
 
 
-@pytest.mark.parametrize(
-    ("argv", "named"),
-    [
-        (["--count", "many"], "--count"),
-        (["--coutn", "3"], "--count INT"),
-        (["--how", "boiled"], "'raw', 'baked'"),
-    ],
-)
-def test_an_option_that_cannot_be_read_is_named(argv, named, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    assert run(*argv) == 2
-    assert named in " ".join(capsys.readouterr().err.split())
-
-
 def test_work_is_handed_the_options_and_returns_the_exit_code():
     got = []
     assert run("--count", "7", work=lambda args, console: got.append(args)) == 0
     assert got == [Options(count=7)]
+    before = signal.getsignal(signal.SIGTERM)
     assert run(work=lambda args, console: command.BAD_NEWS) == 1
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_quick_changes_only_what_was_not_typed():
@@ -195,12 +181,6 @@ def test_quick_changes_only_what_was_not_typed():
     assert typed("--quick").sizes == (2,)
     with pytest.raises(ValueError, match="hidden must be at least 1, got 0"):
         Options(hidden=0)
-
-
-def test_the_signal_handler_of_a_caller_is_restored():
-    before = signal.getsignal(signal.SIGTERM)
-    run()
-    assert signal.getsignal(signal.SIGTERM) is before
 
 
 INTERRUPTED = """

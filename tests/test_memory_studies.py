@@ -13,7 +13,6 @@ from asm_gym.scripts.reproduce import speed_accuracy
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
-    Hopfield,
     mean_demonstrations,
     recalled,
 )
@@ -21,11 +20,8 @@ from asm_gym.scripts.reproduce.handwriting import (
     DT,
     NOISE,
     STEPS,
-    Letter,
-    Stroke,
     copybook,
     repertoire,
-    velocity,
     written,
 )
 from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
@@ -46,16 +42,6 @@ from asm_gym.scripts.reproduce.two_links import (
 )
 from asm_gym.scripts.reproduce.two_links import DT as ARM_DT
 
-STROKE = Stroke(length=4.0, direction=0.3, turn=1.5, onset=-0.05, sigma=0.3)
-
-
-def test_a_stroke_ends_at_its_chord():
-    time = (np.arange(200_000) + 0.5) * 2e-5
-    end = (velocity(Letter("a", (STROKE,)), time) * 2e-5).sum(axis=0)
-    # ∫_0^1 exp(i (θ + Δθ u)) du = (exp(i (θ + Δθ)) - exp(i θ)) / (i Δθ)
-    chord = 4.0 * (np.exp(1j * 1.8) - np.exp(1j * 0.3)) / (1j * 1.5)
-    np.testing.assert_allclose(end, [chord.real, chord.imag], atol=1e-3)
-
 
 def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
     letter = repertoire(1, np.random.default_rng(0))[0]
@@ -71,13 +57,6 @@ def letters_of(count: int, each: int = 6) -> tuple[list, list]:
     rng = np.random.default_rng(0)
     letters = repertoire(count, rng)
     return copybook(letters, each, rng), copybook(letters, 3, rng)
-
-
-def test_a_hopfield_network_completes_what_it_stored():
-    train, _ = letters_of(3, each=1)
-    streams = np.stack([e.stream for e in train], axis=1).astype(np.float64)
-    made = Hopfield.learned(train, beta=1e5).express(streams, 10)
-    np.testing.assert_allclose(made[1:], streams[1:], atol=1e-4)
 
 
 @pytest.mark.parametrize("cell", ["gru", "lstm"])
