@@ -25,7 +25,6 @@ from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
-from asm_gym.rollouts.collect import record_missing
 from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
@@ -34,7 +33,7 @@ from asm_gym.rollouts.pretraining.healthy import Lessons, calibrate_body, health
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment
+from asm_gym.rollouts.staging import environment, record_missing
 from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import Options, option
@@ -127,7 +126,8 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes) for task in args.shown}
     trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
     with stage("healthy hours", console, {}) as progress:
-        found = record_missing(trials, args.config, args.out / "hours", ParallelConfig.named(args.workers), progress)
+        files = record_missing(trials, args.config, args.out / "hours", ParallelConfig.named(args.workers), progress)
+    found = [load_episode(file) for file in files]
     if args.corpus is not None:
         found += Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)
     return [episode for episode in found if episode.success]
@@ -166,7 +166,8 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
         kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
         trials = exam.trials(args.exam_episodes, kinds, args.seed)
         with stage(exam.name, console, {}) as progress:
-            recordings = record_missing(trials, config, folder, ParallelConfig.named(args.workers), progress)
+            files = record_missing(trials, config, folder, ParallelConfig.named(args.workers), progress)
+            recordings = [load_episode(file) for file in files]
             expected = usual.setdefault(exam.task, usual_force(recordings))
             marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))
     return marks

@@ -31,8 +31,8 @@ from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.corpus import VERSION, skill_files
 from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
 from asm_gym.rollouts.progress import stage
-from asm_gym.rollouts.run_folder import claimed, make_missing
-from asm_gym.rollouts.staging import record
+from asm_gym.rollouts.run_folder import claimed
+from asm_gym.rollouts.staging import record_missing
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, evaluation_trials
 from asm_gym.scripts.command import one_line, run
 from asm_gym.scripts.options import Options, option
@@ -180,8 +180,7 @@ def evaluate(args: Args, console: Console) -> None:
     with claimed(args.out, "recordings.json", claim):
         if args.corpus is None:
             with timed("recording") as progress:
-                make = partial(record, config=args.config, folder=args.out.resolve())
-                make_missing(make, trials, lambda trial: args.out / trial.label.path, workers, progress)
+                record_missing(trials, args.config, args.out, workers, progress)
         with timed("fitting and judging") as progress:
             each = partial(parallel_map, parallel=workers, progress=progress)
             how = args.false_alarm_rate, WINDOW_S, args.seed

@@ -155,7 +155,7 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     solved = [ten_minutes(n, peak) for n, peak in enumerate([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])]
     severities = [(2.5, "strong"), (9.0, "medium"), (2.0, "mild")]
     faults = [ten_minutes(n, peak, 200, severity) for n, (peak, severity) in enumerate(severities)]
-    marks = [Marks("lift_sac", solved, [ten_minutes(9, 99.0)], [], DetectionMetrics("", faults, solved, 1.0))]
+    marks = [Marks("lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0))]
     table = hours.kept_table(marks, {1.0: 4.5, 5.0: 1.5})
     assert "in 1.00 healthy hours" in table.caption
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]

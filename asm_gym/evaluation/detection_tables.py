@@ -91,7 +91,7 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"crashed ({crashed}), and faults in such scenes."
         + (f" Kinds that cannot be detected: {', '.join(hidden)}." if hidden else "")
     )
-    return tabulate(caption, monitor_columns(result), [result.ideal, *result.on_visible])
+    return tabulate(caption, monitor_columns(result), _compared(result))
 
 
 def brief_monitors_table(result: BenchmarkResult) -> Table:
@@ -100,6 +100,10 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
     columns = [column for column in monitor_columns(result) if column.heading in wanted]
     rows = [tuple(column.cell(m).partition(" (")[0] for column in columns) for m in (result.ideal, *result.on_visible)]
     return Table(f"found within {result.window_s:g} s of the onset", [column.heading for column in columns], rows)
+
+
+def _compared(result: BenchmarkResult) -> list[Compared]:
+    return [result.ideal, *result.on_visible]
 
 
 def kinds_table(result: BenchmarkResult) -> Table:

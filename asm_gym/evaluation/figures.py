@@ -6,8 +6,7 @@ markers differ too.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence, Sized
+from collections.abc import Iterator, Sequence, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from asm_gym.episode import spans
-from asm_gym.evaluation.metrics import DetectionMetrics, Kind, KindMetrics, delays_ms, in_words, placements
+from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 from asm_gym.evaluation.statistics import wilson_interval
 
@@ -120,25 +119,6 @@ def delay_figure(groups: Sequence[DetectionMetrics]) -> Figure:
         ax.set_ylabel("faults detected [%]")
         ax.grid()
         fig.legend(loc="outside right upper", handlelength=3.5)
-    return fig
-
-
-def heat_map(metrics: Mapping[str, Mapping[Kind, KindMetrics]], visible: Mapping[Kind, bool]) -> Figure:
-    """Draw AUROC by kind of fault and monitor; kinds that no observer could detect are in brackets."""
-    kinds, monitors = list(visible), list(metrics)
-    values = np.array([[metrics[m][k].auroc if k in metrics[m] else math.nan for m in monitors] for k in kinds])
-    with figure(height=1.6 + 0.21 * len(kinds), width=2.8 + 0.62 * len(monitors)) as fig:
-        ax = fig.subplots()
-        image = ax.imshow(values, cmap="cividis", vmin=0.5, vmax=1.0, aspect="auto", interpolation="nearest")
-        for (row, column), value in np.ndenumerate(values):
-            if np.isfinite(value):
-                ink = "white" if value < 0.75 else "black"
-                ax.text(column, row, f"{value:.2f}", ha="center", va="center", color=ink, fontsize=7)
-        ax.set_yticks(range(len(kinds)), [in_words(k) if visible[k] else f"({in_words(k)})" for k in kinds])
-        ax.set_xticks(range(len(monitors)), monitors, rotation=40, ha="right", rotation_mode="anchor")
-        ax.tick_params(length=0, labelsize=8)
-        ax.spines[:].set_visible(False)
-        fig.colorbar(image, ax=ax, label="AUROC", pad=0.02)
     return fig
 
 

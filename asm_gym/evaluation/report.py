@@ -125,9 +125,6 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."
     )
     drawn = {
-        "AUROC by kind and severity of fault. In brackets: no observer could detect it.": figures.heat_map(
-            result.kinds, result.visible
-        ),
         "ROC over all faults, each against nominal episodes of its task in the same steps.": figures.roc_figure(
             result.on_all
         ),

@@ -50,9 +50,10 @@ class Rate(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % exact Poisson interval [1/h]."""
-        low, high = poisson_interval(self.k)
-        return (low / self.hours, high / self.hours) if self.hours else (0.0, math.inf)
+        """95 % exact Poisson interval [1/h] (Garwood 1936); events that come in clusters count once."""
+        low = stats.gamma.ppf(0.025, self.k) if self.k else 0.0
+        high = stats.gamma.isf(0.025, self.k + 1)
+        return (float(low / self.hours), float(high / self.hours)) if self.hours else (0.0, math.inf)
 
     @property
     def text(self) -> str:
@@ -92,16 +93,6 @@ def wilson_interval(k: int, n: int) -> tuple[float, float]:
         return 0.0, 1.0
     found = stats.binomtest(k, n).proportion_ci(method="wilson")
     return float(found.low), float(found.high)
-
-
-def poisson_interval(k: int) -> tuple[float, float]:
-    """Return the exact 95 % interval of the mean of a Poisson variable that came to ``k`` (Garwood 1936).
-
-    Events that come in clusters are not Poisson: count each cluster once.
-    """
-    check_number("k", k, low=0, whole=True)
-    low = stats.gamma.ppf(0.025, k) if k else 0.0
-    return float(low), float(stats.gamma.isf(0.025, k + 1))
 
 
 def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:

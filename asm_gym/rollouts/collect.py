@@ -10,11 +10,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from asm_gym.episode import Episode, load_episode, save_episode
+from asm_gym.episode import Episode, save_episode
 from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.staging import environment, play, policy_for, record, staged
+from asm_gym.rollouts.staging import environment, play, policy_for, staged
 from asm_gym.rollouts.trial import PolicySource, RolloutConfig, Trial
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
@@ -91,20 +91,6 @@ def collect_to(
 
 def _record_to(seed: int, folder: Path, spec: EnvSpec, config: RolloutConfig) -> Path:
     return save_episode(folder / f"{seed}.npz", record_episode(seed, spec, config))
-
-
-def record_missing(
-    trials: Sequence[Trial],
-    config: RolloutConfig,
-    folder: Path,
-    parallel: ParallelConfig | int = 2,
-    progress: Progress | None = None,
-) -> list[Episode]:
-    """Record the trials that are not in ``folder`` yet; return the episodes of all, as monitors need them."""
-    folder = folder.resolve()
-    make = partial(record, config=config, folder=folder)
-    files = make_missing(make, trials, lambda trial: folder / trial.label.path, parallel, progress)
-    return [load_episode(file) for file in files]
 
 
 def check(env_id: str, config: RolloutConfig) -> None:

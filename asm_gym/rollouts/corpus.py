@@ -14,7 +14,6 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +22,9 @@ from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
 from asm_gym.files import written_whole
 from asm_gym.rollouts.parallel import ParallelConfig, Progress
-from asm_gym.rollouts.run_folder import make_missing, versions
+from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment, record
+from asm_gym.rollouts.staging import environment, record_missing
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
@@ -205,13 +204,12 @@ def record_corpus(
     known = {entry.path: entry for entry in read_manifest(folder)} if (folder / MANIFEST).is_file() else {}
     for source in sources:
         wanted = trials(source, number, rounds)
-        make = partial(record, config=RolloutConfig(source.policy), folder=folder.resolve() / source.policy)
-        places = {trial: folder / source.policy / trial.label.path for trial in wanted}
-        for file in (place for place in places.values() if not place.is_file()):
-            known.pop(file.relative_to(folder), None)
-        make_missing(make, wanted, places.__getitem__, parallel, progress)
-        for trial, file in places.items():
-            if file.relative_to(folder) not in known:
+        paths = [Path(source.policy) / trial.label.path for trial in wanted]
+        new = {path for path in paths if not (folder / path).is_file()}
+        known = {path: entry for path, entry in known.items() if path not in new}
+        files = record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, parallel, progress)
+        for trial, path, file in zip(wanted, paths, files, strict=True):
+            if path not in known:
                 episode = load_episode(file)
                 seconds = round(len(episode) * episode.spec.dt, 6)
                 entry = Entry(source.policy, trial.label, digest(file), seconds)

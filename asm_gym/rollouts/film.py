@@ -90,12 +90,17 @@ def record_video(
     trials: Sequence[Trial], config: RolloutConfig, monitor: Monitor, path: Path, progress: Progress
 ) -> Path:
     """Film the trials, one after the other, with the surprise of a calibrated monitor, as H.264 in an MP4."""
-    with imageio.get_writer(path, fps=1.0 / monitor.spec.dt, macro_block_size=2) as writer:
+    writer: Any = imageio.get_writer(path, fps=1.0 / monitor.spec.dt, macro_block_size=2)
+    with closing(writer):
         for k, trial in enumerate(trials):
-            made = gym.make(trial.env_id, **dict(config.settings), **PICTURE)
-            with closing(made), staged(trial, config, made) as faulty:
-                guarded = _guarded(faulty, monitor, trial)
-                watched = SurpriseOverlay(guarded, caption=trial.kind)
-                play(trial, config, watched, lambda _, film=watched: writer.append_data(film.render()))
+            _film(trial, config, monitor, writer)
             progress(k + 1, len(trials))
     return path
+
+
+def _film(trial: Trial, config: RolloutConfig, monitor: Monitor, writer: Any) -> None:
+    made = gym.make(trial.env_id, **dict(config.settings), **PICTURE)
+    with closing(made), staged(trial, config, made) as faulty:
+        guarded = _guarded(faulty, monitor, trial)
+        watched = SurpriseOverlay(guarded, caption=trial.kind, camera=PICTURE["camera"])
+        play(trial, config, watched, lambda _: writer.append_data(watched.render()))

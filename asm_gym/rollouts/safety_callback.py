@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from asm_gym.detection.events import FAULT, KNOCK, NO_EVENT, STOP
 from asm_gym.episode import spans
 
 
@@ -20,16 +18,12 @@ class EpisodeSafety(NamedTuple):
         alarms: how often one began.
         cost: steps in alarm.
         override_s: for how long something else than the policy acted [s].
-        knocks, stops, faults: how often one of these began; see ``info["asm"]["event"]``.
     """
 
     surprise: float
     alarms: int
     cost: float
     override_s: float
-    knocks: int
-    stops: int
-    faults: int
 
 
 class SafetyCallback(BaseCallback):
@@ -49,7 +43,7 @@ class SafetyCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._dt = self._control_period() if self.dt is None else self.dt
-        self._steps: list[list[tuple[float, bool, float, bool, str]]] = [[] for _ in range(self.training_env.num_envs)]
+        self._steps: list[list[tuple[float, bool, float, bool]]] = [[] for _ in range(self.training_env.num_envs)]
 
     def _control_period(self) -> float:
         """Return ``asm_gym.spec.control_period`` of environments that may be in other processes."""
@@ -64,19 +58,15 @@ class SafetyCallback(BaseCallback):
             if "asm" not in info:
                 raise KeyError('info has no "asm": wrap the environment in NeuralASMSafety')
             surprise = float(info["asm_surprise"]) / float(info["asm"]["threshold"])
-            happened = bool(info["asm_alarm"]), float(info["cost"]), bool(info["asm_intervened"])
-            steps.append((surprise, *happened, str(info["asm"]["event"])))
+            steps.append((surprise, bool(info["asm_alarm"]), float(info["cost"]), bool(info["asm_intervened"])))
             if done:
                 self._end_episode(steps)
                 steps.clear()
         return True
 
     def _end_episode(self, steps: list[Any]) -> None:
-        surprise, alarm, cost, overridden, events = zip(*steps, strict=True)
-        begun = [now for before, now in pairwise([NO_EVENT, *events]) if now != before]
-        counts = (begun.count(event) for event in (KNOCK, STOP, FAULT))
-        alarms, override_s = len(spans(np.array(alarm))), self._dt * sum(overridden)
-        episode = EpisodeSafety(max(surprise), alarms, sum(cost), override_s, *counts)
+        surprise, alarm, cost, overridden = zip(*steps, strict=True)
+        episode = EpisodeSafety(max(surprise), len(spans(np.array(alarm))), sum(cost), self._dt * sum(overridden))
         self.ended.append(episode)
         for name, value in episode._asdict().items():
             self.logger.record_mean(f"safety/{name}", float(value))

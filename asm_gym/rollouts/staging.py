@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
+from asm_gym.rollouts.parallel import ParallelConfig, Progress
+from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, PASSING, PolicySource, RolloutConfig, Settings, Trial
 from asm_gym.spec import control_period
@@ -161,3 +164,15 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
 def record(trial: Trial, config: RolloutConfig, folder: Path) -> Path:
     """Record a trial, and write it to its place under ``folder``."""
     return save_episode(folder / trial.label.path, record_stream(trial, config))
+
+
+def record_missing(
+    trials: Sequence[Trial],
+    config: RolloutConfig,
+    folder: Path,
+    parallel: ParallelConfig | int = 2,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Record the trials that are not in ``folder`` yet; return the files of all."""
+    make = partial(record, config=config, folder=folder.resolve())
+    return make_missing(make, trials, lambda trial: folder / trial.label.path, parallel, progress)
