@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,15 +51,11 @@ _SENSED, _COMMANDED = (re.compile(rf"{what}(?:\[(.+)\])?") for what in (r"observ
 _GRIPPER = re.compile(r".*(gripper|hand|jaw).*")
 
 
-class _Seen(NamedTuple):
-    """What a reaction acts on: where to stay (A,), and where the policy wants the arm (A,)."""
-
-    present: Floats
-    wanted: Floats
-
-
 class _Reaction:
-    """Stays where the arm stood when the override began, or goes a part of the policy's way."""
+    """Stays where the arm stood when the override began, or goes a part of the policy's way.
+
+    It observes where to stay (A,), and where the policy wants the arm (A,); its state is where the arm stood (A,).
+    """
 
     def __init__(self, slow: bool) -> None:
         self._slow = slow
@@ -136,13 +132,15 @@ class LeRobotGuard:
 
     def guarded(self, observation: Mapping[str, Any], action: dict[str, Any]) -> dict[str, Any]:
         """Return what is to be sent in place of an action; nothing where no place to stay is known."""
-        self._follow_rate()
+        self._pace.lost(self._clock())
+        if self._pace.change:
+            _log.warning(self._pace.change if self._pace.kind != SLOWER else self._pace.change.partition(":")[0])
         if self._engine is None:
             self._names = tuple(action)
             self._engine = self._guard()
         engine, acts = self._engine, self.on_alarm != "monitor"
         wanted = np.array([action.get(name, np.nan) for name in self._names], np.float64)
-        seen = _Seen(np.array([self._present(name, observation) for name in self._names]), wanted)
+        seen = np.array([self._present(name, observation) for name in self._names]), wanted
         asked = wanted.astype(np.float32)
 
         def command() -> Floats32:
@@ -195,21 +193,14 @@ class LeRobotGuard:
 
     def _row(self, observation: Mapping[str, Any], action: Floats32) -> Floats32:
         """Return (D,) the row of the stream; NaN where something is missing."""
-        named = observation, dict(zip(self._names, action.tolist(), strict=True))
-        ordered = [v for v in observation.values() if isinstance(v, float)], action.tolist()
-        row = []
-        for commanded, name in self._labels:
-            if name.isdigit():  # a dataset that names no motors numbers them
-                values = ordered[commanded]
-                row.append(float(values[int(name)]) if int(name) < len(values) else np.nan)
-            else:
-                row.append(float(named[commanded].get(name, np.nan)))
-        return np.array(row, np.float32)
-
-    def _follow_rate(self) -> None:
-        self._pace.lost(self._clock())
-        if self._pace.change:
-            _log.warning(self._pace.change if self._pace.kind != SLOWER else self._pace.change.partition(":")[0])
+        sensed = dict(enumerate(v for v in observation.values() if isinstance(v, float)))
+        told = dict(enumerate(action.tolist()))  # a dataset that names no motors numbers them
+        known: list[Mapping[Any, Any]] = [
+            {**sensed, **observation},
+            {**told, **dict(zip(self._names, action.tolist(), strict=True))},
+        ]
+        places = ((where, int(name) if name.isdigit() else name) for where, name in self._labels)
+        return np.array([float(known[where].get(name, np.nan)) for where, name in places], np.float32)
 
     def get_config(self) -> dict[str, Any]:
         """Return what LeRobot saves of this step."""

@@ -1,4 +1,4 @@
-"""A recorder that keeps any environment's sensorimotor stream."""
+"""Record any environment's sensorimotor stream."""
 
 from __future__ import annotations
 
@@ -47,41 +47,31 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     @property
     def stream_spec(self) -> StreamSpec:
-        """Names the numbers of a row."""
         return self._source.spec
 
-    def _clear(self, seed: int | None) -> None:
-        self._seed = seed
-        self._observations: list[Any] = []
-        self._actions: list[NDArray[np.float32]] = []
-        self._rewards: list[float] = []
-        self._rows: list[NDArray[np.float32]] = []
-        self._faults: list[bool] = []
-        self._success: bool | None = None  # nobody has said yet
+    def _clear(self, seed: int | None, *first: Any) -> None:
+        """Begin an episode of ``seed`` with its ``first`` observation, if there is one."""
+        self._seed, self._observations = seed, list(first)
+        self._steps: list[tuple[NDArray[np.float32], float, NDArray[np.float32], list[bool]]] = []
+        self._success: bool | None = None  # nothing was reported yet
         self._terminated = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._finish()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._clear(seed)
-        info = dict(info)
-        self._observations.append(deepcopy(observation))
-        info["stream"] = self._source.first(observation, info)
-        return observation, info
+        self._clear(seed, deepcopy(observation))
+        return observation, {**info, "stream": self._source.first(observation, info)}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
+        info = {**info, "stream": self._source.row(observation, action, info)}
         # Copies: an environment, a driver or a policy may use its arrays again.
-        info = dict(info)
-        info["stream"] = self._source.row(observation, action, info)
+        rows = np.array(self._source.rows(observation, action, info))
+        faults = [bool(info.get("fault"))] * len(rows)
         self._observations.append(deepcopy(observation))
-        self._actions.append(np.array(np.atleast_1d(as_float32(action))))
-        self._rewards.append(float(reward))
-        rows = self._source.rows(observation, action, info)
-        self._rows += list(np.array(rows))
-        self._faults += [bool(info.get("fault"))] * len(rows)
-        said = info.get("success", info.get("is_success"))
-        self._success = self._success if said is None else bool(self._success or said)
+        self._steps.append((np.array(np.atleast_1d(as_float32(action))), float(reward), rows, faults))
+        success = info.get("success", info.get("is_success"))
+        self._success = self._success if success is None else bool(self._success or success)
         self._terminated = bool(terminated)
         if terminated or truncated:
             self._finish()
@@ -103,19 +93,20 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         super().close()
 
     def _finish(self) -> None:
-        if self._rows:
+        if self._steps:
             space, own = self.env.observation_space, self._source.own
             kept = [] if own and isinstance(space, gym.spaces.Dict) else [flat(space, o) for o in self._observations]
+            actions, rewards, rows, faults = zip(*self._steps, strict=True)
             self.episodes.append(
                 Episode(
-                    stream=np.stack(self._rows),
+                    stream=np.concatenate(rows),
                     spec=self.stream_spec,
                     success=self._success is not False,
                     seed=self._seed,
-                    actions=np.stack(self._actions),
+                    actions=np.stack(actions),
                     observations=np.stack(kept) if kept else np.zeros((0, 0), np.float32),
-                    rewards=np.asarray(self._rewards, np.float32),
-                    faults=np.asarray(self._faults),
+                    rewards=np.asarray(rewards, np.float32),
+                    faults=np.concatenate(faults),
                     info={"terminated": self._terminated},
                 )
             )
