@@ -6,10 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import FlattenObservation, NormalizeObservation
+from gymnasium.wrappers import NormalizeObservation
 
-import asm_gym  # noqa: F401
+from asm_gym import register_task
 from asm_gym.data.datasets import read_dataset
 from asm_gym.faults import (
     ActionDelay,
@@ -28,6 +27,7 @@ from asm_gym.policies import make_policy
 from asm_gym.rollouts import collect
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec, flat, flat_rows
+from asm_gym.tasks import OWN
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 from tests.needs import needs
@@ -201,13 +201,6 @@ class Named(gym.ObservationWrapper):
         return {"sensed": observation}
 
 
-def test_a_key_of_a_dict_is_a_channel_that_can_be_struck():
-    env = FaultInjection(Named(FakeEnv(own_stream=False)), [Bias(channel="sensed", element=1, onset=1, amount=5.0)])
-    env.reset(seed=0)
-    rows = [env.step(np.zeros(3, np.float32))[0]["sensed"].tolist() for _ in range(2)]
-    assert rows == [[1.0, 1.0], [2.0, 7.0]]
-
-
 def named():
     return Named(FakeEnv(length=5, own_stream=False))
 
@@ -260,18 +253,6 @@ def test_every_kind_strikes_a_sense_that_moves_and_a_twin_shows_it():
                 assert not np.array_equal(broken, healthy), kind
     with pytest.raises(ValueError, match="no sensor of this environment moves"):
         faults_anywhere("frozen_sense", interface, 0 * sigma, "strong", ONSET, seed=1)
-
-
-def test_the_synthetic_arm_is_an_environment_and_follows_what_it_is_told():
-    env = gym.make(ARM).unwrapped
-    check_env(env, skip_render_check=True)
-    env.reset(seed=0)
-    for _ in range(100):
-        observation, *_ = env.step(np.full(7, 0.2, np.float32))
-    # A velocity loop of gain 60 against friction of 3 v + tanh(20 v)/2, gravity apart in the joints without it.
-    settled = 0.2 * 60 / 63 - 0.5 * np.tanh(4) / 63
-    np.testing.assert_allclose(observation[[7, 13]], settled, rtol=0.05)
-    np.testing.assert_allclose(observation[[0, 6]], settled * 1.0, rtol=0.07)
 
 
 def test_what_a_dict_environment_did_is_a_dataset_and_comes_back(tmp_path):
@@ -355,13 +336,51 @@ def test_environments_of_others_give_streams_whose_senses_can_be_struck(package,
     assert stream[2, 0] - stream[1, 0] > 8
 
 
-def test_a_flattened_observation_reads_as_the_dict_did():
-    plain, dicts = FlattenObservation(Named(FakeEnv(own_stream=False))), Named(FakeEnv(own_stream=False))
-    rows = []
-    for env in (plain, dicts):
-        recorder = StreamRecorder(env)
-        recorder.reset(seed=0)
-        for _ in range(3):
-            recorder.step(np.ones(3, np.float32))
-        rows.append(recorder.finish().stream)
-    np.testing.assert_array_equal(*rows)
+def test_an_environment_without_a_body_is_not_told_to_babble():
+    with pytest.raises(ValueError, match="StreamRecorder") as said:
+        NeuralASMSafety(gym.make("Pendulum-v1"))
+    assert "babble" not in str(said.value)
+
+
+def test_an_argument_of_robosuite_is_refused_by_name():
+    with pytest.raises(TypeError, match=r"asm_gym/Lift-v0 takes robot=, got robots='Panda'"):
+        gym.make("asm_gym/Lift-v0", robots="Panda")
+    with pytest.raises(ValueError, match="makes Lift, got task='Door'"):
+        gym.make("asm_gym/Lift-v0", task="Door")
+
+
+def own_class():
+    from robosuite.environments.manipulation.lift import Lift
+
+    class Pour(Lift):
+        """A class of one's own."""
+
+    return Pour
+
+
+def test_robosuites_own_gym_wrapper_is_recorded():
+    from robosuite.wrappers import GymWrapper
+
+    options = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False, "control_freq": 10}
+    recorder = StreamRecorder(GymWrapper(own_class()(robots="Panda", **options)))
+    recorder.reset(seed=0)
+    for _ in range(3):
+        recorder.step(recorder.action_space.sample())
+    episode = recorder.finish()
+    assert episode.spec.dt == pytest.approx(0.1)
+    assert len(episode) == 3
+
+
+def test_a_class_of_robosuite_becomes_a_task_with_named_channels():
+    register_task("Decant", own_class(), horizon=6, robots="Sawyer", control_freq=10)
+    first, again = (collect("asm_gym/Decant-v0", "hold", episodes=1, seed=3, workers=1)[0] for _ in range(2))
+    np.testing.assert_array_equal(first.stream, again.stream)
+    units = {c.name: c.unit for c in first.spec.channels}
+    assert (first.spec.source, first.spec.dt, len(first)) == ("Sawyer", 0.1, 6)
+    assert (units["robot0_joint_pos"], units["robot0_joint_vel"], units["robot0_joint_pos_cos"]) == (
+        "rad",
+        "rad/s",
+        "1",
+    )
+    assert "cube_pos" not in units
+    del OWN["Decant"], gym.registry["asm_gym/Decant-v0"]

@@ -54,6 +54,16 @@ def test_torchrl_reads_the_cost():
     np.testing.assert_array_equal(env.rollout(8)["next"]["cost"].ravel(), [0, 0, 1, 1, 0, 0, 1, 0])
 
 
+def test_a_callback_finds_out_the_control_period():
+    sb3 = needs("stable_baselines3")
+    from asm_gym.rollouts.safety_callback import SafetyCallback
+
+    callback = SafetyCallback()
+    guarded = watched(range(20), length=20, on_alarm="hold")
+    sb3.PPO("MlpPolicy", guarded, n_steps=20, batch_size=20).learn(20, callback=callback)
+    assert callback.ended[0].override_s == pytest.approx(19 * 0.05)
+
+
 def test_a_loop_as_cleanrl_writes_it_sees_cost_and_episodes():
     """Environments side by side, each recorded and clipped outside of the guard, as in its PPO."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import itertools
 import json
-import tracemalloc
 from functools import partial
 
 import numpy as np
@@ -105,18 +104,6 @@ def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, mon
     assert "0.120 s  knock: no alarm" in said
     trace = ScoredEpisode("log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])})
     assert excused_in(trace) == {KNOCK: 2}
-
-
-def test_rows_are_watched_in_constant_memory(monitor, monkeypatch):
-    monkeypatch.setattr("asm_gym.guard.live.LATENCIES", 100)
-    line = json.dumps(episode(500).stream[20].tolist())
-    peaks = []
-    for rows in (400, 2000):
-        tracemalloc.start()
-        watched((line for _ in range(rows)), monitor)
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
-    assert peaks[1] < peaks[0] + 20_000  # 1600 rows more, of 60 bytes as text alone
 
 
 def test_a_pipe_and_a_file_are_watched_as_a_command(monitor, tmp_path, monkeypatch, capsys):

@@ -142,16 +142,3 @@ def test_it_needs_a_monitor_underneath():
     env.reset()
     with pytest.raises(KeyError, match="put it over NeuralASMSafety"):
         env.step(np.zeros(1, np.float32))
-
-
-def test_the_spec_makes_it_again():
-    gym.register("asm_gym_test/Scripted-v0", entry_point=ScriptedEnv)
-    try:
-        env = SurpriseOverlay(gym.make("asm_gym_test/Scripted-v0", render_mode="rgb_array"), "push", seconds=3.0)
-        assert env.spec is not None
-        again = gym.make(env.spec)
-        assert isinstance(again, SurpriseOverlay)
-        assert again.spec == env.spec
-        assert again.caption == "push"
-    finally:
-        del gym.registry["asm_gym_test/Scripted-v0"]

@@ -6,12 +6,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from asm_gym.detection import AdaptiveThreshold
 from asm_gym.guard.reflexes import GRADED, REFLEXES
+from asm_gym.monitors import Surprise
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.wrappers import NeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import SPEC, CueMonitor, FakeEnv
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
@@ -27,13 +30,10 @@ def test_monitor_reports_and_never_touches_the_action():
     env = NeuralASMSafety(FakeEnv(), CueMonitor([3, 4]), on_alarm="monitor")
     infos = run(env, 8)
     assert [i["asm"]["alarm"] for i in infos[1:]] == [False] * 3 + [True] * 2 + [False] * 3
+    assert [i["cost"] for i in infos] == [0.0] * 4 + [1.0] * 2 + [0.0] * 3
+    assert all(set(i["asm"]) == set(infos[0]["asm"]) for i in infos)
     assert not any(i["asm"]["intervened"] for i in infos)
     assert all(np.array_equal(a, ACT) for a in env.unwrapped.actions)
-
-
-def test_cost_is_one_on_exactly_the_steps_in_alarm():
-    infos = run(NeuralASMSafety(FakeEnv(), CueMonitor([2, 5]), on_alarm="monitor"), 8)
-    assert [i["cost"] for i in infos] == [0.0, 0, 0, 1, 0, 0, 1, 0, 0]
 
 
 def test_hold_acts_from_the_next_step_keeps_the_grip_and_hands_back_after_quiet():
@@ -91,13 +91,6 @@ def test_attribution_names_every_number_and_adds_up_to_the_surprise():
     assert info["threshold"] == 1.0
 
 
-def test_reset_and_step_report_the_same_keys():
-    reset, step = run(NeuralASMSafety(FakeEnv(), CueMonitor()), 1)
-    assert set(reset["asm"]) == set(step["asm"])
-    assert reset["cost"] == 0.0
-    assert not reset["asm"]["alarm"]
-
-
 @settings(max_examples=30, deadline=None)
 @given(cue=st.sets(st.integers(0, 19)), release=st.integers(1, 5))
 def test_reset_forgets_everything_whatever_happened(cue, release):
@@ -108,42 +101,56 @@ def test_reset_forgets_everything_whatever_happened(cue, release):
         assert a["asm"]["intervened"] == b["asm"]["intervened"]
 
 
-def test_an_environment_without_a_stream_is_watched_through_its_spaces():
-    env = FakeEnv(own_stream=False)
-    spec = StreamSpec.from_spaces(env.observation_space, env.action_space, dt=0.05)
-    monitor = CueMonitor(spec=spec)
-    run(NeuralASMSafety(env, monitor), 3)
-    np.testing.assert_allclose(monitor.rows[1], [2, 2, *ACT])
+OTHER = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05)
 
 
-def test_unknown_reactions_are_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"'freeze'.*monitor, hold, retract.*terminate"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="freeze")
-    with pytest.raises(ValueError, match="predict"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm=3)
+@pytest.mark.parametrize(
+    ("monitor", "options", "error", "message"),
+    [
+        ({}, {"on_alarm": "freeze"}, ValueError, r"'freeze'.*monitor, hold, retract.*terminate"),
+        ({}, {"on_alarm": 3}, ValueError, "predict"),
+        ({"spec": OTHER}, {}, ValueError, "weight"),
+        ({"threshold": None}, {}, RuntimeError, "calibrate"),
+        ({}, {"release_below": 0.0}, ValueError, "release_below"),
+        ({}, {"release_below": 1.1}, ValueError, "release_below"),
+        ({}, {"max_override": 0}, ValueError, "max_over"),
+        ({}, {"on_overrun": "panic"}, ValueError, r"on_overrun.*warn.*alarm"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(monitor, options, error, message):
+    with pytest.raises(error, match=message):
+        NeuralASMSafety(FakeEnv(), CueMonitor(**monitor), **options)
 
 
-def test_a_memory_for_other_channels_is_refused_by_name():
-    other = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05)
-    with pytest.raises(ValueError, match="weight"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(spec=other))
-
-
-def test_an_uncalibrated_monitor_is_refused_before_anything_runs():
-    with pytest.raises(RuntimeError, match="calibrate"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(threshold=None))
-
-
-def test_discrete_actions_are_refused():
+def test_discrete_actions_are_refused_and_so_is_a_step_before_reset():
     env = FakeEnv()
+    with pytest.raises(gym.error.ResetNeeded):
+        NeuralASMSafety(env, CueMonitor()).step(ACT)
     env.action_space = spaces.Discrete(3)
     with pytest.raises(TypeError, match="Box action space to act in"):
         NeuralASMSafety(env, CueMonitor())
 
 
-def test_stepping_before_reset_is_refused():
-    with pytest.raises(gym.error.ResetNeeded):
-        NeuralASMSafety(FakeEnv(), CueMonitor()).step(ACT)
+@pytest.mark.parametrize(
+    ("answer", "got"),
+    [
+        (lambda state, stream: np.zeros(1), "got ndarray"),
+        (lambda state, stream: (state, np.zeros(1)), r"got \(state, ndarray\)"),
+        (lambda state, stream: (state, 0.0, 1.0), "got a tuple of 3"),
+    ],
+)
+def test_a_monitor_needs_no_base_class_and_must_answer_a_surprise(answer, got):
+    class Foreign:
+        threshold, spec = 1.0, SPEC
+        observe = staticmethod(lambda state, rows: (state, Surprise(np.zeros(len(rows)), np.zeros(rows.shape))))
+
+        def initial_state(self, batch=1):
+            return None
+
+    assert not run(NeuralASMSafety(FakeEnv(), Foreign()), 1)[1]["asm"]["alarm"]
+    Foreign.observe = staticmethod(answer)
+    with pytest.raises(TypeError, match=got):
+        NeuralASMSafety(FakeEnv(), Foreign())
 
 
 def test_a_reflex_that_acts_too_long_gives_up_and_ends_the_episode():
@@ -181,19 +188,6 @@ def test_evidence_that_was_acted_on_is_not_counted_again():
     forgotten.clear()
     run(NeuralASMSafety(FakeEnv(), Remembering([2, 4]), on_alarm="monitor"), 8)
     assert not forgotten  # who only reports, reports all there is
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"release_below": 0.0}, "release_below"),
-        ({"release_below": 1.1}, "release_below"),
-        ({"max_override": 0}, "max_over"),
-    ],
-)
-def test_bad_patience_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), **arguments)
 
 
 def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override():
@@ -249,15 +243,6 @@ def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fai
     assert [r.message.split(":")[0] for r in caplog.records if r.name == "asm_gym.safety"] == said
 
 
-def test_a_trial_that_goes_well_is_forgotten():
-    cue = [3, 4, 5, 20, 21, 22]
-    env = NeuralASMSafety(FakeEnv(length=40), CueMonitor(cue), try_after=2, max_override=3, release_after=4)
-    infos = run(env, 30)
-    acting = "".join("h" if i["asm"]["intervened"] else "p" for i in infos[1:])
-    assert acting == "pppp" + "hh" + "p" * 15 + "hh" + "p" * 7
-    assert not any(i["asm"]["gave_up"] for i in infos)
-
-
 def test_an_alarm_that_is_back_at_once_has_not_gone_and_ends_the_episode():
     """Quiet whenever the robot holds, and surprising again two steps after the policy goes on: a fault that lasts."""
     env = NeuralASMSafety(FakeEnv(length=60), CueMonitor([3, 7, 11, 15, 19]), release_after=2, max_override=6)
@@ -289,8 +274,6 @@ def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
         warnings.simplefilter("error")
         infos = run(NeuralASMSafety(FakeEnv(), Slow(), on_overrun="ignore"), 6)
     assert not any(i["asm"]["alarm"] for i in infos)
-    with pytest.raises(ValueError, match=r"on_overrun.*warn.*alarm"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), on_overrun="panic")
 
 
 def test_recall_does_what_the_memory_expects_and_needs_one_that_expects():
@@ -377,3 +360,113 @@ def test_every_reflex_acts_in_the_step_after_an_alarm_by_an_action_of_its_own(na
     assert all((s["executed_action"] == wanted).all() for s in said[:4])
     assert not (said[4]["executed_action"] == wanted).all()
     assert env.action_space.contains(np.asarray(said[4]["executed_action"], np.float32))
+
+
+# ------------------------------------------------------------------ a threshold that follows the policy
+
+
+HOW = AdaptiveThreshold(rate=0.1, step=0.5, ceiling=20.0)
+
+
+class ScriptedMonitor(CueMonitor):
+    """Says ``values`` of the steps of an episode; the threshold is 1."""
+
+    def __init__(self, values):
+        super().__init__()
+        self.values = values
+
+    def observe(self, state, stream):
+        value = np.full(len(stream), self.values.get(state, 0.5))
+        return state + 1, Surprise(value, np.zeros((len(stream), self.spec.size)))
+
+
+def episode(env, steps=20):
+    _, info = env.reset()
+    for _ in range(steps):
+        *_, info = env.step(np.zeros(3, np.float32))
+    return info["asm"]
+
+
+def test_a_false_alarm_raises_the_threshold_of_the_next_episode_and_not_of_its_own():
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
+    first, second = episode(env), episode(env)
+    assert first["threshold"] == 1.0
+    assert np.isnan(first["level"])
+    assert first["ceiling"] == 20.0
+    assert second["threshold"] == pytest.approx(np.exp(0.45))
+    assert second["level"] == 1.0
+    assert env.threshold == second["threshold"]
+
+
+def test_without_adapt_nothing_moves_and_nothing_is_added():
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor")
+    assert episode(env)["threshold"] == episode(env)["threshold"] == 1.0
+    assert not {"level", "ceiling"} & episode(env).keys()
+
+
+def test_what_goes_on_while_the_reflex_acts_is_no_drift():
+    passing, lasting = {5: 2.0}, dict.fromkeys(range(5, 20), 2.0)
+    for values, moved in ((passing, True), (lasting, False)):
+        env = NeuralASMSafety(FakeEnv(), ScriptedMonitor(values), release_after=3, adaptive_threshold=HOW)
+        episode(env)
+        assert (episode(env)["threshold"] > 1.0) is moved
+
+
+def test_surprise_of_the_reflex_itself_is_not_the_policys():
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0, 6: 1000.0}), release_after=3, adaptive_threshold=HOW)
+    episode(env)
+    assert episode(env)["threshold"] == pytest.approx(np.exp(0.45))  # by the 2; 1000 is above the ceiling
+
+
+def test_a_confirmed_alarm_and_one_above_the_ceiling_teach_nothing():
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
+    episode(env)
+    env.confirm_alarm()
+    assert episode(env)["threshold"] == 1.0
+    assert episode(env)["threshold"] > 1.0  # the confirmation was of one episode
+    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 20.5}), on_alarm="monitor", adaptive_threshold=HOW)
+    for _ in range(5):
+        last = episode(env)
+    assert last["threshold"] == 1.0
+
+
+def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_episodes():
+    class Monitor(ScriptedMonitor):
+        def initial_state(self, batch=1):
+            return np.zeros(batch, np.int64)
+
+        def observe(self, state, stream):
+            value = np.array([self.values.get(int(s), 0.5) for s in state])
+            return state + 1, Surprise(value, np.zeros((len(stream), self.spec.size)))
+
+    lengths = (6, 10)
+    made = SyncVectorEnv([lambda n=n: FakeEnv(n) for n in lengths], autoreset_mode=AutoresetMode.NEXT_STEP)
+    env = VectorNeuralASMSafety(made, Monitor({3: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
+    env.reset()
+    thresholds = []
+    for _ in range(24):
+        *_, infos = env.step(np.zeros((2, 3), np.float32))
+        thresholds.append(infos["asm"]["threshold"])
+    thresholds = np.array(thresholds)
+    np.testing.assert_allclose(thresholds[0], [1.0, 1.0])
+    once = np.exp(0.45)
+    np.testing.assert_allclose(thresholds[7], [once, 1.0])  # the first has begun anew, the second is under way
+    np.testing.assert_allclose(thresholds[12], [once, once**2])
+    assert infos["asm"]["level"].shape == infos["asm"]["ceiling"].shape == (2,)
+    np.testing.assert_allclose(env.threshold, thresholds[-1])
+
+
+@pytest.mark.parametrize("on_alarm", ["monitor", "hold"])
+def test_a_policy_so_strange_that_most_of_its_steps_alarm_is_named_once_with_what_to_do(on_alarm):
+    strange = ScriptedMonitor(dict.fromkeys(range(0, 4000, 2), 2.0) | dict.fromkeys(range(0, 4000, 3), 2.0))
+    env = NeuralASMSafety(FakeEnv(8000), strange, on_alarm=on_alarm, release_after=1, on_overrun="ignore")
+    with pytest.warns(UserWarning, match=r"of the first 200 rows under this policy alarm: .* warm_start=True") as said:
+        episode(env, 4000)
+    assert len(said) == 1
+
+
+def test_a_fault_that_passes_makes_no_policy_strange():
+    passing = ScriptedMonitor(dict.fromkeys(range(20, 110), 2.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        episode(NeuralASMSafety(FakeEnv(400), passing, on_alarm="monitor", on_overrun="ignore"), 300)

@@ -87,12 +87,6 @@ def test_a_policy_that_is_lost_surprises_the_skill_and_not_the_body():
     assert np.mean([s.of_body.max() > both().threshold for s in scores]) <= 0.2
 
 
-def test_a_push_surprises_the_body():
-    asm = both()
-    scores = asm.score_episodes([carried(400 + s, push=0.1) for s in range(20)])
-    assert np.mean([s.of_body[LATE:].max() > asm.threshold for s in scores]) >= 0.9
-
-
 @pytest.mark.parametrize("which", ["skill", "either", "both"])
 def test_each_choice_is_calibrated_and_its_shares_add_up(which):
     asm = alarming_on(which)

@@ -20,19 +20,46 @@ from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself
-from asm_gym.spec import control_period
+from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32, check_choice, short_repr
 from asm_gym.wrappers.robots import body_memory, felt_by, policy_for, robots_of, sensing_within_steps
 
 
-class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class ExchangesMonitor:
+    """A guard whose monitor can be exchanged between episodes."""
+
+    _spec: StreamSpec
+    _monitor: Monitor
+    _next: Monitor
+    _taken_up: Fitted
+
+    @property
+    def monitor(self) -> Monitor:
+        """The monitor in use; one that is assigned, or was fitted or calibrated since, takes over at the next reset."""
+        return self._monitor
+
+    @monitor.setter
+    def monitor(self, monitor: Monitor) -> None:
+        check_answer(monitor)
+        check_monitor(monitor, self._spec)
+        self._next = monitor
+
+    def _changed(self) -> bool:
+        """Return whether a monitor is to be taken over."""
+        changed = Fitted.of(self._next, self._spec).differs(self._taken_up)
+        if changed:
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+        return changed
+
+
+class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Guard an environment with a Box action space under any policy; other environments can be watched.
 
-    After each step the monitor compares the row of the stream with its prediction. From the step after an alarm on, a
-    reflex acts in the policy's place, until surprise has stayed under ``release_below`` of the threshold for
-    ``release_after`` steps. A failure is an alarm too: a monitor that raises or returns nonsense, a stream that is
-    missing, an action of the policy that is not finite (it is not executed). A reflex that fails is replaced by a hold.
+    From the step after an alarm on, a reflex acts in the policy's place, until surprise has stayed under
+    ``release_below`` of the threshold for ``release_after`` steps. A failure is an alarm too: a monitor that raises or
+    returns nonsense, a stream that is missing, an action of the policy that is not finite (it is not executed). A
+    reflex that fails is replaced by a hold.
 
     In environments of this package contact force comes first: from the physics substep that passes ``contact_limits``
     on the arm holds, which is an alarm whatever the surprise. Under ``"graded"`` severity and cause decide what is
@@ -88,7 +115,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         >>> from asm_gym import NeuralASMSafety
         >>> env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"), on_overrun="ignore")  # the shipped memory of the Panda
         >>> observation, info = env.reset(seed=0)
-        >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        >>> *_, info = env.step(env.action_space.sample())
         >>> info["asm"]["state"], bool(info["cost_sum"] >= info["cost"])
         ('policy', True)
     """
@@ -130,10 +157,8 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
         if self._box is None and on_alarm not in ("monitor", "terminate"):
-            raise TypeError(
-                f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}: others "
-                'can only be watched, on_alarm="monitor", or ended, "terminate"'
-            )
+            needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
+            raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
         check_choice("info", info, INFO)
         self._full = info == "full"
         self._source = StreamSource(env)
@@ -148,18 +173,6 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._inner: Any = env.unwrapped
         self._holds = isinstance(self._inner, HoldsItself)
         self._ended = True
-
-    @property
-    def monitor(self) -> Monitor:
-        """What watches. Another that is assigned, or one that was fitted or calibrated since, takes over at the next
-        ``reset``. Raises as the constructor does where it does not fit."""
-        return self._monitor
-
-    @monitor.setter
-    def monitor(self, monitor: Monitor) -> None:
-        check_answer(monitor)
-        check_monitor(monitor, self._spec)
-        self._next = monitor
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
@@ -178,8 +191,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return float(self._engine.threshold[0])
 
     def confirm_alarm(self) -> None:
-        """Say that what has alarmed in this episode was real, so that ``adaptive_threshold`` does not take it for a
-        false alarm."""
+        """Confirm that the alarms of this episode were real, for ``adaptive_threshold``."""
         self._engine.confirmed[:] = True
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -187,8 +199,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         info = dict(info)
         nothing = self._engine.begin()
-        if Fitted.of(self._next, self._spec).differs(self._taken_up):
-            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+        if self._changed():
             self._watch_with(self._next)
             nothing = self._engine.begin()
         self._limit_contact(anew=True)
@@ -239,8 +250,7 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return command
 
     def _run(self) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Make a step of the environment. Rows that come before its end are judged meanwhile, and a robot that is held
-        is held in all steps that wrappers in between make of one."""
+        """Step the environment; rows within the step are judged meanwhile, and a hold lasts through all its parts."""
         hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else None
         if hooks is not None:
             hooks.append(self._judge)
@@ -290,14 +300,11 @@ class NeuralASMSafety(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         alarm = any(bool(row.alarm[0]) for row in rows)
         self._alarms += alarm
         if self._full:
-            info["asm"] = self._asm(rows, executed)
+            failed, done = self._failed, None if executed is None else np.array(executed)
+            more: dict[str, float] = {"alarms": self._alarms}
+            if (running := self._engine.running) is not None:
+                more = more | {"ceiling": running.ceiling, "level": running.level}
+            info["asm"] = LazyInfo(lambda: report(rows, 0, self._spec, done, failed) | more)
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
         info["asm_intervened"] = np.bool_(any(row.intervened[0] for row in rows))
         info["cost_sum"] = np.float64(self._alarms)
-
-    def _asm(self, rows: Sequence[RowReport], executed: Any) -> LazyInfo:
-        """Return all that there is to say of a step; it is made when it is read."""
-        failed, alarms, running = self._failed, {"alarms": self._alarms}, self._engine.running
-        done = None if executed is None else np.array(executed)
-        more = alarms if running is None else alarms | {"ceiling": running.ceiling, "level": running.level}
-        return LazyInfo(lambda: report(rows, 0, self._spec, done, failed) | more)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.guard.checks import LOG, Fitted, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.checks import Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
@@ -22,11 +22,12 @@ from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
 from asm_gym.wrappers.robots import askable, felt_by, memory_of, robots_of_many, shared_policy
+from asm_gym.wrappers.safety import ExchangesMonitor
 
 Mask = NDArray[np.bool_]
 
 
-class VectorNeuralASMSafety(VectorWrapper):
+class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
     """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
 
     Arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is n, and
@@ -134,17 +135,6 @@ class VectorNeuralASMSafety(VectorWrapper):
         self._taken_up = Fitted.of(monitor, self._spec)
 
     @property
-    def monitor(self) -> Monitor:
-        """As in ``NeuralASMSafety``; what has changed is taken over at the next ``reset`` of all environments."""
-        return self._monitor
-
-    @monitor.setter
-    def monitor(self, monitor: Monitor) -> None:
-        check_answer(monitor)
-        check_monitor(monitor, self._spec)
-        self._next = monitor
-
-    @property
     def threshold(self) -> NDArray[np.float64]:
         """(n,) what surprise must exceed for an alarm in the episodes that run."""
         return self._engine.threshold.copy()
@@ -164,8 +154,7 @@ class VectorNeuralASMSafety(VectorWrapper):
             raise gym.error.ResetNeeded("the first reset() must be of all environments")
         self._ended = np.zeros(n, bool) if ended is None else ended
         nothing = self._begin(begun)
-        if begun.all() and Fitted.of(self._next, self._spec).differs(self._taken_up):
-            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+        if begun.all() and self._changed():
             self._watch_with(self._next)
             nothing = self._begin(begun)
         self._report(infos, nothing, np.full(self.env.action_space.shape or (), np.nan, np.float32), begun)
