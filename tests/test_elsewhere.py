@@ -232,7 +232,7 @@ def test_a_stream_that_is_not_the_observation_is_refused():
             return observation + 1, info
 
     env = FaultInjection(Other(), [Bias(channel="position", element=0)])
-    with pytest.raises(ValueError, match="not its observation"):
+    with pytest.raises(ValueError, match="does not hold its observation"):
         env.reset(seed=0)
 
 

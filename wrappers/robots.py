@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,19 +25,6 @@ DELTAS = ("OSC_POSE", "JOINT_POSITION")
 """Controllers whose actions are changes, of pose or of joint angles."""
 
 Values = tuple[Any, ...] | None
-
-
-@runtime_checkable
-class Askable(Protocol):
-    """A vector environment whose members can be asked, and told."""
-
-    def call(self, name: str, *args: Any) -> tuple[Any, ...]:
-        """What the method ``name`` of each returns."""
-        ...
-
-    def set_attr(self, name: str, values: list[Any]) -> None:
-        """Sets an attribute of each."""
-        ...
 
 
 def robots_of(env: gym.Env[Any, Any], spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
@@ -98,10 +85,10 @@ def robots_of_many(envs: VectorEnv[Any, Any, Any], spec: StreamSpec) -> tuple[Ro
     return _known(asked, spec, rest, changed, refused)
 
 
-def askable(envs: VectorEnv[Any, Any, Any]) -> Askable:
+def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     """Return a vector environment whose members can be asked what they are. Raises TypeError where they cannot."""
-    inner = envs.unwrapped
-    if not isinstance(inner, Askable):
+    inner: Any = envs.unwrapped
+    if not (hasattr(inner, "call") and hasattr(inner, "set_attr")):
         raise TypeError(
             f"{inner} cannot be asked what its environments are: make it with SyncVectorEnv or AsyncVectorEnv"
         )
@@ -261,27 +248,15 @@ def shared_policy(policy: Any) -> Policy:
     return shared
 
 
-@runtime_checkable
-class SensesWithinSteps(Protocol):
-    """An environment whose stream can run faster than control, and whose action can be replaced within a step."""
-
-    row_hooks: list[Any]
-    stream_freq: int
-
-    def stream_spec_at(self, rate: int) -> StreamSpec: ...
-
-    def command(self, action: NDArray[np.float32]) -> None: ...
-
-
-def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> SensesWithinSteps:
+def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> Any:
     """Return the environment underneath, once its stream can run at ``rate`` [Hz]; nothing is changed.
 
     Raises:
         ValueError: it cannot, or a wrapper inside changes actions, which a reflex within a step would pass by.
     """
     check_number("monitor_freq", rate, low=1, whole=True)
-    inner = env.unwrapped
-    if not isinstance(inner, SensesWithinSteps):
+    inner: Any = env.unwrapped
+    if not hasattr(inner, "stream_spec_at"):
         raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
     wrapper = env
     while isinstance(wrapper, gym.Wrapper):

@@ -13,44 +13,17 @@ from numpy.typing import NDArray
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.checks import LOG, Fitted, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.motion import Command
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself
-from asm_gym.spec import StreamSpec, control_period
+from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32, check_choice, short_repr
 from asm_gym.wrappers.robots import body_memory, felt_by, policy_for, robots_of, sensing_within_steps
-
-
-class ExchangesMonitor:
-    """A guard whose monitor can be exchanged between episodes."""
-
-    _spec: StreamSpec
-    _monitor: Monitor
-    _next: Monitor
-    _taken_up: Fitted
-
-    @property
-    def monitor(self) -> Monitor:
-        """The monitor in use; one that is assigned, or was fitted or calibrated since, takes over at the next reset."""
-        return self._monitor
-
-    @monitor.setter
-    def monitor(self, monitor: Monitor) -> None:
-        check_answer(monitor)
-        check_monitor(monitor, self._spec)
-        self._next = monitor
-
-    def _changed(self) -> bool:
-        """Return whether a monitor is to be taken over."""
-        changed = Fitted.of(self._next, self._spec).differs(self._taken_up)
-        if changed:
-            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
-        return changed
 
 
 class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.guard.checks import Fitted, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
@@ -22,7 +22,6 @@ from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
 from asm_gym.wrappers.robots import askable, felt_by, memory_of, robots_of_many, shared_policy
-from asm_gym.wrappers.safety import ExchangesMonitor
 
 Mask = NDArray[np.bool_]
 
@@ -33,15 +32,13 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
     Arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is n, and
     ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` are (n,). A monitor
     that raises puts all environments in alarm; any other failure is that of one environment. Where an episode has just
-    begun, surprise is 0 and ``executed_action`` NaN. An episode that the guard ends begins anew as any other; under
-    ``AutoresetMode.NEXT_STEP`` its environment takes one more step before that, which nobody sees.
+    begun, surprise is 0 and ``executed_action`` NaN. An episode that the guard ends begins anew as any other.
 
     Args:
         env: of ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``; where ``info`` has no ``"stream"``,
             observation and action are the stream.
         monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
-        on_alarm: a name as in ``NeuralASMSafety``, or one policy that all share and that keeps what it knows in its
-            state.
+        on_alarm: a name as in ``NeuralASMSafety``, or one policy that all share and that keeps its memory in its state.
         release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there.
         adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
             with.

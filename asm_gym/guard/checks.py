@@ -144,3 +144,30 @@ def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed
             "calibrate it on episodes whose stream holds hand_position and hand_velocity"
         )
     return known
+
+
+class ExchangesMonitor:
+    """A guard whose monitor can be exchanged between episodes."""
+
+    _spec: StreamSpec
+    _monitor: Monitor
+    _next: Monitor
+    _taken_up: Fitted
+
+    @property
+    def monitor(self) -> Monitor:
+        """The monitor in use; one that is assigned, or was fitted or calibrated since, takes over at the next reset."""
+        return self._monitor
+
+    @monitor.setter
+    def monitor(self, monitor: Monitor) -> None:
+        check_answer(monitor)
+        check_monitor(monitor, self._spec)
+        self._next = monitor
+
+    def _changed(self) -> bool:
+        """Return whether a monitor is to be taken over."""
+        changed = Fitted.of(self._next, self._spec).differs(self._taken_up)
+        if changed:
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+        return changed
