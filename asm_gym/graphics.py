@@ -11,8 +11,8 @@ import subprocess
 import sys
 from functools import cache
 
-BACKENDS = ("egl", "osmesa")  # EGL first: it uses a GPU where there is one
-GL_LIBRARIES = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
+BACKENDS = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
+"""Values of ``MUJOCO_GL`` and their libraries; EGL first: it uses a GPU where there is one."""
 GET_RENDERING = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
 GET_ENCODER = "python -m pip install --force-reinstall imageio-ffmpeg (or: apt-get install ffmpeg)"
 
@@ -31,7 +31,7 @@ assert frame.min() < frame.max(), "the frame is one colour"
 
 
 def loads(library: str) -> bool:
-    """The dynamic linker finds ``library``, and everything that it links to."""
+    """Return whether the dynamic linker finds ``library`` and everything that it links to."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -41,7 +41,7 @@ def loads(library: str) -> bool:
 
 @cache
 def rendering_backend() -> str | None:
-    """The first value of ``MUJOCO_GL`` with which MuJoCo draws a frame here, ``"egl"`` or ``"osmesa"``; None: no video.
+    """Return the first backend with which MuJoCo draws a frame here; None where none does.
 
     Tried in other processes: a choice of backend cannot be undone within one.
     """
@@ -49,26 +49,23 @@ def rendering_backend() -> str | None:
 
 
 def draws_a_frame(backend: str) -> bool:
-    """MuJoCo draws one frame with ``MUJOCO_GL=backend``, in a process of its own."""
+    """Return whether MuJoCo draws one frame with ``MUJOCO_GL=backend``, in a process of its own."""
     env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
-    try:
-        # A driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds.
-        done = subprocess.run([sys.executable, "-c", ONE_FRAME], env=env, capture_output=True, timeout=120, check=False)
+    command = [sys.executable, "-c", ONE_FRAME]
+    try:  # a driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds
+        return subprocess.run(command, env=env, capture_output=True, timeout=120, check=False).returncode == 0
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode == 0
 
 
 def rendering_problem() -> str:
-    """Why nothing can be drawn here; empty where it can."""
-    if rendering_backend():
-        return ""
-    found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in GL_LIBRARIES.values())
-    return f"no video: {found}"
+    """Return why nothing can be drawn here; empty where it can."""
+    found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in BACKENDS.values())
+    return "" if rendering_backend() else f"no video: {found}"
 
 
 def encoder_problem() -> str:
-    """Why there is no ffmpeg with the H.264 encoder that browsers and players understand; empty where there is one."""
+    """Return why there is no ffmpeg with the H.264 encoder that browsers understand; empty where there is one."""
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
 
