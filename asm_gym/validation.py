@@ -57,17 +57,10 @@ def check_number(
 def check_number(
     name: str, value: object, *, whole: bool = False, infinite: bool = False, **bounds: Unpack[Bounds]
 ) -> float:
-    """Return ``value`` as a Python number.
-
-    Args:
-        name: of the argument, for the message.
-        value: to be checked.
-        whole: require an integer.
-        infinite: allow infinity, where the bounds do.
-        bounds: limits.
+    """Return ``value`` as a Python number, a ``whole`` one, or perhaps an ``infinite`` one, within ``bounds``.
 
     Raises:
-        ValueError: it is no number, out of bounds, or not finite.
+        ValueError: it is no such number; the message begins with ``name``.
     """
     wanted = _described("whole number" if whole else "number", **bounds)
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral if whole else Real):

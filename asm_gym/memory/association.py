@@ -63,8 +63,7 @@ def synapses(groups: NDArray[np.intp], changes: slice, inputs: int, size: int) -
     Args:
         groups: (X,) group number of each change, from 0.
         changes: columns of the X changes among the inputs.
-        inputs: I.
-        size: hidden units of a group.
+        inputs, size: I, and the hidden units of a group.
     """
     unit_group = np.repeat(np.arange(groups.max() + 1), size)  # (M,)
     V, D = np.ones((len(unit_group), inputs), np.float32), np.ones((len(groups), inputs), np.float32)

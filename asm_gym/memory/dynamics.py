@@ -62,13 +62,10 @@ def train(
     """Learn the synapses through time, then those of association, from whole episodes.
 
     Args:
-        trajectories: the episodes.
+        trajectories, hidden, schedule: the episodes; H and how to learn of the temporal network, one of ``DYNAMICS``.
         groups, changes, units: as in ``association.synapses``.
-        hidden: H.
-        schedule: of the temporal network.
         rng: draws everything random.
         progress: called with steps done and their total.
-        dynamics: one of ``DYNAMICS``.
     """
     done, total = 0, passes(trajectories, schedule) + ALL_TICKS
 

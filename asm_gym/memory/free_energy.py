@@ -78,11 +78,9 @@ class FreeEnergy:
     """F of a memory.
 
     Args:
-        network: its synapses through time and between senses.
-        senses: how it reads a row.
+        network, senses: its synapses, and how it reads a row.
         motor: its motor association; without one the third sum is 0.
-        tau: τ of the temporal network.
-        tau_motor: (A,) τ_j, in spreads of a command.
+        tau, tau_motor: τ of the temporal network, and τ_j (A,) in spreads of a command.
     """
 
     network: TemporalNetwork

@@ -120,8 +120,7 @@ class Learner(ABC):
     Args:
         weights: the synapses through time, a NamedTuple with an array ``W_F``; changed in place.
         names: of those that are learned.
-        schedule: how to learn.
-        rng: draws the first direction of the power iteration.
+        schedule, rng: how to learn; draws the first direction of the power iteration.
     """
 
     early: int  # 1 if running alone is drawn for the row to come, 0 if for the row itself
@@ -150,19 +149,14 @@ class Learner(ABC):
     ) -> tuple[Array, float]:
         """Learn from one row; return the next state (B, Z) and the energy summed over the batch.
 
-        Args:
-            state: (B, Z).
-            now: the row.
-            own: (B, 1) streams that take their own action.
-            alone: (B, 1) streams whose next state follows from what was predicted.
-            rate: of the synapses.
+        Streams take their ``own`` action (B, 1), and their next state follows from the prediction where ``alone`` (B, 1).
         """
 
 
 def one_after_another(trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator) -> Iterator[Moment]:
     """Yield rows of ``size`` endless streams of episodes, each begun at a random row.
 
-    Streams at different phases keep one phase of all skills from displacing what was learned of the others.
+    At different phases, so that no phase of all skills displaces the others.
     """
     senses, commands = (np.concatenate([t[k] for t in trajectories]) for k in range(2))
     length = np.array([len(t.senses) for t in trajectories])

@@ -35,8 +35,7 @@ class TemporalNetwork(ABC):
         weights: a NamedTuple of the synapses through time, among them ``W_F`` (N, H).
         association: the synapses between senses.
         iterations: inference steps a row.
-        prior_precision: Π_z.
-        sensory_precision: Π_x.
+        prior_precision, sensory_precision: Π_z and Π_x.
     """
 
     weights: Any
