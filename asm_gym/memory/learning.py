@@ -149,7 +149,7 @@ class Learner(ABC):
     ) -> tuple[Array, float]:
         """Learn from one row; return the next state (B, Z) and the energy summed over the batch.
 
-        Streams take their ``own`` action (B, 1), and their next state follows from the prediction where ``alone`` (B, 1).
+        Streams take their ``own`` action (B, 1); where ``alone`` (B, 1), their next state follows from the prediction.
         """
 
 
