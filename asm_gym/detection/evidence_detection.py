@@ -59,10 +59,7 @@ class EvidenceDetection:
         habituates: bool = True,
         tail_index: float = TAIL_INDEX,
     ) -> None:
-        try:
-            self.spec, self.gains = spec, tuple(check_number("gains", a, above=0.0, high=1.0) for a in gains)
-        except ValueError as error:
-            raise ValueError(f"gains must be numbers in (0, 1], got {short_repr(gains)}") from error
+        self.spec, self.gains = spec, tuple(check_number("each of gains", a, above=0.0, high=1.0) for a in gains)
         if not self.gains:
             raise ValueError("gains must be numbers in (0, 1], got ()")
         self.bound = check_number("bound", bound, above=0.0)
