@@ -319,28 +319,18 @@ class Archive(RuleBasedStateMachine):
         self.path.write_bytes(made[how])
         self.damaged = made[how] != whole
 
-    @rule(kind=st.sampled_from(["test", "other", None, 3]))
+    @rule(kind=st.sampled_from(["test", "other"]))
     def read(self, kind):
-        if not isinstance(kind, str):
-            with pytest.raises(TypeError, match="kind must be str"):
+        if self.held is None or kind != "test":
+            with pytest.raises(FileNotFoundError if self.held is None else ValueError, match=r"x\.asm"):
                 read_checkpoint(self.path, kind)
             return
-        if self.held is None:
-            with pytest.raises(FileNotFoundError):
-                read_checkpoint(self.path, kind)
-            return
-        if kind != "test":
-            with pytest.raises(ValueError, match=r"x\.asm"):
-                read_checkpoint(self.path, kind)
-            return
-        if self.damaged:
-            try:
-                found = read_checkpoint(self.path, kind)
-            except ValueError as refused:
-                assert str(self.path) in str(refused)  # noqa: PT017
-                return
-        else:
+        try:
             found = read_checkpoint(self.path, kind)
+        except ValueError as refused:
+            assert self.damaged
+            assert str(self.path) in str(refused)  # noqa: PT017
+            return
         # Damage may hit what a zip keeps twice, or nobody reads: then nothing else is read than what was written.
         assert found.header["number"] == self.held[""]
         assert {n: a.tobytes() for n, a in found.arrays.items()} == {n: a.tobytes() for n, a in self.held.items() if n}
