@@ -2,10 +2,8 @@
 
 import gymnasium as gym
 import numpy as np
-import pytest
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
@@ -16,29 +14,6 @@ LENGTH, CUE = 10, (3, 4)
 
 def watched():
     return NeuralASMSafety(FakeEnv(LENGTH), CueMonitor(CUE), on_alarm="hold", release_after=2)
-
-
-class Costs(BaseCallback):
-    """Adds up what constrained agents learn from."""
-
-    def _on_training_start(self):
-        self.cost, self.acted = 0.0, 0
-
-    def _on_step(self):
-        self.cost += sum(info["cost"] for info in self.locals["infos"])
-        self.acted += sum(info["asm"]["intervened"] for info in self.locals["infos"])
-        return True
-
-
-@pytest.mark.parametrize("vec_env", [DummyVecEnv, SubprocVecEnv])
-def test_stable_baselines_agents_learn_under_the_wrapper(vec_env):
-    envs = vec_env([watched, watched])
-    costs = Costs()
-    PPO("MlpPolicy", envs, n_steps=LENGTH, batch_size=LENGTH, n_epochs=1, seed=0).learn(6 * LENGTH, callback=costs)
-    envs.close()
-    episodes = 6  # three in each environment
-    assert costs.cost == episodes * len(CUE)
-    assert costs.acted == episodes * 3  # the second alarm starts the quiet time again
 
 
 def test_an_off_policy_agent_keeps_what_it_commanded_and_is_told_what_was_done():

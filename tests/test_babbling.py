@@ -15,7 +15,6 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.scripted.base import ObservationReader
 from asm_gym.rollouts import harmless
-from asm_gym.rollouts.pretraining import babbling
 from asm_gym.rollouts.pretraining.babbling import (
     ALONE,
     AROUND,
@@ -129,35 +128,6 @@ def test_what_is_held_is_pressed_down_or_aside_for_a_while_and_the_grip_is_kept(
     assert ((starts[:, 2] == 0) & (starts[:, 0] != 0)).any()
     assert (starts[:, 2] > 0).any()
     assert (actions[11:, 3] > 0).all()
-
-
-def test_an_arm_that_drifts_goes_on_in_one_direction_and_keeps_its_grip():
-    lesson = Lesson("Lift", 0, seed=2, guide="", noise=0.01, smoothness=0.9, drift=1.0)
-    babbler = Babbler(FakeEnv(), lesson)
-    actions = np.array([babbler.predict(None)[0] for _ in range(2000)])
-    same = (np.diff(actions[:, :2], axis=0) == 0).all(axis=1)
-    assert 0.8 < same.mean() < 1.0  # between two drifts it is led
-    courses = np.abs(np.unique(actions[1:][same][:, :2], axis=0))
-    assert len(courses) > 20
-    assert courses.max() > 10 * lesson.noise
-    assert (np.diff(actions[:, 2]) != 0).all()  # the gripper of a FakeEnv
-
-
-def test_a_disturbed_guides_grip_is_commanded_more_or_less_firmly_and_never_the_other_way(monkeypatch):
-    monkeypatch.setattr(babbling, "_guide", lambda lesson, env: always(np.array([0.3, -0.3, -1.0])))
-    for noise in (0.0, 0.01):
-        babbler = Babbler(FakeEnv(), Lesson("Lift", 0, seed=3, noise=noise))
-        babbler._noisy_grip = False
-        actions = np.array([babbler.predict(None)[0] for _ in range(2000)])
-        assert (actions[:, 2] < 0).all()
-        assert (np.abs(actions[:, 2]).min() < 0.1) == (noise > 0)
-        assert 20 < len(np.unique(actions[:, 2])) < 200 or not noise
-        np.testing.assert_allclose(actions[:, :2].mean(axis=0), [0.3, -0.3], atol=0.01)
-
-
-def always(action):
-    """A policy that does the same in every step."""
-    return SimpleNamespace(predict=lambda observation, state, episode_start: (action, state))
 
 
 def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(tmp_path):

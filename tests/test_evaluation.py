@@ -46,7 +46,7 @@ from asm_gym.evaluation.metrics import (
     time_matched_auroc,
 )
 from asm_gym.evaluation.resampling import Calibration, Windows, by_episode, interval, resample
-from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail, window_steps
+from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail
 from asm_gym.evaluation.scoring import CODE, code_digest, fitted
 from asm_gym.evaluation.statistics import Rate, Share, auroc, wilson_interval
 from asm_gym.evaluation.tables import Column, ConsoleTable, Table, tabulate
@@ -107,19 +107,6 @@ def test_another_threshold_changes_the_alarms_and_nothing_else():
     other = trace.at(25.0)
     assert (trace.alarms, trace.top_channel) == ((1,), "b")
     assert (other.alarms, other.detected_after, other.top_channel) == ((2,), 1, "")
-
-
-def test_a_window_holds_whole_steps_whatever_the_rounding():
-    assert [window_steps(s, dt) for s, dt in ((0.3, 0.1), (1.0, 0.05), (0.01, 0.05))] == [3, 20, 1]
-    with pytest.raises(ValueError, match="window_s"):
-        window_steps(0, 0.05)
-
-
-def test_the_top_channel_is_read_at_the_first_alarm_since_the_onset():
-    attribution = np.array([[0, 0], [20, 0], [0, 0], [0, 20]])
-    for onset, top in ((2, "loud"), (None, "calm")):
-        assert a_trace([1, 20, 1, 20], onset).attributed(attribution, ("calm", "loud")).top_channel == top
-    assert a_trace([1, 1]).attributed(attribution, ("calm", "loud")).top_channel == ""
 
 
 # ------------------------------------------------------------------ metrics
@@ -347,18 +334,6 @@ def test_more_faults_of_the_same_scenes_do_not_narrow_the_interval():
         widths.append(interval(0.5, drawn).high - interval(0.5, drawn).low)
     assert widths[1] == pytest.approx(widths[0], rel=0.05)
     assert widths[0] == pytest.approx(4 * np.sqrt(0.25 / 60), rel=0.25)  # ± 2 standard errors of 60 scenes
-
-
-def test_the_interval_holds_what_calibration_adds():
-    # Peaks lie close about the threshold, so the threshold decides.
-    rng, half = np.random.default_rng(1), by_episode(0.5)
-    nominal = [peaked(1.0, s) for s in range(60)]
-    faulty = [peaked(float(p), s, onset=5) for s, p in enumerate(1.0 + 0.01 * rng.standard_normal(60))]
-    certain, unsure = (
-        resample(faulty, nominal, Calibration({half: 1.0}, maxima), 0.5, draws=200).found[half]
-        for maxima in (np.ones(40), 1 + 0.05 * rng.standard_normal(40))
-    )
-    assert np.std(unsure) > 1.5 * np.std(certain)
 
 
 def test_resamples_agree_with_the_results_that_they_are_about():

@@ -95,20 +95,6 @@ def test_arguments_of_the_environment_may_be_lists_dictionaries_and_arrays():
     assert (before, len(made)) == (2, 4)  # one environment for equal arguments
 
 
-class Lean:
-    """Left or right, whichever way the pole falls."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return int(observation[2] > 0), state
-
-
-def test_discrete_actions_are_a_number_for_each():
-    (episode,) = collect("CartPole-v1", policy=Lean(), episodes=1, workers=1)
-    assert episode.stream.shape[1] == 4 + 2
-    np.testing.assert_array_equal(episode.stream[:, 4:].sum(axis=1), 1)
-    np.testing.assert_array_equal(episode.stream[1:, 5] > 0, episode.stream[:-1, 2] > 0)
-
-
 # ------------------------------------------------------------------ folders of runs
 
 HOLD = """

@@ -98,7 +98,7 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
     """Return the chief columns without their intervals, narrow enough for a terminal."""
     wanted = {*BRIEF, f"Found at {rate_text(result.promise)}"}
     columns = [column for column in monitor_columns(result) if column.heading in wanted]
-    rows = [tuple(column.cell(m).partition(" (")[0] for column in columns) for m in (result.ideal, *result.on_visible)]
+    rows = [tuple(column.cell(m).partition(" (")[0] for column in columns) for m in _compared(result)]
     return Table(f"found within {result.window_s:g} s of the onset", [column.heading for column in columns], rows)
 
 

@@ -102,5 +102,5 @@ def _film(trial: Trial, config: RolloutConfig, monitor: Monitor, writer: Any) ->
     made = gym.make(trial.env_id, **dict(config.settings), **PICTURE)
     with closing(made), staged(trial, config, made) as faulty:
         guarded = _guarded(faulty, monitor, trial)
-        watched = SurpriseOverlay(guarded, caption=trial.kind, camera=PICTURE["camera"])
+        watched = SurpriseOverlay(guarded, caption=trial.kind)
         play(trial, config, watched, lambda _: writer.append_data(watched.render()))

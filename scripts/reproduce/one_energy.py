@@ -107,7 +107,7 @@ def one(job: tuple[str, int], roles: Roles, config: Config) -> list[Record]:
 
 def run(config: Config) -> Findings:
     """Run both dynamics and every seed."""
-    roles = dict(recorded(config.run, config.tasks).roles)
+    roles = dict(recorded(config.run).roles)
     roles["faulty"] = [e for e in roles["faulty"] if len(e) > (e.labelled.onset or 0)]
     healthy = in_turn(roles["calibration"])  # a fifth sets τ, and no threshold
     roles["spreads"], roles["calibration"] = healthy[: len(healthy) // 5], healthy[len(healthy) // 5 :]
