@@ -1,9 +1,6 @@
 """Guard a policy that runs in LeRobot: a step of the pipeline between the policy and the robot.
 
-    row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors
-    s_t   = surprise of row_t, judged before action_t is sent
-
-    pipeline = RobotProcessorPipeline([LeRobotGuard("so101.asm")], …)      robot_action_processor of its loops
+    row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before it is sent
 
 From an alarm on, until ``quiet_s`` without one, the reaction is sent and judged in place of the policy's action. A hold
 is a rest: a memory that was fitted without rests is surprised by it, and the hold does not end.
@@ -84,9 +81,8 @@ class LeRobotGuard:
         last_alarm: surprise in thresholds, reason and channel of the newest alarm; empty before the first.
 
     Example:
-        >>> from asm_gym.wrappers.lerobot import ON_ALARM
-        >>> ON_ALARM[0]
-        'hold'
+        >>> guard = LeRobotGuard("so101.asm")  # doctest: +SKIP
+        >>> robot_action_processor = RobotProcessorPipeline([guard], ...)  # doctest: +SKIP
     """
 
     def __init__(
@@ -143,11 +139,7 @@ class LeRobotGuard:
         seen = np.array([self._present(name, observation) for name in self._names]), wanted
         asked = wanted.astype(np.float32)
 
-        def command() -> Floats32:
-            action: Floats32 = engine.act(asked[None], lambda _: seen).actions[0]
-            return action
-
-        executed = command() if acts else asked
+        executed: Floats32 = engine.act(asked[None], lambda _: seen).actions[0] if acts else asked
         row = self._row(observation, executed)
         overriding, in_alarm = bool(engine.overriding[0]), self.alarm
         report = engine.judge(row[None], executed[None])
@@ -157,7 +149,7 @@ class LeRobotGuard:
             if not (overriding or in_alarm):
                 _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
         if self.intervened and not overriding:
-            executed = command()
+            executed = engine.act(asked[None], lambda _: seen).actions[0]
             engine.amend(self._row(observation, executed)[None])
         if self.intervened:
             action = {n: float(value) for n, value in zip(self._names, executed, strict=True) if np.isfinite(value)}

@@ -181,26 +181,19 @@ def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | No
     return numbers
 
 
-def body_memory(env: gym.Env[Any, Any], watched: StreamSpec) -> NeuralASM:
-    """Return the shipped memory of the body that ``env`` moves; which one it is goes to the log.
+def body_memory(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any], watched: StreamSpec) -> NeuralASM:
+    """Return the shipped memory of the robot in ``env``, or in all its members; which one it is goes to the log.
 
     Raises:
         ValueError: none fits; the message lists those that there are.
     """
     inner: Any = env.unwrapped
-    return shipped_memory(inner, watched, str(getattr(inner, "controller", "")))
-
-
-def memory_of(envs: VectorEnv[Any, Any, Any], watched: StreamSpec) -> NeuralASM:
-    """Return the shipped memory of the body that all members move.
-
-    Raises:
-        ValueError: none fits; the message lists those that there are.
-    """
-    members = askable(envs)
-    there = all(members.call("has_wrapper_attr", "controller"))
-    controller = members.call("get_wrapper_attr", "controller")[0] if there else ""
-    return shipped_memory(envs, watched, str(controller))
+    if isinstance(env, VectorEnv):
+        known = all(inner.call("has_wrapper_attr", "controller"))
+        controller = inner.call("get_wrapper_attr", "controller")[0] if known else ""
+    else:
+        controller = getattr(inner, "controller", "")
+    return shipped_memory(inner, watched, str(controller))
 
 
 def policy_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:

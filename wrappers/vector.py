@@ -21,7 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
-from asm_gym.wrappers.robots import askable, felt_by, memory_of, robots_of_many, shared_policy
+from asm_gym.wrappers.robots import askable, body_memory, felt_by, robots_of_many, shared_policy
 
 Mask = NDArray[np.bool_]
 
@@ -92,7 +92,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         self._resets_itself = mode == AutoresetMode.NEXT_STEP
         self._members = askable(env)
         self._spec, self._own_stream = self._stream()
-        self._watch_with(memory_of(env, self._spec) if monitor is None else monitor)
+        self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
         self._holding = False
         if self._robots.brakes:
             # Who is held is held in all steps that wrappers in between make of one.
