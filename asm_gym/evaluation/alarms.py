@@ -15,22 +15,14 @@ from asm_gym.spec import StreamSpec
 
 
 class Alarm(NamedTuple):
-    """One alarm of a recording.
-
-    Attributes:
-        log: name of the recording.
-        start, end: span [s]; a row is known at the end of its step.
-        channel: the most surprising number when the alarm was raised; empty where a whole row was missing.
-        why: surprise, missing data, or not finite.
-        excess: surprise of the worst row, in thresholds; infinite where it was not finite.
-    """
+    """One alarm of a recording."""
 
     log: str
-    start: float
-    end: float
-    channel: str
-    why: str
-    excess: float
+    start: float  # [s] at the end of its first row
+    end: float  # [s]
+    channel: str  # the most surprising number when the alarm was raised; empty where a whole row was missing
+    why: str  # surprise, missing data, or not finite
+    excess: float  # surprise of the worst row, in thresholds
 
     def cells(self) -> tuple[str, ...]:
         """Format for a table."""

@@ -57,15 +57,9 @@ def time_matched_auroc(faulty: Sequence[ScoredEpisode], nominal: Sequence[Scored
 
 
 class Delays(NamedTuple):
-    """Detection delays; a miss counts as infinitely late.
+    """Detection delays; a miss counts as infinitely late."""
 
-    Attributes:
-        median_ms: half of all faults were detected within this; ``inf`` where fewer were.
-        p95_ms: the same for 95 % of all faults.
-        detected, missed: numbers of faults.
-    """
-
-    median_ms: float
+    median_ms: float  # half of all faults were detected within this; inf where fewer were
     p95_ms: float
     detected: int
     missed: int
@@ -104,9 +98,7 @@ def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
 def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
     """Count alarms before any fault, and their hours; one that persists, or comes back within a minute, is one.
 
-    Args:
-        traces: scored episodes.
-        event: ``"knock"`` or ``"stop"`` counts the surprise that such an event excused instead.
+    With an ``event``, ``"knock"`` or ``"stop"``, count the surprise that it excused instead.
     """
     count, hours = 0, 0.0
     for t in traces:
@@ -128,34 +120,21 @@ def typical(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
 
 
 class KindMetrics(NamedTuple):
-    """Detection of faults of one kind and severity.
-
-    Attributes:
-        name: in words.
-        auroc: over matched steps.
-        found: faults detected within the window, by the promised rate of false alarms.
-        delays: at the threshold of the episodes; None without faults.
-    """
+    """Detection of faults of one kind and severity."""
 
     name: str
-    auroc: float
+    auroc: float  # over matched steps
     found: Mapping[AlarmRate, Share]
     delays: Delays | None
 
 
 class Outcomes(NamedTuple):
-    """How episodes ended under one response.
-
-    Attributes:
-        acting: ``"policy alone"``, or the response to the alarm.
-        success, ended_by_alarm: numbers of episodes.
-        peak_force: median over episodes of the greatest contact force [N]; NaN where not measured.
-    """
+    """How episodes ended under one response."""
 
     acting: str
     success: Share
     ended_by_alarm: Share
-    peak_force: float
+    peak_force: float  # median over episodes of the greatest contact force [N]
 
     @classmethod
     def of(cls, acting: str, traces: Sequence[ScoredEpisode]) -> Outcomes:

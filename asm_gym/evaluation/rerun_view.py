@@ -29,12 +29,6 @@ BAND = 2.0
 def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode], model: object = None) -> None:
     """Write episodes, one after another, to a ``.rrd`` file, in place of what is there.
 
-    Args:
-        path: of the file.
-        spec: of the stream.
-        traces: with their detail and stream.
-        model: of a memory, for its predictions; any other has none.
-
     Raises:
         ImportError: rerun-sdk is not installed.
     """

@@ -104,12 +104,7 @@ def wins(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], wind
 
 
 class Windows:
-    """The surprise of faults within the window and one step before; a fault is detected where an alarm begins there.
-
-    Args:
-        faulty: episodes with an onset.
-        window_s: length of the window [s].
-    """
+    """The surprise of faults within the window and one step before; a fault is detected where an alarm begins there."""
 
     def __init__(self, faulty: Sequence[ScoredEpisode], window_s: float) -> None:
         longest = max((window_steps(window_s, t.dt) for t in faulty), default=0)

@@ -23,17 +23,11 @@ POLICY_ALONE = "policy alone"
 
 
 class InterventionOutcome(NamedTuple):
-    """How an episode ended.
-
-    Attributes:
-        success: the task was solved at some step.
-        ended_by_alarm: the wrapper ended the episode.
-        contact_force: the greatest contact force [N].
-    """
+    """How an episode ended."""
 
     success: bool = False
     ended_by_alarm: bool = False
-    contact_force: float = math.nan
+    contact_force: float = math.nan  # the greatest [N]
 
 
 @dataclass(frozen=True, eq=False)

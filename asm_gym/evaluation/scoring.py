@@ -37,16 +37,9 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 def benchmark(
     folder: Path, files: Sequence[Path], monitors: Sequence[str], rate: float, window_s: float, seed: int, each: Map
 ) -> BenchmarkResult:
-    """Read the recordings, and score them with every monitor.
+    """Learn from the episodes for fit and calibration, and score all others with every monitor.
 
-    Args:
-        folder: of the run, which keeps the fitted monitors.
-        files: episodes; those for fit and calibration are learned from, all others scored.
-        monitors: names.
-        rate: share of nominal episodes that may raise an alarm.
-        window_s: an alarm within this time of the onset is a detection [s].
-        seed: of the monitors.
-        each: maps a function over items, as ``parallel_map`` does.
+    ``folder`` keeps the fitted monitors; ``each`` maps a function over items, as ``parallel_map`` does.
     """
     paths = tuple(file.resolve() for file in files)
     models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once

@@ -37,12 +37,7 @@ def _guarded(env: gym.Env[Any, Any], monitor: Monitor, trial: Trial) -> gym.Env[
 
 
 def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
-    """Run one trial under the guard in this process's environment, and return its scores.
-
-    Args:
-        trial, config: what is run.
-        memory: file of a calibrated memory; ``config.stream_freq`` is its rate.
-    """
+    """Run one trial under the guard in this process's environment, and return its scores."""
     monitor = _memory(memory, memory.stat().st_mtime_ns)
     infos: list[dict[str, Any]] = []
     with staged(trial, config) as env:

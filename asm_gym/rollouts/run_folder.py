@@ -90,11 +90,7 @@ def make_missing(
 ) -> list[Path]:
     """Make the files that are missing; return the paths of all, in the order of ``items``.
 
-    Args:
-        make: writes the file of an item, complete or not at all.
-        items: one for each file.
-        place: gives the path of an item's file.
-        parallel, progress: of ``parallel_map``; files that exist count as done.
+    ``make`` writes the file of an item, complete or not at all, at its ``place``. Files that exist count as done.
     """
     places = [place(item) for item in items]
     missing = [item for item, path in zip(items, places, strict=True) if not path.is_file()]

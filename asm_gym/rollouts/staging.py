@@ -37,12 +37,7 @@ _CACHE: dict[str, tuple[Any, Any]] = {}
 
 
 def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
-    """Return this process's environment: making one costs as much as an episode, and a seeded reset restores it.
-
-    Args:
-        env_id: a Gymnasium id.
-        settings: further arguments of ``gym.make``.
-    """
+    """Return this process's environment: making one costs as much as an episode, and a seeded reset restores it."""
     given = copy.deepcopy(settings)  # the caller's own lists and dicts may change
     made: gym.Env[Any, Any] = _latest("environment", (env_id, given), lambda: gym.make(env_id, **dict(given)))
     return made
@@ -114,13 +109,7 @@ def play(
     env: gym.Env[Any, Any],
     on_step: Callable[[dict[str, Any]], None] | None = None,
 ) -> bool:
-    """Run the policy in a staged and wrapped ``env``; return whether the task was solved at some step.
-
-    Args:
-        trial, config: what is run.
-        env: a staged environment, perhaps wrapped.
-        on_step: called with every step's ``info``.
-    """
+    """Run the policy in a staged and wrapped ``env``; return whether the task was solved at some step."""
     kwargs: dict[str, Any] = {}
     if trial.kind in EXECUTIONS and config.policy == "scripted":
         kwargs["style"] = Style(speed=EXECUTIONS[trial.kind])

@@ -203,12 +203,6 @@ class Evaluation(BaseCallback):
 def train(plan: Plan, out: Path, demonstrations: Sequence[Episode], progress: Progress) -> tuple[NetworkPolicy, Curve]:
     """Return the best agent of the evaluations, and their results.
 
-    Args:
-        plan: what to train.
-        out: folder of the agents and the log.
-        demonstrations: successful episodes of an expert.
-        progress: is called as (done, total).
-
     Raises:
         TypeError: spaces other than Boxes with one axis.
         ValueError: demonstrations of other sizes.

@@ -150,16 +150,6 @@ def evaluation_trials(
 ) -> list[Trial]:
     """Return the trials of one task: nominal episodes by role, faulty twins of some, and harmless variations.
 
-    Args:
-        env_id: of the environment.
-        name: of the task; decides the seeds.
-        config: how episodes are made, by a policy of a name or a path.
-        episodes: how many, by role.
-        faults: kinds or splits of the suite; all of them for none.
-        severities: of the faults.
-        harmless: kinds of harmless variations.
-        seed: of the evaluation.
-
     Raises:
         ValueError: the policy cannot act in the environment.
     """

@@ -144,12 +144,7 @@ def _lesson(task: str, number: int, seed: int, lead: str) -> Lesson:
 
 
 class Babbler:
-    """The policy of a lesson.
-
-    Args:
-        env: one of the lesson's task.
-        lesson: how it acts.
-    """
+    """The policy of a lesson."""
 
     def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
         self._guide = _guide(lesson, env)
@@ -223,13 +218,7 @@ class Aim(NamedTuple):
 
 
 class Reaching:
-    """A policy that reaches.
-
-    Args:
-        env: of one arm under OSC_POSE.
-        seed: of the places.
-        speed: relative to the usual one.
-    """
+    """A policy of one arm under OSC_POSE that reaches for one place after another."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float = 1.0) -> None:
         self._read, self._rng, self._speed = ObservationReader(env), np.random.default_rng([seed, 2]), PACE * speed

@@ -53,18 +53,12 @@ class Exam(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """The result of one exam.
-
-    Attributes:
-        name: of the exam.
-        solved, failed: scored healthy episodes, by whether the task was solved.
-        metrics: on visible faults, but for scenes in which the policy crashes by itself.
-    """
+    """The result of one exam."""
 
     name: str
-    solved: list[ScoredEpisode]
+    solved: list[ScoredEpisode]  # healthy
     failed: list[ScoredEpisode]
-    metrics: DetectionMetrics
+    metrics: DetectionMetrics  # on visible faults, but for scenes in which the policy crashes by itself
 
     def at(self, threshold: float) -> Marks:
         """Return the result at another threshold."""

@@ -157,12 +157,6 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     By the hours of each task, where all have the hours that it takes. Where there are enough episodes, one in
     ``FOR_CEILINGS`` sets the ceilings of senses, and the others the threshold. The forces of healthy motion are those
     without crashes: a limit raised by a hit would be none.
-
-    Args:
-        memory: fitted.
-        lessons: healthy ones.
-        hours: further healthy episodes.
-        per_hour: false alarms.
     """
     whole, for_ceilings = for_threshold([*lessons.whole, *hours])
     if for_ceilings:
