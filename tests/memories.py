@@ -19,5 +19,7 @@ def sine_memory() -> NeuralASM:
 def learned_bytes(asm: NeuralASM) -> list[bytes]:
     senses = asm.senses_
     detector = [asm.learned_[name] for name in asm.detection.arrays]
-    network = *asm.network_.weights, *asm.network_.association
-    return [a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, asm.energy_)]
+    network = *asm.model.network_.weights, *asm.model.network_.association
+    return [
+        a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, asm.learned_["energy"])
+    ]

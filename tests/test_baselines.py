@@ -5,10 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from asm_gym.checkpoint import read_checkpoint
 from asm_gym.episode import Episode
-from asm_gym.monitors import MONITORS, load_monitor, make_monitor, monitor_class
-from asm_gym.monitors.files import restored
+from asm_gym.monitors import MONITORS, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
 from tests.streams import sine_episodes, sine_spec
@@ -134,31 +132,6 @@ def test_unknown_names_and_hyperparameters_list_the_known():
         make_monitor("oracle", SPEC)
     with pytest.raises(ValueError, match=r"'hiden_size'.*did you mean 'hidden_size'"):
         make_monitor("neural_asm", SPEC, hiden_size=3)
-
-
-@pytest.mark.parametrize(
-    ("name", "setting"),
-    [
-        ("window_pca", {"rows": 3, "kept": 0.9}),
-        ("kalman", {"ridge": 0.5}),
-        ("gru", {"hidden_size": 8}),
-        ("lstm_vae", {"hidden_size": 8, "latent_size": 3}),
-    ],
-)
-def test_what_a_baseline_was_set_to_is_in_its_file_and_a_file_from_before_has_its_own(name, setting, tmp_path):
-    with pytest.MonkeyPatch.context() as less:
-        less.setattr(f"{TORCH}.EPOCHS", 2)
-        monitor, own = (make_monitor(name, SPEC, **s).fit(episodes(12)) for s in (setting, {}))
-    one = episodes(1, seed=7)[0]
-    assert not np.array_equal(monitor.score(one).value, own.score(one).value)
-    for made in (monitor, own):
-        made.save(tmp_path / "m.asm")
-        np.testing.assert_array_equal(load_monitor(tmp_path / "m.asm").score(one).value, made.score(one).value)
-    # A hyperparameter that a file does not hold has its default.
-    saved = read_checkpoint(tmp_path / "m.asm", name)
-    before = {n: v for n, v in saved.header["hyperparameters"].items() if n not in setting}
-    older = restored("m.asm", saved._replace(header={**saved.header, "hyperparameters": before}), monitor_class(name))
-    np.testing.assert_array_equal(older.score(one).value, own.score(one).value)
 
 
 def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_the_best():

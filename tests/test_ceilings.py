@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 
 from asm_gym import Episode, NeuralASM
-from asm_gym.detection.events import EXCUSED, Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.detection.evidence_detection import EvidenceDetection
-from asm_gym.episode import EpisodeLabel
 from asm_gym.monitors import ceilings, make_monitor
 from asm_gym.monitors.ceilings import learn_ceilings
-from asm_gym.monitors.skills import learn_skills
-from asm_gym.monitors.stream_model import model_outputs
-from asm_gym.rollouts.pretraining.healthy import FOR_CEILINGS, for_threshold
 from tests.memories import SMALL, sine_memory
-from tests.streams import EVENTFUL_ARM, UNEVENTFUL, sine_episodes, sine_spec
+from tests.streams import sine_episodes, sine_spec
 
 
 @pytest.fixture
@@ -41,26 +36,13 @@ def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_
     before, detection = asm.detection.detector_, asm.detection
     maxima = ceilings._worst_of(asm, detection, hours)
     learn_ceilings(asm, hours)
-    np.testing.assert_allclose((maxima <= asm.detector_.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
-    np.testing.assert_allclose(asm.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
-    np.testing.assert_array_equal(asm.detector_.whitening, before.whitening)
+    np.testing.assert_allclose((maxima <= asm.detection.detector_.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
+    np.testing.assert_allclose(asm.detection.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
+    np.testing.assert_array_equal(asm.detection.detector_.whitening, before.whitening)
     assert asm.threshold_ is None
-    again = asm.fit(sine_episodes(50)).detector_  # anew: nothing is left of hours
+    again = asm.fit(sine_episodes(50)).detection.detector_  # anew: nothing is left of hours
     for name in ("ceiling", "tail"):
         np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
-
-
-def test_the_largest_evidence_is_that_of_the_detector_row_by_row(asm):
-    episode = sine_episodes(1, seed=21)[0]
-    output = model_outputs(asm.model, [episode])[0]
-    detector, gains = asm.detector_, asm.detector_.gains
-    vector, most = np.zeros((len(gains), output.errors.shape[1])), 0.0
-    for t, error in enumerate(output.errors.astype(np.float64), 1):
-        whitened = (error / np.sqrt(1 + (error / detector.bound) ** 2)) @ detector.whitening
-        vector += gains[:, None] * (whitened - vector)
-        variance = gains / (2 - gains) * (1 - (1 - gains) ** (2 * t))
-        most = np.maximum(most, vector**2 / variance[:, None])
-    np.testing.assert_allclose(ceilings._worst_of(asm, asm.detection, [episode])[0], most, rtol=1e-5)
 
 
 def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(asm):
@@ -84,7 +66,7 @@ def test_learning_them_again_is_as_learning_them_once_and_a_file_keeps_them(asm,
     twice = learn_ceilings(learn_ceilings(deepcopy(asm), first), second)
     once = learn_ceilings(asm, second)
     for name in ("ceiling", "tail"):
-        np.testing.assert_allclose(getattr(twice.detector_, name), getattr(once.detector_, name))
+        np.testing.assert_allclose(getattr(twice.detection.detector_, name), getattr(once.detection.detector_, name))
     once.calibrate(sine_episodes(99, seed=26), 0.05).save(tmp_path / "m.asm")
     again, episode = NeuralASM.load(tmp_path / "m.asm"), sine_episodes(1, seed=27)[0]
     np.testing.assert_allclose(again.score(episode).value, once.score(episode).value, rtol=1e-6)
@@ -95,14 +77,6 @@ def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
     hours = sine_episodes(120, seed=28)
     with pytest.raises(ValueError, match="was learned from"):
         learn_ceilings(asm, hours).calibrate(hours, false_alarms_per_hour=60.0)
-
-
-def test_rows_that_the_senses_excuse_tell_little():
-    quiet = Excuses(EVENTFUL_ARM).divisors(np.tile(UNEVENTFUL, (5, 1)))
-    np.testing.assert_array_equal(quiet, 1.0)
-    knocked = np.tile(UNEVENTFUL, (5, 1))
-    knocked[2, 6] = 60.0
-    np.testing.assert_array_equal(Excuses(EVENTFUL_ARM).divisors(knocked), [1, 1, EXCUSED, EXCUSED, EXCUSED])
 
 
 def test_bad_input_is_named(asm):
@@ -119,35 +93,3 @@ def test_bad_input_is_named(asm):
         learn_ceilings(other, sine_episodes(120, seed=0))
     with pytest.raises(ValueError, match="tail_index must be"):
         EvidenceDetection(sine_spec(), tail_index=0.0)
-
-
-def test_a_rival_under_the_same_detection_learns_them_too():
-    ridge = make_monitor("association_linear+evidence", sine_spec()).fit(sine_episodes(30, seed=0))
-    before = ridge.detection.detector_.ceiling
-    learn_ceilings(ridge, list(shaken(sine_episodes(120, seed=29))))
-    assert (ridge.detection.detector_.ceiling != before).all()
-
-
-def test_skills_that_were_weighed_against_it_are_to_be_learned_anew(asm):
-    learn_skills(asm, sine_episodes(20, seed=0))
-    asm.about["alarm_on"] = "skill"
-    learn_ceilings(asm, sine_episodes(120, seed=30))
-    assert asm.skill_ is None
-    assert asm.alarm_on_ == "body"
-
-
-@pytest.mark.parametrize(("each", "told"), [(500, 100), (499, 0)])
-def test_one_healthy_episode_in_ten_of_each_task_tells_ceilings_where_that_makes_enough(each, told):
-    stream = np.zeros((2, sine_spec().size))
-    whole = [
-        Episode.from_stream(stream, sine_spec(), label=EpisodeLabel(task, "nominal", seed=n))
-        for n in range(each)
-        for task in ("Lift", "Door")
-    ]
-    rest, chosen = for_threshold(whole)
-    assert len(chosen) == told
-    assert len(rest) + len(chosen) == len(whole)
-    if told:
-        assert [e.label.seed for e in chosen if e.label.task == "Door"] == list(
-            range(FOR_CEILINGS - 1, each, FOR_CEILINGS)
-        )

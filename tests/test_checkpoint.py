@@ -125,17 +125,6 @@ def test_a_header_is_not_read_where_it_is_too_long(tmp_path, monkeypatch):
         read_checkpoint(path, "test")
 
 
-def test_files_of_before_arrays_were_declared_are_read(tmp_path):
-    found = read_checkpoint(packed(tmp_path / "x.asm", a=npy(np.arange(3.0))), "test")
-    np.testing.assert_array_equal(found.array("a", 3), np.arange(3.0))
-
-
-def test_arrays_that_are_not_finite_are_refused_where_they_are_asked_for(tmp_path):
-    write_checkpoint(tmp_path / "x.asm", "test", {}, {"a": np.array([1.0, np.inf])})
-    with pytest.raises(ValueError, match="a should be finite"):
-        read_checkpoint(tmp_path / "x.asm", "test").array("a", 2)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_no_flipped_bit_changes_what_is_read(tmp_path, seed):
     path, rng = tmp_path / "x.asm", np.random.default_rng(seed)

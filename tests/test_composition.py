@@ -37,7 +37,7 @@ def kalman():
     return make_monitor("kalman", sine_spec()).fit(sine_episodes(30)).calibrate(sine_episodes(60, 1), 0.05)
 
 
-@pytest.mark.parametrize("detection", [d for d in DETECTIONS if d != "latent_threshold"])
+@pytest.mark.parametrize("detection", DETECTIONS)
 def test_any_model_goes_under_any_detection(detection):
     monitor = make_monitor("kalman", sine_spec(), detection=detection).fit(sine_episodes(30))
     monitor.calibrate(sine_episodes(60, 1), 0.05)

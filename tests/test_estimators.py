@@ -8,7 +8,6 @@ from sklearn.ensemble import IsolationForest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.monitors.estimators import adapted
 from asm_gym.rollouts import parallel_map
 from tests.models import Persistence
 from tests.streams import sine_episodes
@@ -38,8 +37,6 @@ def saying(name, change):
 
 Lopsided = saying("lopsided", lambda state, said: (state, said._replace(errors=said.errors[:, 1:])))
 Stateless = saying("stateless", lambda state, said: said)
-Bare = saying("bare", lambda state, said: (state, tuple(said)))
-Late = saying("late", lambda state, said: (state, said._replace(contexts=said.contexts[1:])))
 Lost = saying("lost", lambda state, said: (state, said._replace(errors=said.errors * np.nan)))
 
 
@@ -99,18 +96,9 @@ def test_what_is_no_model_is_refused_in_a_line():
     [
         ("Lopsided", r"predict of lopsided must give errors \(\d+, 12\), got \(\d+, 11\)"),
         ("Stateless", "must give a state and a ModelOutput, got ModelOutput"),
-        ("Bare", "must give a state and a ModelOutput, got .*, tuple"),
-        ("Late", r"must give contexts \((\d+), C\), got \(\d+, 0\)"),
         ("Lost", "must give errors that are finite where the rows are"),
     ],
 )
 def test_what_a_model_may_not_say_is_refused_in_a_line(name, message):
     with pytest.raises(ValueError, match=message):
         judged(f"tests.test_estimators:{name}")
-
-
-def test_its_score_is_of_rows_that_were_not_learned():
-    model = adapted(IsolationForest)(sine_episodes(1)[0].spec, seed=1)
-    model.fit(sine_episodes(20), np.random.default_rng(0), lambda done, total: None)
-    learned = model.learned_
-    assert abs(len(learned["rows"]) - len(learned["others"])) <= 1

@@ -107,12 +107,6 @@ def test_a_threshold_that_nothing_exceeds_is_refused(asm, tmp_path, threshold):
         NeuralASM.load(tampered(asm, tmp_path / "m.asm", threshold=threshold))
 
 
-def test_a_memory_that_would_never_answer_is_refused(asm, tmp_path):
-    slow = asm.get_params() | {"iterations": 10**9}
-    with pytest.raises(ValueError, match=r"iterations must be a whole number in \[1, 1000\], got 1000000000"):
-        NeuralASM.load(tampered(asm, tmp_path / "m.asm", hyperparameters=slow))
-
-
 @pytest.mark.parametrize("name", ["W_C", "whitening", "mean"])
 def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path, name):
     asm.save(tmp_path / "m.asm")
@@ -124,15 +118,3 @@ def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path
     rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy.npy"]}))
     with pytest.raises(ValueError, match="damaged"):
         NeuralASM.load(tmp_path / "shape.asm")
-
-
-def test_a_checkpoint_with_an_unknown_hyperparameter_is_refused(asm, tmp_path):
-    def change(members):
-        header = json.loads(members["header.json"])
-        header["hyperparameters"]["depth"] = 3
-        members["header.json"] = json.dumps(header).encode()
-
-    asm.save(tmp_path / "m.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "n.asm", change)
-    with pytest.raises(ValueError, match="depth"):
-        NeuralASM.load(tmp_path / "n.asm")

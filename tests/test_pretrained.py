@@ -1,19 +1,13 @@
 """Memories that come with the package: found by name and by the body they know, and refused where they do not fit."""
 
-import re
 from dataclasses import replace
 
 import gymnasium as gym
-import numpy as np
 import pytest
 
-from asm_gym.checkpoint import read_header
-from asm_gym.faults import Freeze, FrozenEncoder
-from asm_gym.monitors import NeuralASM, make_monitor, pretrained, pretrained_for
+from asm_gym.monitors import NeuralASM, pretrained, pretrained_for
 from asm_gym.policies import make_policy, rollout
-from asm_gym.policies.reflexes import Hold
-from asm_gym.scripts.demo import Args, without_fitting
-from asm_gym.wrappers import FaultInjection, NeuralASMSafety, VectorNeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import FakeEnv
 from tests.rates import failures
 from tests.streams import sine_episodes, sine_spec
@@ -41,10 +35,6 @@ def test_a_shipped_memory_is_loaded_by_name_with_its_threshold_and_what_is_known
         NeuralASM.pretrained("cosines")
 
 
-def test_the_memory_of_the_same_body_is_found(shelf):
-    assert pretrained_for(sine_spec(), "SWING") == "sines"
-
-
 @pytest.mark.parametrize(
     ("spec", "controller", "why"),
     [
@@ -65,12 +55,6 @@ def test_another_body_is_refused_with_what_there_is_and_what_to_do(shelf, spec, 
 def test_the_wrapper_without_a_monitor_says_what_there_is_where_none_fits(shelf):
     with pytest.raises(ValueError, match=r"no shipped memory fits this stream of an unnamed body at 20 Hz"):
         NeuralASMSafety(FakeEnv())
-
-
-def test_a_monitor_that_says_nothing_of_itself_says_so(tmp_path):
-    monitor = make_monitor("kalman", sine_spec()).fit(sine_episodes(4)).calibrate(sine_episodes(4, seed=1), 0.5)
-    monitor.save(tmp_path / "k.asm")
-    assert read_header(tmp_path / "k.asm")["about"] == {}
 
 
 @pytest.mark.parametrize("name", list(pretrained()))
@@ -109,50 +93,3 @@ def test_each_arm_and_rate_has_a_memory_of_its_own_and_a_healthy_episode_is_quie
 
     assert not failures(trial, range(4, 14), 0.95, first=1)
     env.close()
-
-
-def test_the_panda_knows_rest_on_the_handle_of_a_door():
-    base = gym.make("asm_gym/Door-v0")
-    env = NeuralASMSafety(base, on_alarm="monitor", on_overrun="ignore")
-    seed, held_from = 306450273, 110
-    expert, hold = make_policy("scripted", env, seed=seed), Hold(base)
-    observation, _ = env.reset(seed=seed)
-    state, infos = None, []
-    for t in range(held_from + 40):
-        if t < held_from:
-            action, state = expert.predict(observation, state, np.array([t == 0]))
-            held = hold.begin(action)
-        else:
-            action, held = hold.predict(observation, held)
-        observation, *_, info = env.step(action)
-        infos.append(info)
-    assert infos[held_from - 1]["contact_force"] > 10  # it presses
-    assert max(i["asm"]["surprise"] for i in infos[held_from:]) < env.threshold
-    env.close()
-
-
-def test_nothing_fitted_a_push_is_noticed_and_a_healthy_episode_is_quiet():
-    said = without_fitting(Args(seed=0))
-    reached, late = re.search(r"reaches (\d+)% of its threshold; .* noticed after (\d+) ms", said).groups()
-    assert int(reached) < 100
-    assert int(late) <= 500  # the push lasts that long
-    assert "TwoArmLift" in without_fitting(Args(task="TwoArmLift"))
-
-
-@pytest.mark.floats
-@pytest.mark.parametrize(
-    ("fault", "completed", "unread"),
-    [
-        (Freeze(channel="wrist_force", element=None, onset=18), ("wrist",), ("wrist",)),
-        (FrozenEncoder(joint=1, onset=18), ("encoder[1]",), ()),
-    ],
-)
-def test_a_sensor_that_the_expert_does_not_need_fails_and_nothing_else_is_done(fault, completed, unread):
-    infos = []
-    faulty = FaultInjection(gym.make("asm_gym/Lift-v0"), [fault])
-    env = NeuralASMSafety(faulty, on_overrun="ignore")
-    rollout(env, make_policy("scripted", env, seed=854111985), 854111985, infos.append, 60)
-    env.close()
-    assert any(info["asm"]["alarm"] for info in infos)
-    assert (infos[-1]["asm"]["completed"], infos[-1]["asm"]["unread"]) == (completed, unread)
-    assert not any(info["asm"]["intervened"] for info in infos)

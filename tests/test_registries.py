@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 import asm_gym
-from asm_gym import collect, make_monitor, register_fault, register_monitor, register_policy, register_task
+from asm_gym import collect, make_monitor, register_fault, register_policy, register_task
 from asm_gym.faults import Push
-from asm_gym.faults.suite import KINDS, kinds_of
+from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import REGISTERED
 from asm_gym.registries import added
 from asm_gym.rollouts import parallel_map
-from asm_gym.scripts.evaluate import Args
 from asm_gym.synthetic_arm import SyntheticArm
 from asm_gym.tasks import OWN, env_id
 from tests.models import Persistence
@@ -62,18 +61,6 @@ def test_a_task_and_a_policy_of_ones_own_are_collected_by_workers():
     assert [len(e) for e in one] == [len(e) for e in two] == [12, 12]
     np.testing.assert_array_equal(one[1].stream, two[1].stream)
     assert not one[0].actions.any()
-
-
-def test_names_of_ones_own_are_options_of_the_commands():
-    register_task("Waving", SyntheticArm, horizon=12)
-    register_fault("mine", lambda drawn, severity: Push(onset=drawn.onset))
-    register_monitor("persistence", Persistence)
-    assert Args(tasks=("Waving",), monitors=("persistence",), false_alarm_rate=0.05).elsewhere
-    assert kinds_of(("mine",))
-    with pytest.raises(ValueError, match="did you mean 'persistence'"):
-        Args(monitors=("persistense",))
-    with pytest.raises(ValueError, match="did you mean 'Waving'"):
-        Args(tasks=("Wavin",))
 
 
 def test_a_monitor_goes_by_its_module_too():

@@ -46,7 +46,7 @@ def expected_by(asm, state, rows):
 def observed_by(asm, state, rows):
     """The value (B,), the attribution (B, D), and the next state."""
     errors, memory = expected_by(asm, state.model, rows)
-    d, senses, (was, before) = asm.detector_, asm.spec.sensory, state.detection
+    d, senses, (was, before) = asm.detection.detector_, asm.spec.sensory, state.detection
     white = bounded(errors, d.bound) @ d.whitening
     vector = was.vector + d.gains[:, None] * (white[:, None] - was.vector)
     evidence = Evidence(vector, was.context + CONTEXT_GAIN * (memory.expected - was.context), was.steps + 1)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,34 +49,6 @@ def test_what_an_annotation_says_is_taken(arguments):
 def test_any_other_type_is_refused_by_name_and_value(name, value):
     with pytest.raises(ArgumentTypeError, match=rf"^{name} must be .*, got "):
         call(**({"path": "a"} | {name: value}))
-
-
-class Sized(Protocol):
-    """Has a method, and a property that cannot be asked for."""
-
-    @property
-    def size(self) -> int: ...
-
-    def grow(self) -> None: ...
-
-
-class Balloon:
-    @property
-    def size(self):
-        raise AssertionError("asked")
-
-    def grow(self):
-        pass
-
-
-def test_a_protocol_is_its_methods_and_no_property_is_run():
-    @typed
-    def take(thing: Sized | str) -> None:
-        pass
-
-    take(Balloon())
-    with pytest.raises(ArgumentTypeError, match=r"thing must be .*, got 3"):
-        take(3)
 
 
 def test_a_function_keeps_its_name_and_its_own_errors():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from asm_gym.data.selection import pieces
-from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
@@ -15,7 +14,6 @@ from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.monitors.values import Values
-from asm_gym.spec import Channel, StreamSpec
 from tests.streams import pendulum_columns
 
 
@@ -54,22 +52,6 @@ def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_i
     assert forces(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
     assert motion(cut[0].spec).tolist() == [0, 1, 2, 3]
     assert model.learned_["R2_values"][5] < 0.5
-
-
-def test_an_error_far_from_what_was_learned_counts_for_less():
-    whole = Episode.from_table(pendulum_columns(3000))
-    cut = pieces(whole, 1.0)
-    model = ValueAssociation(whole.spec, changes=False).fit(cut, np.random.default_rng(0), lambda done, total: None)
-    state = model.start(1)
-    for row in whole.stream[:20].astype(np.float64):
-        state, _ = model.predict(state, row[None])
-    inside = np.ones((1, model.learned_["D"].shape[1]))
-    inside[:, :-1] = 0.0  # the middle of all that was shown
-    assert model._farther(inside).max() == 1.0
-    z = np.hstack([np.full((1, inside.shape[1] - 1), 30.0), np.ones((1, 1))])
-    far = model.learned_["far"][0]
-    assert model._farther(z)[0, 0] == pytest.approx(np.sqrt(z[0] @ far @ z[0]))
-    assert model._farther(2 * z)[0, 0] == pytest.approx(2 * model._farther(z)[0, 0])
 
 
 def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
@@ -116,23 +98,6 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     np.testing.assert_array_equal(again.leverage, values.leverage)
     with pytest.raises(ValueError, match="the leverage of values should be of shape"):
         Values.found(cut[0].spec, arrays | {"leverage": np.eye(3)}, seed=0)
-
-
-def test_a_memory_of_what_nothing_tells_judges_changes_alone():
-    rng = np.random.default_rng(0)
-    spec = StreamSpec((Channel("a", 1), Channel("b", 1)), dt=0.05)
-    episodes = [Episode.from_stream(rng.normal(size=(60, 2)), spec) for _ in range(10)]
-    asm = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1, values=True).fit(episodes)
-    assert asm.values_.monitor is None
-
-
-def test_it_is_saved_and_says_the_same_again(tmp_path):
-    cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
-    monitor = make_monitor("association_values+evidence", cut[0].spec).fit(cut)
-    monitor.save(tmp_path / "x.asm")
-    again = load_monitor(tmp_path / "x.asm")
-    np.testing.assert_array_equal(again.score(cut[3]).value, monitor.score(cut[3]).value)
-    assert isinstance(monitor.detection, EvidenceDetection)
 
 
 def test_speeds_are_known_by_name_or_are_changes_of_positions():

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint, read_checkpoint
-from asm_gym.detection import Detector, EvidenceDetection
+from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.events import Excuses
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
-from asm_gym.memory.motor import Motor
-from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.arm_inputs import Derived
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
@@ -54,9 +52,8 @@ class NeuralASM(CalibratedMonitor):
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
         epochs: passes of the temporal network over the training episodes; fewer where they are very many.
-        free_running_probability: reached half-way through training; with it, after a random cue, a stream runs on
-            alone for a step: the action is the memory's own, and it goes on from what it expected. Above 0 the memory
-            learns to run on without senses (``acting.recall``, best at 0.6).
+        free_running_probability: of a training step that goes on from what was expected, with the memory's own action;
+            reached half-way through training. Above 0 the memory learns to recall (``acting.recall``, best at 0.6).
         habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
             that is to watch any policy leaves it out.
         dynamics: how the temporal network carries on the past: ``"traces"`` of what was sensed and done, or
@@ -148,21 +145,14 @@ class NeuralASM(CalibratedMonitor):
     @classmethod
     @typed
     def load(cls, path: str | Path) -> Self:
-        """Read what ``save`` wrote.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: the file is damaged, from another version, or something else.
-        """
+        """Read what ``save`` wrote. Raises FileNotFoundError, or ValueError for a file that is damaged or foreign."""
         memory: Self = restored(path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how))
         return memory
 
     @classmethod
     @typed
     def pretrained(cls, name: str) -> Self:
-        """Return a memory of a body that comes with the package, calibrated: ``NeuralASM.pretrained("panda")``.
-
-        It has learned what an arm does under any policy, from motor babbling; ``about`` says from which.
+        """Return a calibrated memory that comes with the package, learned from an arm's motor babbling.
 
         Raises:
             ValueError: there is none of that name; the message lists those that there are.
@@ -170,30 +160,9 @@ class NeuralASM(CalibratedMonitor):
         return cls.load(pretrained_file(name))
 
     @property
-    def network_(self) -> TemporalNetwork | None:
-        """The network with its weights; None before ``fit``."""
-        return self.model.network_
-
-    @property
-    def motor_(self) -> Motor | None:
-        """The motor association; None before ``acting.learn_to_act``."""
-        return self.model.motor_
-
-    @property
     def senses_(self) -> StreamScaler:
         """How it reads a row."""
         return self.model.senses_
-
-    @property
-    def detector_(self) -> Detector | None:
-        """Makes surprise of errors; None before ``fit``."""
-        evidence = self.detections["evidence"]
-        return evidence.detector_ if isinstance(evidence, EvidenceDetection) else None
-
-    @property
-    def energy_(self) -> NDArray[np.float64]:
-        """Mean energy of a step in each pass."""
-        return self.model.learned_["energy"]
 
     @property
     def diagnosis_(self) -> Diagnosis | None:
@@ -239,10 +208,7 @@ class NeuralASM(CalibratedMonitor):
         return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.reset_evidence(state.skill))
 
     def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
-        """Return the likely next command (B, A), in the units of the action, after the state that ``observe`` returned.
-
-        It is that of the motor association after ``acting.learn_to_act``, else that of the temporal network.
-        """
+        """Return the likely next command (B, A), in the units of the action, after this state."""
         return self.model.expected_action(state.model)
 
     @typed
@@ -251,8 +217,7 @@ class NeuralASM(CalibratedMonitor):
     ) -> NDArray[np.bool_]:
         """Learn from rows that were just observed, where they were not surprising: for a body that slowly wears.
 
-        It changes this memory for everybody who watches with it. The promise of ``calibrate`` holds for the weights
-        it was made with, so calibrate anew now and then.
+        The promise of ``calibrate`` holds for the weights it was made with, so calibrate anew now and then.
 
         Args:
             before: the state that ``observe`` was given.
@@ -271,10 +236,7 @@ class NeuralASM(CalibratedMonitor):
         return self.model.adapt(before.model, self._rows(before, stream), normal, rate)
 
     def rounded(self) -> Self:
-        """Return the same memory with weights of 8 bits, which takes a quarter of the space when it is saved.
-
-        It has no threshold: ``calibrate`` sets that of the rounded weights.
-        """
+        """Return a copy with weights of 8 bits, whose file is a quarter as large; ``calibrate`` it anew."""
         self._require_fitted()
         other = self._copy()
         other.model.restore(rounded(self.model.learned_), self.skills_)

@@ -26,7 +26,6 @@ DETECTIONS: dict[str, Any] = {
     "mahalanobis": "asm_gym.detection.scores:Mahalanobis",
     "moving_mean": "asm_gym.detection.scores:MovingMean",
     "largest": "asm_gym.detection.scores:Largest",
-    "latent_threshold": "asm_gym.monitors.baselines.lstm_vae:LatentThreshold",
 }
 """The class of each detection, or ``module:class``."""
 
@@ -109,7 +108,7 @@ MONITORS: Registry[MonitorKind] = Registry(
         **_with_evidence(
             {
                 "logpzo": _rival("baselines.logpzo:LogpZO", "moving_mean"),
-                "lstm_vae": _rival("baselines.lstm_vae:LSTMVAE", "latent_threshold"),
+                "lstm_vae": _rival("baselines.lstm_vae:LSTMVAE", "squares"),
                 "gru": _rival("baselines.gru:GRU", "mahalanobis"),
                 "kalman": _rival("baselines.linear:Kalman", "mahalanobis"),
                 "association_linear": _rival("baselines.linear:LinearAssociation", "mahalanobis"),

@@ -1,24 +1,21 @@
-"""LSTM-VAE: a variational autoencoder over time, and a threshold that depends on its latent state.
+"""LSTM-VAE: a variational autoencoder over time.
 
 Source: Park, Hoshi and Kemp 2018 (IEEE RA-L 3(3)), “A multimodal anomaly detector for robot-assisted feeding using an
-LSTM-based variational autoencoder”: denoising, a prior that moves on with the episode's progress, the negative log
-likelihood as score, and its expected value, which a support vector regression takes from the latent state, divided by
-(they deduct it).
+LSTM-based variational autoencoder”: denoising, a prior that moves on with the episode's progress, and the negative log
+likelihood as score. Their threshold that depends on the latent state is left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.svm import SVR
 from torch import Tensor, nn
 
-from asm_gym.detection import ModelOutput, Nominal
-from asm_gym.detection.scores import Squares
+from asm_gym.detection import ModelOutput
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, padded, train_on_episodes
@@ -29,8 +26,6 @@ from asm_gym.validation import check_number, typed
 
 CORRUPTION = 0.1
 """Standard deviation of the noise that the encoder's inputs are corrupted with."""
-REGRESSED = 3000
-"""Steps that the threshold is learned from; a support vector regression takes the square of their number in time."""
 
 
 class _Memory(NamedTuple):
@@ -117,48 +112,6 @@ class LSTMVAE(TorchModel):
         mean, log_variance, decoder = self.module_.decode(z, _cell(state.decoder))
         error = r.seen * (r.senses - mean.numpy()[:, 0]) * np.exp(-0.5 * log_variance.numpy()[:, 0])
         return _Memory(_kept(encoder), _kept(decoder), history), ModelOutput(error, z.numpy()[:, 0])
-
-
-class LatentThreshold(Squares):
-    """The negative log likelihood of errors, over what is expected of it in the model's context: its latent state.
-
-    Args:
-        spec: the stream that is watched.
-        seed: of which steps the expectation is learned from.
-    """
-
-    name = "latent_threshold"
-    arrays = ("centre", "scale", "support", "pull", "offset")
-
-    def __init__(self, spec: StreamSpec, seed: int = 0) -> None:
-        super().__init__(spec)
-        self.seed = seed
-
-    def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
-        outputs = nominal.outputs(nominal.episodes)
-        contexts = np.concatenate([r.contexts for r in outputs])
-        scores = 0.5 * (np.concatenate([r.errors for r in outputs]) ** 2).sum(axis=1)
-        chosen = np.random.default_rng(self.seed).permutation(len(scores))[:REGRESSED]
-        centre, spread = contexts.mean(axis=0), np.maximum(contexts.std(axis=0), 1e-6)
-        machine = SVR(C=10.0, gamma=1.0 / contexts.shape[1], epsilon=0.1)
-        machine.fit((contexts[chosen] - centre) / spread, np.log(scores[chosen] + 1e-6))
-        return self.restore(
-            {
-                "centre": centre.astype(np.float64),
-                "scale": spread.astype(np.float64),
-                "support": machine.support_vectors_,
-                "pull": machine.dual_coef_[0],
-                "offset": machine.intercept_,
-            }
-        )
-
-    def parts(self, output: ModelOutput) -> NDArray[np.float64]:
-        found = self.learned_
-        z = (output.contexts - found["centre"]) / found["scale"]
-        distance = ((z[:, None] - found["support"]) ** 2).sum(axis=-1)  # (B, support vectors)
-        usual = np.exp(np.exp(-distance / z.shape[1]) @ found["pull"] + found["offset"])
-        parts: NDArray[np.float64] = 0.5 * np.asarray(output.errors, np.float64) ** 2 / usual[:, None]
-        return parts
 
 
 def _cell(state: NDArray[np.float32]) -> tuple[Tensor, ...]:

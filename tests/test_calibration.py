@@ -1,13 +1,18 @@
-"""Calibration by the hour: which episodes are refused, and that the promise is saved with the memory."""
+"""Calibration: the law of alarms, promises by the hour, and warnings of crashes and of episodes learned from."""
 
 from __future__ import annotations
 
+import logging
 import re
 
 import numpy as np
 import pytest
+from scipy.stats import betabinom
 
-from asm_gym.episode import Episode
+from asm_gym import harmless
+from asm_gym.data.crashes import crashes
+from asm_gym.detection import conformal_threshold
+from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
 from asm_gym.monitors.training_data import KEPT, STRETCH, check_fresh, marks, sketch
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -23,16 +28,6 @@ def episode(seed: int, steps: int = 120) -> Episode:
 
 def part(whole: Episode, begin: int, end: int) -> Episode:
     return Episode.from_stream(whole.stream[begin:end], SPEC)
-
-
-def test_a_mark_is_of_a_stretch_wherever_it_stands():
-    whole = episode(0)
-    found = marks(whole)
-    assert len(found) == 120 - STRETCH + 1 == len(set(found))
-    np.testing.assert_array_equal(marks(part(whole, 30, 90)), found[30 : 90 - STRETCH + 1])
-    assert not set(marks(episode(1))) & set(found)
-    assert (found == np.floor(found)).all()
-    assert found.max() < 2**52  # so a double holds it
 
 
 def test_a_robot_that_stands_still_is_not_told_apart():
@@ -87,22 +82,6 @@ def test_a_promise_by_the_hour_is_kept_saved_and_loaded(monitor, tmp_path):
     assert monitor.calibrate(NOMINAL, 0.05).promise.per == "episode"
 
 
-def test_fresh_hours_alarm_as_often_as_was_promised(monitor):
-    """Of 20 calibrations, each with 10 fresh hours: what was promised lies inside the interval of all that alarmed."""
-    from asm_gym.detection import Blocks, hourly_threshold
-    from asm_gym.evaluation.statistics import Rate
-
-    rng = np.random.default_rng(5)
-    surprise = [s.value for s in monitor.score_episodes([episode(9000 + n, 600) for n in range(240)])]
-    alarms = 0
-    for _ in range(200):  # halves of two hours: one sets the threshold for the other
-        order = rng.permutation(240)
-        own, other = ([surprise[i] for i in half] for half in (order[:120], order[120:]))
-        q = hourly_threshold(Blocks.of(own, SPEC.dt), 4.0)
-        alarms += sum(v.max() > q for v in other)
-    assert 3.0 < Rate(alarms, 200.0).value < 4.6  # 4 an hour: 4/121 of 120, as of exchangeable ones
-
-
 @pytest.mark.parametrize(
     ("episodes", "asked", "message"),
     [
@@ -137,7 +116,81 @@ def test_a_promise_by_the_episode_says_so_and_is_made_all_the_same(monitor, capl
     assert monitor.promise.episodes == 121
 
 
-def test_a_loaded_memory_still_knows_what_it_learned_from(monitor, tmp_path):
-    monitor.calibrate(NOMINAL, 0.1).save(tmp_path / "m.asm")
-    with pytest.raises(ValueError, match="episode 0 was learned from"):
-        load_monitor(tmp_path / "m.asm").calibrate([episode(3), *NOMINAL], false_alarms_per_hour=1.0)
+ARM = StreamSpec((Channel("joint", 2, "rad"), Channel("external_torque", 2, "N m")), dt=0.05)
+ROWS = 40
+
+
+def pressing(seed: int, hit: float = 0.0, force: float | None = None, task: str = "") -> Episode:
+    """Two joints that wander, and torques of about 1 N m; at ``hit`` both are struck."""
+    rng = np.random.default_rng(seed)
+    stream = np.hstack([np.cumsum(rng.normal(size=(ROWS, 2)), axis=0), rng.normal(size=(ROWS, 2)).clip(-2, 2)])
+    stream[ROWS // 2 :, 2:] += hit
+    felt = {} if force is None else {"contact_force": np.full(ROWS, force, np.float32)}
+    return Episode.from_stream(stream, ARM, label=EpisodeLabel(task, "nominal") if task else None, **felt)
+
+
+@pytest.fixture(scope="module")
+def kalman():
+    return make_monitor("kalman", ARM).fit([pressing(n) for n in range(20)])
+
+
+CALM = [pressing(100 + n) for n in range(40)]
+
+
+def test_what_presses_twice_as_hard_as_usual_is_a_crash_in_its_own_task():
+    light, heavy = [pressing(n, force=10, task="Lift") for n in range(5)], [pressing(9, force=50, task="Nut")] * 5
+    hit = pressing(7, force=45, task="Lift")
+    tasks = [e.labelled.task for e in [*light, *heavy, hit]]
+    assert crashes([*light, *heavy, hit], tasks) == {10: pytest.approx(4.5)}
+    assert crashes([*CALM, pressing(3, hit=30.0)], [""] * 41).keys() == {40}
+    assert crashes(CALM, [""] * 40) == {}
+
+
+@pytest.mark.parametrize("asked", [{"false_alarm_rate": 0.05}, {"false_alarms_per_hour": 60.0}])
+def test_a_threshold_that_a_crash_has_set_is_doubted_and_the_episode_named(kalman, caplog, asked):
+    crashed = [*CALM[:30], pressing(207, hit=40.0), *CALM[30:], pressing(208, hit=30.0)]
+    with caplog.at_level(logging.WARNING):
+        high = kalman.calibrate(crashed, **asked).threshold
+    (said,) = (r.getMessage() for r in caplog.records)
+    assert "2 of 42 episodes press more than 2 times as hard as is usual" in said
+    assert re.search(r"The worst is episode 30, \d.* asm_gym.harmless\(episodes\) does", said)
+    caplog.clear()
+    with caplog.at_level(logging.WARNING):
+        low = kalman.calibrate(harmless(crashed), **asked).threshold  # what it says to do
+    assert not caplog.records
+    assert high > 1.5 * low
+    assert f"with them the threshold is {high:.3g}, without " in said
+
+
+def test_few_calm_episodes_are_compared_with_the_worst_of_them_and_a_crash_that_changes_nothing_is_not_said(
+    kalman, caplog
+):
+    with caplog.at_level(logging.WARNING):
+        kalman.calibrate([*CALM[:18], pressing(207, hit=40.0)], 0.05)  # 19, of which 18 promise no 5 %
+        assert len(caplog.records) == 1
+        kalman.calibrate([*CALM, pressing(207, hit=40.0)], 0.1)  # the worst of 41 is beyond what 10 % allow
+    assert len(caplog.records) == 1
+
+
+RATES = (0.01, 0.05, 0.2)
+
+
+def surprise(rng: np.random.Generator, episodes: int) -> np.ndarray:
+    """(episodes,) the largest of some heavy-tailed, dependent values in each."""
+    walks = rng.standard_t(2, size=(episodes, 30)).cumsum(axis=1)
+    return np.abs(walks).max(axis=1)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_the_number_of_alarms_is_beta_binomial_whatever_the_surprise(rate):
+    rng, n, fresh = np.random.default_rng(0), 199, 300
+    counts = []
+    for _ in range(1500):
+        threshold = conformal_threshold(surprise(rng, n), rate)
+        counts.append(int((surprise(rng, fresh) > threshold).sum()))
+    law = betabinom(fresh, rate * (n + 1), (1 - rate) * (n + 1))
+    spread = law.std() / np.sqrt(len(counts))
+    assert np.mean(counts) / fresh == pytest.approx(rate, abs=4 * spread / fresh)
+    for quantile in (0.1, 0.5, 0.9):
+        at_most = np.mean(np.array(counts) <= law.ppf(quantile))
+        assert at_most == pytest.approx(law.cdf(law.ppf(quantile)), abs=4 * np.sqrt(0.25 / len(counts)))
