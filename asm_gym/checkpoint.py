@@ -1,8 +1,7 @@
 """Checkpoints: one file of arrays and JSON, never pickle.
 
-The file is a zip of ``.npy`` arrays, as an ``.npz`` is, with a JSON header beside them that declares each. A zip has a
-checksum of every member, so damage is noticed when it is read. Nothing is read before its size is known: members are
-not compressed, so that all of them together are no larger than the file.
+The file is a zip of ``.npy`` arrays, as an ``.npz`` is, with a JSON header that declares each. Checksums of the zip
+reveal damage. Members are not compressed, so that all of them together are no larger than the file.
 """
 
 from __future__ import annotations
@@ -31,26 +30,26 @@ LONGEST_HEADER = 16 * 2**20
 """[bytes]"""
 
 MOST_EXPANDED = 30
-"""How many times larger than its file the content of a compressed ``.npz`` may be; real streams shrink by 1.1."""
+"""Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1."""
 
 DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError, NotImplementedError)
-"""What reading a zip may raise whose bytes are not what they should be."""
+"""Errors that reading a damaged zip may raise."""
 
 _npy: Any = np.lib.format
 
 
 class _OtherCheckpointError(ValueError):
-    """A checkpoint that is whole, and not what was asked for."""
+    """An undamaged checkpoint of another kind or version."""
 
 
 class Checkpoint(NamedTuple):
-    """What a file held: JSON values, and arrays by name."""
+    """Content of a file: JSON values, and arrays by name."""
 
     header: dict[str, Any]
     arrays: dict[str, NDArray[Any]]
 
     def array(self, name: str, *shape: int) -> NDArray[Any]:
-        """The array of that name. Raises ValueError unless there is one, of finite numbers and of that shape."""
+        """Return an array. Raises ValueError unless it is there, of finite numbers and of that shape."""
         array = self.arrays.get(name)
         if array is None or array.shape != shape or array.dtype.kind != "f":
             found = "none" if array is None else f"{array.dtype} {array.shape}"
@@ -64,10 +63,10 @@ class Checkpoint(NamedTuple):
 def write_checkpoint(
     path: str | Path, kind: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Writes a checkpoint; a reader sees the old file or the new one, never half of it.
+    """Write a checkpoint; a reader sees the old file or the new one, never half of it.
 
     Args:
-        path: where to, exactly: no suffix is added. Missing folders are made.
+        path: of the file; missing folders are made.
         kind: what it is a checkpoint of, for example ``neural_asm``.
         header: JSON-serialisable.
         arrays: of numbers.
@@ -85,7 +84,7 @@ def write_checkpoint(
 
 @typed
 def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
-    """Reads a checkpoint of that kind.
+    """Read a checkpoint of that kind.
 
     Raises:
         FileNotFoundError: there is none.
@@ -112,35 +111,35 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
 
 
 def read_header(path: str | Path) -> dict[str, Any]:
-    """The JSON values of a checkpoint alone. Raises FileNotFoundError, or ValueError where the file is damaged."""
+    """Return the JSON values of a checkpoint. Raises FileNotFoundError, or ValueError where the file is damaged."""
     with _opened(path, "is damaged or not a checkpoint of asm-gym", expanded=1) as file:
         return _header(file)
 
 
 @typed
 def kind_of(path: str | Path) -> str:
-    """What a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
+    """Return what a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
     return str(read_header(path).get("kind"))
 
 
 @typed
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Every array of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
+    """Return the arrays of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
     with _opened(path, "is damaged", expanded=MOST_EXPANDED) as file:
         return {n.removesuffix(".npy"): _read(file, n, kinds="biufU") for n in file.namelist()}
 
 
 @contextmanager
 def opened_zip(source: str | Path | IO[bytes], size: int, expanded: int) -> Iterator[zipfile.ZipFile]:
-    """A zip whose members are looked at before anything is read.
+    """Open a zip whose members are checked before anything is read.
 
     Args:
         source: a file, or the bytes of one.
         size: of it [bytes].
-        expanded: how many times larger than the file its content may be; 1 where nothing may be compressed.
+        expanded: largest size of its content, in sizes of the file; 1 where nothing may be compressed.
 
     Raises:
-        ValueError: two members have one name, or they are larger than they may be.
+        ValueError: two members have one name, or they are too large.
     """
     with zipfile.ZipFile(source) as file:
         members = file.infolist()
@@ -155,7 +154,7 @@ def opened_zip(source: str | Path | IO[bytes], size: int, expanded: int) -> Iter
 
 @contextmanager
 def _opened(path: str | Path, what: str, expanded: int) -> Iterator[zipfile.ZipFile]:
-    """A zip; whatever is wrong with it is said in a line that names it."""
+    """Open a zip, whose errors become one line that names it."""
     try:
         with opened_zip(path, regular_file(path), expanded) as file:
             yield file
@@ -176,7 +175,7 @@ def _header(file: zipfile.ZipFile) -> dict[str, Any]:
 
 
 def _finite(text: str) -> float:
-    """A number of JSON; 1e999 would pass for infinity."""
+    """Read a number of JSON; 1e999 would pass for infinity."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"its header holds {text}, which is no number")
@@ -184,7 +183,7 @@ def _finite(text: str) -> float:
 
 
 def _read(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]:
-    """An array of numbers, whose shape agrees with the bytes that are there; the zip compares its checksum."""
+    """Read an array of numbers, whose shape agrees with the bytes that are there."""
     data = file.read(name)
     start = io.BytesIO(data)
     version = _npy.read_magic(start)
@@ -197,5 +196,5 @@ def _read(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]
     if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != found:
         raise ValueError(f"{name} has {found} bytes, which are no {dtype} {shape}")
     array: NDArray[Any] = np.frombuffer(data, dtype, offset=start.tell()) if found else np.zeros(0, dtype)
-    # Laid out as it was, or products of it would be rounded otherwise.
+    # In its own memory order, on which the rounding of products depends.
     return array.reshape(shape, order="F" if fortran else "C").copy(order="K")

@@ -1,15 +1,14 @@
 r"""What of a stream row the memory reads: values and their changes.
 
-Of a channel that moves little in a step the best prediction is its last value, plus a little. The temporal network
-senses both the value, which says where in a skill the robot is, and the change, which says what is happening now
-(generalised coordinates of motion: Friston 2008, PLOS Comput Biol 4(11)). Association judges the change of every
-channel, given all values before and all other changes.
+The temporal network senses both the value, which says where in a skill the robot is, and the change, which says what is
+happening now (generalised coordinates of motion: Friston 2008, PLOS Comput Biol 4(11)). Association predicts the change
+of every channel from all values before and all other changes.
 
     s_t = [v_t, Δ_t,slow]      v_t = (x_t - m) / σ      Δ_t = (x_t - x_{t-l}) / σ_Δ      slow:  σ_Δ < 0.3 σ
     a_t = [v_{t-l}, Δ_t, Δ_{t-l},slow, u_t, 1]
 
-l is 1 at a robot's control rate. Where rows come faster, what moves between two of them drowns in the sensors' noise,
-and the change is taken over the l rows of a twentieth of a second.
+l is 1 at a robot's control rate. Where rows come faster, motion between two of them is less than sensor noise, and
+the change is taken over the l rows of a twentieth of a second.
 """
 
 from __future__ import annotations
@@ -33,19 +32,16 @@ SLOW = 0.3
 """A channel is slow where a step's change is under this share of its spread."""
 
 LAPSE = 0.05
-"""Over how long a change is taken, where rows come faster [s]."""
+"""Time over which a change is taken, where rows come faster [s]."""
 
 FEW_VALUES = 5
 """A channel of fewer different values is a flag or a mode."""
 
 MOST_SHOWN = 10_000
-"""Rows from which the resolution of channels is told."""
+"""Rows from which the resolution of channels is estimated."""
 
 FARTHEST = 1e3
-"""Where standardised numbers are cut off, so that no finite row can overflow.
-
-A number that far out is judged, but nothing is expected from it: one broken sense should not make all look wrong.
-"""
+"""Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted from such a number."""
 
 
 class ScaledRows(NamedTuple):
@@ -80,7 +76,7 @@ class StreamScaler:
 
     @classmethod
     def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]], lag: int = 1) -> Self:
-        """From training episodes (T, D) each, of more than ``lag`` rows."""
+        """Learn the scale from training episodes (T, D) of more than ``lag`` rows each."""
         rows = np.concatenate(streams).astype(np.float64)  # (N, D)
         steps = np.concatenate([s[lag:].astype(np.float64) - s[:-lag] for s in streams])
         mean = rows.mean(axis=0)
@@ -128,7 +124,7 @@ class StreamScaler:
         return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
 
     def read_episode(self, stream: NDArray[np.floating[Any]]) -> ScaledRows:
-        """All rows of an episode (T, D); nothing has moved before the first ``lag``."""
+        """Read all rows of an episode (T, D); nothing has moved before the first ``lag``."""
         before = np.concatenate([stream[: self.lag], stream[: -self.lag]])
         return self.read(stream, before, np.concatenate([before[: self.lag], before[: -self.lag]]))
 
@@ -138,7 +134,7 @@ class StreamScaler:
         before: NDArray[np.floating[Any]],
         earlier: NDArray[np.floating[Any]],
     ) -> ScaledRows:
-        """Rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
+        """Read rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
         x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
         sensory, motor = self.spec.sensory, self.spec.motor
         return ScaledRows(*_read(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow))
@@ -146,13 +142,13 @@ class StreamScaler:
 
 @compiled
 def _bounded(number: float) -> float:
-    """Cut off at ``FARTHEST``; what overflowed on both sides of a difference is there already."""
+    """Cut off at ``FARTHEST``; a difference of two infinite numbers is 0."""
     return 0.0 if number != number else min(max(number, -FARTHEST), FARTHEST)
 
 
 @compiled
 def _believed(number: float) -> float:
-    """0 where the number would be cut off."""
+    """Return 0 where the number would be cut off."""
     return number if abs(number) < FARTHEST else 0.0
 
 
@@ -168,7 +164,7 @@ def _read(
     motor: Ints,
     slow: Ints,
 ) -> tuple[Any, ...]:
-    """The fields of a ``ScaledRows``, in order."""
+    """Return the fields of a ``ScaledRows``, in order."""
     B, D = rows.shape
     X, A, L = len(sensory), len(motor), len(slow)
     senses, seen = np.zeros((B, X + L), np.float32), np.zeros((B, X + L), np.float32)
@@ -205,12 +201,12 @@ def _read(
 
 
 def rows_apart(dt: float) -> int:
-    """l for rows that come every ``dt`` seconds."""
+    """Return l for rows that come every ``dt`` seconds."""
     return max(1, round(LAPSE / dt))
 
 
 def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(D,) standard deviation of each column; of one that never changes its sensor noise, or 1 where that is 0."""
+    """Return the standard deviations (D,); of a constant column its sensor noise, or 1 where that is 0."""
     spread = rows.std(axis=0)
     constant = spread <= 1e-6 * np.abs(mean)  # the rounding of float32 is not a signal
     fallback: NDArray[np.float64] = np.where(noise > 0, noise, 1.0)
@@ -218,10 +214,9 @@ def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray
 
 
 def _least_change(streams: Sequence[NDArray[np.float32]], noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(D,) below which no change is told from noise and rounding: √2 of half the one, and of the spread of the other.
+    """Return the least spread of changes (D,): √2 of half the noise, and of the spread of rounding.
 
-    A channel that moves by one of its steps in a thousand rows has a spread of a thirtieth of that, and each step would
-    be thirty of them. Flags and other channels of few values are no rounded ones.
+    Otherwise a channel that moves by one of its steps in a thousand rows would surprise at each step.
     """
     shown = [s[:MOST_SHOWN] for s in streams[: max(1, MOST_SHOWN // max(1, len(streams[0])))]]
     rounded = [[resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown]  # (N, D)

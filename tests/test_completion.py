@@ -104,11 +104,10 @@ def test_what_nothing_else_tells_of_is_trusted_for_a_second_only():
 
 def test_surprise_without_a_sense_is_what_the_others_add_to_it():
     attribution = np.array([[1.0, 2.0, 5.0], [0.0, 0.0, 4.0], [0.0, 0.0, 0.0]])
-    surprise = Surprise(np.array([8.0, 4.0, np.inf]), attribution, of_body=np.array([6.0, 4.0, np.inf]))
+    surprise = Surprise(np.array([8.0, 4.0, np.inf]), attribution)
     left = surprise.without(np.array([False, False, True]))
     np.testing.assert_allclose(left.value, [3.0, 0.0, np.inf])  # what failed goes on to be an alarm
     np.testing.assert_allclose(left.attribution[:2].sum(axis=1), left.value[:2])
-    np.testing.assert_allclose(left.of_body, [6.0 * 3 / 8, 0.0, np.inf])
     assert surprise.without(np.zeros(3, bool)) is surprise
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from asm_gym.memory.recall import continued
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.acting import recall
 from asm_gym.monitors.memory_model import MemoryModel
+from asm_gym.monitors.skills import recall
 from asm_gym.scaling import StreamScaler
 from tests.streams import sine_episodes, sine_spec
 

@@ -7,7 +7,7 @@ import pytest
 
 from asm_gym import Channel, Episode, NeuralASM, StreamSpec
 from asm_gym.memory.free_energy import FreeEnergy
-from asm_gym.monitors.acting import learn_to_act
+from asm_gym.monitors.skills import learn_to_act
 
 SPEC = StreamSpec(
     (

@@ -15,7 +15,7 @@ from asm_gym.episode import Episode
 from asm_gym.memory import motor
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.acting import learn_to_act
+from asm_gym.monitors.skills import learn_to_act
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
 from asm_gym.policies.memory_policy import ENOUGH, FORGETS, CommandReadout, StreamReader
 from asm_gym.scaling import StreamScaler

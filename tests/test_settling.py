@@ -17,8 +17,7 @@ from asm_gym.memory.settling import (
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import MemoryConfig, NeuralASM, load_monitor
-from asm_gym.monitors.acting import recall
-from asm_gym.monitors.skills import name_skills, named_skills
+from asm_gym.monitors.skills import name_skills, named_skills, recall
 from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
 

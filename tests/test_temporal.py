@@ -31,7 +31,7 @@ from asm_gym.memory.traces import (
     learn_traces,
 )
 from asm_gym.monitors import MemoryConfig, NeuralASM
-from asm_gym.monitors.acting import recall
+from asm_gym.monitors.skills import recall
 from tests.problems import energy, problem, schedule, some_rows, trajectory
 from tests.streams import sine_episodes, sine_spec
 

@@ -11,7 +11,7 @@ from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.arm_inputs import forces, motion, speeds
 from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.monitors.values import Values
 from tests.streams import pendulum_columns

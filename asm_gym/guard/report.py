@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,9 +109,8 @@ def report(
         failed: what failed before the step; empty where nothing did.
 
     Returns:
-        ``surprise``: the largest of this step; infinite where something failed. ``surprise_body`` and
-        ``surprise_skill``: the largest at what no body does, and at what no known skill does, not a number where the
-        monitor does not tell. ``threshold``. ``alarm``, and its ``reason``: ``"surprise"`` is over the threshold, a
+        ``surprise``: the largest of this step; infinite where something failed. ``threshold``. ``alarm``, and its
+        ``reason``: ``"surprise"`` is over the threshold, a
         ``"contact"`` limit was passed, hand and joints are in ``"contradiction"``, a number of the stream is
         ``"missing"``, or a ``"failure"``. ``event``: ``"fault"`` of the body, its senses or its commands; ``"knock"``,
         from which the policy goes on after a pause; ``"stop"``, a joint at its stop, which is no alarm; or empty.
@@ -140,8 +138,6 @@ def report(
     completed, unread = last.repairs.get(robot, ((), ()))
     return {
         "surprise": float(surprises[largest]),
-        "surprise_body": _largest((row.surprise.of_body for row in rows), robot, float(surprises[largest])),
-        "surprise_skill": _largest((row.surprise.of_skill for row in rows), robot, math.nan),
         "threshold": float(last.threshold[robot]),
         "alarm": any(bool(row.alarm[robot]) for row in rows),
         "reason": min(reasons, key=REASONS.index, default=""),
@@ -163,11 +159,6 @@ def report(
         "unread": unread,
         "lost": last.lost.get(robot, ()),
     }
-
-
-def _largest(parts: Iterable[NDArray[np.float64] | None], robot: int, unknown: float) -> float:
-    """Return the largest of one part of the surprise in each row; ``unknown`` where no monitor said it."""
-    return max((float(part[robot]) for part in parts if part is not None), default=unknown)
 
 
 def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:

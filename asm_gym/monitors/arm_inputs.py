@@ -23,29 +23,29 @@ from asm_gym.spec import StreamSpec
 Floats = NDArray[np.float64]
 
 _FORCE = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
-_TOLD = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
+_COMMANDED = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
 
 WIDTHS = (0.01, 0.1, 1.0)
 """w, shares of a speed's spread."""
 
 MOST_ANGLES = 12
-"""More are no arm's: their products would be too many."""
+"""Of more angles no sines are taken: their products would be too many."""
 
 CHAIN = 3
-"""Angles from the second on that are added up: shoulder, elbow and wrist often turn about parallel axes."""
+"""Angles from the second on that are summed: shoulder, elbow and wrist often turn about parallel axes."""
 
 
 class Derived(NamedTuple):
-    """What is made of speeds and angles.
+    """Inputs that are derived from speeds and angles.
 
     Attributes:
         speeds: (S,) senses that are speeds, or whose changes are.
-        from_steps: they are those of positions.
+        from_steps: speeds are changes of positions.
         angles: (J,) senses that are angles, along the chain.
         radians: (J,) in one of their units.
         pairs: (2, P) of sines and cosines of single angles, that are multiplied.
-        sources: (M, X) which senses each is made of.
-        links: what the joints carry, where a body model says it; the sines are not there then.
+        sources: (M, X) which senses each derived input is made of.
+        links: body model that replaces the sines; None without one.
     """
 
     speeds: NDArray[np.intp]
@@ -97,9 +97,12 @@ class Derived(NamedTuple):
         return cls(at, from_steps, angles, radians, pairs, sources, links)
 
     def __call__(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> Floats:
-        """(N, M) of values (N, X) in their units, standardised changes (N, X), and the values' spread (X,).
+        """Return the derived inputs (N, M).
 
-        A standardised change of 1 is ``rate`` (X,) in a second.
+        Args:
+            values: (N, X) in their units.
+            steps: (N, X) standardised changes; 1 is ``rate`` (X,) in a second.
+            spread: (X,) of the values.
         """
         speed = steps[:, self.speeds] if self.from_steps else values[:, self.speeds] / spread[self.speeds]
         parts = [np.tanh(speed / width) for width in WIDTHS]
@@ -114,7 +117,7 @@ class Derived(NamedTuple):
         return np.hstack(parts)
 
     def _carried(self, links: BodyModel, values: Floats, steps: Floats, rate: Floats) -> tuple[Floats, Floats]:
-        """Torques (N, J) by weight, and by motion."""
+        """Return torques (N, J) by weight, and by motion."""
         q, pace = values[:, self.angles] * self.radians, (steps * rate)[:, self.speeds]
         if self.from_steps:
             return links.torques(q, pace * self.radians, np.zeros_like(q))
@@ -122,7 +125,7 @@ class Derived(NamedTuple):
 
 
 def _links(spec: StreamSpec, columns: NDArray[np.intp], urdf: str) -> BodyModel | None:
-    """The body model for columns of angles. Raises ValueError where it does not fit them."""
+    """Return the body model for columns of angles. Raises ValueError where it does not fit them."""
     if not urdf:
         return None
     moving = speeds(spec)[0]
@@ -135,16 +138,13 @@ def _links(spec: StreamSpec, columns: NDArray[np.intp], urdf: str) -> BodyModel 
 
 
 def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
-    """Columns of senses whose channel is called so."""
-    named = zip(spec.channels, spec.slices.values(), strict=True)
-    found = [np.arange(s.start, s.stop) for c, s in named if pattern.fullmatch(c.name.lower())]
-    every = np.concatenate([*found, np.zeros(0, np.intp)])
-    own: NDArray[np.intp] = np.intersect1d(every, spec.sensory).astype(np.intp)
-    return own
+    """Return the columns of senses whose channel's name matches."""
+    columns = {i for n, s in spec.slices.items() if pattern.fullmatch(n.lower()) for i in range(s.start, s.stop)}
+    return np.array([i for i in spec.sensory if int(i) in columns], np.intp)
 
 
 def speeds(spec: StreamSpec) -> tuple[NDArray[np.intp], bool]:
-    """Columns of the stream that are speeds; or of positions, and that their changes are."""
+    """Return the columns that are speeds and False; or those of positions and True."""
     for pattern, from_steps in ((SPEED, False), (POSITION, True)):
         found = _named(spec, pattern)
         if len(found):
@@ -153,11 +153,11 @@ def speeds(spec: StreamSpec) -> tuple[NDArray[np.intp], bool]:
 
 
 def forces(spec: StreamSpec) -> NDArray[np.intp]:
-    """Columns of senses that are measured torques or currents by their names, and no targets of them."""
-    return np.setdiff1d(_named(spec, _FORCE), _named(spec, _TOLD)).astype(np.intp)
+    """Return the columns of measured torques or currents, by their names."""
+    return np.setdiff1d(_named(spec, _FORCE), _named(spec, _COMMANDED)).astype(np.intp)
 
 
 def motion(spec: StreamSpec) -> NDArray[np.intp]:
-    """Columns of senses that are positions or speeds by their names."""
+    """Return the columns of positions and speeds, by their names."""
     found: NDArray[np.intp] = np.union1d(_named(spec, POSITION), _named(spec, SPEED)).astype(np.intp)
     return found

@@ -28,8 +28,6 @@ class Surprise(NamedTuple):
         value: (B,) number that the threshold applies to; ``inf`` where the row is not finite.
         attribution: (B, D) share of each number of the row; adds up to ``value`` along the last axis.
         skill: (B,) name of the skill that seems to be running; None where no skill has a name.
-        of_body: (B,) surprise of the body, where a monitor tells it from ``of_skill``; None elsewhere.
-        of_skill: (B,) surprise of the skill; None where no skill model runs.
         raw: (B,) ``value`` before knocks and stops excuse part of it; None where nothing is excused.
         excuse: (B,) index in ``detection.events.EVENTS`` of the event that excuses it; None likewise.
     """
@@ -37,8 +35,6 @@ class Surprise(NamedTuple):
     value: NDArray[np.float64]
     attribution: NDArray[np.float64]
     skill: NDArray[np.str_] | None = None
-    of_body: NDArray[np.float64] | None = None
-    of_skill: NDArray[np.float64] | None = None
     raw: NDArray[np.float64] | None = None
     excuse: NDArray[np.int8] | None = None
 
@@ -70,7 +66,8 @@ class Surprise(NamedTuple):
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """Return it with no surprise ``where`` (B,) nothing is judged."""
         shares = np.where(where[:, None], 0.0, self.attribution)
-        return self._replace(attribution=shares, **self._mapped(lambda value: np.where(where, 0.0, value)))
+        raw = None if self.raw is None else np.where(where, 0.0, self.raw)
+        return self._replace(value=np.where(where, 0.0, self.value), attribution=shares, raw=raw)
 
     def without(self, columns: NDArray[np.bool_]) -> Surprise:
         """Return what is left of it where the precision of ``columns`` (D,) is 0."""
@@ -81,12 +78,8 @@ class Surprise(NamedTuple):
         judged = np.isfinite(self.value) & (self.value > 0)
         left[judged] -= self.attribution[judged][:, columns].sum(axis=1) / self.value[judged]
         left = np.clip(left, 0.0, 1.0)
-        return self._replace(attribution=shares, **self._mapped(lambda value: np.where(judged, left * value, value)))
-
-    def _mapped(self, change: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> dict[str, Any]:
-        """Return every surprise that is known, changed."""
-        values = {name: getattr(self, name) for name in ("value", "of_body", "of_skill", "raw")}
-        return {name: change(value) for name, value in values.items() if value is not None}
+        raw = None if self.raw is None else np.where(judged, left * self.raw, self.raw)
+        return self._replace(value=np.where(judged, left * self.value, self.value), attribution=shares, raw=raw)
 
 
 class Monitor(Protocol):

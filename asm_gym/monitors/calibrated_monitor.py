@@ -33,13 +33,12 @@ from asm_gym.validation import check_choice, check_flag, check_number, short_rep
 
 
 class MonitorState(NamedTuple):
-    """What is carried from step to step, one row a stream; a value, never changed in place."""
+    """State of a monitor, one row a stream; a value, never changed in place."""
 
     model: State
     detection: State
     excuses: State = ()  # of knocks and stops
     values: State = ()  # of the monitor of values
-    skill: State = ()  # of the monitor of skills
 
 
 class CalibratedMonitor(Calibrated):
@@ -51,9 +50,8 @@ class CalibratedMonitor(Calibrated):
         seed: of all random draws while learning.
 
     Attributes:
-        about: anything else to keep, such as its ``name``; JSON-serialisable, and saved with it.
-        learned_from_: marks of the episodes that ``fit`` was given; None before.
-        ceilings_from_: marks of the episodes that ``learn_ceilings`` was given; None where there were none.
+        about: JSON values to save with it, such as its ``name``.
+        learned_from_, ceilings_from_: marks of the episodes of ``fit`` and of ``learn_ceilings``; None before.
     """
 
     model: StreamModel
@@ -70,7 +68,7 @@ class CalibratedMonitor(Calibrated):
         self.about: dict[str, Any] = {}
 
     def __repr__(self) -> str:
-        """Return its name, body and threshold in one line."""
+        """Return name, body and threshold in one line."""
         name = f"{self.about['name']!r}, " if "name" in self.about else ""
         limit = "no threshold" if self.threshold_ is None else f"threshold {self.threshold_:.4g}"
         return f"<{type(self).__name__} {name}{self.spec.source or 'a stream'} at {1 / self.spec.dt:g} Hz, {limit}>"
@@ -124,8 +122,7 @@ class CalibratedMonitor(Calibrated):
 
         Raises:
             ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
-            TypeError: the model cannot go on from what it knows.
-            RuntimeError: it is to go on, and knows nothing yet.
+            TypeError, RuntimeError: the model cannot go on from what it knows, or knows nothing yet.
         """
         if check_flag("warm_start", warm_start):
             if not hasattr(self.model, "specialise"):
@@ -187,7 +184,7 @@ class CalibratedMonitor(Calibrated):
                 by the hour also episodes that overlap, or that ``fit`` has learned from. Or not exactly one rate.
         """
         self._require_fitted()
-        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)  # refuses a bad rate before the work begins
+        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         check_nominal(episodes, self.spec, self.model.shortest)
         if each and len(each) != len(episodes):
             raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
@@ -250,14 +247,10 @@ class CalibratedMonitor(Calibrated):
         scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
         with threadpool_limits(1):
             for group, steps in side_by_side(episodes, self.initial_state, self.observe):
+                known = [f for f in Surprise._fields if f != "skill" and steps and getattr(steps[0], f) is not None]
                 for n, i in enumerate(group):
-                    own = steps[: len(episodes[i])]
-                    fields = {
-                        name: np.array([getattr(s, name)[n] for s in own])
-                        for name in Surprise._fields
-                        if name != "skill" and own and getattr(own[0], name) is not None
-                    }
-                    scores[i] = Surprise(**fields) if own else scores[i]
+                    if own := steps[: len(episodes[i])]:
+                        scores[i] = Surprise(**{name: np.array([getattr(s, name)[n] for s in own]) for name in known})
         return scores
 
     @typed
@@ -300,7 +293,7 @@ class CalibratedMonitor(Calibrated):
         return f"{self.model.kind} monitor"
 
     def _copy(self) -> Self:
-        """Return another that shares nothing that learning changes; learned arrays are never changed in place."""
+        """Return a copy that shares nothing that learning changes; learned arrays are never changed in place."""
         other = copy.copy(self)
         other.model = copy.copy(self.model)
         other.detections = {name: copy.copy(d) for name, d in self.detections.items()}

@@ -13,7 +13,6 @@ from asm_gym.detection.events import Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.episode import Episode
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.training_data import check_fresh, check_nominal, sketch
 from asm_gym.validation import typed
@@ -27,7 +26,7 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
     """Learn from healthy hours how far each sense goes at its worst, and return the monitor.
 
     The episodes it was fitted to, babbling say, are not like hours of operation. It has no threshold then: calibrate it
-    on other hours of the same policies and tasks. Skills are to be learned anew.
+    on other hours of the same policies and tasks.
 
     Args:
         monitor: fitted, under the detection of evidence; it is changed.
@@ -51,9 +50,6 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
     monitor.detections = {**monitor.detections, learned.name: learned}
     monitor.ceilings_from_ = sketch(episodes)
     monitor._uncalibrate()
-    if isinstance(monitor, NeuralASM):
-        monitor.skill_ = None  # it was weighed against the memory as it was
-        monitor.about = {name: value for name, value in monitor.about.items() if name != "alarm_on"}
     return monitor
 
 

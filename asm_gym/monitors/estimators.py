@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +26,6 @@ from asm_gym.spec import StreamSpec
 
 MOST_ROWS = 20_000
 """What it learns from at most, drawn evenly: many estimators take the square of their number in time."""
-
-
-class _Fitted(NamedTuple):
-    estimator: Any
-    centre: float
-    spread: float
 
 
 class EstimatorModel(StreamModel):
@@ -68,7 +62,7 @@ class EstimatorModel(StreamModel):
         made = self.estimator(**({"random_state": self.seed} if seeded else {}))
         made.fit(np.asarray(learned["rows"], np.float32))
         usual = _scores(made, np.asarray(learned["others"], np.float32))
-        self._fitted = _Fitted(made, float(usual.mean()), max(float(usual.std()), 1e-9))
+        self._fitted, self._centre, self._spread = made, float(usual.mean()), max(float(usual.std()), 1e-9)
         return super().restore(learned, skills)
 
     def start(self, batch: int) -> RowHistory:
@@ -76,8 +70,7 @@ class EstimatorModel(StreamModel):
 
     def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
         state, reading, _ = read_next(self._senses, state, rows)
-        scores = _scores(self._fitted.estimator, _features(reading))
-        error = np.maximum(0.0, self._fitted.centre - scores) / self._fitted.spread
+        error = np.maximum(0.0, self._centre - _scores(self._fitted, _features(reading))) / self._spread
         return state, ModelOutput(reading.whole * error[:, None], no_context(rows))
 
 

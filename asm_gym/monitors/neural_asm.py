@@ -2,7 +2,7 @@
 
 row → memory: errors, context → whiten → accumulate → value, attribution
 
-What else a memory can do takes it as an argument: ``skills``, ``acting``, ``ceilings``, ``hub``.
+What else a memory can do takes it as an argument: ``skills``, ``ceilings``, ``hub``.
 """
 
 from __future__ import annotations
@@ -31,14 +31,12 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.packing import rounded
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
-from asm_gym.monitors.skill_surprise import ALARMS_ON, BODY, SkillSurprise
-from asm_gym.monitors.skill_surprise import PREFIX as SKILL
 from asm_gym.monitors.stream_model import made, parameter_names
 from asm_gym.monitors.values import PREFIX as VALUES
 from asm_gym.monitors.values import Values
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
+from asm_gym.validation import check_choice, check_flag, check_number, typed
 
 ADAPTED_BELOW = 0.5
 """Share of the threshold below which ``adapt`` learns from a row."""
@@ -53,7 +51,7 @@ class NeuralASM(CalibratedMonitor):
         association_size: hidden units of association, shared out among the groups of senses.
         epochs: passes of the temporal network over the training episodes; fewer where they are very many.
         free_running_probability: of a training step that goes on from what was expected, with the memory's own action;
-            reached half-way through training. Above 0 the memory learns to recall (``acting.recall``, best at 0.6).
+            reached half-way through training. Above 0 the memory learns to recall (``skills.recall``, best at 0.6).
         habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
             that is to watch any policy leaves it out.
         dynamics: how the temporal network carries on the past: ``"traces"`` of what was sensed and done, or
@@ -68,7 +66,6 @@ class NeuralASM(CalibratedMonitor):
         config: all other hyperparameters.
 
     Attributes:
-        skill_: surprise of skills; None before ``skills.learn_skills``.
         values_: judges values; empty before ``fit``, with ``values=False``, and where nothing predicts any.
         excuses_: tells knocks and stops from faults; None with ``excuses=False``.
 
@@ -129,7 +126,6 @@ class NeuralASM(CalibratedMonitor):
         self.config, self.habituates = replace(config, **checked), evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = Excuses(spec) if excuses else None
-        self.skill_: SkillSurprise | None = None
         self.values_ = Values()
         self._diagnosis: Diagnosis | None = None
         self._kernel: RowKernel | None = None
@@ -176,14 +172,12 @@ class NeuralASM(CalibratedMonitor):
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
-        found = super().learned_ | self.values_.arrays
-        return found if self.skill_ is None else found | self.skill_.arrays
+        return super().learned_ | self.values_.arrays
 
     def initial_state(self, batch: int = 1) -> MonitorState:
         state = super().initial_state(batch)
         excuses = np.zeros((batch, 0), np.int64) if self.excuses_ is None else self.excuses_.start(batch)
-        skill = () if self.skill_ is None else self.skill_.monitor.initial_state(batch)
-        return state._replace(excuses=excuses, values=self.values_.start(batch), skill=skill)
+        return state._replace(excuses=excuses, values=self.values_.start(batch))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
         self._require_fitted()
@@ -198,14 +192,10 @@ class NeuralASM(CalibratedMonitor):
             now = now._replace(values=values)
         if self.skills_:
             surprise = surprise._replace(skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)])
-        if self.skill_ is not None:
-            skill, other = self.skill_.monitor.observe(state.skill, rows)
-            now, surprise = now._replace(skill=skill), self.skill_.joined(surprise, other, self.alarm_on_)
         return now, surprise
 
     def reset_evidence(self, state: MonitorState) -> MonitorState:
-        state = super().reset_evidence(state)._replace(values=self.values_.reset(state.values))
-        return state if self.skill_ is None else state._replace(skill=self.skill_.monitor.reset_evidence(state.skill))
+        return super().reset_evidence(state)._replace(values=self.values_.reset(state.values))
 
     def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), in the units of the action, after this state."""
@@ -244,20 +234,10 @@ class NeuralASM(CalibratedMonitor):
         return other
 
     def restore(self, saved: Checkpoint) -> Self:
-        own, skill = split_off(saved, SKILL)
-        own, values = split_off(own, VALUES)
+        own, values = split_off(saved, VALUES)
         super().restore(own)
-        self.skill_ = SkillSurprise.restored(self.spec, skill, self.seed) if skill else None
         self.values_ = Values.found(self.spec, values, self.seed, self.urdf)
-        if self.alarm_on_ != BODY and self.skill_ is None:
-            raise ValueError(f"the checkpoint alarms on {short_repr(self.alarm_on_)} surprise, and holds no skills")
-        check_choice("alarm_on", self.alarm_on_, ALARMS_ON)
         return self
-
-    @property
-    def alarm_on_(self) -> str:
-        """The surprise that ``value`` and an alarm go by, one of ``skill_surprise.ALARMS_ON``."""
-        return str(self.about.get("alarm_on", BODY))
 
     def _row_kernel(self) -> RowKernel | None:
         """Return the kernel of the weights as they are; None under another detection than that of evidence."""
@@ -270,6 +250,5 @@ class NeuralASM(CalibratedMonitor):
         return self._kernel
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
-        self.skill_ = None  # it was weighed against the memory as it was
         super()._learn(episodes, progress, warm_start)
         self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()

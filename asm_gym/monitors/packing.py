@@ -22,12 +22,12 @@ WEIGHTS = "V", "U", "W_S", "W_C", "W_D", "W_F"
 """Of association and of the traces' network."""
 
 COVARIANCES = "completion_covariance", "moments"
-"""What is solved with them is wrong by as much as their smallest directions are, which a root keeps."""
+"""A root keeps their smallest directions, on which solutions with them depend."""
 
 LARGEST = 127
 SCALE_BITS = 10
 FAINT = 1e-6
-"""A direction that no row ever went is taken to have this share of the mean variance."""
+"""Share of the mean variance that a direction without any is given."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -84,7 +84,7 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 
 def _quantised(W: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
-    """k (P, Q) and s (P, 1)."""
+    """Return k (P, Q) and s (P, 1)."""
     fraction, exponent = np.frexp(np.abs(W).max(axis=1, keepdims=True).astype(np.float64) / LARGEST)
     scale = np.ldexp(np.ceil(np.ldexp(fraction, SCALE_BITS) - 1e-9), exponent - SCALE_BITS).astype(np.float32)
     k = np.rint(W / np.where(scale > 0, scale, np.float32(1)))
@@ -96,7 +96,7 @@ def _weights(k: NDArray[np.int8], scale: NDArray[np.float32]) -> NDArray[np.floa
 
 
 def _root(C: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
-    """K (N, N) and s, of a positive definite C."""
+    """Return K (N, N) and s, of a positive definite C."""
     L = np.linalg.cholesky(np.asarray(C, np.float64))
     scale = np.exp2(np.ceil(np.log2(np.abs(L).max())) - 15)
     K = np.clip(np.rint(L / scale), -32767, 32767)
@@ -105,14 +105,14 @@ def _root(C: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int16], NDArray[np.f
 
 
 def _squared(K: NDArray[np.int16], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """C (N, N), whichever way its sums are formed: they are of whole numbers below 2⁵³."""
+    """Return C (N, N), exact for any order of its sums: they are of whole numbers below 2⁵³."""
     exact = K.astype(np.float64)
     C: NDArray[np.float64] = (exact @ exact.T) * scale**2
     return C
 
 
 def _exact_root(C: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float64]] | None:
-    """The root that gives C to the last bit; None where there is none."""
+    """Return the root that gives C to the last bit; None where there is none."""
     try:
         found = _root(C)
     except np.linalg.LinAlgError:

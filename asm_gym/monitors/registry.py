@@ -108,8 +108,8 @@ MONITORS: Registry[MonitorKind] = Registry(
         **_with_evidence(
             {
                 "logpzo": _rival("baselines.logpzo:LogpZO", "moving_mean"),
-                "lstm_vae": _rival("baselines.lstm_vae:LSTMVAE", "squares"),
-                "gru": _rival("baselines.gru:GRU", "mahalanobis"),
+                "lstm_vae": _rival("baselines.recurrent:LSTMVAE", "squares"),
+                "gru": _rival("baselines.recurrent:GRU", "mahalanobis"),
                 "kalman": _rival("baselines.linear:Kalman", "mahalanobis"),
                 "association_linear": _rival("baselines.linear:LinearAssociation", "mahalanobis"),
                 "association_values": _rival("value_association:ValueAssociation", "mahalanobis"),
@@ -132,17 +132,11 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
 
     Args:
         name: the ``kind`` of the model, by which its files are known too.
-        model: a class of models (see ``StreamModel``), or of whole monitors; or ``module:class``.
+        model: a subclass of ``StreamModel`` or of a monitor; or ``module:class``.
         detection: which judges it unless asked otherwise; a name in ``DETECTIONS``.
 
     Raises:
         ValueError: the name is taken or is not that of the model's ``kind``, or there is no such detection.
-
-    Example:
-        >>> from asm_gym import NeuralASM, register_monitor
-        >>> class Watchman(NeuralASM):
-        ...     kind = "watchman"
-        >>> register_monitor("watchman", Watchman)
     """
     check_choice("detection", detection, DETECTIONS)
     if not isinstance(model, str) and getattr(model, "kind", None) != name:
@@ -155,8 +149,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
 def check_monitor_name(name: str) -> None:
     """Raise ValueError unless there is such a monitor, or such a model and detection.
 
-    A model that goes by ``module:class`` is imported and registered by its kind, by which its files are known; nothing
-    else is imported. An estimator of scikit-learn becomes a model.
+    A model or estimator that goes by ``module:class`` is imported and registered by its kind; nothing else is imported.
     """
     model, plus, detection = name.partition("+")
     if ":" in model and model not in MONITORS:
@@ -186,7 +179,7 @@ def _model_class(own: Any, name: str) -> Any:
 
 @typed
 def monitor_class(name: str) -> MonitorKind:
-    """Return what makes and loads the monitors of that name; torch is imported only for those that need it.
+    """Return what makes and loads the monitors of that name.
 
     Raises:
         ValueError: there is no monitor of that name, or no such detection; the message lists what exists.
@@ -219,13 +212,9 @@ def make_monitor(
         ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
 
     Example:
-        >>> import numpy as np
-        >>> from asm_gym import Channel, Episode, StreamSpec, make_monitor
-        >>> spec, rng = StreamSpec((Channel("position", 3, "m"),), dt=0.05), np.random.default_rng(0)
-        >>> healthy = [Episode.from_stream(rng.normal(size=(60, 3)), spec) for _ in range(30)]
-        >>> monitor = make_monitor("kalman+evidence", spec, ridge=1e-3).fit(healthy[:10])
-        >>> monitor = monitor.calibrate(healthy[10:], false_alarm_rate=0.05)
-        >>> monitor.detection.name
+        >>> from asm_gym import Channel, StreamSpec, make_monitor
+        >>> spec = StreamSpec((Channel("position", 3, "m"),), dt=0.05)
+        >>> make_monitor("kalman+evidence", spec, ridge=1e-3).detection.name
         'evidence'
     """
     kind = monitor_class(name if not isinstance(detection, str) else f"{name.partition('+')[0]}+{detection}")

@@ -144,7 +144,7 @@ class RowKernel:
                 observe_rows(*arguments)
         surprise = Surprise(value, attribution)
         if self._excuses is not None:
-            surprise = Surprise(value, attribution, None, None, None, raw, excuse)
+            surprise = Surprise(value, attribution, None, raw, excuse)
         memory = MemoryState(new[0], new[1], RowHistory(new[2], new[3], new[4]), new[5])
         detection = EvidenceState(Evidence(new[6], new[7], new[8]), Repetition(new[9], new[10], new[11]))
         return MonitorState(memory, detection, new[12]), surprise, divisor

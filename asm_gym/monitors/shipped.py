@@ -6,7 +6,6 @@ A file's header says whose body it is; nothing else is read to find the one that
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from asm_gym.checkpoint import read_header
 from asm_gym.spec import StreamSpec
@@ -17,8 +16,6 @@ SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 
 :meta hide-value:
 """
-MAKE = "asm-gym babble"
-"""The command that makes one."""
 USUAL = 20
 """Rows of a stream a second where each control step has one [Hz]."""
 
@@ -53,31 +50,22 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
     lines = []
     for name, path in pretrained().items():
         header = read_header(path)
-        known, about = StreamSpec.from_json(header["spec"]), header["about"]
-        misfits = [f"{what}: {mine} against {theirs}" for what, mine, theirs in _named(known, about, spec, controller)]
+        known = StreamSpec.from_json(header["spec"])
+        bodies = ("robot", known.source, spec.source), ("controller", header["about"].get("controller", ""), controller)
+        misfits = [f"{what}: {mine} against {theirs}" for what, mine, theirs in bodies if mine != theirs]
         misfits += known.difference(spec)
         if not misfits:
             return name
         lines.append(f"  {name}: {'; '.join(misfits)}")
-    own = "fit one on nominal episodes of it, as StreamRecorder(env) keeps them, and hand it over as monitor"
     if spec.source == "spaces":
         raise ValueError(
-            f"shipped memories know arms of robosuite, and this stream is made of an environment's spaces: {own}"
+            "shipped memories know arms of robosuite, and this stream is made of an environment's spaces: fit one on "
+            "nominal episodes of it, as StreamRecorder(env) keeps them, and hand it over as monitor"
         )
+    rate = round(1.0 / spec.dt)
+    make = f"asm-gym babble --robot {spec.source or 'ROBOT'}" + (f" --stream-freq {rate}" if rate != USUAL else "")
     raise ValueError(
         f"no shipped memory fits this stream of {spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
         f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "
-        f"{made_by(spec)} for an arm of robosuite, asm-gym fit DATA for recordings, and hand it over as monitor"
+        f"{make} for an arm of robosuite, asm-gym fit DATA for recordings, and hand it over as monitor"
     )
-
-
-def made_by(spec: StreamSpec) -> str:
-    """Return the command that makes a memory of this body at this rate."""
-    rate = round(1.0 / spec.dt)
-    return f"{MAKE} --robot {spec.source or 'ROBOT'}" + (f" --stream-freq {rate}" if rate != USUAL else "")
-
-
-def _named(known: StreamSpec, about: dict[str, Any], spec: StreamSpec, controller: str) -> list[tuple[str, str, str]]:
-    """Return the names that differ where channels need not."""
-    pairs = [("robot", known.source, spec.source), ("controller", str(about.get("controller", "")), controller)]
-    return [pair for pair in pairs if pair[1] != pair[2]]

@@ -12,39 +12,24 @@ Source: Hoerl and Kennard 1970 for ridge regression; ``memory.linear`` for how i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection import EvidenceDetection, ModelOutput
+from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import RowHistory
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
-from asm_gym.monitors.base import Progress, Surprise
-from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_number
 
 FAINTEST = 1e-4
 """Smallest spread of an error, in standard deviations of what is expected."""
-
-GAINS = (0.8, 0.2, 0.05)
-"""Of the evidence."""
-
-BODY = "body"
-ALARMS_ON = (BODY, "skill", "either", "both")
-"""The surprise that an alarm goes by: of the body, of the skill, the larger or the smaller of the two."""
-
-PREFIX = "skill."
-"""Prefix of the names of its arrays in a checkpoint."""
-
-SMALLEST = 1e-9
-"""Lower bound of a surprise that another is divided by."""
 
 Rows = NDArray[np.float64]
 
@@ -129,50 +114,3 @@ def _traces(rows: NDArray[np.float32], gains: NDArray[np.float32]) -> NDArray[np
         c = advance(c, row[None], gains)
         found.append(c[0])
     return np.array(found)
-
-
-class SkillSurprise(NamedTuple):
-    """The surprise of skills beside that of the body.
-
-    Attributes:
-        monitor: of skills, fitted.
-        weight: factor that brings skill surprise to the scale of the body's, where the two are compared.
-    """
-
-    monitor: CalibratedMonitor
-    weight: float
-
-    @classmethod
-    def learned(cls, episodes: Sequence[Episode], body: Sequence[Surprise], seed: int) -> Self:
-        """Learn it from nominal episodes, and the surprise of the body at each."""
-        monitor = _monitor(episodes[0].spec, seed).fit(episodes)
-        skill = monitor.score_episodes(episodes)
-        at_worst = [float(np.median([s.value.max() for s in scores])) for scores in (body, skill)]
-        return cls(monitor, at_worst[0] / max(at_worst[1], SMALLEST))
-
-    def joined(self, body: Surprise, skill: Surprise, alarm_on: str) -> Surprise:
-        """Return the surprise of one of ``ALARMS_ON``, attributed as the part is that it comes from."""
-        weighed = self.weight * skill.value
-        ways = body.value, skill.value, np.maximum(body.value, weighed), np.minimum(body.value, weighed)
-        value = ways[ALARMS_ON.index(alarm_on)]
-        first = value == body.value if alarm_on != "skill" else np.zeros(len(value), np.bool_)
-        scale = 1.0 if alarm_on == "skill" else self.weight
-        shares = np.where(first[:, None], body.attribution, scale * skill.attribution)
-        excused = body if alarm_on == BODY else body._replace(raw=None, excuse=None)
-        return excused._replace(value=value, attribution=shares, of_body=body.value, of_skill=skill.value)
-
-    @property
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays to keep in a checkpoint, by name."""
-        kept = {**self.monitor.learned_, "weight": np.array(self.weight)}
-        return {PREFIX + name: array for name, array in kept.items()}
-
-    @classmethod
-    def restored(cls, spec: StreamSpec, arrays: Arrays, seed: int) -> Self:
-        """Restore it from arrays by their names without the prefix. Raises where they do not fit."""
-        weight = check_number("the weight of skill surprise", float(arrays["weight"]), above=0.0)
-        return cls(_monitor(spec, seed).with_learned({n: a for n, a in arrays.items() if n != "weight"}), weight)
-
-
-def _monitor(spec: StreamSpec, seed: int) -> CalibratedMonitor:
-    return CalibratedMonitor(SkillModel(spec), EvidenceDetection(spec, GAINS, habituates=False), seed=seed)

@@ -1,4 +1,4 @@
-"""Skills of a memory: their names, and the surprise at how a skill goes on."""
+"""What a memory learns of skills: their names, the command that comes next, and to recall them from a cue."""
 
 from __future__ import annotations
 
@@ -11,57 +11,13 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.episode import Episode
 from asm_gym.memory.association import hidden_units
+from asm_gym.memory.motor import learn_motor, lessons
 from asm_gym.memory.readout import learn_readout
+from asm_gym.memory.recall import continued
 from asm_gym.monitors.neural_asm import NeuralASM
-from asm_gym.monitors.skill_surprise import ALARMS_ON, BODY, SkillSurprise
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.training_data import check_nominal
-from asm_gym.validation import check_choice, check_number, short_repr
-
-
-def learn_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
-    """Learn how the skills of the guarded policy go on, so that each row has a skill surprise too; return the memory.
-
-    The surprise of the body, its threshold and its alarms stay as they are: ``with_alarm_on`` chooses others.
-
-    Args:
-        memory: fitted, which alarms on the body; it is changed.
-        episodes: nominal ones, of one skill or many; those of ``fit`` will do.
-
-    Raises:
-        RuntimeError: the memory has not learned anything yet.
-        ValueError: as ``fit``; or there are more channels than can be weighed against all traces.
-    """
-    memory._require_fitted()
-    check_nominal(episodes, memory.spec, memory.model.shortest)
-    if memory.alarm_on_ != BODY:
-        raise ValueError(f"this memory alarms on {memory.alarm_on_!r}: take with_alarm_on(memory, {BODY!r})")
-    memory.skill_ = None
-    memory.skill_ = SkillSurprise.learned(episodes, memory.score_episodes(episodes), memory.seed)
-    memory._remember(episodes)
-    return memory
-
-
-def with_alarm_on(memory: NeuralASM, which: str) -> NeuralASM:
-    """Return the same memory with alarms on another surprise, without a threshold: ``calibrate`` it.
-
-    Args:
-        memory: fitted; it keeps its own.
-        which: ``"body"`` or ``"skill"``; ``"either"`` goes by the larger of the two, ``"both"`` by the smaller.
-
-    Raises:
-        ValueError: an unknown name; the message lists what exists.
-        RuntimeError: the skills have not been learned yet: ``learn_skills`` comes first.
-    """
-    check_choice("alarm_on", which, ALARMS_ON)
-    other = memory._copy()
-    if which == memory.alarm_on_:
-        return other
-    if memory.skill_ is None:
-        raise RuntimeError(f"alarm_on={which!r} takes a skill surprise: call learn_skills(memory, episodes) first")
-    other.about = {**memory.about, "alarm_on": which}
-    other._uncalibrate()
-    return other
+from asm_gym.validation import check_number, short_repr
 
 
 def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
@@ -141,3 +97,40 @@ def skills_of(episode: Episode) -> NDArray[np.str_]:
     if (lengths < 1).any():
         raise ValueError(f"has {len(episode)} rows, in which skills cannot begin at {', '.join(map(str, begins))}")
     return np.repeat(names, lengths)
+
+
+def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 512) -> NeuralASM:
+    """Learn what to command in which situation, so that ``NeuralASMPolicy`` can act by it, and return the memory.
+
+    Only ``expected_action`` depends on it: neither the other weights nor the surprise do.
+
+    Args:
+        memory: fitted; it is changed.
+        episodes: whose ``actions`` are the commands; where they are empty, the stream holds them.
+        units: hidden units of the motor association.
+    """
+    memory._require_fitted()
+    check_nominal(episodes, memory.spec, memory.model.shortest)
+    model = memory.model
+    with threadpool_limits(1):
+        motor = learn_motor(*lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed))
+    model.restore({**model.learned_, **motor.named(model.senses_)}, model.skills_)
+    return memory
+
+
+def recall(memory: NeuralASM, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+    """Return the rows (steps, D) that follow a cue, from memory alone, in the units of the stream.
+
+    Actions are the memory's own motor predictions. Fit with ``free_running_probability`` above 0 to make it learn to
+    run on.
+
+    Args:
+        memory: fitted.
+        cue: (T, D) the first rows of an episode, at least a tenth of a second and 2 rows.
+        steps: number of rows to recall.
+
+    Raises:
+        ValueError: the cue is too short, not finite, or of another width; fewer than one step, or more than a million.
+    """
+    memory._require_fitted()
+    return continued(memory.model.network, memory.model.senses_, cue, steps)

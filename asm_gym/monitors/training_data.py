@@ -2,10 +2,9 @@
 
     mark of a stretch = hash(x_t, …, x_{t+L-1})
 
-Sensors are noisy, so a second of numbers that occurs twice is the same second. A stretch in which a row repeats the one
-before is left out: a robot that stands still without noise is like any other that does. A monitor keeps the few least
-marks of each episode that it learned from (bottom sketch, Broder 1997), so that an episode that is cut or joined anew
-is known by them.
+Sensors are noisy, so a stretch of numbers that occurs twice is the same stretch; one in which a row repeats the one
+before has no mark. A monitor keeps the least marks of each episode that it learned from (bottom sketch, Broder 1997),
+so that an episode that is cut or joined anew is known by them.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from asm_gym.episode import Episode
 from asm_gym.spec import StreamSpec
 
 WILD = 1e6
-"""How many times the range of its channel a number may be away from the median."""
+"""Largest distance of a number from its channel's median, in ranges of the channel."""
 
 STRETCH = 20
 """L [rows]. Shorter episodes have no marks."""
@@ -49,10 +48,10 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
             step, column = bad[0]
             label, value = spec.labels[column], episode.stream[step, column]
             raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
-    check_range(episodes)
+    _check_range(episodes)
 
 
-def check_range(episodes: Sequence[Episode]) -> None:
+def _check_range(episodes: Sequence[Episode]) -> None:
     """Raise ValueError for a number out of all proportion, beside which its channel would look constant."""
     if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
         return

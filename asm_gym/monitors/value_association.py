@@ -6,12 +6,10 @@ r"""Ridge regression of values: each group of senses from the values and changes
     ε      = (x - x̂) / s_x √max(1, h/h̃)                      s_x: the cross-fitted spread
     h      = zᵀ (ZᵀZ/N + λ)⁻¹ z,  h̃ its cross-fitted median    z: what x is expected from
 
-What is judged given its own last value explains a push that is held after one step; a value that is expected from the
-others does not. A torque is judged however well it is told: what is left of it is known, and a push is seldom less.
-Positions and speeds, beside torques, are left to their changes, for where an arm may go nothing tells. Few rows tell
-little of places that they do not hold: there h is large, and an error counts for less.
-Changes are judged only where they are nearly certain, as those of encoders are given speeds. Penalties, spreads, R²
-and h̃ come from five folds over episodes, or over blocks of a long one.
+A push that is held is explained after one step where a value is predicted from its own last one; where it is predicted
+from the others, it is not. A torque is always judged; positions and speeds, beside torques, are left to their changes,
+for no other sense predicts where an arm may go. Where few rows were learned from, h is large and an error counts for
+less. Penalties, spreads, R² and h̃ come from five folds over episodes, or over blocks of a long one.
 
 Sources: Hoerl and Kennard 1970; for h, the leverage: Hoaglin and Welsch 1978 (The American Statistician 32).
 """
@@ -42,7 +40,7 @@ FOLDS = 5
 PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 """Of standardised inputs."""
 
-TOLD, CERTAIN = 0.5, 0.99
+PREDICTED, CERTAIN = 0.5, 0.99
 """R² from which on a value and a change are judged."""
 
 FAINTEST = 1e-4
@@ -52,13 +50,13 @@ STIFFNESS = 1e-2
 """λ."""
 
 MOST_INPUTS = 1024
-"""Of more inputs it is not asked how far they are from what was learned: the matrices would be too large."""
+"""With more inputs no leverage is computed: the matrices would be too large."""
 
 
 class _Fitted(NamedTuple):
     weights: Floats  # (X, I)
     left: Floats  # (X,) cross-fitted spread
-    told: Floats  # (X,) cross-fitted R²
+    R2: Floats  # (X,) cross-fitted
 
 
 class ValueAssociation(StreamModel):
@@ -85,8 +83,8 @@ class ValueAssociation(StreamModel):
     def error_columns(self) -> NDArray[np.intp]:
         if not self.learned_:
             return self.spec.sensory
-        found: NDArray[np.intp] = self.spec.sensory[np.concatenate([self._told, self._certain])]
-        return found
+        judged: NDArray[np.intp] = np.concatenate([self._values, self._steps])
+        return self.spec.sensory[judged]
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
@@ -103,23 +101,23 @@ class ValueAssociation(StreamModel):
         own = self._own(values=True)
         given = _crossfitted(inputs, values, fold, senses.groups, own)
         progress(1, 2)
-        told, certain, moved = self._judged(given.told), np.zeros(0, np.intp), given
-        if self.changes or not len(told):
+        judged, certain, moved = self._judged(given.R2), np.zeros(0, np.intp), given
+        if self.changes or not len(judged):
             moved = _crossfitted(inputs, steps, fold, senses.groups, self._own(values=False))
-            certain = np.flatnonzero(moved.told > CERTAIN)
+            certain = np.flatnonzero(moved.R2 > CERTAIN)
         progress(2, 2)
-        if not len(told) + len(certain):
-            certain = np.arange(len(self.spec.sensory))  # nothing can be told: the changes are all there is
-        left = np.concatenate([given.left[told], moved.left[certain]])
-        judging = np.unique(senses.groups[told]) if inputs.shape[1] <= MOST_INPUTS else ()
+        if not len(judged) + len(certain):
+            certain = np.arange(len(self.spec.sensory))  # nothing predicts a value: all changes are judged
+        left = np.concatenate([given.left[judged], moved.left[certain]])
+        judging = np.unique(senses.groups[judged]) if inputs.shape[1] <= MOST_INPUTS else ()
         far = [_far(inputs, fold, own[g]) for g in judging]
         learned = {
             "derived_mean": middle,
             "derived_spread": width,
-            "judged_values": told * 1.0,
+            "judged_values": judged * 1.0,
             "judged_changes": certain * 1.0,
-            "R2_values": given.told,
-            "D": given.weights[told],
+            "R2_values": given.R2,
+            "D": given.weights[judged],
             "E": moved.weights[certain],
             "remainder": np.maximum(left, FAINTEST),
             "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
@@ -128,7 +126,7 @@ class ValueAssociation(StreamModel):
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
-        self._told, self._certain = (learned[f"judged_{what}"].astype(np.intp) for what in ("values", "changes"))
+        self._values, self._steps = (learned[f"judged_{what}"].astype(np.intp) for what in ("values", "changes"))
         return super().restore(learned, skills)
 
     def start(self, batch: int) -> RowHistory:
@@ -140,12 +138,12 @@ class ValueAssociation(StreamModel):
         found = self.learned_
         derived = (derived - found["derived_mean"]) / found["derived_spread"]
         inputs = np.hstack([values, steps, before, derived, commands])
-        values, steps = values[:, self._told], steps[:, self._certain]
+        values, steps = values[:, self._values], steps[:, self._steps]
         errors = np.hstack([(values - inputs @ found["D"].T) / self._farther(inputs), steps - inputs @ found["E"].T])
         return state, ModelOutput(known * errors / found["remainder"], no_context(rows))
 
     def _read(self, read: ScaledRows) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Values, changes and values before (N, X), what is derived (N, M), and commands with a 1 (N, A + 1)."""
+        """Return values, changes and values before (N, X), derived inputs (N, M), and commands with a 1 (N, A + 1)."""
         senses, sensory = self.senses_, self.spec.sensory
         values = np.asarray(read.senses[:, : len(sensory)], np.float64)
         steps = np.asarray(read.inputs[:, senses.changes], np.float64)
@@ -156,10 +154,10 @@ class ValueAssociation(StreamModel):
         )
         return values, steps, before, derived, np.asarray(read.commands, np.float64)
 
-    def _judged(self, told: Floats) -> NDArray[np.intp]:
-        """Which values are, by their cross-fitted R² (X,)."""
+    def _judged(self, R2: Floats) -> NDArray[np.intp]:
+        """Return which values are judged, by their cross-fitted R² (X,)."""
         place = {int(column): k for k, column in enumerate(self.spec.sensory)}
-        judged = told > TOLD
+        judged = R2 > PREDICTED
         loads, moves = ([place[int(i)] for i in found] for found in (forces(self.spec), motion(self.spec)))
         if loads and moves:
             judged[moves] = False
@@ -167,42 +165,40 @@ class ValueAssociation(StreamModel):
         return np.flatnonzero(judged)
 
     def _farther(self, inputs: Floats) -> Floats:
-        """(N, V) what the spread of each judged value is multiplied by, for inputs (N, I)."""
-        found = np.ones((len(inputs), len(self._told)))
-        groups = self.senses_.groups[self._told]
+        """Return the factors (N, V) of the spreads of judged values, for inputs (N, I)."""
+        found = np.ones((len(inputs), len(self._values)))
+        groups = self.senses_.groups[self._values]
         for group, far in zip(np.unique(groups), self.learned_.get("far", ()), strict=False):
             found[:, groups == group] = np.sqrt(np.maximum(1.0, ((inputs @ far) * inputs).sum(axis=1)))[:, None]
         return found
 
     def _own(self, values: bool) -> list[NDArray[np.intp]]:
-        """Of each group, the inputs that say what it says itself, which it is not expected from."""
+        """Return the inputs of each group that hold its own values, which it is not predicted from."""
         X, groups = len(self.spec.sensory), self.senses_.groups
         found = []
         for g in range(int(groups.max()) + 1):
             own = np.flatnonzero(groups == g)
             withheld = [own, X + own, 3 * X + np.flatnonzero(self._derived.sources[:, own].any(axis=1))]
-            # A value is expected from now alone; a change from all that was before, and not from values now.
+            # A value is predicted from this row alone; a change from the values before, not from those now.
             withheld.append(2 * X + np.arange(X) if values else np.arange(X))
             found.append(np.unique(np.concatenate(withheld)).astype(np.intp))
         return found
 
 
 def _folds(lengths: Sequence[int]) -> NDArray[np.intp]:
-    """(N,) the fold of each row: whole episodes, or blocks where they are few."""
+    """Return the fold (N,) of each row: whole episodes, or blocks where they are few."""
     if len(lengths) >= FOLDS:
-        whole = [np.full(length, n % FOLDS, np.intp) for n, length in enumerate(lengths)]
-        return np.concatenate(whole)
-    total = sum(lengths)
-    blocks: NDArray[np.intp] = np.arange(total, dtype=np.intp) * FOLDS // max(total, 1)
+        return np.repeat(np.arange(len(lengths)) % FOLDS, lengths)
+    blocks: NDArray[np.intp] = np.arange(sum(lengths), dtype=np.intp) * FOLDS // max(sum(lengths), 1)
     return blocks
 
 
 def _crossfitted(
     inputs: Floats, targets: Floats, fold: NDArray[np.intp], groups: NDArray[np.intp], own: list[NDArray[np.intp]]
 ) -> _Fitted:
-    """Weights by the penalty that leaves the least in rows that were not learned from, and what it leaves there."""
+    """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there."""
     N, size = inputs.shape
-    weights, left, told = np.zeros((targets.shape[1], size)), np.zeros(targets.shape[1]), np.zeros(targets.shape[1])
+    weights, left, R2 = np.zeros((targets.shape[1], size)), np.zeros(targets.shape[1]), np.zeros(targets.shape[1])
     grams = [inputs[fold == f].T @ inputs[fold == f] for f in range(FOLDS)]
     crosses = [inputs[fold == f].T @ targets[fold == f] for f in range(FOLDS)]
     gram, cross = sum(grams), sum(crosses)
@@ -222,17 +218,17 @@ def _crossfitted(
         best = np.argmin(squares, axis=0)
         left[mine] = np.sqrt(squares[best, np.arange(len(mine))] / N)
         variance = targets[:, mine].var(axis=0)
-        told[mine] = 1.0 - left[mine] ** 2 / np.maximum(variance, FAINTEST**2)
+        R2[mine] = 1.0 - left[mine] ** 2 / np.maximum(variance, FAINTEST**2)
         whole = gram[np.ix_(used, used)] / N
         for n in np.unique(best):
             solved = np.linalg.solve(whole + PENALTIES[n] * np.eye(len(used)), cross[np.ix_(used, mine)] / N)
             for k in np.flatnonzero(best == n):
                 weights[mine[k], used] = solved[:, k]
-    return _Fitted(weights, left, told)
+    return _Fitted(weights, left, R2)
 
 
 def _far(inputs: Floats, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> Floats:
-    """(I, I) of which zᵀ far z is h/h̃ for inputs z."""
+    """Return the matrix (I, I) with which zᵀ far z is h/h̃ for inputs z."""
     size = inputs.shape[1]
     found = np.zeros((size, size))
     used = np.setdiff1d(np.arange(size), withheld)
@@ -245,6 +241,6 @@ def _far(inputs: Floats, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> 
 
 
 def _inverse(inputs: Floats) -> Floats:
-    """(ZᵀZ/N + λ)⁻¹ of inputs Z (N, I)."""
+    """Return (ZᵀZ/N + λ)⁻¹ of inputs Z (N, I)."""
     found: Floats = np.linalg.inv(inputs.T @ inputs / max(len(inputs), 1) + STIFFNESS * np.eye(inputs.shape[1]))
     return found

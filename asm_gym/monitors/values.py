@@ -4,10 +4,8 @@
     f = max(1, (1 + τ h)/(1 + τ h̃))         h: leverage of a row, h̃ its median in the episodes learned from
     h = zᵀ (ZᵀZ + λ N)⁻¹ z                  z: inputs that changes are predicted from, and 1;  τ: rows of a tenth of a s
 
-A regression's error in a fresh row has the variance σ² (1 + h). Rows that follow each other are alike, so that as many
-as a tenth of a second holds count as one. Long logs make h small, and f 1; for a few minutes it says how little is
-known of places that they do not show. Errors of values are not whitened: how those of a few minutes belong together is
-not known.
+A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
+a tenth of a second count as one. Errors of values are not whitened: a few minutes do not show their correlations.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ ALIKE_S = 0.1
 
 
 class Values(NamedTuple):
-    """The monitor of values; empty where nobody asked for it, and where nothing predicts any.
+    """The monitor of values; empty where it is not asked for, and where no value can be predicted.
 
     Attributes:
         monitor: of values alone.

@@ -25,7 +25,7 @@ from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.acting import learn_to_act
+from asm_gym.monitors.skills import learn_to_act
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record

@@ -26,7 +26,7 @@ from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
-from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.options import option

@@ -13,24 +13,19 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
+from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context
 from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
-
-
-class _State(NamedTuple):
-    """A limit remembers nothing; the array only says how many streams there are."""
-
-    streams: NDArray[np.bool_]  # (B,)
 
 
 class _Limit(StreamModel):
@@ -63,10 +58,10 @@ class _Limit(StreamModel):
         centre, scale = self.range_of(np.concatenate([e.stream for e in episodes])[:, self._columns].astype(float))
         return self.restore({"limit_centre": centre, "limit_scale": scale})
 
-    def start(self, batch: int) -> _State:
-        return _State(np.zeros(batch, np.bool_))
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, 1, self.spec.size)  # it only says how many streams there are
 
-    def predict(self, state: _State, rows: Floats) -> tuple[_State, ModelOutput]:
+    def predict(self, state: RowHistory, rows: Floats) -> tuple[RowHistory, ModelOutput]:
         error = (rows[:, self._columns] - self.learned_["limit_centre"]) / self.learned_["limit_scale"]
         return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
 

@@ -1,8 +1,9 @@
-"""Linear baselines: a Kalman filter, principal components of a window, and ridge regression across the senses.
+"""Linear baselines: a Kalman filter, principal components of a window, ridge regression, and a rule of friction.
 
     Kalman      x_t = A x_{t-1} + B u_t + c + w, w ~ N(0, Q)      y_t = x_t + v, v ~ N(0, R)     ε: innovations
     WindowPCA   w_t = [x_{t-R+1}, …, x_t] standardised            ε_t = w_t - W Wᵀ w_t, of x_t
     ridge       ε_t = (Δ_t - D a_t)/s                             D, s, a_t: association without hidden units
+    friction    r_j = mean over 0.1 s of τ_j - (c_0 + c_1 v_j + Σ_w c_w tanh(v_j/w s_j))    ε = r_j / spread_j
 
 R is the sensor noise that the stream's spec states; A, B, c by ridge regression; Q is what is left of the residuals.
 W: the leading eigenvectors of the windows' covariance, as many as hold most of the variance. What the memory's hidden
@@ -26,6 +27,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import RowHistory
+from asm_gym.monitors.arm_inputs import WIDTHS, forces, speeds
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
 from asm_gym.scaling import StreamScaler, rows_apart
@@ -179,6 +181,82 @@ class LinearAssociation(StreamModel):
         state, r, known = read_next(self.senses_, state, rows)
         error = known * (r.changes - r.inputs @ self.learned_["D"].T) / self.learned_["remainder"]
         return state, ModelOutput(error, no_context(rows))
+
+
+OVER = 0.1
+"""Seconds that a residual is averaged over."""
+
+
+class _Averaged(NamedTuple):
+    history: RowHistory
+    residuals: Floats  # (B, W, J) the newest last; NaN before the first
+
+
+class FrictionRule(StreamModel):
+    """Torque beyond friction; it needs channels of torque or current, and of speed or position.
+
+    Raises:
+        ValueError: the stream has none of them.
+    """
+
+    kind = "friction_rule"
+    held_out = 0
+
+    def __init__(self, spec: StreamSpec) -> None:
+        super().__init__(spec)
+        self._torques = forces(spec)
+        self._speeds, self._from_positions = speeds(spec)
+        joints = min(len(self._torques), len(self._speeds))
+        if not joints:
+            raise ValueError(f"a rule of friction needs a torque and a speed of each joint; there are: {spec.slices}")
+        self._torques, self._speeds = self._torques[:joints], self._speeds[:joints]
+        self.lag = rows_apart(spec.dt)
+        self.window = max(1, round(OVER / spec.dt))
+        self.shortest = self.lag + self.window
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        return self._torques
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        parts = []
+        for episode in episodes:
+            rows = episode.stream.astype(np.float64)
+            parts.append((rows[self.lag :, self._torques], self._speed(rows[self.lag :], rows[: -self.lag])))
+        torque, speed = (np.concatenate([p[k] for p in parts]) for k in range(2))
+        width = np.maximum(speed.std(axis=0), 1e-9)
+        inputs = _friction_inputs(speed, width)
+        solved = [np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in range(torque.shape[1])]
+        weights, smoothed = np.array(solved), []
+        for tau, v in parts:
+            left = tau - np.einsum("njk,jk->nj", _friction_inputs(v, width), weights)
+            means = [left[max(0, n - self.window + 1) : n + 1].mean(axis=0) for n in range(len(left))]
+            smoothed.append(np.array(means))
+        spread = np.maximum(np.concatenate(smoothed).std(axis=0), 1e-9)
+        return self.restore({"width": width, "weights": weights, "rule_spread": spread})
+
+    def start(self, batch: int) -> _Averaged:
+        residuals = np.full((batch, self.window, len(self._torques)), np.nan)
+        return _Averaged(RowHistory.empty(batch, self.lag, self.spec.size), residuals)
+
+    def predict(self, state: _Averaged, rows: Floats) -> tuple[_Averaged, ModelOutput]:
+        speed = self._speed(rows, state.history.past(rows)[0])
+        friction = np.einsum("njk,jk->nj", _friction_inputs(speed, self.learned_["width"]), self.learned_["weights"])
+        left = rows[:, self._torques] - friction
+        residuals = np.concatenate([state.residuals[:, 1:], left[:, None]], axis=1)
+        ready = np.isfinite(residuals).all(axis=1)  # (B, J)
+        mean = np.where(ready, residuals.mean(axis=1), 0.0)
+        now = _Averaged(state.history.followed_by(rows), residuals)
+        return now, ModelOutput(mean / self.learned_["rule_spread"], no_context(rows))
+
+    def _speed(self, rows: Floats, before: Floats) -> Floats:
+        now = rows[:, self._speeds]
+        return (now - before[:, self._speeds]) / (self.lag * self.spec.dt) if self._from_positions else now
+
+
+def _friction_inputs(speed: Floats, width: Floats) -> Floats:
+    """Return 1, the speed and its smooth signs (N, J, K)."""
+    return np.stack([np.ones_like(speed), speed, *(np.tanh(speed / (w * width)) for w in WIDTHS)], axis=2)
 
 
 def _scale(rows: Floats) -> tuple[Floats, Floats]:
