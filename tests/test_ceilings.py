@@ -61,18 +61,6 @@ def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(as
     assert found() > as_it_was + 0.5
 
 
-def test_learning_them_again_is_as_learning_them_once_and_a_file_keeps_them(asm, tmp_path):
-    first, second = list(shaken(sine_episodes(120, seed=24))), sine_episodes(120, seed=25)
-    twice = learn_ceilings(learn_ceilings(deepcopy(asm), first), second)
-    once = learn_ceilings(asm, second)
-    for name in ("ceiling", "tail"):
-        np.testing.assert_allclose(getattr(twice.detection.detector_, name), getattr(once.detection.detector_, name))
-    once.calibrate(sine_episodes(99, seed=26), 0.05).save(tmp_path / "m.asm")
-    again, episode = NeuralASM.load(tmp_path / "m.asm"), sine_episodes(1, seed=27)[0]
-    np.testing.assert_allclose(again.score(episode).value, once.score(episode).value, rtol=1e-6)
-    assert again.get_params() == once.get_params()
-
-
 def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
     hours = sine_episodes(120, seed=28)
     with pytest.raises(ValueError, match="was learned from"):

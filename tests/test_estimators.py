@@ -8,7 +8,6 @@ from sklearn.ensemble import IsolationForest
 
 from asm_gym.episode import Episode
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.rollouts import parallel_map
 from tests.models import Persistence
 from tests.streams import sine_episodes
 
@@ -76,10 +75,6 @@ def test_an_isolation_forest_finds_a_jump_and_its_file_has_no_pickle(tmp_path):
     episode = sine_episodes(1, 9)[0]
     np.testing.assert_array_equal(again.score(episode).value, monitor.score(episode).value)
     assert b"sklearn" not in (tmp_path / "m.asm").read_bytes()
-
-
-def test_workers_know_it_too():
-    assert parallel_map(alarms, [NAME, f"{NAME}+largest"], 2) == [True, True]
 
 
 def test_what_is_no_model_is_refused_in_a_line():

@@ -103,18 +103,3 @@ def test_torchrl_collects_and_meets_every_cost():
     collector = kind(with_cost, None, frames_per_batch=64, total_frames=STEPS)
     assert sum(float(batch["next", "cost"].sum()) for batch in collector) == COST
     collector.shutdown()
-
-
-@pytest.mark.slow
-def test_rllib_trains_on_a_watched_environment():  # a minute: it starts Ray
-    pytest.importorskip("ray.rllib", reason="pip install 'ray[rllib]' torch")
-    from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.tune import register_env
-
-    register_env("watched", lambda config: watched())
-    config = PPOConfig().environment("watched").env_runners(num_env_runners=0)
-    algorithm = config.training(train_batch_size_per_learner=STEPS, minibatch_size=64, num_epochs=1).build_algo()
-    found = algorithm.train()
-    assert found["env_runners"]["num_env_steps_sampled"] >= STEPS
-    assert found["env_runners"]["episode_len_mean"] == 8
-    algorithm.stop()

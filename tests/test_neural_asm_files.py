@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
-from asm_gym.monitors import MemoryConfig, NeuralASM
+from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.packing import unpacked
 from tests.memories import learned_bytes, sine_memory
-from tests.streams import sine_episodes, sine_spec
+from tests.streams import sine_episodes
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +30,6 @@ def test_save_and_load_keep_every_bit(asm, tmp_path):
     back.save(tmp_path / "again.asm")
     with zipfile.ZipFile(tmp_path / "memory.asm") as a, zipfile.ZipFile(tmp_path / "again.asm") as b:
         assert {n: a.read(n) for n in a.namelist()} == {n: b.read(n) for n in b.namelist()}
-
-
-def test_a_memory_without_a_threshold_can_be_saved(tmp_path):
-    config = MemoryConfig(gains=(np.float32(0.5),), learning_rate=np.float32(1e-3))
-    numbers = {"hidden_size": np.int64(8), "epochs": np.int64(1), "config": config}
-    NeuralASM(sine_spec(), **numbers).fit(sine_episodes(3)).save(tmp_path / "m.asm")
-    with pytest.raises(RuntimeError, match="calibrate"):
-        _ = NeuralASM.load(tmp_path / "m.asm").threshold
 
 
 def rewritten(source, target, change) -> None:

@@ -83,14 +83,10 @@ def test_names_that_were_learned_from_changes_follow_one_that_single_skills_do_n
     ("info", "message"),
     [
         ({"skills": ["a", "b"]}, "episode 1 names 2 skills, and says of 0 where they begin"),
-        ({"skills": ["a", "b"], "changed": [3, 9]}, "names 2 skills, and says of 2"),
         ({"skills": ["a", "b", "a"], "changed": [9, 3]}, "cannot begin at 0, 9, 3"),
         ({"skills": ["a", "b"], "changed": 10**6}, "rows, in which skills cannot begin at 0, 1000000"),
         ({"skills": ["a", "b"], "changed": 0}, r"info\['changed'\] must be a whole number .*, got 0"),
-        ({"skills": ["a", "b"], "changed": 2.5}, r"info\['changed'\] must be a whole number .*, got 2.5"),
-        ({"skills": ["a", "b"], "changed": None}, r"info\['changed'\] must be a whole number .*, got None"),
         ({"skills": "ab", "changed": 3}, "must name its skills in order"),
-        ({"skills": ["a", ""], "changed": 3}, "must name its skills in order"),
     ],
 )
 def test_changes_that_cannot_be_are_refused(asm, info, message):

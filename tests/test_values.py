@@ -9,7 +9,7 @@ from asm_gym.data.selection import pieces
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
-from asm_gym.monitors.arm_inputs import forces, motion, speeds
+from asm_gym.monitors.arm_inputs import forces, motion
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.value_association import ValueAssociation
@@ -98,13 +98,6 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     np.testing.assert_array_equal(again.leverage, values.leverage)
     with pytest.raises(ValueError, match="the leverage of values should be of shape"):
         Values.found(cut[0].spec, arrays | {"leverage": np.eye(3)}, seed=0)
-
-
-def test_speeds_are_known_by_name_or_are_changes_of_positions():
-    spec = Episode.from_table(pendulum_columns(100)).spec
-    assert speeds(spec)[0].tolist() == [2, 3]
-    columns = {"position": np.zeros((9, 2)), "current": np.zeros((9, 2))}
-    assert speeds(Episode.from_table(columns, rate=10).spec) == (pytest.approx([0, 1]), True)
 
 
 def test_the_rule_takes_friction_from_torque_and_needs_a_speed():

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.detection import Blocks, Detection, Nominal
+from asm_gym.detection import Detection, Nominal
 from asm_gym.detection.base import Arrays
-from asm_gym.detection.conformal import HOUR
-from asm_gym.detection.contact_limits import FamiliarSpeed, healthy_forces
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, State, Surprise
-from asm_gym.monitors.calibration import LOG, AlarmRate, Calibrated, require_sight, warn_of_crashes
+from asm_gym.monitors.calibration import Calibrated
 from asm_gym.monitors.files import SavedMonitor, write_monitor
 from asm_gym.monitors.stream_model import (
     ErrorPlaces,
@@ -28,7 +26,7 @@ from asm_gym.monitors.stream_model import (
     parameter_names,
     side_by_side,
 )
-from asm_gym.monitors.training_data import Marks, check_fresh, check_nominal, sketch
+from asm_gym.monitors.training_data import Marks, check_nominal, sketch
 from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
 
 
@@ -158,53 +156,6 @@ class CalibratedMonitor(Calibrated):
                 if taken:
                     raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
                 detection.fit(nominal, rng)
-
-    @typed
-    def calibrate(
-        self,
-        episodes: Sequence[Episode],
-        false_alarm_rate: float | None = None,
-        *,
-        false_alarms_per_hour: float | None = None,
-        each: Sequence[str] = (),
-    ) -> Self:
-        """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
-
-        ``threshold_at`` then knows the threshold of every other rate too.
-
-        Args:
-            episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
-            false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
-            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
-                comes back within a minute of the same episode, is one alarm.
-            each: task or policy of each episode, where the promise is to hold in each of them.
-
-        Raises:
-            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
-                by the hour also episodes that overlap, or that ``fit`` has learned from. Or not exactly one rate.
-        """
-        self._require_fitted()
-        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
-        check_nominal(episodes, self.spec, self.model.shortest)
-        if each and len(each) != len(episodes):
-            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
-        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
-        try:
-            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
-        except ValueError as error:
-            if asked.per == HOUR:
-                raise
-            LOG.warning("%s; the promise by the episode does not hold for these", error)
-        values = [s.value for s in self.score_episodes(episodes)]
-        threshold = asked.threshold_of(values, self.spec.dt, each)
-        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
-        self.threshold_, self.promised_ = threshold, asked.per
-        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
-        warn_of_crashes(episodes, values, threshold, asked, each)
-        streams = [episode.stream for episode in episodes]
-        self.healthy_ = healthy_forces(streams, self.spec)
-        self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
-        return self
 
     @typed
     def initial_state(self, batch: int = 1) -> MonitorState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.data.crashes import CRASH, crashes
 from asm_gym.detection import (
     Blocks,
+    Detection,
     Promise,
     check_per_hour,
     conformal_episodes,
@@ -21,21 +23,22 @@ from asm_gym.detection import (
 )
 from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import EPISODE, HOUR, check_hours
-from asm_gym.detection.contact_limits import FamiliarSpeed
+from asm_gym.detection.contact_limits import FamiliarSpeed, healthy_forces
 from asm_gym.episode import Episode
+from asm_gym.monitors.base import Surprise
+from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.training_data import Marks, check_fresh, check_nominal
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
 LOG = logging.getLogger("asm_gym.monitors")
 
 MOST_BLIND = 0.6
-"""A monitor that is blind to more than this share of the channels is refused."""
-
+"""Largest share of the channels that a monitor may be blind to."""
 MOST_NAMED = 6
 """Channels that a message names."""
-
 RAISED = 1.5
-"""Crashes are reported if they raise the threshold by this factor."""
+"""Factor of the threshold from which on crashes are reported."""
 
 
 class AlarmRate(NamedTuple):
@@ -88,25 +91,76 @@ class AlarmRate(NamedTuple):
 
 
 class Calibrated:
-    """A threshold, conformal on the maxima of nominal episodes.
+    """A threshold, conformal on the maxima of nominal episodes; what it rests on is None before ``calibrate``.
 
     Attributes:
-        threshold_: surprise above which a row is an alarm; None before it is set.
-        maxima_: (n,) largest surprise in each episode that it was set by; None before.
-        blocks_: the same by the hour, as ``detection.conformal`` counts it; None before.
+        threshold_: surprise above which a row is an alarm.
+        maxima_: (n,) largest surprise in each calibration episode.
+        blocks_: the same by the hour, as ``detection.conformal`` counts it.
         promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
-        healthy_: (N,) largest force of each of ``felt_channels`` in the calibration episodes [N m], [N]; contact limits
-            are no less. Empty before, and where the stream has no such channels.
-        familiar_: speed of the hand at each place in them; None before, and where the stream has no hand.
+        healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
+            limits; empty where the stream has no such channels.
+        familiar_: speed of the hand at each place in them; None where the stream has no hand.
     """
 
     spec: StreamSpec
+    model: StreamModel
+    detection: Detection
+    learned_from_: Marks | None
+    ceilings_from_: Marks | None
     threshold_: float | None
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
     promised_: str
     healthy_: tuple[float, ...]
     familiar_: FamiliarSpeed | None
+
+    @typed
+    def calibrate(
+        self,
+        episodes: Sequence[Episode],
+        false_alarm_rate: float | None = None,
+        *,
+        false_alarms_per_hour: float | None = None,
+        each: Sequence[str] = (),
+    ) -> Self:
+        """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
+
+        ``threshold_at`` then knows the threshold of every other rate too.
+
+        Args:
+            episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
+            false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
+            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
+                comes back within a minute of the same episode, is one alarm.
+            each: task or policy of each episode, where the promise is to hold in each of them.
+
+        Raises:
+            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
+                by the hour also episodes that overlap, or that ``fit`` has learned from. Or not exactly one rate.
+        """
+        self._require_fitted()
+        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
+        check_nominal(episodes, self.spec, self.model.shortest)
+        if each and len(each) != len(episodes):
+            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
+        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+        try:
+            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
+        except ValueError as error:
+            if asked.per == HOUR:
+                raise
+            LOG.warning("%s; the promise by the episode does not hold for these", error)
+        values = [s.value for s in self.score_episodes(episodes)]
+        threshold = asked.threshold_of(values, self.spec.dt, each)
+        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
+        self.threshold_, self.promised_ = threshold, asked.per
+        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
+        warn_of_crashes(episodes, values, threshold, asked, each)
+        streams = [episode.stream for episode in episodes]
+        self.healthy_ = healthy_forces(streams, self.spec)
+        self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
+        return self
 
     @property
     def threshold(self) -> float:
@@ -135,6 +189,13 @@ class Calibrated:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
 
+    @abstractmethod
+    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
+        """Return the surprise of each step of each episode."""
+
+    @abstractmethod
+    def _require_fitted(self) -> None: ...
+
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = self.familiar_ = None
         self.promised_, self.healthy_ = EPISODE, ()
@@ -154,11 +215,9 @@ def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, thresho
     """
     if not hasattr(detection, "reach_of"):
         return []
-    reach = np.zeros(spec.size)
-    own = np.flatnonzero(errors >= 0)
+    reach, own = np.zeros(spec.size), np.flatnonzero(errors >= 0)
     np.maximum.at(reach, errors[own], detection.reach_of(own))
-    judged = np.unique(errors[own])
-    return [spec.labels[i] for i in judged if not reach[i] > threshold]
+    return [spec.labels[i] for i in np.unique(errors[own]) if not reach[i] > threshold]
 
 
 def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> None:
@@ -183,10 +242,9 @@ def warn_of_crashes(
     """Log a warning where crashes among nominal episodes have raised the threshold, which hides milder faults.
 
     Args:
-        episodes: the calibration set.
-        values: (T,) surprise of each.
-        threshold, asked: the threshold that keeps the rate asked for.
-        each: task of each episode, where a promise is to hold in each; else its own label names the task.
+        episodes, values: of the calibration set, and their surprise (T,).
+        threshold, asked: the threshold, and the rate that it keeps.
+        each: task of each episode; where empty, its own label names the task.
     """
     tasks = list(each) or [e.label.task if e.label else str(e.info.get("skill", "")) for e in episodes]
     hit = crashes(episodes, tasks)

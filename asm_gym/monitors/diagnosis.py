@@ -1,12 +1,9 @@
-"""Diagnosis: what is wrong, from which precision has to go to 0 for the rest to make sense again.
+"""Diagnosis: the cause of a surprise, by the senses whose precision has to go to 0 for the rest to agree again.
 
     E      = yᵀ P y                           the energy of a moment; y, P = (C + λ)⁻¹: see ``memory.completion``
     E_S    = E - g_Eᵀ (P_EE)⁻¹ g_E, g = P y    what is left of it once the senses S, which take part in E, are completed
     L_S    = log E / E_S                      how much of it S explains
     p      = softmax(W [L, log E/E₀, a] + b)  the families of causes; a: where the surprise is; W by the delta rule
-
-A sensor at fault is explained by that sensor, a command that is not carried out by the command, a contact by external
-torques and the wrist's forces together, a joint by the torques of that joint.
 
 Source: Alcala and Qin 2009 (Automatica 45(7)) for contributions by reconstruction.
 """
@@ -26,8 +23,8 @@ from asm_gym.memory.completion import PENALTY, Completion
 from asm_gym.spec import MOTOR
 
 FAMILIES = ("sensor", "contact", "actuator", "action", "object", "unknown")
-"""Of causes: a sensor; something that touches the body; a joint or gripper; what becomes of an action on its way; a
-thing that is handled; none of these, or none for sure."""
+"""Of causes: a sensor; a contact of the body; a joint or gripper; an action that is not carried out; a handled object;
+none of these, or none for sure."""
 
 CLASSES: dict[str, tuple[str, tuple[str, ...]]] = {
     "sensor": ("sensor", ("sensor",)),
@@ -40,10 +37,10 @@ CLASSES: dict[str, tuple[str, tuple[str, ...]]] = {
     "object": ("object", ("gripper",)),
     "unknown": ("unknown", ()),
 }
-"""What is told apart: the family of each, and the kinds of hypotheses among which its part is looked for."""
+"""Classes of causes: the family of each, and the kinds of hypotheses that name its part."""
 
 WINDOW = 3
-"""Rows that a diagnosis looks at: the last ones."""
+"""Last rows that a diagnosis rests on."""
 
 KINDS = (
     *("sensor", "force sensor", "commanded torque", "measured torque", "external torque", "joint", "contact"),
@@ -52,28 +49,28 @@ KINDS = (
 """Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
 
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper")
-"""Of channels, whose share of the surprise is weighed."""
+"""Of channels, whose share of the surprise is evidence."""
 
 EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
-"""What is weighed, in order: how much the best hypothesis of each kind explains; the energy; the share of the surprise
-that is in one sensor alone, and in each group of channels."""
+"""In order: how much the best hypothesis of each kind explains; the energy; the largest share of the surprise in one
+sensor, and the share in each group of channels."""
 
 SETTLED, SETTLED_AFTER = 0.9, 3
-"""A belief of so much, after so many diagnoses, is not changed any more."""
+"""A belief of so much, after so many diagnoses, is final."""
 
 REPEATS = 3
-"""Readings that are the same to the last digit, of a sensor that has noise and surprises: it is stuck."""
+"""Equal readings of a noisy sensor after which it is stuck."""
 
 
 class Cause(NamedTuple):
-    """What seems to be wrong.
+    """The likely cause of a surprise.
 
     Attributes:
         family: one of ``FAMILIES``.
-        part: a sensor such as ``encoder[3]``, a joint such as ``joint[3]``, or what else explains it; may be empty.
-        probability: of the family; calibrated: 0.9 means nine of ten.
+        part: such as ``encoder[3]`` or ``joint[3]``; may be empty.
+        probability: of the family, calibrated.
         probabilities: of all families.
-        columns: (n,) of the stream, whose precision goes to 0 where the cause is a sensor.
+        columns: (n,) of the stream, where the cause is a sensor.
     """
 
     family: str
@@ -149,7 +146,7 @@ class Diagnosis:
 
     @cached_property
     def precision(self) -> NDArray[np.float64]:
-        """(Y, Y) P."""
+        """P (Y, Y)."""
         C = self.completion.covariance
         found: NDArray[np.float64] = np.linalg.inv(C + PENALTY * np.eye(len(C)))
         return found
@@ -166,7 +163,7 @@ class Diagnosis:
 
     @cached_property
     def _freed(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
-        """For each hypothesis what takes part in it, and the inverse of its precision."""
+        """Of each hypothesis the columns of y in it, and the inverse of their precision."""
         found = []
         for h in self.hypotheses:
             missing = np.zeros(self.completion.spec.size, bool)
@@ -183,7 +180,7 @@ class Diagnosis:
         Args:
             lifted: (T, Y) y of the last rows.
             attribution: (D,) where the surprise is, of the last row.
-            missing: (D,) senses that are completed, and so explain nothing any more.
+            missing: (D,) senses that are completed already, and so explain nothing.
         """
         energy, left = self._explained(lifted[-WINDOW:])
         usual = len(self.completion.covariance)
@@ -246,7 +243,7 @@ class Diagnosis:
     def _stuck(
         self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
     ) -> tuple[str, NDArray[np.intp]] | None:
-        """The sensor that most surprise is about, where it repeats itself to the last digit though it has noise."""
+        """Return the sensor with most of the surprise, where it repeats itself though it has noise."""
         if len(rows) < REPEATS:
             return None
         same = (np.ptp(rows[-REPEATS:], axis=0) == 0) & (self.completion.spec.noise > 0)
@@ -287,11 +284,11 @@ def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
 
 
 NO_FORCE: dict[str, Any] = {"link": "", "newtons": 0.0, "vector": [0.0, 0.0, 0.0]}
-"""Where no force is behind it, or nobody knows which; the same in kind, so that many environments' go together."""
+"""Where no force is known, in the same structure, so that many environments' stack."""
 
 
 def as_info(cause: Cause | None, force: dict[str, Any] | None = None) -> dict[str, Any]:
-    """What ``info["asm"]["cause"]`` says; all empty where there is nothing to explain."""
+    """Return ``info["asm"]["cause"]``; all empty where there is none."""
     if cause is None:
         return {"family": "", "part": "", "probability": 0.0, "force": NO_FORCE, "probabilities": {}}
     named = {"family": cause.family, "part": cause.part, "probability": cause.probability}

@@ -3,8 +3,8 @@
     [x̂_t, â_t] = D [c_{t-1}, 1]        c: the traces of ``memory.traces``; D by ridge regression, in closed form
     ε_t = ([x_t, a_t] - [x̂_t, â_t]) / s
 
-There is no efference copy: the command is judged too. The body moves as always under a policy that is lost, after a
-grasp that failed, or where an object is missing; but no skill that was shown goes on like that.
+There is no efference copy: the command is judged too. Under a policy that is lost the body moves as always, but no
+skill that was shown goes on like that.
 
 Source: Hoerl and Kennard 1970 for ridge regression; ``memory.linear`` for how its penalty is chosen.
 """
