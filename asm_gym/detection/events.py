@@ -75,13 +75,6 @@ class Excuses:
         return found
 
 
-def event_of(value: float, raw: float, kind: int, threshold: float) -> str:
-    """Return one of ``EVENTS`` for a row with excused surprise ``value``, full surprise ``raw`` and event ``kind``."""
-    if not value <= threshold:
-        return FAULT
-    return EVENTS[kind] if raw > threshold else NO_EVENT
-
-
 def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.intp]:
     """Return the columns (N,) of the channels that ``which`` selects."""
     return np.flatnonzero([which(c) for c in spec.channels for _ in c.labels])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.events import EVENTS, KNOCK, STOP, event_of
+from asm_gym.detection.events import EVENTS, KNOCK, STOP
 from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
@@ -48,13 +48,6 @@ class Surprise(NamedTuple):
         """Return the surprise of one stream, as a batch of one."""
         at = slice(stream, stream + 1)
         return Surprise(*(None if part is None else part[at] for part in self))  # type: ignore[arg-type]
-
-    def event(self, threshold: float) -> str:
-        """Return the event of the first stream at this threshold, one of ``detection.events.EVENTS``."""
-        value = float(self.value[0])
-        if self.raw is None or self.excuse is None:
-            return event_of(value, value, 0, threshold)
-        return event_of(value, float(self.raw[0]), int(self.excuse[0]), threshold)
 
     @property
     def excused_by_event(self) -> dict[str, NDArray[np.float64]]:

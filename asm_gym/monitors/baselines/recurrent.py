@@ -57,16 +57,14 @@ class GRU(TorchModel):
     Args:
         spec: the stream it is to expect.
         hidden_size: H, hidden units.
-        learning_rate: of Adam, before the first plateau.
     """
 
     kind = "gru"
 
     @typed
-    def __init__(self, spec: StreamSpec, hidden_size: int = 128, learning_rate: float = 1e-3) -> None:
+    def __init__(self, spec: StreamSpec, hidden_size: int = 128) -> None:
         super().__init__(spec)
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
-        self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
 
     def module(self, senses: StreamScaler) -> nn.Module:
         return _GRUModule(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size)
@@ -80,7 +78,7 @@ class GRU(TorchModel):
             x, real = padded([inputs[i] for i in chosen])
             return _loss(module, x, padded([readings[i].changes for i in chosen])[0], real)
 
-        train_on_episodes(module, loss, len(readings), rng, progress, self.learning_rate)
+        train_on_episodes(module, loss, len(readings), rng, progress)
 
     def start(self, batch: int) -> _GRUState:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
@@ -142,19 +140,15 @@ class LSTMVAE(TorchModel):
         spec: the stream it is to expect.
         hidden_size: H, units of the encoder, and of the decoder.
         latent_size: numbers of the latent state.
-        learning_rate: of Adam, before the first plateau.
     """
 
     kind = "lstm_vae"
 
     @typed
-    def __init__(
-        self, spec: StreamSpec, hidden_size: int = 128, latent_size: int = 32, learning_rate: float = 1e-3
-    ) -> None:
+    def __init__(self, spec: StreamSpec, hidden_size: int = 128, latent_size: int = 32) -> None:
         super().__init__(spec)
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
         self.latent_size = check_number("latent_size", latent_size, low=1, whole=True)
-        self.learning_rate = check_number("learning_rate", learning_rate, above=0.0)
 
     def module(self, senses: StreamScaler) -> nn.Module:
         return _VAEModule(senses.size, self.hidden_size, self.latent_size)
@@ -181,7 +175,7 @@ class LSTMVAE(TorchModel):
             divergence = 0.5 * (log_variance.exp() + prior - 1.0 - log_variance).sum(dim=-1)
             return ((likelihood + divergence) * real).sum() / real.sum()
 
-        train_on_episodes(module, loss, len(readings), rng, progress, self.learning_rate)
+        train_on_episodes(module, loss, len(readings), rng, progress)
 
     def start(self, batch: int) -> _VAEState:
         nothing = np.zeros((batch, 2, self.hidden_size), np.float32)

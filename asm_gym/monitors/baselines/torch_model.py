@@ -83,7 +83,6 @@ def train_on_episodes(
     episodes: int,
     rng: np.random.Generator,
     progress: Progress,
-    rate: float = 1e-3,
 ) -> None:
     """Train by Adam, slowed down at every plateau of the fresh loss, until no gain is left; keep the best weights.
 
@@ -93,12 +92,11 @@ def train_on_episodes(
         episodes: how many there are. A fifth is not trained on; with fewer than five all are trained on.
         rng: of the order of episodes.
         progress: called with the epochs done, and the most there can be.
-        rate: of Adam, before the first plateau.
     """
     order = rng.permutation(episodes).astype(np.intp)
     kept = episodes // FRESH
     trained, fresh = order[kept:], order[:kept] if kept else order
-    optimiser = torch.optim.Adam(module.parameters(), rate)
+    optimiser = torch.optim.Adam(module.parameters(), 1e-3)
     plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=SLOWER, patience=PATIENCE)
     least, best = math.inf, copy.deepcopy(module.state_dict())
     for epoch in range(EPOCHS):
