@@ -144,11 +144,11 @@ def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_
     def loss(chosen, training):
         if training:
             return module.weight.sum()
-        weights.append(float(module.weight))
+        weights.append(float(module.weight.detach()))
         return torch.tensor(next(fresh))
 
     train_on_episodes(module, loss, 1, np.random.default_rng(0), lambda done, total: None)
-    assert float(module.weight) == weights[1]
+    assert float(module.weight.detach()) == weights[1]
     assert len(weights) == 2 + 3 * (PATIENCE + 1)
     steps = -np.diff(weights)
     np.testing.assert_allclose([steps[0], steps[-1]], [1e-3, 9e-5], rtol=0.01)

@@ -20,7 +20,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
+from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -28,7 +28,7 @@ MOST_ROWS = 20_000
 """What it learns from at most, drawn evenly: many estimators take the square of their number in time."""
 
 
-class EstimatorModel(StreamModel):
+class EstimatorModel(ScaledModel):
     """An estimator's score of each row, by itself.
 
     Args:
@@ -57,7 +57,6 @@ class EstimatorModel(StreamModel):
         return self.restore({**senses.arrays, "rows": rows[chosen[:half]], "others": rows[chosen[half:]]})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self._senses = StreamScaler.of(self.spec, learned)
         seeded = "random_state" in inspect.signature(self.estimator).parameters
         made = self.estimator(**({"random_state": self.seed} if seeded else {}))
         made.fit(np.asarray(learned["rows"], np.float32))
@@ -65,11 +64,8 @@ class EstimatorModel(StreamModel):
         self._fitted, self._centre, self._spread = made, float(usual.mean()), max(float(usual.std()), 1e-9)
         return super().restore(learned, skills)
 
-    def start(self, batch: int) -> RowHistory:
-        return RowHistory.empty(batch, 1, self.spec.size)
-
     def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
-        state, reading, _ = read_next(self._senses, state, rows)
+        state, reading, _ = read_next(self.senses_, state, rows)
         error = np.maximum(0.0, self._centre - _scores(self._fitted, _features(reading))) / self._spread
         return state, ModelOutput(reading.whole * error[:, None], no_context(rows))
 

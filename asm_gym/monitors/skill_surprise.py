@@ -24,7 +24,7 @@ from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import RowHistory
 from asm_gym.memory.traces import DECAYS, advance, at_rest, fit_gains
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
+from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 
@@ -41,20 +41,13 @@ class SkillState(NamedTuple):
     history: RowHistory
 
 
-class SkillModel(StreamModel):
-    """Ridge regression of the next row on the traces; no context.
-
-    Attributes:
-        senses_: how it reads a row.
-    """
+class SkillModel(ScaledModel):
+    """Ridge regression of the next row on the traces; no context."""
 
     kind = "memory_skill"
-    senses_: StreamScaler
 
     def __init__(self, spec: StreamSpec) -> None:
-        super().__init__(spec)
-        self.lag = rows_apart(spec.dt)
-        self.shortest = 1 + self.lag
+        super().__init__(spec, rows_apart(spec.dt))
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -76,16 +69,16 @@ class SkillModel(StreamModel):
         return self.restore({**senses.arrays, "gains": gains, "D": D, "remainder": np.maximum(left, FAINTEST)})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
+        super().restore(learned, skills)
         N = self.senses_.size + len(self.spec.motor)
         shape = N, len(DECAYS) * (N + 1) + 1
         if learned["D"].shape != shape:
             raise ValueError(f"D of a skill should be of shape {shape}, found {learned['D'].shape}")
-        return super().restore(learned, skills)
+        return self
 
     def start(self, batch: int) -> SkillState:
         width = self.senses_.size + len(self.spec.motor) + 1
-        return SkillState(at_rest(batch, width), RowHistory.empty(batch, self.lag, self.spec.size))
+        return SkillState(at_rest(batch, width), super().start(batch))
 
     def predict(self, state: SkillState, rows: Rows) -> tuple[SkillState, ModelOutput]:
         (history, reading, _), found = read_next(self.senses_, state.history, rows), self.learned_

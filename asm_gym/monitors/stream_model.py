@@ -72,6 +72,27 @@ class StreamModel:
         """Return the new state after the next rows (B, D), perhaps not all finite, and the errors."""
 
 
+class ScaledModel(StreamModel):
+    """Base class of models that read rows as the memory does: values, and their changes over ``lag`` rows.
+
+    Attributes:
+        senses_: how it reads a row.
+    """
+
+    senses_: StreamScaler
+
+    def __init__(self, spec: StreamSpec, lag: int = 1) -> None:
+        super().__init__(spec)
+        self.lag, self.shortest = lag, 1 + lag
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
+        return super().restore(learned, skills)
+
+    def start(self, batch: int) -> Any:
+        return RowHistory.empty(batch, self.lag, self.spec.size)
+
+
 class ErrorPlaces:
     """The column of the stream that each error belongs to.
 

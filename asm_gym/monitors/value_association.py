@@ -29,7 +29,7 @@ from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.arm_inputs import Derived, forces, motion
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
+from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, typed
@@ -59,7 +59,7 @@ class _Fitted(NamedTuple):
     R2: Floats  # (X,) cross-fitted
 
 
-class ValueAssociation(StreamModel):
+class ValueAssociation(ScaledModel):
     """Ridge regression of values and of changes that are nearly certain; it has no context.
 
     Args:
@@ -72,10 +72,8 @@ class ValueAssociation(StreamModel):
 
     @typed
     def __init__(self, spec: StreamSpec, changes: bool = True, urdf: str = "") -> None:
-        super().__init__(spec)
+        super().__init__(spec, rows_apart(spec.dt))
         self.changes = check_flag("changes", changes)
-        self.lag = rows_apart(spec.dt)
-        self.shortest = 1 + self.lag
         self.urdf = urdf
         self._derived = Derived.of(spec, urdf)
 
@@ -125,12 +123,8 @@ class ValueAssociation(StreamModel):
         return self.restore({**senses.arrays, **learned})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
         self._values, self._steps = (learned[f"judged_{what}"].astype(np.intp) for what in ("values", "changes"))
         return super().restore(learned, skills)
-
-    def start(self, batch: int) -> RowHistory:
-        return RowHistory.empty(batch, self.lag, self.spec.size)
 
     def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
         state, read, known = read_next(self.senses_, state, rows)

@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solve_discrete_are
 
 from asm_gym.detection import ModelOutput
-from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.state import RowHistory
 from asm_gym.monitors.arm_inputs import WIDTHS, forces, speeds
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel, no_context, read_next
+from asm_gym.monitors.stream_model import ScaledModel, StreamModel, no_context, read_next
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
@@ -151,15 +150,13 @@ class WindowPCA(StreamModel):
         return _Window(window[:, 1:], state.steps + 1), ModelOutput(np.where(judged, left, 0.0), no_context(rows))
 
 
-class LinearAssociation(StreamModel):
+class LinearAssociation(ScaledModel):
     """Ridge regression of each group's changes; it has no context."""
 
     kind = "association_linear"
 
     def __init__(self, spec: StreamSpec) -> None:
-        super().__init__(spec)
-        self.lag = rows_apart(spec.dt)
-        self.shortest = 1 + self.lag
+        super().__init__(spec, rows_apart(spec.dt))
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
@@ -169,13 +166,6 @@ class LinearAssociation(StreamModel):
         D = learn_linear(a, senses.groups, senses.changes)
         left = np.sqrt(np.mean((a[:, senses.changes] - a @ D.T) ** 2, axis=0))
         return self.restore({**senses.arrays, "D": D, "remainder": np.maximum(left, FAINTEST)})
-
-    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
-        return super().restore(learned, skills)
-
-    def start(self, batch: int) -> RowHistory:
-        return RowHistory.empty(batch, self.lag, self.spec.size)
 
     def predict(self, state: RowHistory, rows: Floats) -> tuple[RowHistory, ModelOutput]:
         state, r, known = read_next(self.senses_, state, rows)

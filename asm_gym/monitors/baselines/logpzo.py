@@ -77,9 +77,6 @@ class LogpZO(TorchModel):
             flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
             descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
 
-    def start(self, batch: int) -> RowHistory:
-        return RowHistory.empty(batch, 1, self.spec.size)
-
     def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
         state, reading, _ = read_next(self.senses_, state, rows)
         error = self._noise(torch.as_tensor(_features(reading))).numpy().astype(np.float64)

@@ -83,7 +83,7 @@ class GRU(TorchModel):
     def start(self, batch: int) -> _GRUState:
         hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
         last = self.senses_.read(rows, rows, rows).senses
-        return _GRUState(hidden, last, RowHistory.empty(batch, 1, self.spec.size))
+        return _GRUState(hidden, last, super().start(batch))
 
     def predict(self, state: _GRUState, rows: NDArray[np.float64]) -> tuple[_GRUState, ModelOutput]:
         history, r, _ = read_next(self.senses_, state.history, rows)
@@ -179,7 +179,7 @@ class LSTMVAE(TorchModel):
 
     def start(self, batch: int) -> _VAEState:
         nothing = np.zeros((batch, 2, self.hidden_size), np.float32)
-        return _VAEState(nothing, nothing, RowHistory.empty(batch, 1, self.spec.size))
+        return _VAEState(nothing, nothing, super().start(batch))
 
     def predict(self, state: _VAEState, rows: NDArray[np.float64]) -> tuple[_VAEState, ModelOutput]:
         assert isinstance(self.module_, _VAEModule)

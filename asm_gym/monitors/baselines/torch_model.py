@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import ScaledRows, StreamScaler
 
 EPOCHS, BATCH = 200, 16
@@ -29,15 +29,13 @@ PATIENCE, SLOWER, SLOWEST = 5, 0.3, 3e-5
 """Epochs without a gain after which the step size is cut to a share; below the smallest, training has converged."""
 
 
-class TorchModel(StreamModel):
+class TorchModel(ScaledModel):
     """A model that is a torch module.
 
     Attributes:
-        senses_: how it reads a row, which is as the Neural ASM does.
         module_: the network, once it is fitted.
     """
 
-    senses_: StreamScaler
     module_: nn.Module
 
     @abstractmethod
@@ -73,7 +71,7 @@ class TorchModel(StreamModel):
             module.load_state_dict(state)
         except RuntimeError as error:
             raise ValueError(f"the weights of this {self.kind} do not fit: {error}") from error
-        self.senses_, self.module_ = senses, module.eval().requires_grad_(False)
+        self.module_ = module.eval().requires_grad_(False)
         return super().restore(learned, skills)
 
 
