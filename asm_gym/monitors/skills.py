@@ -114,7 +114,7 @@ def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 51
     model = memory.model
     with threadpool_limits(1):
         motor = learn_motor(*lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed))
-    model.restore({**model.learned_, **motor.named(model.senses_)}, model.skills_)
+    model.restore({**model.learned_, **motor.named()}, model.skills_)
     return memory
 
 
