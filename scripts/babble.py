@@ -26,7 +26,7 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.parallel import ParallelConfig
+from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.exam import Exam, Marks, card, examine, summary, usual_force
 from asm_gym.rollouts.pretraining.healthy import Lessons, calibrate_body, healthy, held_out, learn_body
@@ -69,7 +69,7 @@ class Args(Options):
     """A corpus of asm-gym corpus, whose experts' healthy hours are calibrated on, too."""
     exam_episodes: int = option(60, quick=0, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
-    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    workers: str = option("2", check=parse_workers, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
@@ -116,8 +116,7 @@ def record_lessons(args: Args, console: Console) -> Lessons:
     wanted = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
-        workers = ParallelConfig.named(args.workers)
-        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, workers, progress)
+        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress)
     return healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
 
 
@@ -126,7 +125,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes) for task in args.shown}
     trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
     with stage("healthy hours", console, {}) as progress:
-        files = record_missing(trials, args.config, args.out / "hours", ParallelConfig.named(args.workers), progress)
+        files = record_missing(trials, args.config, args.out / "hours", args.workers, progress)
     found = [load_episode(file) for file in files]
     if args.corpus is not None:
         found += Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)
@@ -166,7 +165,7 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
         kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
         trials = exam.trials(args.exam_episodes, kinds, args.seed)
         with stage(exam.name, console, {}) as progress:
-            files = record_missing(trials, config, folder, ParallelConfig.named(args.workers), progress)
+            files = record_missing(trials, config, folder, args.workers, progress)
             recordings = [load_episode(file) for file in files]
             expected = usual.setdefault(exam.task, usual_force(recordings))
             marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))

@@ -18,7 +18,7 @@ from rich.console import Console
 from asm_gym.data.datasets import require_minari, write_dataset
 from asm_gym.episode import load_episode
 from asm_gym.rollouts.collect import check, collect_to
-from asm_gym.rollouts.parallel import ParallelConfig
+from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.seeds import episode_seeds
@@ -42,7 +42,7 @@ class Args(Options):
     """How many; a second call with more of them continues."""
     only_successful: bool = False
     """Leave failed episodes out of the dataset."""
-    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    workers: str = option("2", check=parse_workers, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     out: Path = option(Path("runs/collect"), metavar="FOLDER")
     """Folder of the episodes and of the dataset."""
@@ -63,7 +63,7 @@ def collect(args: Args, console: Console) -> None:
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
         with stage("recording", console, {}) as progress:
-            seeds, workers = episode_seeds(args.seed, args.episodes), ParallelConfig.named(args.workers)
+            seeds, workers = episode_seeds(args.seed, args.episodes), args.workers
             files = collect_to(args.out / "episodes", task, config, seeds, workers, progress)
         episodes = [load_episode(file) for file in files]
         kept = [e for e in episodes if e.success or not args.only_successful]

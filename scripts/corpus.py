@@ -15,7 +15,7 @@ from rich.console import Console
 
 from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
-from asm_gym.rollouts.parallel import ParallelConfig
+from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.scripts.command import run
@@ -30,7 +30,7 @@ class Args(Options):
     """Parts to record."""
     rounds: int = option(ROUNDS, quick=1, least=1)
     """How many rounds; each has as much of every task, and the first what is learned from."""
-    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    workers: str = option("2", check=parse_workers, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     out: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of the corpus."""
@@ -60,7 +60,7 @@ def make(args: Args, console: Console) -> None:
         for part in args.part:
             for number in range(min(args.rounds, total)):
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
-                    record_corpus(args.out, sources[part], number, total, ParallelConfig.named(args.workers), progress)
+                    record_corpus(args.out, sources[part], number, total, args.workers, progress)
     console.print(ConsoleTable(contents(Corpus.open(args.out))))
 
 

@@ -29,7 +29,7 @@ from asm_gym.faults.suite import HARMLESS, SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.corpus import VERSION, skill_files
-from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
+from asm_gym.rollouts.parallel import parallel_map, parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.staging import record_missing
@@ -90,7 +90,7 @@ class Args(Options):
     """Episodes of each task for each harmless variation."""
     false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
-    workers: str = option("2", check=ParallelConfig.named, metavar="N")
+    workers: str = option("2", check=parse_workers, metavar="N")
     """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
@@ -168,7 +168,7 @@ def trials_of(args: Args, task: str) -> list[Trial]:
 def evaluate(args: Args, console: Console) -> None:
     """Record, fit, judge and publish; print the tables in brief."""
     args = without_unfit_monitors(args, console)
-    workers, seconds = ParallelConfig.named(args.workers), dict[str, float]()
+    workers, seconds = args.workers, dict[str, float]()
     timed = partial(stage, console=console, seconds=seconds)
     claim: dict[str, Any] = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     if args.corpus is not None:
@@ -182,7 +182,7 @@ def evaluate(args: Args, console: Console) -> None:
             with timed("recording") as progress:
                 record_missing(trials, args.config, args.out, workers, progress)
         with timed("fitting and judging") as progress:
-            each = partial(parallel_map, parallel=workers, progress=progress)
+            each = partial(parallel_map, workers=workers, progress=progress)
             how = args.false_alarm_rate, WINDOW_S, args.seed
             result = benchmark(args.out, files, args.monitors, *how, each)
         with timed("drawing"):

@@ -20,7 +20,7 @@ from rich.console import Console
 from asm_gym.data.datasets import read_dataset
 from asm_gym.episode import load_episode
 from asm_gym.rollouts.collect import check, collect_to
-from asm_gym.rollouts.parallel import ParallelConfig
+from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
@@ -53,7 +53,7 @@ class Args(Options):
     """Episodes of each evaluation."""
     final_episodes: int = option(100, quick=2, least=1)
     """Episodes of the last evaluation, on other seeds."""
-    workers: str = option("1", check=ParallelConfig.named, metavar="N")
+    workers: str = option("1", check=parse_workers, metavar="N")
     """Processes that record demonstrations; or a running cluster, as dask:tcp://host:8786 or ray:host:6379."""
     out: Path = option(Path("runs/train"), metavar="FOLDER")
     """Folder of the run."""
@@ -75,7 +75,7 @@ def train_agent(args: Args, console: Console) -> None:
         if episodes is None:
             folder, seeds = args.out / "demonstrations" / "episodes", episode_seeds(args.seed, args.demonstrations)
             with stage("recording demonstrations", console, {}) as tick:
-                files = collect_to(folder, task, config, seeds, ParallelConfig.named(args.workers), tick)
+                files = collect_to(folder, task, config, seeds, args.workers, tick)
             episodes = [load_episode(file) for file in files]
         solved = [e for e in episodes if e.success]
         if not solved:

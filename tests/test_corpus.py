@@ -12,7 +12,6 @@ import pytest
 from asm_gym.episode import save_episode
 from asm_gym.rollouts import corpus as module
 from asm_gym.rollouts.corpus import MANIFEST, ROUNDS, VERSION, Corpus, Source, record_corpus, trials
-from asm_gym.rollouts.parallel import ParallelConfig
 from asm_gym.rollouts.trial import faulty_trial
 from asm_gym.scripts.corpus import contents
 from asm_gym.scripts.evaluate import main as evaluate
@@ -22,7 +21,7 @@ SOURCES = (Source("Lift", fit=2, calibration=1, nominal=4), Source("Stack", "sta
 
 
 def record_round(folder, number, rounds=2, sources=SOURCES):
-    record_corpus(folder, sources, number, rounds, ParallelConfig(1), lambda done, total: None)
+    record_corpus(folder, sources, number, rounds, 1, lambda done, total: None)
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.rollouts import ParallelConfig, collect, parallel_map
+from asm_gym.rollouts import collect, parallel_map
+from asm_gym.rollouts.parallel import parse_workers
 from tests.needs import needs
 
 PARENT = """
@@ -100,22 +101,7 @@ def _kill_myself(how: int) -> None:
 
 
 def test_nothing_to_do_needs_nobody():
-    assert parallel_map(abs, [], ParallelConfig(backend="dask", address="tcp://127.0.0.1:1")) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"workers": 0}, "workers.*0"),
-        ({"workers": 10**9}, "workers.*1000000000"),
-        ({"backend": "slurm"}, "slurm.*dask"),
-        ({"backend": "dask"}, "address"),
-        ({"address": "tcp://host:1"}, "loky"),
-    ],
-)
-def test_a_config_that_makes_no_sense_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        ParallelConfig(**arguments)
+    assert parallel_map(abs, [], "dask:tcp://127.0.0.1:1") == []
 
 
 @pytest.fixture(scope="module", params=["dask", "ray"])
@@ -125,12 +111,12 @@ def cluster(request):
         distributed = needs("distributed")
         quiet = {"processes": True, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
         with distributed.LocalCluster(2, **quiet) as made:
-            yield ParallelConfig(2, "dask", made.scheduler_address)
+            yield f"dask:{made.scheduler_address}"
     else:
         utils = needs("ray.cluster_utils")
         os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
         made = utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False})
-        yield ParallelConfig(2, "ray", made.address)
+        yield f"ray:{made.address}"
         made.shutdown()
 
 
@@ -169,13 +155,13 @@ def test_a_cluster_collects_the_same_episodes(cluster):
 def test_no_cluster_at_the_address_is_said():
     needs("distributed")
     with pytest.raises(ConnectionError, match=r"tcp://127\.0\.0\.1:1"):
-        parallel_map(abs, [1], ParallelConfig(2, "dask", "tcp://127.0.0.1:1"))
+        parallel_map(abs, [1], "dask:tcp://127.0.0.1:1")
 
 
 def test_workers_are_named_in_one_word():
-    assert ParallelConfig.named("3") == ParallelConfig(3)
-    assert ParallelConfig.named("dask:tcp://host:8786") == ParallelConfig(backend="dask", address="tcp://host:8786")
-    assert ParallelConfig.named("ray") == ParallelConfig(backend="ray")
-    for wrong in ("", "two", "0", "-1", "loky", "dask", "slurm:host"):
+    assert parse_workers("3") == parse_workers(3) == ("loky", 3)
+    assert parse_workers("dask:tcp://host:8786") == ("dask", "tcp://host:8786")
+    assert parse_workers("ray") == ("ray", "")
+    for wrong in ("", "two", 0, "-1", 10**9, "loky", "dask", "slurm:host"):
         with pytest.raises(ValueError, match=r"workers must be|needs the address"):
-            ParallelConfig.named(wrong)
+            parse_workers(wrong)

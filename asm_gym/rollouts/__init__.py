@@ -5,7 +5,7 @@ from typing import Any
 from asm_gym.extras import needed_for
 
 with needed_for("running episodes"):
-    from asm_gym.rollouts.parallel import ParallelConfig, parallel_map
+    from asm_gym.rollouts.parallel import parallel_map
 try:
     with needed_for("a robosuite environment or a fault in one"):
         from asm_gym.rollouts.collect import collect
@@ -16,7 +16,7 @@ except ImportError as error:
     # imported on access, as in ``asm_gym.wrappers``: ``collect`` is a module too, which would be found first.
     _missing = error
 
-__all__ = ["ParallelConfig", "RolloutConfig", "Trial", "collect", "harmless", "parallel_map"]
+__all__ = ["RolloutConfig", "Trial", "collect", "harmless", "parallel_map"]
 
 
 def __getattr__(name: str) -> Any:

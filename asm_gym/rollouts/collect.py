@@ -11,7 +11,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from asm_gym.episode import Episode, save_episode
-from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.staging import environment, play, policy_for, staged
@@ -27,7 +27,7 @@ def collect(
     policy: PolicySource = "scripted",
     episodes: int = 100,
     seed: int = 0,
-    workers: int | ParallelConfig = 2,
+    workers: int | str = 2,
     *,
     stage: int = 0,
     progress: Progress | None = None,
@@ -45,7 +45,7 @@ def collect(
             random must have ``set_random_seed``.
         episodes: how many.
         seed: of everything; the same seed gives the same episodes.
-        workers: processes, 1 of which is this one; or a ``ParallelConfig`` that names a cluster.
+        workers: processes, 1 of which is this one; or a cluster, such as ``dask:tcp://host:8786``.
         stage: sets of episodes with the same ``seed`` and different stages are different.
         progress: is called as (done, total).
         env_kwargs: arguments of ``gym.make``.
@@ -81,12 +81,12 @@ def collect_to(
     env_id: str,
     config: RolloutConfig,
     seeds: Sequence[int],
-    parallel: ParallelConfig | int = 2,
+    workers: int | str = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the episodes that are not in ``folder`` yet; return the files of all."""
     make = partial(_record_to, folder=folder.resolve(), spec=env_spec(env_id), config=config)
-    return make_missing(make, seeds, lambda seed: folder.resolve() / f"{seed}.npz", parallel, progress)
+    return make_missing(make, seeds, lambda seed: folder.resolve() / f"{seed}.npz", workers, progress)
 
 
 def _record_to(seed: int, folder: Path, spec: EnvSpec, config: RolloutConfig) -> Path:

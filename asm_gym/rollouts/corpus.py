@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
 from asm_gym.files import written_whole
-from asm_gym.rollouts.parallel import ParallelConfig, Progress
+from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.staging import environment, record_missing
@@ -198,7 +198,7 @@ def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
 
 
 def record_corpus(
-    folder: Path, sources: Sequence[Source], number: int, rounds: int, parallel: ParallelConfig, progress: Progress
+    folder: Path, sources: Sequence[Source], number: int, rounds: int, workers: int | str, progress: Progress
 ) -> None:
     """Record what is missing of a round, source by source, and add it to the manifest."""
     known = {entry.path: entry for entry in read_manifest(folder)} if (folder / MANIFEST).is_file() else {}
@@ -207,7 +207,7 @@ def record_corpus(
         paths = [Path(source.policy) / trial.label.path for trial in wanted]
         new = {path for path in paths if not (folder / path).is_file()}
         known = {path: entry for path, entry in known.items() if path not in new}
-        files = record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, parallel, progress)
+        files = record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress)
         for trial, path, file in zip(wanted, paths, files, strict=True):
             if path not in known:
                 episode = load_episode(file)

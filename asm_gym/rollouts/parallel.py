@@ -10,8 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
@@ -20,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.extras import require
 from asm_gym.registries import added, knowing
-from asm_gym.validation import check_choice, check_number, typed
+from asm_gym.validation import check_number, typed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -37,52 +36,35 @@ ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 """Environment of each worker: more threads would compete for the same cores."""
 
 
-@dataclass(frozen=True)
-class ParallelConfig:
-    """Who does the work.
+def parse_workers(workers: int | str) -> tuple[str, Any]:
+    """Return the backend, and its number of processes or the address of its cluster.
 
     Args:
-        workers: processes; 1 with ``loky`` stays in this one. A cluster decides by itself.
-        backend: ``loky`` for processes on this machine; ``dask`` or ``ray`` for a running cluster, whose workers have
-            this package and share the folder of the results.
-        address: of the cluster, such as ``tcp://host:8786``; Ray finds one on this machine by itself.
+        workers: processes on this machine, 1 of which is this one; or a running cluster, ``dask:ADDRESS``,
+            ``ray:ADDRESS`` or ``ray``, whose workers have this package and share the folder of the results.
+
+    Raises:
+        ValueError: it is none of these.
     """
-
-    workers: int = 2
-    backend: str = "loky"
-    address: str | None = None
-
-    def __post_init__(self) -> None:
-        check_number("workers", self.workers, low=1, high=MOST_WORKERS, whole=True)
-        check_choice("backend", self.backend, BACKENDS)
-        if self.backend == "dask" and self.address is None:
-            raise ValueError("backend='dask' needs the address of its scheduler, such as tcp://host:8786")
-        if self.backend == "loky" and self.address is not None:
-            raise ValueError(f"an address is for a cluster: backend must be dask or ray, got loky with {self.address}")
-
-    @classmethod
-    def named(cls, workers: str) -> ParallelConfig:
-        """Parse a number of processes, ``dask:ADDRESS``, ``ray`` or ``ray:ADDRESS``.
-
-        Raises:
-            ValueError: it is none of these.
-        """
-        if workers.lstrip("-").isdecimal():
-            return cls(int(workers))
-        backend, _, address = workers.partition(":")
-        if backend not in BACKENDS or backend == "loky":
-            raise ValueError(f"workers must be a number, dask:ADDRESS or ray:ADDRESS, got {workers!r}")
-        return cls(backend=backend, address=address or None)
+    if not isinstance(workers, str) or workers.lstrip("-").isdecimal():
+        count = int(workers) if isinstance(workers, str) else workers
+        return "loky", check_number("workers", count, low=1, high=MOST_WORKERS, whole=True)
+    backend, _, address = workers.partition(":")
+    if backend not in ("dask", "ray"):
+        raise ValueError(f"workers must be a number, dask:ADDRESS or ray:ADDRESS, got {workers!r}")
+    if backend == "dask" and not address:
+        raise ValueError("dask needs the address of its scheduler, such as dask:tcp://host:8786")
+    return backend, address
 
 
 @typed
 def parallel_map(
     task: Callable[[Item], Result],
     items: Sequence[Item],
-    parallel: ParallelConfig | int = 2,
+    workers: int | str = 2,
     progress: Progress | None = None,
 ) -> list[Result]:
-    """Return ``[task(item) for item in items]``, computed by workers; a number is that many processes here.
+    """Return ``[task(item) for item in items]``, computed by ``workers`` as of ``parse_workers``.
 
     Processes stay alive between calls, and end with this one. A cluster repeats the task of a lost worker.
 
@@ -92,16 +74,16 @@ def parallel_map(
         ConnectionError: there is no cluster at the address.
         ChildProcessError: a process was killed.
     """
-    parallel = parallel if isinstance(parallel, ParallelConfig) else ParallelConfig(parallel)
+    backend, where = parse_workers(workers)
     report = progress or (lambda done, total: None)
     found: dict[int, Result] = {}
-    if parallel.backend == "loky" and parallel.workers == 1:
+    if where == 1:
         for index, item in enumerate(items):
             found[index] = task(item)
             report(len(found), len(items))
     elif items:
         pickled = _pickled(task)
-        with BACKENDS[parallel.backend](parallel, len(items)) as submit:
+        with BACKENDS[backend](where, len(items)) as submit:
             index_of = {submit(pickled, item): index for index, item in enumerate(items)}
             for future in as_completed(index_of):
                 found[index_of[future]] = future.result()
@@ -136,9 +118,9 @@ def _call_on_cluster(task: bytes, item: Any) -> Any:
 
 
 @contextmanager
-def _loky(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
+def _loky(workers: int, items: int) -> Iterator[Submit]:
     get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
-    workers = min(parallel.workers, items)  # an executor starts all of them at once
+    workers = min(workers, items)  # an executor starts all of them at once
     how = {"timeout": IDLE_S, "initializer": _end_with_parent, "initargs": (os.getpid(),), "env": ONE_THREAD}
     executor = get_reusable_executor(workers, **how)
     try:
@@ -163,22 +145,22 @@ def _end_with_parent(parent: int) -> None:
 
 
 @contextmanager
-def _dask(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
-    distributed = require("distributed", what="backend='dask'")
+def _dask(address: str, items: int) -> Iterator[Submit]:
+    distributed = require("distributed", what="a Dask cluster")
     try:
-        client = distributed.Client(parallel.address, timeout=10)
+        client = distributed.Client(address, timeout=10)
     except OSError as error:
-        raise ConnectionError(f"no dask scheduler answers at {parallel.address}: {error}") from error
+        raise ConnectionError(f"no dask scheduler answers at {address}: {error}") from error
     with client:  # closing it cancels what still runs
         yield partial(client.get_executor(pure=False).submit, _call_on_cluster)
 
 
 @contextmanager
-def _ray(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
-    ray = require("ray", what="backend='ray'")
+def _ray(address: str, items: int) -> Iterator[Submit]:
+    ray = require("ray", what="a Ray cluster")
     joined = not ray.is_initialized()
     if joined:
-        ray.init(address=parallel.address or "auto", log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address or "auto", log_to_driver=False, logging_level="ERROR")
     try:
         remote = ray.remote(_call_on_cluster)
         yield lambda task, item: remote.remote(task, item).future()
@@ -187,5 +169,5 @@ def _ray(parallel: ParallelConfig, items: int) -> Iterator[Submit]:
             ray.shutdown()
 
 
-BACKENDS = {"loky": _loky, "dask": _dask, "ray": _ray}
+BACKENDS: dict[str, Callable[[Any, int], AbstractContextManager[Submit]]] = {"loky": _loky, "dask": _dask, "ray": _ray}
 """Each is a context that gives a function to submit a pickled task with an item."""

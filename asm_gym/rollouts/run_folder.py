@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 import asm_gym
 from asm_gym.files import written_whole
-from asm_gym.rollouts.parallel import ParallelConfig, Progress, parallel_map
+from asm_gym.rollouts.parallel import Progress, parallel_map
 
 Item = TypeVar("Item")
 
@@ -85,7 +85,7 @@ def make_missing(
     make: Callable[[Item], Path],
     items: Sequence[Item],
     place: Callable[[Item], Path],
-    parallel: ParallelConfig | int = 2,
+    workers: int | str = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Make the files that are missing; return the paths of all, in the order of ``items``.
@@ -96,5 +96,5 @@ def make_missing(
     missing = [item for item, path in zip(items, places, strict=True) if not path.is_file()]
     done, tell = len(items) - len(missing), progress or (lambda done, total: None)
     tell(done, len(items))
-    parallel_map(make, missing, parallel, lambda k, _: tell(done + k, len(items)))
+    parallel_map(make, missing, workers, lambda k, _: tell(done + k, len(items)))
     return places

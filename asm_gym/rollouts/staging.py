@@ -24,7 +24,7 @@ from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
-from asm_gym.rollouts.parallel import ParallelConfig, Progress
+from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import EXECUTIONS, PASSING, PolicySource, RolloutConfig, Settings, Trial
@@ -159,9 +159,9 @@ def record_missing(
     trials: Sequence[Trial],
     config: RolloutConfig,
     folder: Path,
-    parallel: ParallelConfig | int = 2,
+    workers: int | str = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the trials that are not in ``folder`` yet; return the files of all."""
     make = partial(record, config=config, folder=folder.resolve())
-    return make_missing(make, trials, lambda trial: folder / trial.label.path, parallel, progress)
+    return make_missing(make, trials, lambda trial: folder / trial.label.path, workers, progress)
