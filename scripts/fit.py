@@ -5,7 +5,6 @@ Part of the episodes are learned from, the others set the threshold. Episodes th
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -143,13 +142,6 @@ def divide(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[E
                 f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
             )
     else:
-        total, seconds = math.ceil(args.needed / args.calibration_share) + SPARE, 3600 * hours_of(episodes)
-        length = math.floor(100 * seconds / total) / 100
-        if by_episode and args.split is None and 2 * len(episodes) < total and length >= SHORTEST_S:
-            raise ValueError(
-                f"a false-alarm rate of {args.false_alarm_rate:g} needs {total} normal episodes, got {len(episodes)} "
-                f"that are {seconds:.4g} s long together: --split {min(length, PIECE_S):g} cuts them"
-            )
         rate = args.false_alarm_rate if by_episode else ANY_EPISODE
         fitting, calibration = split_at_random(episodes, rate, args.calibration_share, args.seed)
     args.promise.check_hours(hours_of(calibration))

@@ -97,3 +97,17 @@ EVENTFUL_ARM = StreamSpec(
 
 UNEVENTFUL = np.array([0.2, 1.5, 60.0, 0, 0, 10.0, 0, 0, 0, 0])
 """A row of it without an event; where a peak is sensed, the mean tells no knock."""
+
+
+def arm_table(seed: int, rows: int = 80) -> dict[str, np.ndarray]:
+    """A log at 50 Hz: two joints that follow a command, and the torque that takes."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(rows) / 50.0
+    command = np.sin(np.outer(t, [2.0, 3.0]) + rng.uniform(0, 6, 2))
+    joints = command + 0.01 * rng.normal(size=command.shape)
+    return {
+        "time": t,
+        **{f"q_{k}": joints[:, k] for k in range(2)},
+        **{f"cmd_{k}": command[:, k] for k in range(2)},
+        "torque": joints.sum(axis=1) + 0.01 * rng.normal(size=rows),
+    }

@@ -75,22 +75,6 @@ def test_collecting_touches_nothing_outside_its_folder(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
-def test_a_second_call_goes_on_and_more_episodes_are_added(folder, tmp_path):
-    (first,) = [p for p in (folder / "episodes").iterdir() if p.name.startswith(str(read_dataset(folder)[0].seed))]
-    (tmp_path / "episodes").mkdir()
-    os.link(first, tmp_path / "episodes" / first.name)
-    written = first.stat().st_mtime_ns
-    assert main(["collect", "Lift", *ONE, "2", "--seed", "5", "--out", str(tmp_path)]) == 0
-    assert first.stat().st_mtime_ns == written
-    for a, b in zip(read_dataset(tmp_path), read_dataset(folder), strict=True):
-        assert_same(a, b)
-
-
-def test_other_settings_are_refused_by_name(folder, capsys):
-    assert main(["collect", "Lift", *ONE, "2", "--seed", "6", "--out", str(folder)]) == 2
-    assert "seed: 5 there, 6 here" in capsys.readouterr().err
-
-
 def test_a_killed_run_loses_only_what_was_running(tmp_path):
     command = [sys.executable, "-m", "asm_gym.scripts.collect", "Lift", *ONE, "400", "--out", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -107,24 +91,6 @@ def test_a_killed_run_loses_only_what_was_running(tmp_path):
     assert len(read_dataset(tmp_path)) == more
     assert all((tmp_path / "episodes" / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
     assert not [p.name for p in tmp_path.rglob("*") if p.name.endswith(UNFINISHED)]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["Juggle"], "Juggle"),
-        (["Lift", "--policy", "teleop"], "teleop"),
-        (["Lift", "--episodes", "0"], "episodes"),
-        (["Lift", "--robot", "R2D2"], "R2D2"),
-        (["Wipe", "--policy", "nowhere/agent_sac.zip"], "agent_sac"),
-        (["Door", "--policy", "lift_sac"], "lift_sac takes observations of 37 numbers"),
-        (["Lift", "--robot", "Sawyer", "--policy", "lift_sac"], "['Panda'] there, ['Sawyer'] here"),
-    ],
-)
-def test_bad_arguments_are_refused_before_anything_runs(arguments, message, tmp_path, capsys):
-    assert main(["collect", *arguments, "--out", str(tmp_path / "out")]) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 class _Sines(gym.Env):
@@ -185,21 +151,6 @@ def test_a_dataset_of_somebody_elses_environment_is_read_as_observation_and_acti
     # A memory that is fitted on it watches the environment itself.
     NeuralASM(episodes[0].spec, hidden_size=8, association_size=8, epochs=1).fit(episodes)
     episodes[0].spec.require(env.stream_spec, "the dataset")
-
-
-def test_streams_of_others_are_taken_without_the_row_of_reset(tmp_path, folder):
-    (data,) = (folder / "asm_gym" / "lift-scripted-v0").glob("data")
-    copy = tmp_path / "data"
-    copy.mkdir()
-    (copy / "metadata.json").write_bytes((data / "metadata.json").read_bytes())
-    (copy / "main_data.hdf5").write_bytes((data / "main_data.hdf5").read_bytes())
-    with h5py.File(copy / "main_data.hdf5", "a") as file:
-        for episode in file.values():
-            stream = episode["infos/stream"][()]
-            del episode["infos/stream"]
-            episode["infos"]["stream"] = np.concatenate([stream[:1] * np.nan, stream])
-    for a, b in zip(read_dataset(copy), read_dataset(folder), strict=True):
-        np.testing.assert_array_equal(a.stream, b.stream)
 
 
 def test_streams_that_run_faster_than_control_are_kept_whole(tmp_path):

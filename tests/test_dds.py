@@ -1,25 +1,50 @@
 """Topics of ROS 2 over DDS, published with types of their own."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from asm_gym.data.live import SourceDied, lines_from
-from tests.dds_types import Header, JointState, Text, Time
 from tests.needs import needs
 
 domain, pub, topic = (needs(f"cyclonedds.{part}") for part in ("domain", "pub", "topic"))
+idl, types = needs("cyclonedds.idl"), needs("cyclonedds.idl.types")
 
 NAMES = ["shoulder", "elbow"]
 RATE = 200.0
+
+
+@dataclass
+class Time(idl.IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: types.int32
+    nanosec: types.uint32
+
+
+@dataclass
+class Header(idl.IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class JointState(idl.IdlStruct, typename="sensor_msgs.msg.dds_.JointState_"):
+    header: Header
+    name: types.sequence[str]
+    position: types.sequence[types.float64]
+    velocity: types.sequence[types.float64]
+    effort: types.sequence[types.float64]
+
+
+@dataclass
+class Text(idl.IdlStruct, typename="std_msgs.msg.dds_.String_"):
+    data: str
 
 
 @pytest.fixture(autouse=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,24 +18,11 @@ from asm_gym.data.text import read_text
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.alarms import traces_of
 from asm_gym.guard.live import follow
-from asm_gym.monitors import load_monitor, make_monitor
+from asm_gym.monitors import load_monitor
 from asm_gym.scripts.cli import main
+from tests.streams import arm_table as log
 
-RATE, ROWS = 50.0, 80
-
-
-def log(seed: int, rows: int = ROWS) -> dict[str, np.ndarray]:
-    """Two joints that follow a command, and the torque that takes."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(rows) / RATE
-    command = np.sin(np.outer(t, [2.0, 3.0]) + rng.uniform(0, 6, 2))
-    joints = command + 0.01 * rng.normal(size=command.shape)
-    return {
-        "time": t,
-        **{f"q_{k}": joints[:, k] for k in range(2)},
-        **{f"cmd_{k}": command[:, k] for k in range(2)},
-        "torque": joints.sum(axis=1) + 0.01 * rng.normal(size=rows),
-    }
+RATE, ROWS = 50.0, 80  # of ``arm_table``
 
 
 def write_csv(path: Path, columns: dict[str, np.ndarray]) -> Path:
@@ -258,18 +244,6 @@ def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
     ]
 
 
-def test_a_number_that_is_lost_is_an_alarm(memory):
-    monitor = load_monitor(memory)
-    rows = Episode.from_table(log(100), channels=monitor.spec).stream.astype(float)
-    lines = [json.dumps(dict(zip(monitor.spec.labels, row.tolist(), strict=True))) for row in rows[:10]]
-    lost = json.loads(lines[5])
-    del lost["torque"]
-    for line in (json.dumps(lost), json.dumps({**lost, "torque": None})):
-        said = io.StringIO()
-        assert follow([*lines[:5], line], monitor, lambda line, said=said: print(line, file=said)) == 1
-        assert "torque  inf thresholds" in said.getvalue()
-
-
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
@@ -285,13 +259,6 @@ def test_a_number_that_is_lost_is_an_alarm(memory):
 def test_a_line_that_is_no_row_is_refused_with_its_number(lines, message, memory):
     with pytest.raises(ValueError, match=message):
         follow(lines, load_monitor(memory), print)
-
-
-def test_standard_input_is_watched_as_a_command(memory, monkeypatch, capsys):
-    rows = Episode.from_table(log(100), channels=load_monitor(memory).spec).stream
-    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(json.dumps(row.tolist()) for row in rows)))
-    assert main(["watch", "-", "--monitor", str(memory)]) == 0
-    assert f"{ROWS} rows, 0 alarms" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -312,13 +279,6 @@ def test_what_makes_no_sense_is_refused_in_one_line(arguments, message, capsys):
     said = capsys.readouterr().err
     assert message in said
     assert len(said.strip().splitlines()) == 1
-
-
-def test_a_memory_without_a_threshold_cannot_watch(tmp_path, capsys):
-    episodes = [Episode.from_table(log(n)) for n in range(4)]
-    make_monitor("kalman", episodes[0].spec).fit(episodes).save(tmp_path / "raw.asm")
-    assert main(["watch", "-", "--monitor", str(tmp_path / "raw.asm")]) == 2
-    assert "raw.asm has no threshold" in capsys.readouterr().err
 
 
 def test_what_lost_rows_is_learned_in_parts_and_a_lost_row_is_an_alarm(tmp_path, capsys):

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.data.channels import read_recorded
 from asm_gym.data.clock import clock_among, evenly, period
 from asm_gym.data.logs import FILES, LogLayout, read_logs
 from asm_gym.data.names import is_clock, is_command
@@ -25,30 +24,12 @@ from asm_gym.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.readings import noise_of, resolution
 from asm_gym.spec import MOTOR
 from tests.needs import needs
+from tests.streams import arm_table as log
 
 RATE, ROWS = 50.0, 80
 
 REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
 """A folder of recordings of real arms, which are published elsewhere."""
-
-
-def log(seed: int, rows: int = ROWS) -> dict[str, np.ndarray]:
-    """Two joints that follow a command, and the torque that takes."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(rows) / RATE
-    command = np.sin(np.outer(t, [2.0, 3.0]) + rng.uniform(0, 6, 2))
-    joints = command + 0.01 * rng.normal(size=command.shape)
-    return {
-        "time": t,
-        **{f"q_{k}": joints[:, k] for k in range(2)},
-        **{f"cmd_{k}": command[:, k] for k in range(2)},
-        "torque": joints.sum(axis=1) + 0.01 * rng.normal(size=rows),
-    }
-
-
-def write_csv(path: Path, columns: dict[str, np.ndarray]) -> Path:
-    pd.DataFrame(columns).to_csv(path, index=False)
-    return path
 
 
 def read(path: Path, **layout: Any) -> Episode:
@@ -81,20 +62,10 @@ def test_a_frame_an_arrow_table_and_a_dictionary_say_the_same(frame):
     np.testing.assert_array_equal(made.stream, wanted.stream)
 
 
-def test_channels_can_be_chosen():
-    assert Episode.from_table(log(0), channels=["torque", "q_1"]).spec.labels == ("q[1]", "torque")
-
-
 def test_a_memory_reads_its_channels_whatever_else_there_is_and_in_whatever_order():
     episode = Episode.from_table(log(0), action=["cmd*"])
     shuffled = dict(sorted(log(0).items(), reverse=True)) | {"more": np.zeros(ROWS), "note": np.array(["x"] * ROWS)}
     np.testing.assert_array_equal(Episode.from_table(shuffled, channels=episode.spec).stream, episode.stream)
-
-
-def test_two_dimensional_arrays_are_channels_of_several_numbers():
-    episode = Episode.from_table({"pose": np.zeros((4, 3)), "action": np.zeros((4, 2))}, rate=10)
-    assert episode.spec.labels == ("pose[0]", "pose[1]", "pose[2]", "action[0]", "action[1]")
-    assert list(episode.spec.motor) == [3, 4]
 
 
 @pytest.mark.parametrize(
@@ -114,6 +85,11 @@ def test_a_table_that_makes_no_sense_is_refused(change, arguments, message):
     columns = {name: values for name, values in {**log(0), **change}.items() if values is not None}
     with pytest.raises(ValueError, match=message):
         Episode.from_table(columns, **arguments)
+
+
+def test_commands_go_by_their_names():
+    assert all(map(is_command, ("target_q_0", "Desired Torque", "cmd", "motor_reference_3")))
+    assert not any(map(is_command, ("actual_q", "preference", "distance_to_goalkeeper")))
 
 
 def test_a_memory_says_what_a_log_lacks():
@@ -155,22 +131,6 @@ def test_the_noise_and_the_step_of_a_sense_are_found():
         assert resolution(smooth) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("name", "commanded"),
-    [
-        ("target_q_0", True),
-        ("Desired Torque", True),
-        ("cmd", True),
-        ("actual_q", False),
-        ("motor_reference_3", True),
-        ("preference", False),
-        ("distance_to_goalkeeper", False),
-    ],
-)
-def test_commands_go_by_their_names(name, commanded):
-    assert is_command(name) is commanded
-
-
 # ------------------------------------------------------------------ clocks
 
 
@@ -182,14 +142,10 @@ def test_commands_go_by_their_names(name, commanded):
     ],
 )
 def test_a_clock_is_known_by_its_name_whatever_the_case(name, unit):
+    assert clock_among(["T", "temperature", "torque_t", "target", "timestep_error", "wrist.t", "timeout"]) is None
     found = clock_among(["q", name])
     assert found is not None
     assert (found.column, found.unit) == (name, unit)
-
-
-@pytest.mark.parametrize("name", ["T", "temperature", "torque_t", "target", "timestep_error", "wrist.t", "timeout"])
-def test_what_senses_something_is_no_clock(name):
-    assert not is_clock(name)
 
 
 @pytest.mark.parametrize(
@@ -227,23 +183,12 @@ def test_the_period_is_the_mean_step_and_gaps_and_lost_rows_are_none_of_it():
     assert period(with_a_gap) == pytest.approx(np.diff(jittering).mean(), rel=1e-3)
 
 
-def test_rows_that_come_on_time_are_left_as_they_are():
-    t = np.arange(50) * 0.02 + np.random.default_rng(0).uniform(-0.003, 0.003, 50)
-    rows = np.arange(50.0)[:, None]
-    assert evenly(rows, t, 0.02) is rows
-
-
 def test_rows_that_were_lost_are_marked_and_the_others_keep_their_place_and_values():
     kept = np.delete(np.arange(50), [10, 11, 30])
     out = evenly(np.stack([kept, -kept], axis=1).astype(float), kept * 0.02, 0.02)
     assert len(out) == 50
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(out[:, 0])), [10, 11, 30])
     np.testing.assert_array_equal(out[kept], np.stack([kept, -kept], axis=1))
-
-
-def test_a_clock_that_runs_a_little_fast_moves_no_row():
-    t = np.arange(5000) * 0.0201
-    assert len(evenly(t[:, None], t, 0.02)) == 5000
 
 
 def test_rows_at_odd_times_are_interpolated_and_gaps_are_not():
@@ -312,21 +257,6 @@ def test_labels_are_asked_for_by_name_and_words_of_them_are_read(tmp_path):
     path = written(tmp_path / "x.csv", "time,q,state\n0,1,ok\n1,2,crash\n2,3,ok\n3,4,normal\n")
     assert not read(path).faults.any()
     np.testing.assert_array_equal(read(path, labels=["state"]).faults, [False, True, False, False])
-
-
-def test_labels_keep_their_rows_where_rows_are_put_right():
-    t = np.delete(np.arange(50) * 0.02, [10, 11])
-    wrong = (t > 0.5).astype(int)
-    found = read_recorded({"time": t, "q": t, "anomaly": wrong})
-    assert found.spec.labels == ("q",)
-    np.testing.assert_array_equal(found.faults, np.arange(50) * 0.02 > 0.5)
-
-
-def test_an_empty_cell_is_a_lost_number_and_a_column_of_words_is_left_out(tmp_path):
-    (tmp_path / "x.csv").write_text("a,word\n1,go\n,\n3,stop\n")
-    (columns,) = [read_text(tmp_path / "x.csv")]
-    assert list(columns) == ["a"]
-    np.testing.assert_array_equal(columns["a"], [1, np.nan, 3])
 
 
 @pytest.mark.parametrize(
@@ -448,7 +378,7 @@ def test_every_format_of_a_table_gives_the_same_rows(tmp_path):
     wanted = Episode.from_table(columns, action=["cmd*"])
     arrays = {"time": columns["time"]} | {n: np.stack([columns[f"{n}_{k}"] for k in (0, 1)], 1) for n in ("q", "cmd")}
     arrays["torque"] = columns["torque"]
-    write_csv(tmp_path / "a.csv", columns)
+    pd.DataFrame(columns).to_csv(tmp_path / "a.csv", index=False)
     pq.write_table(pa.table(columns), tmp_path / "b.parquet")
     pq.write_table(pa.table({n: pa.array(v.tolist()) for n, v in arrays.items()}), tmp_path / "c.parquet")
     np.savez(tmp_path / "d.npz", **arrays)
@@ -473,40 +403,6 @@ def test_a_file_of_any_kind_that_is_none_is_named(suffix, content, tmp_path):
     (tmp_path / f"no{suffix}").write_bytes(content)
     with pytest.raises(ValueError, match=rf"no\{suffix}: ."):
         read(tmp_path / f"no{suffix}")
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda raw: raw[: len(raw) // 2], r"x\.parquet"),
-        (lambda raw: b"", r"x\.parquet"),
-        (lambda raw: b"PAR1" + raw[4:-8] + b"\xff\xff\xff\x7fPAR1", r"x\.parquet"),
-    ],
-)
-def test_a_damaged_parquet_file_is_named(damage, message, tmp_path):
-    path = tmp_path / "x.parquet"
-    pq.write_table(pa.table(log(0)), path)
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ValueError, match=message):
-        list(read_logs(path))
-
-
-def test_a_damaged_header_of_an_array_is_one_line(tmp_path):
-    path = tmp_path / "x.npy"
-    np.save(path, np.zeros((20, 3), np.float32))
-    whole = path.read_bytes()
-    rng = np.random.default_rng(0)
-    said = []
-    for _ in range(300):
-        raw = bytearray(whole)
-        raw[rng.integers(0, 128)] ^= 1 << rng.integers(0, 8)
-        path.write_bytes(bytes(raw))
-        try:
-            read(path, rate=10.0)
-        except ValueError as error:
-            said.append(str(error))
-    assert len(said) > 100
-    assert all(line.startswith(f"{path}: ") and "\n" not in line for line in said)
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,6 @@ def read_bag(path: Path) -> Columns:
 
     Raises:
         ValueError: it is damaged, or has no JointState; the message lists its topics.
-        ImportError: rosbags is not installed.
     """
     regular_file(path)
     highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))

@@ -105,15 +105,7 @@ def read_recorded(
 
 
 def table_of(frame: Any) -> dict[str, NDArray[Any]]:
-    """Return all columns of a table by name, (T,) or (T, k).
-
-    Args:
-        frame: a dictionary of columns, a frame of pandas or Polars, or an Arrow table.
-
-    Raises:
-        TypeError: it is none of these.
-        ValueError: two columns have one name.
-    """
+    """Return the columns, (T,) or (T, k), of a dictionary, a frame of pandas or Polars, or an Arrow table by name."""
     names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
     if names is None or callable(names):
         raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}")
@@ -133,15 +125,12 @@ def as_array(column: Any) -> NDArray[Any]:
 def columns_of(
     table: Mapping[str, NDArray[Any]], labels: Sequence[str] = (), senses: Collection[str] = ()
 ) -> list[Column]:
-    """Decide for every column of a table what is done with it; of arrays (T, k) each column is one.
+    """Decide for every column (T,) or (T, k) of a table what is done with it; k columns are made of the latter.
 
     Args:
-        table: columns (T,) or (T, k).
+        table: columns by name.
         labels: patterns of the columns that say what is wrong, beside those that are called so.
         senses: names of columns that are senses, whatever they are called.
-
-    Raises:
-        ValueError: two columns that are read have one name.
     """
     parts = {name: values.T if values.ndim == 2 else [values] for name, values in table.items() if values.ndim < 3}
     roles = {n: "sense" if n in senses else role_of(n, np.asarray(p[0]), labels) for n, p in parts.items() if len(p)}

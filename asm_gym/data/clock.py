@@ -53,11 +53,7 @@ class Clock(NamedTuple):
     unit: float | None = None  # seconds in one of its numbers; None where its name does not say
 
     def seconds(self, values: NDArray[Any]) -> Floats:
-        """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits.
-
-        Raises:
-            ValueError: it holds no times, or may count anything.
-        """
+        """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits."""
         if values.dtype.kind == "M":
             return np.asarray((values - values[:1]) / np.timedelta64(1, "ns"), np.float64) * 1e-9
         if values.dtype.kind not in "biuf":
@@ -137,9 +133,6 @@ def period(times: Floats) -> float | None:
 
     Where nearly all steps are whole multiples of the median, rows were lost between those that are more than one;
     elsewhere the clock jitters, and only steps that are far longer are gaps.
-
-    Raises:
-        ValueError: time does not increase.
     """
     if len(times) < 2:
         return None
@@ -163,11 +156,7 @@ def period(times: Floats) -> float | None:
 
 
 def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
-    """Return rows (T, D) as rows that are ``dt`` [s] apart, NaN where one was lost; unchanged where they are.
-
-    Raises:
-        ValueError: more rows are missing than can have been lost.
-    """
+    """Return rows (T, D) as rows that are ``dt`` [s] apart, NaN where one was lost; unchanged where they are."""
     steps = np.diff(times) / dt
     whole = np.rint(steps)
     size = int(np.sum(steps)) + 1

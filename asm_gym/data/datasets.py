@@ -43,14 +43,14 @@ def require_minari() -> None:
 def write_dataset(
     root: Path, dataset_id: str, episodes: Sequence[Episode], env: gym.Env[Any, Any], details: dict[str, Any]
 ) -> Path:
-    """Write episodes as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
+    """Write episodes of one spec as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
 
     Args:
         root: the folder of all datasets.
         dataset_id: such as ``asm_gym/lift-v0``.
-        episodes: of one spec.
+        episodes: with an action, a reward and a flat observation of every step.
         env: that they were recorded in.
-        details: JSON-serialisable; kept in the metadata, for example versions.
+        details: JSON-serialisable; kept in the metadata.
 
     Raises:
         ValueError: episodes are missing, incomplete or of several specs; the name leads out of ``root``, or to a folder
@@ -150,20 +150,15 @@ def _hdf5(episodes: Sequence[Episode]) -> bytes:
 
 
 @typed
-def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None = None) -> list[Episode]:
-    """Return the episodes of a Minari dataset, whoever recorded them.
-
-    Where it holds no stream, observation and action are the stream, as in ``StreamSpec.from_spaces``.
+def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
+    """Return the episodes of a Minari dataset; without streams, observation and action are the stream.
 
     Args:
         path: the folder that holds ``metadata.json``, or one with a single dataset anywhere below it.
         env_id: what the dataset must have been recorded in.
-        dt: control period of a dataset that does not say its own [s]; by default that of the environment where it
-            can be made here, or else 1.
 
     Raises:
         FileNotFoundError: there is no dataset.
-        TypeError: its spaces are no Boxes, and it holds no stream.
         ValueError: the dataset is damaged, of another environment, or of one of ours without streams.
     """
     folder = _find_dataset(Path(path))
@@ -182,7 +177,7 @@ def read_dataset(path: str | Path, env_id: str | None = None, dt: float | None =
     found = dataset.env_spec.id if dataset.env_spec is not None else None
     if env_id is not None and found != env_id:
         raise ValueError(f"{folder} was recorded in {found}, not in {env_id!r}")
-    spec = _spec(folder, metadata, dataset, found, dt)
+    spec = _spec(folder, metadata, dataset, found)
     if not recorded:
         raise ValueError(f"{folder} holds no episode")
     return [_episode(folder, data, note, spec, spaces) for data, note in zip(recorded, notes, strict=True)]
@@ -216,7 +211,7 @@ def _check_whole(folder: Path) -> None:
         check_hdf5(folder / ARRAYS)
 
 
-def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | None, dt: float | None) -> StreamSpec:
+def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | None) -> StreamSpec:
     if "stream_spec" in metadata:
         try:
             return StreamSpec.from_json(metadata["stream_spec"])
@@ -224,10 +219,11 @@ def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | No
             raise ValueError(f"{folder} names its channels in a way that cannot be read: {error}") from error
     if env_id in {task.id for task in TASKS.values()}:
         raise ValueError(f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`")
-    if dt is None and env_id in gym.registry:  # how the file itself says to make it is not followed
+    dt = 1.0
+    if env_id in gym.registry:  # how the file itself says to make it is not followed
         with suppress(gym.error.Error, ImportError), closing(gym.make(env_id)) as env:
             dt = control_period(env)
-    return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt or 1.0)
+    return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt)
 
 
 def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, spaces: tuple[Any, Any]) -> Episode:

@@ -19,9 +19,6 @@ FEW_VALUES = 8
 JITTERS = 0.1
 """Share of a period that steps spread by from which on a clock jitters."""
 
-LISTED = 6
-"""Names in a remark."""
-
 TREATMENT = {
     "clock": "tells the rate; no channel",
     "label": "rows it marks are not learned from; no channel",
@@ -55,7 +52,7 @@ class Inspection(NamedTuple):
         clock, rows = self.clock, len(self.clock.times)
         seconds = float(np.ptp(clock.times)) if clock.rate and rows else 0.0
         rate = f"{clock.rate:.6g} Hz, jitter {100 * clock.jitter:.1f} %" if clock.rate else "no rate"
-        return f"{self.name}: {rows} rows, {in_time(seconds)}, {rate}, {len(clock.gaps)} gaps"
+        return f"{self.name}: {rows} rows, {seconds:.5g} s, {rate}, {len(clock.gaps)} gaps"
 
     def remarks(self) -> list[str]:
         """List what a user should know of the whole, a line each."""
@@ -68,36 +65,15 @@ class Inspection(NamedTuple):
             share, step = 100 * clock.jitter, 1e3 / clock.rate
             lines.append(f"the clock jitters by {share:.0f} % of a step: rows are put {step:.3g} ms apart")
         if len(clock.gaps):
-            longest = in_time(float(np.diff(clock.gaps, axis=1).max()))
-            lines.append(
-                f"{len(clock.gaps)} gaps in the clock, the longest {longest}: "
-                "those up to --bridge are filled, the log is cut at others"
-            )
+            longest = f"{len(clock.gaps)} gaps in the clock, the longest {np.diff(clock.gaps, axis=1).max():.3g} s"
+            lines.append(f"{longest}: those up to --bridge are filled, the log is cut at others")
         if all(c.role != "command" for c in self.columns):
             lines.append("no command by name: the memory learns without the arm's commands, unless fit --action says")
-        still = [c.name for c in self.columns if is_constant(c)]
-        if still:
-            more = ", …" if len(still) > LISTED else ""
-            lines.append(f"{len(still)} channels never move: {', '.join(still[:LISTED])}{more}")
         return lines
 
 
-def in_time(seconds: float) -> str:
-    """Return a duration in the unit that people would use."""
-    for unit, least in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * least:
-            return f"{seconds / least:.3g} {unit}"
-    return f"{seconds:.3g} s"
-
-
 def inspected(name: str, table: Mapping[str, NDArray[Any]], rate: float | None = None) -> Inspection:
-    """Describe a table.
-
-    Args:
-        name: where it was found.
-        table: (T,) or (T, k) each, as read from a file.
-        rate: rows a second [Hz], where its clock does not say.
-    """
+    """Describe a table of columns (T,) or (T, k); ``rate`` is in rows a second, where its clock does not say."""
     table = table_of(table)
     columns = columns_of(table)
     return Inspection(name, _clock(table, rate or 0.0), columns, list(map(_facts, columns)))

@@ -27,11 +27,7 @@ SENSED, COMMANDED = "observation.", "action"
 
 
 def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
-    """Yield the columns of each episode, its rate [Hz], and whether it succeeded (by default it did).
-
-    Raises:
-        ValueError: ``meta/info.json`` cannot be read, is of another version, or names what is not in the files.
-    """
+    """Yield the columns of each episode, its rate [Hz], and whether it succeeded (by default it did)."""
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         version, rate, features = info["codebase_version"], float(info["fps"]), dict(info["features"])

@@ -51,12 +51,7 @@ def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
         source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
             machine from itself, of which an empty one is the end, ``dds:/joint_states`` for topics of ROS 2.
         stdin: standard input.
-        silence: seconds without a line, after the first one, from which on the source has died.
-
-    Raises:
-        SourceDied: it has.
-        ValueError: it is none of these, the port is no number, or the file became shorter.
-        OSError: there is no such file, or the port is taken.
+        silence: seconds without a line, after the first one, from which on SourceDied is raised.
     """
     found = live_source(source)
     if found is None:
@@ -149,11 +144,7 @@ def _lines(more: Callable[[], bytes | None], silence: float) -> Iterator[str]:
 
 
 def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:
-    """Write rows to a file until the time is over or the source ends; return how long that took [s], and why it ended.
-
-    Raises:
-        ValueError: no row came.
-    """
+    """Write rows to a file until the time is over or the source ends; return the seconds, and why it ended."""
     to.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     why, seconds, rows = "the source ended", 0.0, 0

@@ -99,7 +99,7 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
             try:
                 ours = file.suffix == ".npz" and _is_episode(file)
                 episode = load_episode(file) if ours else layout.episode(FILES[file.suffix](file, layout))
-            except ValueError as error:
+            except (ValueError, zipfile.BadZipFile) as error:
                 raise ValueError(f"{file}: {error}") from error
             layout = replace(layout, spec=layout.spec or episode.spec)  # the others are read as the first one was
             yield Log(str(file.relative_to(root)) if file != path else file.name, episode)
@@ -123,12 +123,8 @@ def _files_at(path: Path) -> list[Path]:
 
 
 def _is_episode(path: Path) -> bool:
-    """Whether this package wrote an ``.npz``."""
-    try:
-        with zipfile.ZipFile(path) as file:
-            return "header.json" in file.namelist()
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"it is damaged: {error}") from error
+    with zipfile.ZipFile(path) as file:
+        return "header.json" in file.namelist()
 
 
 def read_tables(path: str | Path, layout: LogLayout) -> Iterator[tuple[str, Columns]]:

@@ -82,11 +82,7 @@ def ratio(unit: str, other: str) -> float | None:
 
 
 def factor(name: str, own: str, unit: str) -> float:
-    """Return how many of ``unit`` are in one of a column's own unit; 1 where either is unknown.
-
-    Raises:
-        ValueError: the two do not measure the same.
-    """
+    """Return how many of ``unit`` are in a column's ``own`` one; 1 where either is unknown, ValueError if unlike."""
     found = 1.0 if not own or unit == "1" else ratio(own, unit)
     if found is None:
         raise ValueError(f"{name} is in {own}, and the memory reads {unit}")
@@ -124,13 +120,7 @@ def is_counter(name: str, values: NDArray[Any]) -> bool:
 
 
 def role_of(column: str, values: NDArray[Any], labels: Sequence[str] = ()) -> str:
-    """Return the role of a column (T,): clock, label, words, counter, command or sense.
-
-    Args:
-        column: its name.
-        values: what it holds.
-        labels: patterns of the columns that say what is wrong, beside those that are called so.
-    """
+    """Return the role of a column (T,): clock, label, words, counter, command or sense; ``labels`` are patterns."""
     name, _ = split_unit(column)
     if is_clock(column):
         return "clock"

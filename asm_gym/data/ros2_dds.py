@@ -81,7 +81,6 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
     Raises:
         ValueError: no such names, or a topic is of another type, or ROS_DOMAIN_ID is no number.
         OSError: nobody publishes one of them, or no first row came.
-        SourceDied: nothing came for so long after a row.
     """
     names = [name.strip() for name in topics.split(",")]
     if not all(name.strip("/") for name in names):

@@ -50,11 +50,7 @@ class Pace:
         self._read = 0.0  # time of the last row that was read
 
     def lost(self, stamp: float) -> int | None:
-        """Return how many rows were lost before the one of this time [s]; None where it is not to be read.
-
-        Raises:
-            ClockWentBack: its time is not later than that of the row before.
-        """
+        """Return how many rows were lost before the one of this time [s]; None where it is not to be read."""
         before, self._before, self.change = self._before, stamp, ""
         self._rows += 1
         if before is None:
@@ -113,11 +109,7 @@ class RowReader:
         self._pace = Pace(spec.dt)
 
     def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
-        """Yield each row, and when its line came, by ``time.perf_counter``.
-
-        Raises:
-            ValueError: a line is no row; the message says which.
-        """
+        """Yield each row, and when its line came, by ``time.perf_counter``; ValueError names a line that is none."""
         for line in filter(str.strip, lines):
             arrived = time.perf_counter()
             self.line += 1

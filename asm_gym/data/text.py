@@ -52,7 +52,7 @@ class Dialect(NamedTuple):
 
     @classmethod
     def of(cls, line: str) -> Dialect:
-        """Tell by the first line of a table."""
+        """Return the dialect of a table by its first line."""
         counts = {mark: line.count(mark) for mark in SEPARATORS}
         best = ";" if counts[";"] else max(counts, key=lambda mark: counts[mark])
         separator = best if counts[best] else (" " if len(line.split()) > 1 else ",")
@@ -92,13 +92,12 @@ def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clo
     """Return the columns of numbers of a table of text; an empty cell is NaN, true and false are 1 and 0.
 
     Args:
-        path: of the file, in UTF-8 or UTF-16, or else in the encoding of Western Windows.
+        path: of the file.
         columns: names of the columns of a table without a header.
         keeps: whose words are kept, by name; other columns of words are left out.
 
     Raises:
-        ValueError: no header or no row, a name that stands twice, rows of several lengths, a column of numbers that
-            holds something else.
+        ValueError: it is no table: no header or no row, a name twice, rows of several lengths, words among numbers.
     """
     import pandas as pd
 
@@ -220,11 +219,7 @@ def _numbers(series: Mapping[str, pd.Series[Any]], keeps: KeepWords, comma: bool
 
 
 def read_json_lines(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clock) -> Columns:
-    """Return the columns of a file with an object, or a list of numbers, on each line; a missing number is NaN.
-
-    Raises:
-        ValueError: a line is neither; it names the line.
-    """
+    """Return the columns of a file with an object, or a list of numbers, on each line; a missing number is NaN."""
     import pandas as pd
 
     rows: list[dict[str, Any]] = []
@@ -245,11 +240,7 @@ def read_json_lines(path: Path, columns: Sequence[str] = (), keeps: KeepWords = 
 
 
 def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the values of a row of JSON by name: ``tool.force`` of an object within, ``q[0]`` of a list.
-
-    Raises:
-        ValueError: it is no object, nor a list as long as ``columns``.
-    """
+    """Return the values of a row of JSON by name: ``tool.force`` of an object within, ``q[0]`` of a list."""
     if isinstance(row, list):
         if len(row) != len(columns):
             raise ValueError(f"it is a list of {len(row)}, and {len(columns)} columns are named (--columns)")
