@@ -75,7 +75,8 @@ def table(facts: list[dict[str, Any]]) -> list[str]:
 
 
 def _cell(heading: str, fact: Any) -> str:
-    return FORMATS.get(heading, "{}").format(fact) if fact or heading in ("from", "to") else ""
+    known = fact == fact and (fact or heading in ("from", "to"))  # words have no range: NaN
+    return FORMATS.get(heading, "{}").format(fact) if known else ""
 
 
 def differences(first: Inspection, other: Inspection) -> str:

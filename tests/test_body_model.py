@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import re
-from pathlib import Path
 
 import mujoco
 import numpy as np
+import pandas as pd
 import pytest
 
 from asm_gym.data.selection import pieces
@@ -165,7 +164,8 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
 
 
 def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
-    write(tmp_path / "log.csv", recorded(60))
+    columns = {f"{n}_{k}": v for n, c in recorded(60).items() for k, v in enumerate(c.T if c.ndim > 1 else [c])}
+    pd.DataFrame(columns).rename(columns={"time_0": "time"}).to_csv(tmp_path / "log.csv", index=False)
     (tmp_path / "arm.urdf").write_text(arm())
     command = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "x.asm"), "--split", "1", "--quick"]
     command += ["--urdf", str(tmp_path / "arm.urdf")]
@@ -178,11 +178,3 @@ def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
     (tmp_path / "arm.urdf").write_text("<robot")
     assert main([*command, "--monitor", "association_values+evidence"]) == 2
     assert "arm.urdf: the body is no URDF" in capsys.readouterr().err
-
-
-def write(path: Path, columns: dict[str, np.ndarray]) -> None:
-    names = [f"{n}_{k}" for n, c in columns.items() for k in range(c.shape[1] if c.ndim > 1 else 1)]
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["time", *names[1:]])
-        rows.writerows(np.column_stack(list(columns.values())).tolist())

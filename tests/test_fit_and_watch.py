@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 from pathlib import Path
@@ -311,19 +310,8 @@ def test_a_memory_is_fitted_from_a_pipe(tmp_path, monkeypatch, capsys):
 # ------------------------------------------------------------------ few and long logs
 
 
-def write(path, seed, seconds):
-    rng, rows = np.random.default_rng(seed), int(seconds * 50)
-    q = np.sin(np.outer(np.arange(rows) / 50, [1.0, 1.7]) + rng.uniform(0, 6, 2)) + 1e-3 * rng.normal(size=(rows, 2))
-    torque = 3 * q + 0.01 * rng.normal(size=q.shape)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        out = csv.writer(file)
-        out.writerow(["time", "q_0", "q_1", "torque_0", "torque_1"])
-        out.writerows(np.column_stack([np.arange(rows) / 50, q, torque]).tolist())
-
-
 def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
-    write(tmp_path / "log.csv", 0, 120)
+    write_csv(tmp_path / "log.csv", log(0, 6000))
     rows = (tmp_path / "log.csv").read_text().splitlines()
     marked = [f"{row},{'fault' if n == 0 else int(2500 <= n < 2550)}" for n, row in enumerate(rows)]
     (tmp_path / "log.csv").write_text("\n".join(marked))

@@ -14,7 +14,7 @@ import pytest
 
 from asm_gym.data.gaps import Bridge, blamed, bridged, filled, reason
 from asm_gym.data.live import SourceDied, lines_from, live_source
-from asm_gym.data.rows import NEWEST, ClockWentBack, Pace, RowReader
+from asm_gym.data.rows import NEWEST, Pace, RowReader
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
@@ -178,11 +178,6 @@ def test_of_a_slower_source_nothing_is_judged_until_it_is_right_again():
     assert pace.kind == "right"
     assert found[NEWEST:100] == [None] * (100 - NEWEST)
     assert found[-30:] == [0] * 30
-
-
-def test_a_clock_that_goes_back_is_refused():
-    with pytest.raises(ClockWentBack, match=r"time must increase, got 1 s after 2 s"):
-        paced(np.array([0.0, 2.0, 1.0]))
 
 
 def test_a_bridge_goes_over_short_gaps_and_no_longer_or_frequent_ones():

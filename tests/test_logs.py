@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import pytest
 
 from asm_gym.data.clock import clock_among, evenly, period
 from asm_gym.data.logs import FILES, LogLayout, read_logs
-from asm_gym.data.names import is_clock, is_command
+from asm_gym.data.names import is_command
 from asm_gym.data.reader_notes import LogWarning
 from asm_gym.data.selection import normal_episodes
 from asm_gym.data.text import read_text
@@ -27,9 +25,6 @@ from tests.needs import needs
 from tests.streams import arm_table as log
 
 RATE, ROWS = 50.0, 80
-
-REAL = Path(os.environ.get("ASM_GYM_REAL", "/nowhere"))
-"""A folder of recordings of real arms, which are published elsewhere."""
 
 
 def read(path: Path, **layout: Any) -> Episode:
@@ -303,12 +298,10 @@ def test_text_is_read_in_the_encodings_of_loggers(encoding, tmp_path):
         (",".join(f"x{k}" for k in range(10_000)) + "\n", [], "it has 10000 columns, and at most 8192"),
     ],
 )
-def test_text_that_is_no_table_is_refused_soon_and_in_one_line(text, columns, message, tmp_path):
+def test_text_that_is_no_table_is_refused_in_one_line(text, columns, message, tmp_path):
     path = written(tmp_path / "x.csv", text)
-    start = time.perf_counter()
     with pytest.raises(ValueError, match=message) as refused:
         read(path, columns=columns, rate=10.0)
-    assert time.perf_counter() - start < 5
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
 
@@ -403,23 +396,3 @@ def test_a_file_of_any_kind_that_is_none_is_named(suffix, content, tmp_path):
     (tmp_path / f"no{suffix}").write_bytes(content)
     with pytest.raises(ValueError, match=rf"no\{suffix}: ."):
         read(tmp_path / f"no{suffix}")
-
-
-@pytest.mark.parametrize(
-    ("place", "layout", "rate", "shape", "faults"),
-    [
-        ("ur3_cobotops/dataset_02052023.csv", {}, 0.9949, (26188, 20), 518),
-        ("tiago_figaroh/tiago_effort.csv", {}, 99.999, (8022, 8), 0),
-        ("staubli_tx40_figaroh/pos_read_data.csv", {"rate": 5000.0}, 5000.0, (45000, 6), 0),
-        ("unisa_acg/panda_exciting_trajectory.db3", {}, 29.9999, (727, 21), 0),
-        ("unisa_acg/ur10_exciting_trajectory.db3", {}, 125.0, (3441, 18), 0),
-    ],
-)
-def test_recordings_of_real_arms_are_read(place, layout, rate, shape, faults):
-    if not (REAL / place).exists():
-        pytest.skip(f"ASM_GYM_REAL names no folder with {place}")
-    episode = read(REAL / place, **layout)
-    assert episode.stream.shape == shape
-    assert 1 / episode.spec.dt == pytest.approx(rate, rel=1e-4)
-    assert episode.faults.sum() == faults
-    assert not any(is_clock(label) for label in episode.spec.labels)
