@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -55,27 +54,6 @@ def test_a_callback_finds_out_the_control_period():
     guarded = watched(range(20), length=20, on_alarm="hold")
     sb3.PPO("MlpPolicy", guarded, n_steps=20, batch_size=20).learn(20, callback=callback)
     assert callback.ended[0].override_s == pytest.approx(19 * 0.05)
-
-
-def test_a_loop_as_cleanrl_writes_it_sees_cost_and_episodes():
-    """Environments side by side, each recorded and clipped outside of the guard, as in its PPO."""
-
-    def make():
-        env = gym.wrappers.RecordEpisodeStatistics(watched())
-        return gym.wrappers.ClipAction(env)
-
-    envs = gym.vector.SyncVectorEnv([make, make], autoreset_mode=gym.vector.AutoresetMode.SAME_STEP)
-    envs.reset(seed=0)
-    costs, lengths = np.zeros(2), []
-    for _ in range(16):
-        _, _, _, _, infos = envs.step(np.zeros((2, 3), np.float32))
-        last = infos.get("final_info", infos)
-        costs += np.where(infos.get("_final_info", np.zeros(2, bool)), last["cost"], infos["cost"])
-        if "final_info" in infos:
-            lengths += infos["final_info"]["episode"]["l"].tolist()
-    assert lengths == [8] * 4
-    np.testing.assert_array_equal(costs, [6, 6])
-    envs.close()
 
 
 STEPS = 256

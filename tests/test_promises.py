@@ -192,22 +192,6 @@ def test_a_step_after_a_reset_that_failed_is_refused(many):
     env.step(np.zeros(env.action_space.shape, np.float32))
 
 
-def test_a_step_after_one_that_failed_is_refused():
-    class Breaking(FakeEnv):
-        def step(self, action):
-            if self.t == 1:
-                raise RuntimeError("no power")
-            return super().step(action)
-
-    env = NeuralASMSafety(Breaking(), CueMonitor())
-    env.reset()
-    env.step(ACT)
-    with pytest.raises(RuntimeError, match="no power"):
-        env.step(ACT)
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(ACT)
-
-
 # ---------------------------------------------------------------- many at once
 
 

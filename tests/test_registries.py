@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import asm_gym
-from asm_gym import collect, make_monitor, register_fault, register_policy, register_task
+from asm_gym import collect, register_fault, register_policy, register_task
 from asm_gym.faults import Push
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
@@ -16,7 +16,6 @@ from asm_gym.rollouts import parallel_map
 from asm_gym.synthetic_arm import SyntheticArm
 from asm_gym.tasks import OWN, env_id
 from tests.models import Persistence
-from tests.streams import sine_spec
 
 
 class Still:
@@ -61,16 +60,6 @@ def test_a_task_and_a_policy_of_ones_own_are_collected_by_workers():
     assert [len(e) for e in one] == [len(e) for e in two] == [12, 12]
     np.testing.assert_array_equal(one[1].stream, two[1].stream)
     assert not one[0].actions.any()
-
-
-def test_a_monitor_goes_by_its_module_too():
-    monitor = make_monitor("tests.test_composition:Persistence+squares", sine_spec())
-    assert (monitor.model.kind, monitor.detection.name) == ("persistence", "squares")
-    assert "persistence" in MONITORS  # its files are known by its kind
-    with pytest.raises(ValueError, match=r"tests\.test_composition has no 'Nobody'"):
-        make_monitor("tests.test_composition:Nobody", sine_spec())
-    with pytest.raises(ImportError, match="nowhere_at_all"):
-        make_monitor("nowhere_at_all:Monitor", sine_spec())
 
 
 @pytest.mark.parametrize(
