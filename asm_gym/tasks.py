@@ -109,7 +109,7 @@ def task(name: str) -> TaskSpec:
 
 
 def env_id(name: str) -> str:
-    """Return the Gymnasium id of a task or any environment. Raises ValueError or ImportError where it is not known."""
+    """Return the Gymnasium id of a task or any environment. Raises ValueError or ImportError where it is unknown."""
     if name in OWN:
         gym.registry[OWN[name].id] = OWN[name]  # which a worker has not done yet
         return OWN[name].id

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from asm_gym.memory.completion import Completion, sensors_of
+from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
@@ -49,14 +49,6 @@ def test_what_a_memory_saves_completes_the_same():
     assert Completion.found({}, SENSES) is None
     with pytest.raises(ValueError, match="completion_centre"):
         Completion.found({**MEMORY.named(), "completion_centre": np.zeros(3)}, SENSES)
-
-
-def test_a_joint_and_the_wrist_are_one_sensor_each():
-    spec = gym.make("asm_gym/Lift-v0").unwrapped.stream_spec
-    named = {name: [spec.labels[c] for c in columns] for name, columns in sensors_of(spec)}
-    assert named["encoder[3]"] == ["joint_position[3]", "joint_velocity[3]"]
-    assert len(named["wrist"]) == 12
-    assert sorted(c for columns in dict(sensors_of(spec)).values() for c in columns) == spec.sensory.tolist()
 
 
 def test_a_sense_is_repaired_until_it_is_well_again():
@@ -109,16 +101,6 @@ def test_surprise_without_a_sense_is_what_the_others_add_to_it():
     np.testing.assert_allclose(left.value, [3.0, 0.0, np.inf])  # what failed goes on to be an alarm
     np.testing.assert_allclose(left.attribution[:2].sum(axis=1), left.value[:2])
     assert surprise.without(np.zeros(3, bool)) is surprise
-
-
-def test_a_sense_that_is_completed_is_the_cause_no_more():
-    rows, diagnosis = arm(30, 8), Judge(()).diagnosis_
-    rows[-3:, 0] += 0.3
-    attribution = np.array([9.0, 0.1, 0.1, 0.1, 0, 0, 0])
-    assert diagnosis(rows, attribution).part == "observation[0]"
-    without = diagnosis(rows, attribution, missing(0))
-    assert without.part.startswith("observation")
-    assert 0 not in without.columns
 
 
 def played(env, steps):

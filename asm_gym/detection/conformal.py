@@ -63,10 +63,9 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
 
 
 class Promise(NamedTuple):
-    """The promise of a threshold set on nominal episodes.
+    """The promise of a threshold set on nominal episodes, or blocks by the hour.
 
-    If k of n maxima exceed the threshold, the share of fresh episodes (or blocks, by the hour) that alarm is
-    Beta(k + 1, n - k)-distributed (Vovk 2012, continuous maxima).
+    If k of n maxima exceed it, the share of fresh ones that do is Beta(k + 1, n - k)-distributed (Vovk 2012).
     """
 
     episodes: int  # that it was set on

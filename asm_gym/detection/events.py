@@ -55,8 +55,7 @@ class Excuses:
         return [self._wrist, self._joints, self._fingers, self._rows], self._ends
 
     def start(self, batch: int) -> NDArray[np.int64]:
-        """Return the state (B, 3 + J): rows left of the excuses of a knock, a stop and a finger; whether each joint may
-        be at its stop in the next row."""
+        """Return the state (B, 3 + J): rows left of each excuse, and which joints may be at their stops next."""
         left = np.ones((batch, 3 + len(self._joints)), np.int64)
         left[:, :3] = 0
         return left
