@@ -2,6 +2,8 @@
 
 import math
 from itertools import product
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from asm_gym.guard.arbiter import STATES, TRANSITIONS, Arbiter, Judged, Situation, State, following
-from asm_gym.guard.options import GuardOptions, ReleaseRule
+from asm_gym.guard.arbiter import STATES, Arbiter, Judged, Situation, State, following
+from asm_gym.guard.options import ReleaseRule
+from asm_gym.guard.reflexes import COMPLIANCE, Reflexes
 from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 ACTING = (State.POLICY, State.TRIAL)
 EVERYONE = np.ones(1, bool)
@@ -43,13 +47,6 @@ def test_every_alarm_of_the_policy_is_answered_with_something_that_is_said(state
             found = following(state, situation)
             assert found is not None, situation
             assert found.name, situation
-
-
-def test_nothing_leads_out_of_the_reflex_without_a_name_and_a_reason():
-    for t in TRANSITIONS:
-        assert t.why
-        if State.REFLEX in t.within and t.to is not None:
-            assert t.name
 
 
 def test_an_ended_episode_stays_ended():
@@ -156,14 +153,48 @@ def test_control_does_not_go_back_while_something_presses_though_surprise_is_low
     assert decide(0.0, touched=None) == "release"
 
 
-def test_graded_gives_up_after_seconds_and_not_steps():
-    rules = [GuardOptions().rule(True, dt, 1) for dt in (0.05, 0.01)]
-    assert [(r.try_after, r.max_override) for r in rules] == [(10, 60), (50, 300)]
-
-
 def test_an_episode_that_begins_leaves_the_other_robots_as_they_are():
     arbiter = Arbiter(2, ReleaseRule(), 1.0)
     for robot in range(2):
         arbiter.decide(robot, Judged(2.0, True, False, True, False, 0.0, False, False, NO_RESPONSE))
     arbiter.begin(np.array([True, False]))
     assert [STATES[s] for s in arbiter.state] == [State.POLICY, State.REFLEX]
+
+
+SPEC = StreamSpec((Channel("external_torque", 2), Channel("action", 2, group=MOTOR)), 0.05)
+
+
+def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> Reflexes:
+    robots: Any = SimpleNamespace(
+        count=1, rest=np.zeros(2, np.float32), refused=refused or {}, brakes=False, dt=0.05, turn=lambda _, turns: turns
+    )
+    made = Reflexes(robots, spec, on_alarm)
+    made.begin(np.ones(1, bool))
+    return made
+
+
+def test_retract_undoes_the_last_actions_newest_first_and_then_stays():
+    felt = reflexes("retract")
+    felt.path[0, -2:, 0], felt.steps[0] = (0.2, 0.3), 2
+    moves = [felt.move(0, "retract").action[0] for _ in range(3)]
+    np.testing.assert_allclose(moves, [-0.3, -0.2, 0.0], rtol=1e-6)
+
+
+def test_comply_gives_way_beyond_what_is_usual_and_tolerated():
+    felt = reflexes("comply")
+    felt.torque[0], felt.usual[0] = [5.0, -9.0], [0.0, -5.0]
+    beyond = np.array([3.0, -2.0])
+    np.testing.assert_allclose(felt.move(0, "comply").action, COMPLIANCE * 0.05 * beyond, rtol=1e-6)
+    felt.torque[0] = felt.usual[0]
+    assert not felt.move(0, "comply").action.any()
+
+
+def test_a_reflex_that_the_robots_cannot_do_is_refused_and_graded_stays_instead():
+    blind = StreamSpec((Channel("position", 2), Channel("action", 2, group=MOTOR)), 0.05)
+    with pytest.raises(ValueError, match="external_torque"):
+        reflexes("comply", blind)
+    with pytest.raises(ValueError, match="OSC_POSE"):
+        reflexes("retract", refused={"retract": "retract needs OSC_POSE"})
+    graded = reflexes("graded", blind)
+    graded.expected[0] = 0.7
+    assert not graded.move(0, "comply").action.any()

@@ -7,13 +7,11 @@ from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import collect
 from asm_gym.detection.contact_limits import UNKNOWN, ContactLimits, FamiliarSpeed, healthy_forces
-from asm_gym.guard.checks import limits_of
 from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.faults import OracleReflex
 from asm_gym.wrappers.robots import robots_of
 from tests.fakes import SPEC, CueMonitor
 
@@ -58,13 +56,6 @@ def test_limits_are_forgotten_by_reset_and_change_nothing_of_gentle_motion(lift)
     assert lift.unwrapped.contact_limits is None
 
 
-def test_who_only_watches_is_told_of_limits_and_neither_slowed_nor_stopped(lift):
-    alone, _ = down(lift, 40)
-    watched, said = down(NeuralASMSafety(lift, NeuralASM.pretrained("panda"), "monitor", on_overrun="ignore"), 40)
-    assert watched == alone
-    assert any(i["asm"]["reason"] == "contact" and i["cost"] for i in said)
-
-
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -85,19 +76,6 @@ def test_limits_of_another_arm_are_refused_at_construction(lift):
         NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits="none")
 
 
-def test_what_healthy_motion_was_seen_to_reach_counts_where_it_is_more(lift):
-    felt = lift.unwrapped.felt_channels
-    most = ContactLimits(healthy=(50.0, *[1.0] * 9)).most(felt)
-    np.testing.assert_array_equal(most, [50, *[40] * 6, 80, 80, 80])
-
-
-def test_a_force_range_that_was_never_calibrated_is_the_usual_one():
-    assert limits_of("memory", CueMonitor()) == ContactLimits()
-    unknown = CueMonitor()
-    unknown.healthy_, unknown.familiar_ = (), None
-    assert limits_of("memory", unknown) == ContactLimits()
-
-
 def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
     spec, yes, no = lift.unwrapped.stream_spec, np.ones(1, bool), np.zeros(1, bool)
     limits, rows = EpisodeLimits(robots_of(lift, spec)[0], spec, ContactLimits(), True, None), np.zeros((1, spec.size))
@@ -109,14 +87,6 @@ def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_
         limits.follow(rows, yes, no)
     assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
     assert told[20] == ContactLimits()
-
-
-def test_the_ideal_reflex_stops_at_what_the_simulator_knows(lift):
-    alone, _ = down(lift, 40)
-    stopped, said = down(OracleReflex(lift, beyond=40.0), 40)
-    assert stopped < 0.95 * alone
-    assert any(info["overridden"] for info in said)
-    assert not lift.unwrapped.substep_hooks
 
 
 def test_side_by_side_robots_are_stopped_as_each_alone():

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym.policies.reflexes import Hold
-from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.arms import ACT as ARM_ACT
 from tests.arms import Acting, Judge, infos
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
@@ -68,17 +68,6 @@ def test_numbers_that_are_lost_in_turn_hide_no_surprise(every):
         assert said[step + 1]["intervened"]
 
 
-def test_where_most_senses_are_missing_the_robot_holds_and_says_why():
-    def broken(t, row):
-        row[:3] = np.nan if t >= 20 else row[:3]
-
-    env = NeuralASMSafety(Acting(broken), Finite(()), "graded")
-    with pytest.warns(UserWarning, match="too much is missing"):
-        said = infos(env, 30)
-    assert said[20]["alarm"]
-    assert all(s["intervened"] for s in said[21:])
-
-
 # ---------------------------------------------------------------- whose reflex
 
 
@@ -98,23 +87,6 @@ def test_a_reflex_of_another_environment_is_refused_and_a_class_is_bound():
     made = []
     NeuralASMSafety(env, CueMonitor([1]), on_alarm=lambda e: made.append(e) or BackOff(e))
     assert made == [env]
-
-
-def test_what_a_spec_makes_anew_is_guarded_by_a_reflex_of_its_own():
-    gym.register("asm_gym_tests/Fake-v0", entry_point=FakeEnv)
-    try:
-        guarded = NeuralASMSafety(gym.make("asm_gym_tests/Fake-v0"), CueMonitor([1]), on_alarm=BackOff)
-        again = gym.make(guarded.spec)
-        again.reset(seed=0)
-        for _ in range(4):
-            again.step(ACT)
-        np.testing.assert_array_equal(again.unwrapped.actions, [ACT, ACT, [0, 0, 1], [0, 0, 1]])
-        bound = NeuralASMSafety(
-            gym.make("asm_gym_tests/Fake-v0"), CueMonitor([1]), on_alarm=Hold(FakeEnv(), np.zeros(3))
-        )
-        assert gym.make(bound.spec).reset(seed=0)  # an action of one's own belongs to no environment
-    finally:
-        del gym.registry["asm_gym_tests/Fake-v0"]
 
 
 # ---------------------------------------------------------------- copies
@@ -144,14 +116,6 @@ class Driver(FakeEnv):
         self.row[:] = info["stream"]
         self.info["stream"] = self.row
         return sensed, self.info
-
-
-def test_a_recorder_keeps_what_a_driver_said_though_it_uses_its_arrays_again():
-    env = StreamRecorder(Driver())
-    env.reset(seed=0)
-    for _ in range(4):
-        env.step(ACT)
-    np.testing.assert_array_equal(env.finish().stream[:, 0], [1, 2, 3, 4])
 
 
 def test_an_info_that_an_environment_uses_again_says_nothing_of_steps_before():

@@ -6,14 +6,12 @@ import pytest
 
 from asm_gym.guard.diagnosis import Alarm, Diagnostician
 from asm_gym.guard.responses import DEFAULT
-from asm_gym.guard.robots import Robots
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from tests.arms import ACT, Acting, Judge, Named, infos
-from tests.needs import needs
 
 SOLID = StreamSpec(
     (
@@ -158,10 +156,11 @@ def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure
 def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_motion(force, goes_on):
     monitor = Judge({10}, "object")
     diagnosis, spec = monitor.diagnosis_, monitor.spec
-    diagnostician = Diagnostician(Robots.unknown(spec), spec, diagnosis, DEFAULT, asked=True)
+    diagnostician = Diagnostician(spec, diagnosis, DEFAULT, asked=True)
     no, shares = np.zeros(spec.size, bool), np.full(spec.size, 1.0 / spec.size)
     rows = np.zeros((3, spec.size), np.float32)
-    alarm = Alarm(rows, shares, no, None, False, False, True, force, 0.1, True, ~no)
+    found = {"over": True, "knocked": False, "lost": False, "contradiction": None, "failed": False, "presses": False}
+    alarm = Alarm(rows, shares, no, **found, feels=True, force=force, speed=0.1, may_go_on=True, read=~no, completed=())
     assert diagnostician.respond(0, alarm)[0].name == ("go on" if goes_on else "hold")
 
 
@@ -180,18 +179,3 @@ def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
 def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
     with pytest.raises(ValueError, match=f"'{response}' would let an arm go on that presses: {cause} takes hold"):
         NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
-
-
-def test_the_force_of_a_push_is_found_where_it_pushes():
-    mujoco = needs("mujoco")
-    env = gym.make("asm_gym/Lift-v0", horizon=20)
-    env.reset(seed=0)
-    inner = env.unwrapped
-    model, data = inner.simulation.model, inner.simulation.data
-    body, force = model.body("robot0_link5").id, np.array([3.0, -8.0, 5.0])
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
-    link, found = inner.force_behind(jacobian[:, inner.simulation.dofs].T @ force)
-    assert link == "robot0_link5"
-    np.testing.assert_allclose(found, force, atol=0.5)
-    env.close()

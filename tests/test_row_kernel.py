@@ -1,5 +1,7 @@
 """A row in one compiled call, against the same equations in NumPy."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +13,12 @@ from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps
 from asm_gym.memory.energy import activate
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
+from asm_gym.memory.recall import continued
 from asm_gym.memory.state import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.acting import recall
 from asm_gym.monitors.calibrated_monitor import MonitorState
+from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.row_kernel import _ONE_THREAD
 from asm_gym.monitors.skills import name_skills
 from tests.streams import sine_episodes, sine_spec
@@ -167,3 +172,64 @@ def test_many_streams_leave_the_threads_of_blas_as_they_were():
         inside = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     assert set(inside) == {1}
     assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == before
+
+
+LAG = 3
+FAST = replace(sine_spec(), dt=0.05 / LAG)
+
+
+@pytest.fixture(scope="module")
+def fast() -> NeuralASM:
+    return NeuralASM(FAST, hidden_size=24, association_size=60, epochs=2).fit(sine_episodes(12, spec=FAST))
+
+
+@pytest.fixture(scope="module")
+def slow(fast) -> MemoryModel:
+    """The same weights, for a stream at the control rate."""
+    asm = NeuralASM(sine_spec(), hidden_size=24, association_size=60, epochs=2)
+    return asm.model.restore(fast.model.learned_)
+
+
+def told(model: MemoryModel, stream: np.ndarray) -> np.ndarray:
+    """(T, X) errors, row by row."""
+    state, errors = model.start(1), []
+    for row in stream.astype(np.float64):
+        state, output = model.predict(state, row[None])
+        errors.append(output.errors[0])
+    return np.array(errors)
+
+
+def test_every_third_row_feels_as_if_there_were_no_others(fast, slow):
+    stream = sine_episodes(1, seed=3)[0].stream
+    errors = told(fast.model, stream)
+    for first in range(LAG):
+        np.testing.assert_allclose(errors[first::LAG], told(slow, stream[first::LAG]), rtol=2e-5, atol=2e-6)
+    assert np.abs(errors[2 * LAG :]).max() > 0.1
+
+
+def test_a_whole_episode_is_read_as_its_rows_are(fast):
+    stream = sine_episodes(1, seed=4)[0].stream.astype(np.float64)
+    senses = fast.senses_
+    assert senses.lag == LAG
+    whole = senses.read_episode(stream)
+    for t in (0, LAG - 1, LAG, 2 * LAG - 1, 2 * LAG, 30):
+        before = stream[t - LAG] if t >= LAG else stream[t]
+        earlier = stream[t - 2 * LAG] if t >= 2 * LAG else before
+        one = senses.read(*(x[None] for x in (stream[t], before, earlier)))
+        np.testing.assert_array_equal(whole.inputs[t], one.inputs[0])
+
+
+def test_recall_goes_on_with_every_third_row(fast, slow):
+    cue = sine_episodes(1, seed=6)[0].stream[:16]
+    rows = recall(fast, cue, 7)
+    for turn in range(LAG):  # the cue's first row belongs to none of them
+        expected = continued(slow.network, slow.senses_, cue[1 + turn :: LAG], 3)
+        np.testing.assert_allclose(rows[turn::LAG], expected[: len(rows[turn::LAG])], rtol=1e-4, atol=1e-5)
+    with pytest.raises(ValueError, match="at least 6 rows long"):
+        recall(fast, cue[:5], 1)
+
+
+def test_episodes_too_short_to_have_a_change_are_refused():
+    short = sine_episodes(1, spec=FAST, steps=(LAG, LAG))
+    with pytest.raises(ValueError, match="episode 0 must be at least 4 steps long, got 3"):
+        NeuralASM(FAST).fit(short)

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.faults import Push
-from asm_gym.wrappers import FaultInjection
 
 ACTION = np.array([0.4, 0.2, -0.3, 0.1, 0.0, 0.2, -1.0], np.float32)
 WIDE = 1e6
@@ -102,14 +100,3 @@ def test_the_arm_stays_from_the_next_substep_on_whatever_its_controller(controll
     assert not said[:2].any()  # what was done last
     assert said[-1] == 1.0
     env.close()
-
-
-def test_a_push_of_20_newtons_is_felt_within_two_substeps(free):
-    robot = begin(free)
-    usual = np.abs(robot.felt).max(axis=0) + 2.0
-    pushed = FaultInjection(free, [Push(body="robot0_link5", newtons=20.0, onset=6, duration=4)])
-    robot = begin(pushed, 6)
-    robot.contact_limits = limits(usual)
-    *_, info = pushed.step(ACTION)
-    assert info["contact_left_s"] <= 0.004
-    pushed.undo_faults()

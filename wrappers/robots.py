@@ -157,7 +157,6 @@ def _known(
         limits_contact=bool(felt) and ask("contact_limits") is not None,
         read=None if places is None else places.shown,
         turn=(lambda i, turns: call("action_for", turns)[i]) if controller in DELTAS else None,
-        force_behind=(lambda i, torques: call("force_behind", torques)[i]) if felt else None,
         refused=refused,
     )
     return robots, places

@@ -269,8 +269,8 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
 
     def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
         """Say in ``info`` what became of a step."""
-        surprise = max(float(row.surprise.value[0]) for row in rows)
-        alarm = any(bool(row.alarm[0]) for row in rows)
+        surprise = max([float(row.surprise.value[0]) for row in rows])
+        alarm = True in [bool(row.alarm[0]) for row in rows]
         self._alarms += alarm
         if self._full:
             failed, done = self._failed, None if executed is None else np.array(executed)
@@ -279,5 +279,5 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
                 more = more | {"ceiling": running.ceiling, "level": running.level}
             info["asm"] = LazyInfo(lambda: report(rows, 0, self._spec, done, failed) | more)
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
-        info["asm_intervened"] = np.bool_(any(row.intervened[0] for row in rows))
+        info["asm_intervened"] = np.bool_(True in [bool(row.intervened[0]) for row in rows])
         info["cost_sum"] = np.float64(self._alarms)

@@ -8,7 +8,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.detection.kinematics import Chain
 from asm_gym.envs import compiled_substeps as kernels
@@ -221,24 +220,3 @@ class NominalDynamics:
             nominal = NominalViews(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)
             self._copy = model, data, nominal
         return self._copy[2]
-
-
-def force_behind(
-    model: mujoco.MjModel, data: mujoco.MjData, motors: NDArray[np.intp], dofs: NDArray[np.intp], torques: Any
-) -> tuple[str, NDArray[np.float64]]:
-    """Return the link on which a force would explain external torques (J,) [N m] best, and that force (3,) [N].
-
-    For a force F on link k, τ = J_kᵀ F, and no joint beyond k is loaded: of all links the one that leaves the least.
-    The arms' joints are those of actuators ``motors`` (J,), with ``dofs`` (J,) among the velocities.
-    """
-    best: tuple[float, str, NDArray[np.float64]] = (np.inf, "", np.zeros(3))
-    jacobian = np.zeros((3, model.nv))
-    for joint in model.actuator_trnid[motors, 0]:
-        link = int(model.jnt_bodyid[joint])
-        mujoco.mj_jacBodyCom(model, data, jacobian, None, link)
-        J = jacobian[:, dofs]  # (3, J)
-        force = np.linalg.lstsq(J.T, torques, rcond=1e-2)[0]
-        left = float(np.sum((torques - J.T @ force) ** 2))
-        if left < best[0]:
-            best = left, model.body(link).name, force
-    return best[1], best[2]

@@ -14,7 +14,7 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.backend import ObjectSensors
 from asm_gym.envs.edits import SimulatorEdits
-from asm_gym.envs.robots import PHYSICS_FREQ, force_behind
+from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.envs.senses import Reading, Senses
 from asm_gym.envs.sensors import Corruption
 from asm_gym.envs.simulation import Simulation
@@ -122,11 +122,6 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     def felt(self) -> NDArray[np.float64]:
         """(K, N) noiseless loads in each physics substep since the row began; see ``felt_channels``."""
         return self.simulation.felt
-
-    def force_behind(self, torques: NDArray[np.floating[Any]]) -> tuple[str, NDArray[np.float64]]:
-        """Return the link on which a force explains external torques (J,) [N m] best, and that force (3,) [N]."""
-        sim = self.simulation
-        return force_behind(sim.model, sim.data, sim.motors, sim.dofs, np.asarray(torques, np.float64))
 
     @property
     def motors(self) -> NDArray[np.intp]:

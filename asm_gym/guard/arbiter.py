@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection import AdaptiveThreshold
 from asm_gym.guard.options import ReleaseRule
 from asm_gym.guard.responses import GOING_ON, Response
 
@@ -122,16 +123,20 @@ class Arbiter:
         count: n.
         rule: when control is handed back; None where no reflex ever acts.
         threshold: what surprise must exceed for an alarm.
+        adaptive: how it follows the policies, from episode to episode; None where it does not.
     """
 
-    def __init__(self, count: int, rule: ReleaseRule | None, threshold: float) -> None:
+    def __init__(
+        self, count: int, rule: ReleaseRule | None, threshold: float, adaptive: AdaptiveThreshold | None = None
+    ) -> None:
+        self.running = None if adaptive is None else adaptive.start(threshold)
         self._rule, self._acts = rule or ReleaseRule(), rule is not None
         self.threshold = np.full(count, threshold)
         """(n,) of the episodes that run."""
         self.state = np.zeros(count, np.int8)
         """(n,) who acts next, a place in ``STATES``."""
         self.confirmed = np.zeros(count, bool)
-        """(n,) what alarmed in this episode went on while the reflex acted, and so was no habit of the policy."""
+        """(n,) an alarm in this episode was no false one: it went on while the reflex acted, or the user says so."""
         self.counts = np.zeros((len(COUNTS), count), np.int64)
         """(10, n) rows and strikes, in the order of ``COUNTS``."""
         self.largest = np.full(count, -np.inf)
@@ -143,6 +148,11 @@ class Arbiter:
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
+        for robot in np.flatnonzero(which) if self.running is not None else ():
+            if self.largest[robot] > -np.inf:
+                largest, confirmed = float(self.largest[robot]), bool(self.confirmed[robot])
+                self.running.follow(largest, float(self.threshold[robot]), confirmed)
+                self.threshold[robot] = self.running.value
         self.counts[:ROWS, which] = 0
         self.state[which], self.largest[which] = POLICY, -np.inf
         self.confirmed[which] = self._on_trial[which] = False

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from asm_gym.detection.contact_limits import ContactLimits, FamiliarSpeed
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM, pretrained_for
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
@@ -26,17 +25,6 @@ class Watches(Protocol):
     def initial_state(self, batch: int = 1) -> Any: ...
 
     def observe(self, state: Any, stream: Any) -> Any: ...
-
-
-@runtime_checkable
-class KnowsHealthyForces(Protocol):
-    """A monitor whose calibration episodes have shown what healthy motion feels like."""
-
-    healthy_: tuple[float, ...]
-    """(N,) the most that it reached, of each number that an arm feels [N m], [N]; empty where that is not known."""
-
-    familiar_: FamiliarSpeed | None
-    """How fast it went at each place; None where that is not known."""
 
 
 class Fitted(NamedTuple):
@@ -120,30 +108,6 @@ def shipped_memory(whose: object, watched: StreamSpec, controller: str = "") -> 
     memory = NeuralASM.pretrained(pretrained_for(watched, controller))
     LOG.info("watching %s with %r", whose, memory)
     return memory
-
-
-def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> ContactLimits | None:
-    """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones."""
-    if contact_limits is None or isinstance(contact_limits, ContactLimits):
-        return contact_limits
-    return ContactLimits(healthy=monitor.healthy_ if isinstance(monitor, KnowsHealthyForces) else ())
-
-
-def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed | None:
-    """Return how fast a hand has gone at each place, where ``limits`` ask for that; None where they do not.
-
-    Raises:
-        ValueError: they do, and the monitor does not know.
-    """
-    if limits is None or not limits.by_place:
-        return None
-    known = monitor.familiar_ if isinstance(monitor, KnowsHealthyForces) else None
-    if known is None:
-        raise ValueError(
-            "by_place needs a monitor that knows how fast the hand healthily goes where: "
-            "calibrate it on episodes whose stream holds hand_position and hand_velocity"
-        )
-    return known
 
 
 class ExchangesMonitor:

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robots import named
 from asm_gym.memory.completion import Completion
-from asm_gym.spec import StreamSpec
 
 PRESSING = 2.5
 """Something presses where an external torque is so many of its completion's standard deviations off."""
@@ -22,14 +21,15 @@ class ContactEstimator:
     """Tells what presses, by one completion of all that a contact shows in.
 
     Args:
-        robots: they say, where they can, which force is behind the torques.
         completion: of the memory that watches; its stream measures external torques.
     """
 
-    def __init__(self, robots: Robots, completion: Completion) -> None:
+    def __init__(self, completion: Completion) -> None:
         spec = completion.spec
-        self._completion, self._dt, self._robots = completion, spec.dt, robots
-        self._filling = completion.filling(_contact_columns(spec))
+        self._completion, self._dt = completion, spec.dt
+        # Where a contact shows: in external torques, their peaks too, and in forces and torques at the wrist.
+        shows = ["external_torque" in c.name or c.group == "wrench" for c in spec.channels for _ in range(c.size)]
+        self._filling = completion.filling(np.array(shows, bool))
         self._own = np.isin(self._filling.columns, named(spec, "external_torque"))
         self._joints = named(spec, "joint_position")
 
@@ -58,24 +58,3 @@ class ContactEstimator:
             return bool(pressed.any() and still.all())
         labels = [self._completion.spec.labels[column].replace("joint_position", "joint") for column in self._joints]
         return bool((pressed & still)[[label == joint for label in labels]].any())
-
-    def force(self, robot: int, rows: NDArray[np.floating[Any]]) -> dict[str, Any] | None:
-        """Return the link that is pressed in the last of the rows (T, D), and the force (3,) [N] on it in the world."""
-        if self._robots.force_behind is None:
-            return None
-        torques = self.beyond(rows[-2:])[-1] * self._filling.error[self._own]
-        link, force = self._robots.force_behind(robot, torques)
-        return {"link": link, "newtons": float(np.linalg.norm(force)), "vector": force.round(3).tolist()}
-
-
-def named(spec: StreamSpec, channel: str) -> NDArray[np.intp]:
-    """Return (J,) the columns of a channel, of all arms."""
-    return np.array([i for i, label in enumerate(spec.labels) if label.split("[")[0].endswith(channel)], np.intp)
-
-
-def _contact_columns(spec: StreamSpec) -> NDArray[np.bool_]:
-    """Return (D,) what a contact shows in: external torques, their peaks too, and forces and torques at the wrist."""
-    groups = [c.group for c in spec.channels for _ in range(c.size)]
-    external = np.array(["external_torque" in label for label in spec.labels])
-    found: NDArray[np.bool_] = external | np.array([g == "wrench" for g in groups])
-    return found

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.guard.contact import ContactEstimator, named
+from asm_gym.guard.contact import ContactEstimator
 from asm_gym.guard.hand import Contradiction
 from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, UNREAD, Response
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robots import NO_COLUMNS, named
 from asm_gym.guard.severity import FAST, FREE_FORCE
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
 from asm_gym.spec import StreamSpec
@@ -29,33 +29,33 @@ Mask = NDArray[np.bool_]
 
 
 class Alarm(NamedTuple):
-    """An alarming row of one robot.
+    """An alarming row of one robot."""
 
-    Attributes:
-        rows: (T, D) the last ones, the newest last.
-        attribution: (D,) where the surprise is.
-        known: (D,) what is completed, or right by the hand and its joints: it explains nothing.
-        contradiction: of hand and joints; None where there is none.
-        failed: monitor, stream or policy failed, so that nothing is known.
-        presses: the arm presses harder than healthy motion does.
-        feels: somebody would know if it pressed.
-        force: contact force [N].
-        speed: of the fastest hand [m/s].
-        may_go_on: the policy has not gone on in alarm for too long yet.
-        read: (D,) which columns the policy reads; None where senses cannot be completed.
-    """
+    rows: NDArray[np.float32]  # (T, D) the last ones, the newest last
+    attribution: Floats  # (D,) where the surprise is
+    known: Mask  # (D,) what is completed, or right by the hand and its joints: it explains nothing
+    over: bool  # surprise is over the threshold
+    knocked: bool  # it is but for a knock, which excuses it
+    lost: bool  # numbers are missing
+    contradiction: Contradiction | None  # of hand and joints
+    failed: bool  # monitor, stream or policy failed, so that nothing is known
+    presses: bool  # the arm presses harder than healthy motion does
+    feels: bool  # somebody would know if it pressed
+    force: float  # contact force [N]
+    speed: float  # of the fastest hand [m/s]
+    may_go_on: bool  # the policy has not gone on in alarm for too long yet
+    read: Mask | None  # (D,) which columns the policy reads; None where senses cannot be completed
+    completed: tuple[str, ...] | None  # the sensors that are completed; None where they cannot be
 
-    rows: NDArray[np.float32]
-    attribution: Floats
-    known: Mask
-    contradiction: Contradiction | None
-    failed: bool
-    presses: bool
-    feels: bool
-    force: float
-    speed: float
-    may_go_on: bool
-    read: Mask | None
+    @property
+    def certain(self) -> bool:
+        """Whether it is one whatever the surprise."""
+        return self.contradiction is not None or self.failed or self.presses
+
+    @property
+    def only_lost(self) -> bool:
+        """Whether nothing is wrong but missing numbers."""
+        return self.lost and not (self.certain or self.over or self.knocked or self.speed > FAST)
 
 
 @dataclass
@@ -78,19 +78,16 @@ class Diagnostician:
     """Finds the causes of alarms of n robots, and the responses to them.
 
     Args:
-        robots: whose.
         spec: of their streams.
         diagnosis: of the monitor; without one every cause is unknown.
         table: what is done about which cause, as ``responses_from`` gives it.
         asked: the table is followed; else causes are only named.
     """
 
-    def __init__(
-        self, robots: Robots, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool
-    ) -> None:
+    def __init__(self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool) -> None:
         self._spec, self._diagnosis, self._table, self._asked = spec, diagnosis, table, asked
         measured = diagnosis is not None and named(spec, "external_torque").size > 0
-        self._contact = ContactEstimator(robots, diagnosis.completion) if measured and diagnosis is not None else None
+        self._contact = ContactEstimator(diagnosis.completion) if measured and diagnosis is not None else None
         self.incidents: dict[int, _Incident] = {}
         """Of the robots that have not been calm for long enough."""
 
@@ -118,7 +115,14 @@ class Diagnostician:
 
     def respond(self, robot: int, alarm: Alarm) -> tuple[Response, NDArray[np.intp]]:
         """Return what is to be done about an alarm, and the columns to complete where it is ``"complete"``."""
+        if alarm.only_lost:
+            missing = Response("complete", _named("sensor", ", ".join(alarm.completed or ())), None, "sensor")
+            return NO_RESPONSE if alarm.completed is None else missing, NO_COLUMNS
         incident = self.incidents.setdefault(robot, _Incident())
+        if alarm.knocked and not alarm.certain:  # it presses no more: the arm is braked until the contact has gone
+            incident.touched, incident.calm = True, 0
+            name = "hold" if self._asked else ""
+            return Response(name, _named("contact"), self._touched(robot, alarm.rows), "contact"), NO_COLUMNS
         incident.calm, touched = 0, self._touched(robot, alarm.rows)
         incident.age()
         cause = self._cause(incident, alarm)
@@ -126,10 +130,10 @@ class Diagnostician:
         incident.touched = alarm.presses or (cause is not None and cause.family == "contact")
         incident.since.setdefault(PRESSING if alarm.presses else family, 0)
         case, name = self._looked_up(incident, family, cause, alarm)
-        said = as_info(cause, self._force(robot, family, alarm.rows))
+        said = as_info(cause)
         if cause is None or family != cause.family:
             said |= {"family": family, "part": ""}
-        columns = cause.columns if cause is not None and name == "complete" else np.zeros(0, np.intp)
+        columns = cause.columns if cause is not None and name == "complete" else NO_COLUMNS
         if not self._asked:
             return Response("", said, touched), columns
         return Response(name, said, touched, case), columns
@@ -137,18 +141,6 @@ class Diagnostician:
     def uncompleted(self, response: Response) -> Response:
         """Return what is done where the sensors at fault cannot be completed."""
         return response._replace(name=self._table["unknown"])
-
-    def missed(self, completed: tuple[str, ...]) -> Response:
-        """Return what is done about a row in which numbers are missing, and nothing else is wrong."""
-        said = as_info(None) | {"family": "sensor", "part": ", ".join(completed), "probability": 1.0}
-        return Response("complete", said, None, "sensor")
-
-    def knocked(self, robot: int, rows: NDArray[np.float32]) -> Response:
-        """Return what is done about a knock that presses no more: the arm is braked until the contact has gone."""
-        incident = self.incidents.setdefault(robot, _Incident())
-        incident.touched, incident.calm = True, 0
-        said = as_info(None) | {"family": "contact", "part": "", "probability": 1.0}
-        return Response("hold" if self._asked else "", said, self._touched(robot, rows), "contact")
 
     def _looked_up(self, incident: _Incident, family: str, cause: Cause | None, alarm: Alarm) -> tuple[str, str]:
         """Return the row of the table that holds, and the response."""
@@ -209,10 +201,10 @@ class Diagnostician:
         longest = LASTING.get("contact" if family == PRESSING else family, np.inf)
         return incident.since.get(family, 0) >= longest / self._spec.dt
 
-    def _force(self, robot: int, family: str, rows: NDArray[np.float32]) -> dict[str, Any] | None:
-        """Return what is behind a contact."""
-        known = family == "contact" and self._contact is not None and len(rows) >= 2
-        return self._contact.force(robot, rows[-2:]) if known and self._contact is not None else None
+
+def _named(family: str, part: str = "") -> dict[str, Any]:
+    """Return what ``info`` says of a cause beyond doubt."""
+    return as_info(None) | {"family": family, "part": part, "probability": 1.0}
 
 
 def _believed(incident: _Incident, newest: Cause) -> Cause:

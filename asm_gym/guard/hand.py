@@ -50,15 +50,10 @@ Mask = NDArray[np.bool_]
 
 
 class Contradiction(NamedTuple):
-    """Hand and joints contradict each other.
+    """Hand and joints contradict each other."""
 
-    Attributes:
-        part: the one sensor that explains it, such as ``encoder[3]``; empty where none does.
-        columns: (n,) of the stream, its own.
-    """
-
-    part: str
-    columns: NDArray[np.intp]
+    part: str  # the one sensor that explains it, such as ``encoder[3]``; empty where none does
+    columns: NDArray[np.intp]  # (n,) of the stream, its own
 
 
 class _Case:
@@ -106,7 +101,8 @@ class HandAgainstJoints:
         self._cases: dict[int, _Case] = {}
         how = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
         state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
-        self._arguments: tuple[Any, ...] = *how, *state
+        self.arguments: tuple[Any, ...] = *how, *state
+        """Of ``compare``, after the rows."""
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
@@ -114,10 +110,9 @@ class HandAgainstJoints:
         for robot in np.flatnonzero(which):
             self._cases.pop(int(robot), None)
 
-    def compare(self, rows: NDArray[np.float32]) -> list[int]:
-        """Take in the next rows (n, D) as they were sensed; return which robots' contradict themselves."""
-        some = _compare(rows, *self._arguments)
-        for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT]:
+    def contradicting(self, some: bool) -> list[int]:
+        """Return which robots' last rows contradict themselves; ``some`` do by ``compare``."""
+        for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT] if self._cases else ():
             del self._cases[robot]
         return np.flatnonzero(self._size_of > LIMIT).tolist() if some else []
 
@@ -138,8 +133,7 @@ class HandAgainstJoints:
         return found
 
     def vouched(self, robot: int) -> Mask:
-        """Return (D,) what is right by the last row: each tells the same of the hand, and of a joint's speed, and none
-        repeats itself."""
+        """Return (D,) what is right by the last row: all tell the same of hand and speeds, and none repeats itself."""
         J, right = len(self._q), np.zeros(self._size, bool)
         if self._whole[robot] < 2 or np.linalg.norm(self._mean[robot]) > LIMIT / 2:
             return right
@@ -211,8 +205,15 @@ class HandAgainstJoints:
         return found + late, float(left)
 
 
+def no_hand(count: int) -> tuple[Any, ...]:
+    """Return the arguments of ``compare`` for ``count`` robots without a hand that their joints tell of."""
+    none, each, whole = np.zeros((count, 0, 3)), np.zeros(count), np.zeros(count, np.int64)
+    geometry, late = (none, none, np.zeros((count, 3, 3))), (each, np.zeros((count, HAND)), 1.0, 1.0, LIMIT)
+    return NO_COLUMNS, *geometry, *late, np.zeros((count, HAND)), each, whole, none, whole, np.zeros((count, 0))
+
+
 @compiled
-def _compare(
+def compare(
     rows: Any,
     at: Any,
     axes: Any,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import PLACE, ContactLimits, FamiliarSpeed
 from asm_gym.guard.robots import Robots
+from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec
 
 CAREFUL = 1.0 / 3.0
@@ -21,6 +23,17 @@ CAREFUL_S = 1.0
 """For so long [s], counted while the policy acts."""
 
 Mask = NDArray[np.bool_]
+
+
+@runtime_checkable
+class KnowsHealthyForces(Protocol):
+    """A monitor whose calibration episodes have shown what healthy motion feels like."""
+
+    healthy_: tuple[float, ...]
+    """(N,) the most that it reached, of each number that an arm feels [N m], [N]; empty where that is not known."""
+
+    familiar_: FamiliarSpeed | None
+    """How fast it went at each place; None where that is not known."""
 
 
 class EpisodeLimits:
@@ -90,3 +103,27 @@ class EpisodeLimits:
             speeds = [self._familiar.at(place) for place in self._places]
             now = [limits and limits.stricter(1.0, speed) for limits, speed in zip(now, speeds, strict=True)]
         self.now = tuple(now)
+
+
+def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> ContactLimits | None:
+    """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones."""
+    if contact_limits is None or isinstance(contact_limits, ContactLimits):
+        return contact_limits
+    return ContactLimits(healthy=monitor.healthy_ if isinstance(monitor, KnowsHealthyForces) else ())
+
+
+def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed | None:
+    """Return how fast a hand has gone at each place, where ``limits`` ask for that; None where they do not.
+
+    Raises:
+        ValueError: they do, and the monitor does not know.
+    """
+    if limits is None or not limits.by_place:
+        return None
+    known = monitor.familiar_ if isinstance(monitor, KnowsHealthyForces) else None
+    if known is None:
+        raise ValueError(
+            "by_place needs a monitor that knows how fast the hand healthily goes where: "
+            "calibrate it on episodes whose stream holds hand_position and hand_velocity"
+        )
+    return known

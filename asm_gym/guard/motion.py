@@ -24,19 +24,12 @@ Mask = NDArray[np.bool_]
 
 
 class Command(NamedTuple):
-    """What is to be done in a step.
+    """What is to be done in a step."""
 
-    Attributes:
-        actions: (n, A) finite, in the action space.
-        brakes: (n,) the robot stays, whatever the action is.
-        overridden: (n,) something else than the policy's action is done.
-        failures: what failed when it was chosen, by robot.
-    """
-
-    actions: Floats32
-    brakes: Mask
-    overridden: Mask
-    failures: Mapping[int, str]
+    actions: Floats32  # (n, A) finite, in the action space
+    brakes: Mask  # (n,) the robot stays, whatever the action is
+    overridden: Mask  # (n,) something else than the policy's action is done
+    failures: Mapping[int, str]  # what failed when it was chosen, by robot
 
 
 class Motions:
@@ -107,25 +100,18 @@ class Motions:
             if idle[robot]:
                 executed[robot] = np.clip(0.0, robots.low, robots.high)
                 continue
-            said = ""
+            said, reacts = "", self._reflexes is not None or bool(self._policies)
             if refused[robot]:
                 said = f"policy: the action must be finite, got {short_repr(actions[robot].tolist())}"
                 self._warn(robot, said, "another is done instead")
-                if self._acts:
+                if reacts:
                     self._take_over(robot)
-                    self.start(robot, self._last[robot])
-            if self._acts:
-                executed[robot], brakes[robot], failed = self._reaction(robot, names[robot], seen)
-            else:
-                (executed[robot], brakes[robot]), failed = self._stay(robot, self._last[robot]), ""
+                self.start(robot, self._last[robot])
+            executed[robot], brakes[robot], failed = self._reaction(robot, names[robot] if reacts else None, seen)
             if said or failed:
                 failures[robot] = joined(said, failed)
         self._last[:] = executed
         return Command(executed, brakes, overridden, failures), refused
-
-    @property
-    def _acts(self) -> bool:
-        return self._reflexes is not None or bool(self._policies)
 
     def feel(self, rows: Floats32, executed: Floats32, intervened: Mask, active: Mask) -> Mapping[int, str]:
         """Let the reflexes feel rows (n, D) and what was executed (n, A); return what failed, by robot."""
@@ -146,16 +132,16 @@ class Motions:
                 self._warn(int(i), failures[int(i)], "it has not felt this row")
         return failures
 
-    def expect(self, expected: Floats32 | None) -> None:
+    def expect(self, expected: Floats32) -> None:
         """Take up what the memory expects to be commanded next (n, A)."""
-        if expected is not None and self._reflexes is not None:
+        if self._reflexes is not None:
             self._reflexes.expected = np.nan_to_num(expected)
 
-    def _reaction(self, robot: int, name: str, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
-        """Return what the reflex does, whether the robot brakes, and what failed; where it fails the robot stays."""
+    def _reaction(self, robot: int, name: str | None, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
+        """Return what is done, whether the robot brakes, and what failed; where nothing reacts the robot stays."""
         robots, before = self._robots, self._before[robot]
         try:
-            motion = self._asked(robot, name, seen)
+            motion = self._stay(before) if name is None else self._asked(robot, name, seen)
             action = as_float32(motion.action).reshape(-1)
             if action.shape != robots.rest.shape or not np.isfinite(action).all():
                 raise ValueError(f"a finite action of {robots.rest.size} numbers was needed, got {action}")
@@ -165,7 +151,8 @@ class Motions:
             # Whatever a user's policy does, an alarm must not end in no action.
             said = f"reflex: {error!r}"
             self._warn(robot, said, "the robot holds instead")
-            return *self._stay(robot, before), said
+            stay = self._stay(before)
+            return stay.action, stay.brakes, said
         return np.clip(action, robots.low, robots.high), motion.brakes, ""
 
     def _asked(self, robot: int, name: str, seen: Callable[[int], Any]) -> Motion:
@@ -184,11 +171,11 @@ class Motions:
         self._memory[robot], self._fresh[robot] = memory, False
         return Motion(np.array(action), keeps_grip=False)
 
-    def _stay(self, robot: int, executed: Floats32) -> tuple[Floats32, bool]:
+    def _stay(self, before: Floats32) -> Motion:
         action = self._robots.rest.copy()
         if self._robots.rests:
-            action[self._robots.grip] = executed[self._robots.grip]
-        return action, self._robots.brakes
+            action[self._robots.grip] = before[self._robots.grip]
+        return Motion(action, self._robots.brakes, keeps_grip=False)
 
 
 @partial(compiled, calls=(".",))

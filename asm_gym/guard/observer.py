@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.rows import Rows
 from asm_gym.monitors import ExpectsActions, ForgetsEvidence, LearnsOnTheJob, Monitor, NeuralASM, Surprise
 
 Mask = NDArray[np.bool_]
 
 
 class Observation(NamedTuple):
-    """What a monitor made of n rows.
+    """What a monitor made of n rows."""
 
-    Attributes:
-        surprise: infinite, and attributed to nothing, where there is a failure.
-        expected: (n, A) what is likely to be commanded next; None where nobody asks.
-        failures: what failed, by robot.
-        latency: of the monitor [s].
-    """
-
-    surprise: Surprise
-    expected: NDArray[np.float32] | None
-    failures: Mapping[int, str]
-    latency: float
+    surprise: Surprise  # infinite, and attributed to nothing, where there is a failure
+    expected: NDArray[np.float32] | None  # (n, A) what is likely to be commanded next; None where nobody asks
+    failures: Mapping[int, str]  # what failed, by robot
+    latency: float  # of the monitor [s]
 
 
 @runtime_checkable
@@ -44,16 +40,20 @@ class Observer:
     Args:
         monitor: fitted and calibrated.
         count: n.
+        rows: they know which surprise counts.
+        options: say what a late monitor is, and whether it learns on the job.
         recalls: the monitor is asked what it expects to be commanded.
     """
 
-    def __init__(self, monitor: Monitor, count: int, recalls: bool = False) -> None:
-        self._monitor, self._count, self._size = monitor, count, monitor.spec.size
+    def __init__(self, monitor: Monitor, count: int, rows: Rows, options: GuardOptions, recalls: bool) -> None:
+        self._monitor, self._count, self._size, self._rows = monitor, count, monitor.spec.size, rows
+        self._dt, self._on_overrun, self._rate = monitor.spec.dt, options.on_overrun, options.online_learning_rate
+        self._warm = self._said_late = False
         self._copies = not isinstance(monitor, NeuralASM)  # another's arrays may be buffers that it uses again
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
-        self._learns = monitor if isinstance(monitor, LearnsOnTheJob) else None
-        self._recalls = monitor if recalls and isinstance(monitor, ExpectsActions) else None
+        self._learns = monitor if isinstance(monitor, LearnsOnTheJob) and self._rate > 0 else None
+        self._recalls = monitor if isinstance(monitor, ExpectsActions) and recalls else None
         self.begin(np.ones(count, bool))
 
     def begin(self, which: Mask) -> None:
@@ -63,24 +63,45 @@ class Observer:
         elif which.any():
             self._state = choose(which, self._initial, self._state)
 
-    def observe(self, rows: NDArray[np.float32], failures: Mapping[int, str]) -> Observation:
-        """Judge the next rows (n, D), some of which may be no more than NaN by the failures that are known already."""
-        self._before, start, latency = self._state, time.perf_counter(), 0.0
+    def observe(self, rows: NDArray[np.float32], failures: Mapping[int, str], held: Mask, active: Mask) -> Observation:
+        """Return what counts of the surprise at the next rows.
+
+        Args:
+            rows: (n, D) as they are believed, perhaps not finite.
+            failures: that are known already, by robot.
+            held: (n,) the reflex acts.
+            active: (n,) whose rows count.
+        """
+        self._before, start, latency, expected = self._state, time.perf_counter(), 0.0, None
         try:
             state, surprise = self._monitor.observe(self._before, rows)
             latency = time.perf_counter() - start
-            surprise = self._checked(surprise)
-            expected = None if self._recalls is None else self._expected(self._recalls, state)
+            if self._copies:
+                surprise = self._copied(surprise)
+            if self._recalls is not None:
+                expected = self._expected(self._recalls, state)
             self._state = state
         except Exception as error:  # nothing has judged these rows
-            surprise = Surprise(np.zeros(self._count), np.zeros((self._count, self._size)))
-            everywhere = dict.fromkeys(range(self._count), f"monitor: {error!r}")
-            failures = {i: joined(failures.get(i, ""), said) for i, said in everywhere.items()}
-            return Observation(_infinite(surprise, failures), None, failures, latency)
+            surprise = Surprise(np.full(self._count, np.inf), np.zeros((self._count, self._size)))
+            failures = {i: joined(failures.get(i, ""), f"monitor: {error!r}") for i in range(self._count)}
         for i, value in enumerate(surprise.value.tolist()):
             if not value > -math.inf:  # NaN too
                 failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
-        return Observation(_infinite(surprise, failures) if failures else surprise, expected, failures, latency)
+        late, everyone = latency > self._dt and self._late(latency), all(active.tolist())
+        self._warm = True
+        if everyone and not (late or failures or self._rows.repairs or self._learns):
+            return Observation(surprise, expected, failures, latency)
+        surprise = self._rows.counted(_infinite(surprise, failures), failures)
+        if late:
+            surprise = surprise._replace(value=np.full(self._count, np.inf))
+        if self._learns is not None and not failures and not held.any():
+            try:
+                self._learns.adapt(self._before, rows, surprise, self._rate)
+            except Exception as error:
+                failures = dict.fromkeys(range(self._count), f"monitor: {error!r}")
+                surprise = surprise._replace(value=np.full(self._count, np.inf))
+        surprise = surprise if everyone else surprise.silenced(~active)
+        return Observation(surprise, expected, failures, latency)
 
     def amend(self, rows: NDArray[np.float32]) -> None:
         """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
@@ -100,26 +121,24 @@ class Observer:
             return f"monitor: {error!r}"
         return ""
 
-    def learn(self, rows: NDArray[np.float32], surprise: Surprise, rate: float) -> str:
-        """Let the monitor learn from the rows that were observed last; return what failed."""
-        try:
-            if self._learns is not None:
-                self._learns.adapt(self._before, rows, surprise, rate)
-        except Exception as error:
-            return f"monitor: {error!r}"
-        return ""
+    def _late(self, latency: float) -> bool:
+        """Return whether it is an alarm that the monitor took longer than a row lasts; the first row does not count."""
+        if self._warm and self._on_overrun == "warn" and not self._said_late:
+            self._said_late = True
+            said = f"the monitor took {1e3 * latency:.1f} ms for a row that lasts {1e3 * self._dt:.1f} ms"
+            warnings.warn(said, stacklevel=5)
+        return self._warm and self._on_overrun == "alarm"
 
-    def _checked(self, surprise: Surprise) -> Surprise:
+    def _copied(self, surprise: Surprise) -> Surprise:
+        """Return what another monitor than ours says in arrays of its own."""
+        value, attribution = np.array(surprise.value, np.float64), np.array(surprise.attribution, np.float64)
         shapes = (self._count,), (self._count, self._size)
-        value, attribution = surprise.value, surprise.attribution
-        if self._copies:
-            value, attribution = np.array(value, np.float64), np.array(attribution, np.float64)
         if (value.shape, attribution.shape) != shapes:
             raise ValueError(
                 f"a surprise must have values of shape {shapes[0]} and attributions of shape {shapes[1]}, "
                 f"got {value.shape} and {attribution.shape}"
             )
-        return surprise._replace(value=value, attribution=attribution) if self._copies else surprise
+        return surprise._replace(value=value, attribution=attribution)
 
     def _expected(self, monitor: ExpectsActions, state: Any) -> NDArray[np.float32]:
         expected = np.asarray(monitor.expected_action(state), np.float32)
@@ -149,6 +168,8 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
 
 def _infinite(surprise: Surprise, failures: Mapping[int, str]) -> Surprise:
     """Return it infinite, and attributed to nothing, where there are failures."""
+    if not failures:
+        return surprise
     value, attribution = surprise.value.copy(), surprise.attribution.copy()
     for robot in failures:
         value[robot], attribution[robot] = np.inf, 0.0

@@ -31,37 +31,21 @@ TRUST_S = 1.0
 """How long a sense that no other sense tells of is completed, by its last good value [s]."""
 
 
-LEANS_S = 0.4
-"""More than 40 N for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
-did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
-
-
 @dataclass(frozen=True)
 class ReleaseRule:
-    """When control is handed back, and when the episode ends.
+    """When control is handed back, and when the episode ends; None for never."""
 
-    Args:
-        release_after: calm steps after which control is handed back.
-        release_below: share of the threshold, in (0, 1], that surprise must be under to count as calm.
-        max_override: steps for which a reflex may act. Those before a hand-back after which the alarm is back within
-            ``release_after`` steps count too. None for no limit.
-        try_after: steps after which control is handed back on trial though surprise is not low; after each trial that
-            fails, twice as many. None for no trials.
-        free_after: steps without contact after which a contact is over though surprise is not low; after each
-            hand-back that was too early, twice as many.
-        strikes: how often the policy may pass a contact limit before the episode ends. None for no limit.
-        impulse: how much the arm may press in an episode, beyond healthy motion [N s]. None for no limit.
-        go_on: steps in alarm in an episode for which the policy may go on; the robot holds at all later alarms.
-    """
-
-    release_after: int = 10
-    release_below: float = 0.8
+    release_after: int = 10  # calm steps after which control is handed back
+    release_below: float = 0.8  # share of the threshold, in (0, 1], that surprise must be under to count as calm
     max_override: int | None = None
+    """Steps for which a reflex may act, those before a hand-back after which the alarm was soon back included."""
     try_after: int | None = None
+    """Steps after which control is handed back on trial; after each trial that fails, twice as many."""
     free_after: int = 5
-    strikes: int | None = None
-    impulse: float | None = None
-    go_on: int = 100
+    """Steps without contact after which a contact is over; after each hand-back that was too early, twice as many."""
+    strikes: int | None = None  # how often the policy may pass a contact limit before the episode ends
+    impulse: float | None = None  # how much the arm may press in an episode, beyond healthy motion [N s]
+    go_on: int = 100  # steps in alarm for which the policy may go on in an episode; at all later alarms it is held
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robots import Robots, named
 from asm_gym.spec import StreamSpec
 
 Mask = NDArray[np.bool_]
@@ -32,17 +32,11 @@ TOLERATED_ALONE = 2.0
 
 
 class Motion(NamedTuple):
-    """What a reflex does next.
+    """What a reflex does next."""
 
-    Attributes:
-        action: (A,).
-        brakes: the robot stays, whatever the action is.
-        keeps_grip: the grippers are told what they were told before the override.
-    """
-
-    action: NDArray[np.float32]
-    brakes: bool = False
-    keeps_grip: bool = True
+    action: NDArray[np.float32]  # (A,)
+    brakes: bool = False  # the robot stays, whatever the action is
+    keeps_grip: bool = True  # the grippers are told what they were told before the override
 
 
 class Reflexes:
@@ -60,7 +54,7 @@ class Reflexes:
     def __init__(self, robots: Robots, spec: StreamSpec, on_alarm: str) -> None:
         n, actions = robots.count, robots.rest.size
         wanted = ("hold", "retract", "comply") if on_alarm == GRADED else (on_alarm,)
-        self.torques = _columns(spec, "external_torque")
+        self.torques = named(spec, "external_torque")
         """(J,) columns of external torques."""
         lacks = dict(robots.refused)
         if not self.torques.size:
@@ -75,12 +69,11 @@ class Reflexes:
         """One of them depends on what was felt and done."""
         self.robots = robots
         self.tolerated = TOLERATED.get(on_alarm, TOLERATED_ALONE)
+        # (n, J) external torque now, and what is usual while the policy acts [N m]
         self.torque, self.usual = np.zeros((n, len(self.torques))), np.zeros((n, len(self.torques)))
-        """(n, J) external torque now, and what is usual while the policy acts [N m]."""
+        # (n, PATH, A) what the policy did last, the newest last, and (n,) how much of it there is
         self.path, self.steps = np.zeros((n, PATH, actions), np.float32), np.zeros(n, np.int64)
-        """(n, PATH, A) what the policy did last, the newest last, and how much of it there is."""
-        self.expected = np.zeros((n, actions), np.float32)
-        """(n, A) what the memory expects to be commanded next."""
+        self.expected = np.zeros((n, actions), np.float32)  # (n, A) what is likely to be commanded next
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
@@ -128,10 +121,3 @@ REFLEXES: dict[str, Callable[[Reflexes, int], Motion]] = {
     "recall": recall,
 }
 """Reflexes by name."""
-
-
-def _columns(spec: StreamSpec, ending: str) -> NDArray[np.intp]:
-    """(N,) columns of the channels whose names end so."""
-    found = [np.arange(spec.size)[s] for name, s in spec.slices.items() if name.endswith(ending)]
-    columns: NDArray[np.intp] = np.concatenate([np.zeros(0, np.intp), *found]).astype(np.intp)
-    return columns

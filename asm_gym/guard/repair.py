@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.guard.hand import HandAgainstJoints
+from asm_gym.guard.robots import NO_COLUMNS
 from asm_gym.memory.completion import Completion, Filling
 
 WELL_AFTER_S = 1.0
@@ -90,10 +91,7 @@ class Repair:
 
     @property
     def trusted(self) -> bool:
-        """Whether the policy can rely on it.
-
-        False once a sense that no other sense tells of is missing for long, any for very long, or too many at a time.
-        """
+        """False once a sense that no other tells of is missing for long, any for very long, or too many at a time."""
         sensory = self._spec.sensory
         few = self.missing[sensory].mean() <= MOST_MISSING if len(sensory) else True
         return bool(few and self._unchecked <= self._patience and max(self._age.values(), default=0) <= self._longest)
@@ -105,8 +103,7 @@ class Repair:
 
     @property
     def unjudged(self) -> Mask:
-        """(D,) the numbers that surprise nobody: those that are missing, or were so recently that their changes are
-        taken from what was completed."""
+        """(D,) the numbers that surprise nobody: they are missing, or their changes are those from completed ones."""
         return self.missing | (self._returned > 0)
 
     def next(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
@@ -128,8 +125,7 @@ class Repair:
         return repaired.astype(np.float32)
 
     def suspect(self, columns: NDArray[np.intp]) -> NDArray[np.float32] | None:
-        """Return the last row (D,) with the sensors of ``columns`` completed too; None where that leaves nothing to go
-        by."""
+        """Return the last row (D,) with the sensors of ``columns`` completed too; None where that leaves nothing."""
         wanted = self.missing.copy()
         wanted[columns] = True
         if wanted[self._spec.sensory].all() or not (wanted & ~self.missing).any():
@@ -148,10 +144,9 @@ class Repair:
 
     def _choose(self) -> None:
         """Take up which sensors are missing."""
+        columns = [own for name, own in self._completion.sensors if name in self._well]
         self.missing = np.zeros(self._spec.size, bool)
-        for name, own in self._completion.sensors:
-            if name in self._well:
-                self.missing[own] = True
+        self.missing[np.concatenate([NO_COLUMNS, *columns])] = True
         self._filling: Filling = self._completion.filling(self.missing)
         spread = self._completion.senses.spread[self._filling.columns]
         self._untold = self._filling.error > UNTOLD * spread  # (M,)
@@ -182,14 +177,14 @@ class Repair:
         for hand in self._hands:
             close &= ~hand.accused(self._robot)[columns]
         back = np.isfinite(self._raw[columns]) & (close | self._untold)
-        fine = dict(zip(columns.tolist(), (close & ~repeats & ~self._untold).tolist(), strict=True))
-        there = dict(zip(columns.tolist(), back.tolist(), strict=True))
+        fine, there = np.zeros(self._spec.size, bool), np.zeros(self._spec.size, bool)
+        fine[columns], there[columns] = close & ~repeats & ~self._untold, back
         before = self.names
         for name, own in self._completion.sensors:
             if name not in self._well:
                 continue
-            self._well[name] = self._well[name] + 1 if all(fine[int(c)] for c in own) else 0
-            if self._well[name] >= self._well_after or (name in self._lost and all(there[int(c)] for c in own)):
+            self._well[name] = self._well[name] + 1 if fine[own].all() else 0
+            if self._well[name] >= self._well_after or (name in self._lost and there[own].all()):
                 del self._well[name]
                 self._age.pop(name, None)
                 self._lost.discard(name)

@@ -121,7 +121,7 @@ def report(
         They go to the log ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``,
         ``stream: …``, ``monitor: …``, ``completion: …`` or ``reflex: …``; or empty. ``cause``: at an alarm, ``family``
         (one of ``asm_gym.monitors.diagnosis.FAMILIES``), ``part``, ``probability`` of the family, ``probabilities`` of
-        all, and for a contact ``force``: the link, the force's size [N] and its vector. ``severity``: how bad it is,
+        all. ``severity``: how bad it is,
         see ``asm_gym.guard.severity.Severity``. ``response``: what is done about it under ``"graded"``, and ``case``:
         the row of the table that says so. ``executed_action``: the last one, a copy; beneath it ``contact_limits`` may
         have slowed the hand down, as the stream says. ``attribution``: what each number of the stream adds to

@@ -20,42 +20,30 @@ NOTHING: Mapping[int, Any] = MappingProxyType({})
 """Where there is nothing to say of any robot."""
 
 
+def named(spec: StreamSpec, channel: str) -> NDArray[np.intp]:
+    """Return (N,) the columns of a channel, of all arms."""
+    return np.array([i for i, label in enumerate(spec.labels) if label.split("[")[0].endswith(channel)], np.intp)
+
+
 @dataclass(frozen=True, eq=False)
 class Robots:
-    """n robots of one kind, as far as a guard asks.
+    """n robots of one kind, as far as a guard asks."""
 
-    Args:
-        count: n.
-        low, high: (A,) bounds of the actions.
-        rest: (A,) the action for which a robot stays, or what comes nearest to it.
-        rests: ``rest`` is known to make a robot stay.
-        brakes: the robots stay by themselves where they are told to, whatever the action is.
-        grip: (G,) places of the action that command grippers.
-        dt: control period [s].
-        chains: of each arm, its kinematics in each of the n robots.
-        felt_channels: what the arms feel in physics substeps; empty where they feel nothing there.
-        limits_contact: the robots compare what they feel with contact limits in every physics substep.
-        read: (D,) which columns of the stream stand in the observation; None where that is not known.
-        turn: the action (A,) that turns the joints of robot i by so much (J,) [rad]; None where there is none.
-        force_behind: link and force (3,) [N] that explain external torques (J,) of robot i; None where not known.
-        refused: for each reflex that these robots cannot do, why.
-    """
-
-    count: int
-    low: NDArray[np.float32]
+    count: int  # n
+    low: NDArray[np.float32]  # (A,) bounds of the actions
     high: NDArray[np.float32]
-    rest: NDArray[np.float32]
-    rests: bool = True
-    brakes: bool = False
-    grip: NDArray[np.intp] = field(default_factory=lambda: NO_COLUMNS)
-    dt: float = 1.0
-    chains: tuple[tuple[Chain, ...], ...] = ()
-    felt_channels: tuple[Channel, ...] = ()
-    limits_contact: bool = False
-    read: NDArray[np.bool_] | None = None
+    rest: NDArray[np.float32]  # (A,) the action for which a robot stays, or what comes nearest to it
+    rests: bool = True  # ``rest`` is known to make a robot stay
+    brakes: bool = False  # the robots stay by themselves where they are told to, whatever the action is
+    grip: NDArray[np.intp] = field(default_factory=lambda: NO_COLUMNS)  # (G,) places in the action of grippers
+    dt: float = 1.0  # control period [s]
+    chains: tuple[tuple[Chain, ...], ...] = ()  # of each arm, its kinematics in each of the n robots
+    felt_channels: tuple[Channel, ...] = ()  # what the arms feel in physics substeps; empty where nothing
+    limits_contact: bool = False  # they compare what they feel with contact limits in every physics substep
+    read: NDArray[np.bool_] | None = None  # (D,) the columns of the stream that are observed; None: not known
     turn: Callable[[int, NDArray[np.floating[Any]]], NDArray[np.float32]] | None = None
-    force_behind: Callable[[int, NDArray[np.floating[Any]]], tuple[str, NDArray[np.float64]]] | None = None
-    refused: Mapping[str, str] = field(default_factory=dict)
+    """The action (A,) that turns the joints of robot i by so much (J,) [rad]; None where there is none."""
+    refused: Mapping[str, str] = field(default_factory=dict)  # why they cannot do a reflex, by its name
 
     @cached_property
     def felt_size(self) -> int:

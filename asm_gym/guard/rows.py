@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
-from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints
+from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints, compare, no_hand
 from asm_gym.guard.repair import Repair
 from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.memory.completion import Completion
@@ -25,19 +25,12 @@ Mask = NDArray[np.bool_]
 
 
 class Believed(NamedTuple):
-    """The next row of each robot, as the monitor is to see it.
+    """The next row of each robot, as the monitor is to see it."""
 
-    Attributes:
-        rows: (n, D).
-        lost: the numbers that were not finite, by robot.
-        contradictions: of hand and joints, by robot.
-        failures: what can no longer be relied on, by robot.
-    """
-
-    rows: NDArray[np.float32]
-    lost: Mapping[int, tuple[str, ...]]
-    contradictions: Mapping[int, Contradiction]
-    failures: Mapping[int, str]
+    rows: NDArray[np.float32]  # (n, D)
+    lost: Mapping[int, tuple[str, ...]]  # the numbers that were not finite, by robot
+    contradictions: Mapping[int, Contradiction]  # of hand and joints, by robot
+    failures: Mapping[int, str]  # what can no longer be relied on, by robot
 
 
 class Rows:
@@ -71,10 +64,12 @@ class Rows:
         """(D,) which columns the policy reads; None where senses cannot be completed."""
         arms = (c for c in robots.chains if all(c[0].prefix + name in spec.slices for name in NEEDS))
         self._hands = tuple(HandAgainstJoints(chains, spec) for chains in arms)
+        self._first = self._hands[0].arguments if self._hands else no_hand(robots.count)
         self._history = np.zeros((robots.count, 2 * kept, spec.size), np.float32)
         self._end = 0  # the newest row is before it
         self._seen = np.zeros(robots.count, np.int64)  # rows in this episode
-        self._repairs: dict[int, Repair] = {}
+        self.repairs: dict[int, Repair] = {}
+        """Of the robots of which something is completed, or was a moment ago."""
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
@@ -82,35 +77,32 @@ class Rows:
         for hand in self._hands:
             hand.begin(which)
         for robot in np.flatnonzero(which):
-            self._repairs.pop(int(robot), None)
+            self.repairs.pop(int(robot), None)
 
     def next(self, rows: NDArray[np.float32], active: Mask) -> Believed:
         """Take in the next rows (n, D) as they were sensed, of which those of ``active`` (n,) robots count."""
         if self._end == self._history.shape[1]:
             self._history[:, : self._kept] = self._history[:, -self._kept :]
             self._end = self._kept
-        finite = _keep(rows, self._history, self._end, self._seen)
-        contradictory = [hand.compare(rows) for hand in self._hands]
-        if finite and not self._repairs and not any(contradictory):
+        found = _take_in(rows, self._history, self._end, self._seen, *self._first)
+        contradictory = [hand.contradicting(found > 1) for hand in self._hands[:1]]
+        contradictory += [hand.contradicting(compare(rows, *hand.arguments)) for hand in self._hands[1:]]
+        if found == 0 and not self.repairs and not any(contradictory):
             self._end += 1
             return Believed(rows, NOTHING, NOTHING, NOTHING)
         lost: dict[int, tuple[str, ...]] = {}
-        if not finite:
+        if found != 2:
             for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & active).tolist():
                 lost[i] = tuple(self._spec.labels[k] for k in np.flatnonzero(~np.isfinite(rows[i])))
-        unusual = {i for i in (*self._repairs, *lost, *(i for found in contradictory for i in found)) if active[i]}
+        unusual = {i for i in (*self.repairs, *lost, *(i for found in contradictory for i in found)) if active[i]}
         believed, contradictions, failures = rows.copy(), {}, {}
         for i in sorted(unusual):
-            missing = self._missing(i)
-            found = [
-                hand.contradiction(i, missing)
-                for hand, said in zip(self._hands, contradictory, strict=True)
-                if i in said
-            ]
+            missing, pairs = self._missing(i), zip(self._hands, contradictory, strict=True)
+            found = [hand.contradiction(i, missing) for hand, robots in pairs if i in robots]
             if first := next(filter(None, found), None):
                 contradictions[i] = first
             believed[i] = self._history[i, self._end] = self._repaired(i, rows[i], i in lost)
-            repair = self._repairs.get(i)
+            repair = self.repairs.get(i)
             if repair is not None and not repair.trusted:
                 failures[i] = f"completion: too much is missing, or for too long: {', '.join(repair.names)}"
         self._end += 1
@@ -122,29 +114,28 @@ class Rows:
         return self._history[robot, self._end - rows : self._end]
 
     def suspect(self, robot: int, columns: NDArray[np.intp]) -> bool:
-        """Believe the sensors of ``columns`` no more, from a robot's last row on; return whether that leaves anything
-        to go by."""
+        """Complete the sensors of ``columns`` from a robot's last row on; return whether that leaves any to go by."""
         if self._completion is None:
             return False
-        repair = self._repairs.get(robot) or self._new_repair(robot, reading=False)
+        repair = self.repairs.get(robot) or self._new_repair(robot, reading=False)
         row = repair.suspect(columns)
         if row is None:
             return False
-        self._repairs[robot] = repair
+        self.repairs[robot] = repair
         self._history[robot, self._end - 1] = row
         return True
 
-    def explained(self, robot: int) -> Mask:
+    def known(self, robot: int) -> Mask:
         """Return (D,) what is completed, or right by the hand and its joints."""
         known: Mask = np.logical_or.reduce([self._missing(robot), *(hand.vouched(robot) for hand in self._hands)])
         return known
 
     def counted(self, surprise: Surprise, failures: Mapping[int, str]) -> Surprise:
         """Return what counts of the surprise at the last rows: nothing is surprised by what was completed."""
-        if not self._repairs:
+        if not self.repairs:
             return surprise
         parts = [None if part is None else part.copy() for part in surprise]
-        for robot, repair in self._repairs.items():
+        for robot, repair in self.repairs.items():
             own = surprise.of(robot).without(repair.unjudged)
             if repair.settling and robot not in failures:
                 own = own.silenced(np.ones(1, bool))
@@ -153,23 +144,18 @@ class Rows:
                     part[robot] = value[0]
         return Surprise(*parts)  # type: ignore[arg-type]
 
-    @property
-    def repairs(self) -> Mapping[int, Repair]:
-        """The robots of which something is completed, or was a moment ago."""
-        return self._repairs
-
     def drop_repairs(self) -> None:
         """Forget the repairs that are over."""
-        for robot in [robot for robot, repair in self._repairs.items() if repair.over]:
-            del self._repairs[robot]
+        for robot in [robot for robot, repair in self.repairs.items() if repair.over]:
+            del self.repairs[robot]
 
     def _missing(self, robot: int) -> Mask:
-        return self._repairs[robot].missing if robot in self._repairs else np.zeros(self._spec.size, bool)
+        return self.repairs[robot].missing if robot in self.repairs else np.zeros(self._spec.size, bool)
 
     def _repaired(self, robot: int, row: NDArray[np.float32], lost: bool) -> NDArray[np.float32]:
-        if self._completion is None or not (lost or robot in self._repairs):
+        if self._completion is None or not (lost or robot in self.repairs):
             return row
-        repair = self._repairs.setdefault(robot, self._repairs.get(robot) or self._new_repair(robot, reading=True))
+        repair = self.repairs.setdefault(robot, self.repairs.get(robot) or self._new_repair(robot, reading=True))
         known = repair.names
         try:
             row = repair.next(row)
@@ -188,13 +174,42 @@ class Rows:
         return Repair(self._completion, robot, before, self._trust_s, self.read, self._hands)
 
 
-@partial(compiled, calls=(".",))
-def _keep(rows: Any, history: Any, end: int, seen: Any) -> bool:
-    """Write rows (n, D) into what is kept of each robot (n, T, D); return whether every number is finite."""
+@partial(compiled, calls=("detection", "."))
+def _take_in(
+    rows: Any,
+    history: Any,
+    end: int,
+    seen: Any,
+    at: Any,
+    axes: Any,
+    anchors: Any,
+    hand: Any,
+    late: Any,
+    weights: Any,
+    gain: float,
+    cap: float,
+    limit: float,
+    mean: Any,
+    size: Any,
+    whole: Any,
+    recent: Any,
+    kept: Any,
+    good: Any,
+) -> int:
+    """Write rows (n, D) into what is kept of each robot (n, T, D), and compare the hand of the first arm.
+
+    Returns:
+        1 where a number is not finite, and 2 more where ``compare``, whose arguments begin with ``at``, says so.
+    """
     finite = True
     for n in range(len(rows)):
         seen[n] += 1
         for i in range(rows.shape[1]):
             history[n, end, i] = rows[n, i]
             finite = finite and np.isfinite(rows[n, i])
-    return finite
+    found = 0 if finite else 1
+    if len(at) and compare(
+        rows, at, axes, anchors, hand, late, weights, gain, cap, limit, mean, size, whole, recent, kept, good
+    ):
+        found += 2
+    return found

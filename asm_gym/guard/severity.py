@@ -30,6 +30,10 @@ LEVER = 0.5
 BLOW = 2900.0
 """First blow on a table for each m/s of the hand [N s/m]; measured 2,500 to 3,100, on a bin 4,100."""
 
+LEANS_S = 0.4
+"""More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
+did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
+
 FAST = 0.35
 """No healthy hand is faster [m/s]."""
 
@@ -44,7 +48,9 @@ Mask = NDArray[np.bool_]
 
 def nothing_felt(count: int, size: int) -> Floats:
     """Return that ``count`` arms felt nothing within a step; arguments and result as ``felt`` in ``Severity``."""
-    return np.full((count, 2 + size), np.nan)
+    felt = np.empty((count, 2 + size))
+    felt.fill(np.nan)
+    return felt
 
 
 class Severity(NamedTuple):
@@ -162,7 +168,7 @@ def _weigh(
         state, counts, largest: of the arbiter.
         active: (n,) whose rows count.
         decides: (n,) where something is known already that takes a decision; more are added.
-        numbers, presses, over, event: of ``Severity`` and ``Weighed``; they are written.
+        numbers, presses, over, event: what ``SeverityEstimator.weigh`` returns; they are written.
     """
     some = 0
     for n in range(len(rows)):
@@ -194,19 +200,6 @@ def _weigh(
     return some
 
 
-class Weighed(NamedTuple):
-    """What surprise and severity come to."""
-
-    over: Mask  # (n,) surprise is over the threshold
-    event: NDArray[np.int8]  # (n,) what excuses a surprise that is over the threshold but for that, of ``EVENTS``
-    decides: Mask  # (n,) there is something to decide
-    some: int  # how many of them
-
-    def knocked(self, robot: int) -> bool:
-        """Return whether a knock, and nothing else, excuses the surprise at a robot's row."""
-        return bool(self.event[robot] == KNOCKED)
-
-
 class SeverityEstimator:
     """Estimates severity from the rows of n streams, by the names of their channels.
 
@@ -214,14 +207,13 @@ class SeverityEstimator:
         count: n.
         spec: of the streams.
         felt: what arms feel in physics substeps.
-        leans_s: how long an arm may press with more than ``FREE_FORCE`` [s].
         arbiter: counts the rows about which there is nothing to decide.
     """
 
-    def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], leans_s: float, arbiter: Arbiter) -> None:
+    def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], arbiter: Arbiter) -> None:
         columns = *_forces(felt), *_forces(spec.channels), _vectors(spec.channels, "hand_velocity")
         self._pressed, self._no_excuse = np.zeros((2, count)), np.zeros(count, np.int8)
-        self._how: tuple[Any, ...] = *columns, spec.dt, leans_s, arbiter.most_impulse, self._pressed
+        self._how: tuple[Any, ...] = *columns, spec.dt, LEANS_S, arbiter.most_impulse, self._pressed
         self._arbiter: tuple[Any, ...] = arbiter.threshold, arbiter.state, arbiter.counts, arbiter.largest
 
     def begin(self, which: Mask) -> None:
@@ -230,18 +222,24 @@ class SeverityEstimator:
 
     def weigh(
         self, rows: NDArray[np.float32], felt: Floats, held: Mask, surprise: Surprise, active: Mask, decides: Mask
-    ) -> tuple[Severity, Weighed]:
-        """Judge the next rows (n, D), which may have numbers that are not finite.
+    ) -> tuple[Severity, Mask, NDArray[np.int8], int]:
+        """Judge the next rows.
 
         Args:
+            rows: (n, D), perhaps not finite.
+            felt: as in ``Severity``.
             held: (n,) the arm is kept where it is.
+            surprise: at the rows.
             active: (n,) whose rows count.
             decides: (n,) where there is something to decide already; more are added.
+
+        Returns:
+            Severity; (n,) where surprise is over the threshold; (n,) what excuses it where it is over but for that, of
+            ``EVENTS``; and for how many robots there is something to decide.
         """
-        value, raw, excuse, n = surprise.value, surprise.raw, surprise.excuse, len(rows)
-        presses, over, event, numbers = np.empty(n, bool), np.empty(n, bool), np.empty(n, np.int8), np.empty((n, 3))
+        value, raw, excuse, empty, n = surprise.value, surprise.raw, surprise.excuse, np.empty, len(rows)
+        numbers, presses, over, event = empty((n, 3)), empty(n, bool), empty(n, bool), empty(n, np.int8)
         judged: tuple[Any, ...] = value, value if raw is None else raw, self._no_excuse if excuse is None else excuse
-        found: tuple[Any, ...] = numbers, presses, over, event
-        arguments: tuple[Any, ...] = rows, felt, *self._how, *judged, *self._arbiter, active, decides, *found
-        some = _weigh(*arguments)
-        return Severity(felt, numbers, presses, held), Weighed(over, event, decides, some)
+        arguments = *self._how, *judged, *self._arbiter, active, decides, numbers, presses, over, event
+        some = _weigh(rows, felt, *arguments)
+        return Severity(felt, numbers, presses, held), over, event, some

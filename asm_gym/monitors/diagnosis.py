@@ -283,13 +283,9 @@ def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
     return tuple(found)
 
 
-NO_FORCE: dict[str, Any] = {"link": "", "newtons": 0.0, "vector": [0.0, 0.0, 0.0]}
-"""Where no force is known, in the same structure, so that many environments' stack."""
-
-
-def as_info(cause: Cause | None, force: dict[str, Any] | None = None) -> dict[str, Any]:
+def as_info(cause: Cause | None) -> dict[str, Any]:
     """Return ``info["asm"]["cause"]``; all empty where there is none."""
     if cause is None:
-        return {"family": "", "part": "", "probability": 0.0, "force": NO_FORCE, "probabilities": {}}
+        return {"family": "", "part": "", "probability": 0.0, "probabilities": {}}
     named = {"family": cause.family, "part": cause.part, "probability": cause.probability}
-    return {**named, "force": force or NO_FORCE, "probabilities": cause.probabilities}
+    return {**named, "probabilities": cause.probabilities}

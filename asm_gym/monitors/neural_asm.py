@@ -180,8 +180,10 @@ class NeuralASM(CalibratedMonitor):
         return state._replace(excuses=excuses, values=self.values_.start(batch))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
-        self._require_fitted()
-        rows, kernel = self._rows(state, stream), self._row_kernel()
+        kernel = self._row_kernel()
+        if kernel is None:
+            self._require_fitted()
+        rows = self._rows(state, stream)
         if kernel is None:
             now, surprise = super().observe(state, rows)
             now, divisor = now._replace(excuses=state.excuses), np.ones(len(rows))
@@ -190,7 +192,7 @@ class NeuralASM(CalibratedMonitor):
         if self.values_.monitor is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
             now = now._replace(values=values)
-        if self.skills_:
+        if self.model.skills_:
             surprise = surprise._replace(skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)])
         return now, surprise
 

@@ -142,9 +142,8 @@ class RowKernel:
         else:
             with _ONE_THREAD:
                 observe_rows(*arguments)
-        surprise = Surprise(value, attribution)
-        if self._excuses is not None:
-            surprise = Surprise(value, attribution, None, raw, excuse)
+        excused = (raw, excuse) if self._excuses is not None else (None, None)
+        surprise = Surprise(value, attribution, None, *excused)
         memory = MemoryState(new[0], new[1], RowHistory(new[2], new[3], new[4]), new[5])
         detection = EvidenceState(Evidence(new[6], new[7], new[8]), Repetition(new[9], new[10], new[11]))
         return MonitorState(memory, detection, new[12]), surprise, divisor
