@@ -16,6 +16,7 @@ from asm_gym.guard.arbiter import ENDED
 from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.motion import Command
+from asm_gym.guard.observer import joined
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
@@ -217,7 +218,8 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         """Choose what is to be done next: the policy's ``action`` (A,), or something else."""
         command = self._engine.act(action.reshape(1, -1), lambda _: self._observation)
         self._executed = command.actions[0].reshape(action.shape)
-        self._failed = "; ".join(filter(None, (self._failed, command.failures.get(0, ""))))
+        if command.failures:
+            self._failed = joined(self._failed, command.failures.get(0, ""))
         if command.brakes[0]:
             self._inner.holding = True
         return command

@@ -186,8 +186,9 @@ class LazyInfo(dict[str, Any]):
         make: returns the content, from values that never change.
     """
 
+    __slots__ = ("_make",)
+
     def __init__(self, make: Callable[[], Mapping[str, Any]]) -> None:
-        super().__init__()
         self._make: Callable[[], Mapping[str, Any]] | None = make
 
     def __missing__(self, key: str) -> Any:

@@ -126,6 +126,7 @@ class RowKernel:
         packed = [_packed(*part) for part in ((np.float32, singles), (np.float64, doubles), (np.int64, places))]
         self._learned: tuple[Any, ...] = *(flat for flat, _ in packed), np.array([w for _, at in packed for w in at])
         self._excuses = excuses
+        self._kinds: dict[int, list[tuple[tuple[int, ...], Any]]] = {}  # of the arrays of a state of B streams
 
     def __call__(
         self, state: MonitorState, rows: NDArray[np.float64]
@@ -134,7 +135,8 @@ class RowKernel:
         B, empty = len(rows), np.empty
         (traces, expected, (before, earlier, steps), skill), (evidence, repetition) = state.model, state.detection
         old = traces, expected, before, earlier, steps, skill, *evidence, *repetition, state.excuses
-        new = [empty(a.shape, a.dtype) for a in old]
+        kinds = self._kinds.get(B) or self._kinds.setdefault(B, [(a.shape, a.dtype) for a in old])
+        new = [empty(*kind) for kind in kinds]
         value, attribution, raw, excuse, divisor = empty(B), empty(rows.shape), empty(B), empty(B, np.int8), empty(B)
         arguments: tuple[Any, ...] = rows, *old, *new, value, attribution, raw, excuse, divisor, *self._learned
         if B == 1:  # calls no BLAS

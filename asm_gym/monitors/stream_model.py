@@ -214,4 +214,6 @@ def first_of(state: State, count: int) -> State:
 
 def batch_of(state: State) -> int:
     """Return the number of streams B of a state."""
-    return batch_of(state[0]) if isinstance(state, tuple) else len(state)
+    while isinstance(state, tuple):
+        state = state[0]
+    return len(state)
