@@ -150,12 +150,7 @@ class HandAgainstJoints:
         return np.zeros(self._size, bool) if case is None else case.accused
 
     def refined(self, robot: int, row: Floats, missing: Mask, error: Floats) -> Floats:
-        """Return the row (D,), with the angles that are ``missing`` (D,) as the hand tells of them.
-
-        Args:
-            row: (D,) completed.
-            error: (D,) standard deviations of that.
-        """
+        """Return a completed row (D,), of errors (D,), with ``missing`` angles (D,) as the hand tells of them."""
         free, unseen = missing[self._q], missing[self._x]
         now = row[self._at]
         if not free.any() or unseen.all() or not np.isfinite(now).all():
@@ -193,8 +188,7 @@ class HandAgainstJoints:
     ) -> tuple[Floats, float]:
         """Return (J,) angles of which those that are ``free`` are what the hand says, and |z|² of what it leaves.
 
-        Args:
-            about, error: (J,) what is known of them, and its standard deviation [rad]; nothing where None.
+        What is known ``about`` them (J,), with the standard deviation ``error`` (J,) [rad], counts beside.
         """
         J, geometry = len(self._q), (part[robot] for part in self._geometry)
         q = np.where(free, self._good[robot], row[:J])

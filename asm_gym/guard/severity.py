@@ -160,15 +160,8 @@ def _weigh(
 ) -> int:
     """Judge rows (n, D), and count those about which there is nothing to decide; return how many there are to decide.
 
-    Args:
-        felt: as in ``Severity``.
-        pressed: (2, n) impulse, and for how long each arm has leant; they are moved on.
-        value, raw, excuse: (n,) as ``Surprise``.
-        threshold: (n,) of surprise.
-        state, counts, largest: of the arbiter.
-        active: (n,) whose rows count.
-        decides: (n,) where something is known already that takes a decision; more are added.
-        numbers, presses, over, event: what ``SeverityEstimator.weigh`` returns; they are written.
+    The impulse and the time that each arm has leant, ``pressed`` (2, n), move on; ``decides`` (n,) gets more, and
+    ``numbers``, ``presses``, ``over`` and ``event`` are written.
     """
     some = 0
     for n in range(len(rows)):
