@@ -130,9 +130,9 @@ EVERYONE = np.ones(1, bool)
 class Repaired:
     """The rows of one arm, as a guard believes them."""
 
-    def __init__(self, trust_s=1.0):
+    def __init__(self):
         robots = Robots.unknown(SPEC, np.ones(SPEC.size, bool))
-        self.rows = Rows(robots, SPEC, MEMORY, trust_s, kept=10)
+        self.rows = Rows(robots, SPEC, MEMORY, kept=10)
 
     def read(self, row):
         self.rows.drop_repairs()

@@ -81,7 +81,7 @@ def test_numbers_that_are_none_are_completed_at_once_and_several_together():
 
 
 def test_what_nothing_else_tells_of_is_trusted_for_a_second_only():
-    repair, rows = Repaired(trust_s=1.0), arm(60, 9)
+    repair, rows = Repaired(), arm(60, 9)
     trusted = []
     for t, row in enumerate(rows):
         faulty = row.copy()

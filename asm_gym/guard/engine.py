@@ -23,7 +23,7 @@ from asm_gym.guard.diagnosis import Alarm, Diagnostician
 from asm_gym.guard.limits import EpisodeLimits, familiar_to, limits_of
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import Observation, Observer, joined
-from asm_gym.guard.options import TRUST_S, GuardOptions
+from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
 from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from
@@ -93,7 +93,7 @@ class Engine:
         self._severity = SeverityEstimator(n, spec, robots.felt_channels, self._arbiter)
         self._diagnostician = Diagnostician(spec, diagnosis, responses_from(options.responses), graded)
         completion = diagnosis.completion if diagnosis is not None and graded else None
-        self._rows = Rows(robots, spec, completion, TRUST_S, self._diagnostician.rows)
+        self._rows = Rows(robots, spec, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, n, self._rows, options, recalls)
         limits, acts_on_them = limits_of(options.contact_limits, monitor), name != "monitor" and robots.rest.size > 0
         self._limits = EpisodeLimits(robots, spec, limits, acts_on_them, familiar_to(monitor, limits))

@@ -27,9 +27,6 @@ STRIKES, IMPULSE = 3, 20.0
 """Under ``"graded"``: the episode ends where the policy passes a contact limit for the time ``STRIKES``, or presses
 with more than ``IMPULSE`` beyond healthy motion [N s]."""
 
-TRUST_S = 1.0
-"""How long a sense that no other sense tells of is completed, by its last good value [s]."""
-
 
 @dataclass(frozen=True)
 class ReleaseRule:

@@ -26,6 +26,9 @@ WELL_WITHIN = 4.0
 UNTOLD = 0.5
 """No other sense tells of one whose completion leaves more than this share of its spread."""
 
+TRUST_S = 1.0
+"""How long a sense that no other sense tells of is completed, by its last good value [s]."""
+
 LONGEST_S = 20.0
 """No sense is completed for longer than this [s]."""
 
@@ -46,7 +49,6 @@ class Repair:
         completion: of the memory that watches the stream.
         robot: which of those that ``hands`` know.
         before: (D,) the row before; None where there is none.
-        trust_s: how long a sense that no other sense tells of is completed [s].
         read: (D,) which columns the policy reads, of whose completion something depends.
         hands: tell of missing angles better than the memory, and which senses are not to be believed again yet.
     """
@@ -56,13 +58,12 @@ class Repair:
         completion: Completion,
         robot: int,
         before: NDArray[np.floating[Any]] | None,
-        trust_s: float,
         read: Mask,
         hands: Sequence[HandAgainstJoints] = (),
     ) -> None:
         self._completion, self._robot, self._hands, self._read = completion, robot, hands, read
         spec = self._spec = completion.spec
-        self._patience, self._longest = round(trust_s / spec.dt), round(LONGEST_S / spec.dt)
+        self._patience, self._longest = round(TRUST_S / spec.dt), round(LONGEST_S / spec.dt)
         self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
         self._settle = 2 * completion.senses.lag + 1  # rows in which changes are taken from what was not yet repaired
         self.missing = np.zeros(spec.size, bool)

@@ -40,7 +40,6 @@ class Rows:
         robots: whose.
         spec: of their streams.
         completion: of the memory that watches; None where nothing completes senses.
-        trust_s: how long a sense that no other sense tells of is completed [s].
         kept: how many rows are kept of each.
     """
 
@@ -49,10 +48,9 @@ class Rows:
         robots: Robots,
         spec: StreamSpec,
         completion: Completion | None,
-        trust_s: float,
         kept: int,
     ) -> None:
-        self._spec, self._trust_s, self._kept = spec, trust_s, kept
+        self._spec, self._kept = spec, kept
         self._completion = None if robots.read is None else completion
         if completion is not None and robots.read is None:
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
@@ -171,7 +169,7 @@ class Rows:
         assert self._completion is not None
         assert self.read is not None
         before = self._history[robot, self._end - 1] if self._seen[robot] > reading else None
-        return Repair(self._completion, robot, before, self._trust_s, self.read, self._hands)
+        return Repair(self._completion, robot, before, self.read, self._hands)
 
 
 @partial(compiled, calls=("detection", "."))
