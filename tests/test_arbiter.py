@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from asm_gym.guard.arbiter import STATES, Arbiter, Judged, Situation, State, following
 from asm_gym.guard.options import ReleaseRule
@@ -91,47 +90,6 @@ def test_whatever_the_rows_a_pressing_arm_is_never_left_to_the_policy(rows):
         if alarm and before in ACTING and after in ACTING:
             assert response in GOING_ON
         assert strikes <= 3
-
-
-class Episodes(RuleBasedStateMachine):
-    """Rows and resets in any order."""
-
-    def __init__(self):
-        super().__init__()
-        self.limits = ReleaseRule(2, try_after=2, max_override=6, strikes=3, impulse=5.0, go_on=4)
-        self.arbiter = Arbiter(1, self.limits, 1.0)
-        self.went_on = 0
-
-    @rule(
-        surprise=st.sampled_from([0.0, 0.9, 2.0, math.inf]),
-        presses=st.booleans(),
-        response=st.sampled_from(["", *RESPONSES]),
-        touched=st.sampled_from([None, True, False]),
-        impulse=st.sampled_from([0.0, 4.9, 5.1]),
-    )
-    def row(self, surprise, presses, response, touched, impulse):
-        if STATES[self.arbiter.state[0]] is State.ENDED:
-            return
-        if response == "go on" and not self.arbiter.may_go_on(0):
-            response = "hold"  # as the diagnostician does
-        _, said = decided(self.arbiter, surprise, presses, response, touched, impulse)
-        self.went_on += said.transition == "go on"
-        if impulse > 5.0:
-            assert STATES[self.arbiter.state[0]] is State.ENDED
-
-    @rule()
-    def begin(self):
-        self.arbiter.begin(EVERYONE)
-        self.went_on = 0
-        assert STATES[self.arbiter.state[0]] is State.POLICY
-
-    @invariant()
-    def nobody_goes_on_for_longer_than_is_allowed(self):
-        assert self.went_on <= self.limits.go_on
-
-
-TestEpisodes = Episodes.TestCase
-TestEpisodes.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 
 
 def held_by_a_contact():

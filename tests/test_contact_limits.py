@@ -106,23 +106,6 @@ def test_side_by_side_robots_are_stopped_as_each_alone():
     envs.close()
 
 
-def test_a_wrapper_inside_that_skips_frames_is_held_in_every_one(lift):
-    env = NeuralASMSafety(
-        gym.wrappers.MaxAndSkipObservation(lift, skip=4),
-        CueMonitor(range(3, 500), spec=lift.unwrapped.stream_spec),
-        on_alarm="hold",
-        contact_limits=None,
-    )
-    env.reset(seed=1)
-    action = np.array([1, 1, 1, 1, -1, 1, 1], np.float32)
-    for _ in range(5):
-        env.step(action)
-    start = lift.unwrapped.simulation.data.qpos[:7].copy()
-    for _ in range(12):
-        env.step(action)
-    assert np.abs(lift.unwrapped.simulation.data.qpos[:7] - start).max() < 0.05
-
-
 def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twenty_and_saved(tmp_path, lift):
     spec = lift.unwrapped.stream_spec
     streams = [np.zeros((5, spec.size), np.float32) for _ in range(40)]

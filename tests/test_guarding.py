@@ -1,6 +1,5 @@
 """What a guard promises at its edges: to copy, to be bound to its robot, and to see its monitor change."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
@@ -104,48 +103,7 @@ def test_a_policy_that_uses_one_buffer_changes_nothing_that_was_said_or_kept():
     np.testing.assert_allclose([s[2] for s in said], 1.0)  # the grip of before the alarm, whatever came into the buffer
 
 
-class Driver(FakeEnv):
-    """Writes every row into one array, and every answer into one dict."""
-
-    def __init__(self):
-        super().__init__()
-        self.row, self.info = np.zeros(5, np.float32), {}
-
-    def _out(self, action):
-        sensed, info = super()._out(action)
-        self.row[:] = info["stream"]
-        self.info["stream"] = self.row
-        return sensed, self.info
-
-
-def test_an_info_that_an_environment_uses_again_says_nothing_of_steps_before():
-    env = NeuralASMSafety(Driver(), CueMonitor([1]), on_alarm="hold", release_after=2)
-    env.reset(seed=0)
-    assert [env.step(ACT)[4]["overridden"] for _ in range(6)] == [False, False, True, True, False, False]
-    assert set(env.unwrapped.info) == {"stream"}
-
-
 # ---------------------------------------------------------------- a monitor that changes
-
-
-class Changing(CueMonitor):
-    """Can be calibrated anew."""
-
-    def calibrate(self, episodes, false_alarm_rate=0.01):
-        self._threshold = 20.0
-        return self
-
-
-def test_a_threshold_that_was_set_anew_is_in_force_from_the_next_episode_on():
-    monitor = Changing([1])
-    env = NeuralASMSafety(FakeEnv(), monitor, on_alarm="hold")
-    env.reset(seed=0)
-    monitor.calibrate([])
-    assert env.threshold == 1.0
-    assert [env.step(ACT)[4]["asm"]["alarm"] for _ in range(3)] == [False, True, False]
-    env.reset(seed=0)
-    assert env.threshold == 20.0
-    assert [env.step(ACT)[4]["asm"]["alarm"] for _ in range(3)] == [False, False, False]
 
 
 @pytest.mark.parametrize("many", [False, True])
@@ -200,14 +158,6 @@ def test_what_would_lose_what_it_is_is_no_action(action):
     env.reset(seed=0)
     with pytest.raises(ValueError, match="an action must be numbers"):
         env.step(action)
-
-
-def test_statistics_that_go_on_are_refused_around_many_environments_too():
-    many = gym.wrappers.vector.NormalizeObservation(SyncVectorEnv([FakeEnv, FakeEnv]))
-    with pytest.raises(ValueError, match="NormalizeObservation changes what it makes of the same sense"):
-        VectorNeuralASMSafety(many, FadingMonitor())
-    many.update_running_mean = False
-    VectorNeuralASMSafety(many, FadingMonitor())
 
 
 def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():

@@ -207,18 +207,6 @@ def test_every_third_row_feels_as_if_there_were_no_others(fast, slow):
     assert np.abs(errors[2 * LAG :]).max() > 0.1
 
 
-def test_a_whole_episode_is_read_as_its_rows_are(fast):
-    stream = sine_episodes(1, seed=4)[0].stream.astype(np.float64)
-    senses = fast.senses_
-    assert senses.lag == LAG
-    whole = senses.read_episode(stream)
-    for t in (0, LAG - 1, LAG, 2 * LAG - 1, 2 * LAG, 30):
-        before = stream[t - LAG] if t >= LAG else stream[t]
-        earlier = stream[t - 2 * LAG] if t >= 2 * LAG else before
-        one = senses.read(*(x[None] for x in (stream[t], before, earlier)))
-        np.testing.assert_array_equal(whole.inputs[t], one.inputs[0])
-
-
 def test_recall_goes_on_with_every_third_row(fast, slow):
     cue = sine_episodes(1, seed=6)[0].stream[:16]
     rows = recall(fast, cue, 7)

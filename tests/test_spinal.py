@@ -41,18 +41,6 @@ def test_what_is_felt_is_what_the_stream_says_the_mean_of(free):
     np.testing.assert_allclose(felt.mean(axis=0), means, atol=6 * noise.max())
 
 
-def test_limits_that_are_not_passed_change_nothing(free):
-    robot = begin(free)
-    free.step(ACTION)
-    alone = robot.simulation.data.qpos.copy()
-    robot = begin(free)
-    robot.contact_limits = limits(np.full(10, WIDE))
-    *_, info = free.step(ACTION)
-    assert np.isnan(info["contact_left_s"])
-    assert info["contact_load"] == pytest.approx(np.abs(robot.felt).max() / WIDE)
-    np.testing.assert_array_equal(robot.simulation.data.qpos, alone)
-
-
 @pytest.mark.parametrize("number", range(10))
 def test_passing_any_of_them_is_known_in_that_substep_and_counts_for_one_step(free, number):
     robot = begin(free)
