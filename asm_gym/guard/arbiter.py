@@ -148,10 +148,10 @@ class Arbiter:
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        for robot in np.flatnonzero(which) if self.running is not None else ():
-            if self.largest[robot] > -np.inf:
-                largest, confirmed = float(self.largest[robot]), bool(self.confirmed[robot])
-                self.running.follow(largest, float(self.threshold[robot]), confirmed)
+        if self.running is not None:
+            for robot in np.flatnonzero(which & (self.largest > -np.inf)):
+                largest, threshold = float(self.largest[robot]), float(self.threshold[robot])
+                self.running.follow(largest, threshold, bool(self.confirmed[robot]))
                 self.threshold[robot] = self.running.value
         self.counts[:ROWS, which] = 0
         self.state[which], self.largest[which] = POLICY, -np.inf

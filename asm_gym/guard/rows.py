@@ -96,8 +96,8 @@ class Rows:
         believed, contradictions, failures = rows.copy(), {}, {}
         for i in sorted(unusual):
             missing, pairs = self._missing(i), zip(self._hands, contradictory, strict=True)
-            found = [hand.contradiction(i, missing) for hand, robots in pairs if i in robots]
-            if first := next(filter(None, found), None):
+            named = [hand.contradiction(i, missing) for hand, robots in pairs if i in robots]
+            if first := next(filter(None, named), None):
                 contradictions[i] = first
             believed[i] = self._history[i, self._end] = self._repaired(i, rows[i], i in lost)
             repair = self.repairs.get(i)
