@@ -89,7 +89,7 @@ class Observer:
                 failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
         late, everyone = latency > self._dt and self._late(latency), all(active.tolist())
         self._warm = True
-        if everyone and not (late or failures or self._rows.repairs or self._learns):
+        if everyone and not (late or failures or self._rows.repairs or self._learns is not None):
             return Observation(surprise, expected, failures, latency)
         surprise = self._rows.counted(_infinite(surprise, failures), failures)
         if late:
