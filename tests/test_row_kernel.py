@@ -16,11 +16,10 @@ from asm_gym.memory.readout import KEPT, SMALLEST, certainty
 from asm_gym.memory.recall import continued
 from asm_gym.memory.state import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.acting import recall
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.row_kernel import _ONE_THREAD
-from asm_gym.monitors.skills import name_skills
+from asm_gym.monitors.skills import name_skills, recall
 from tests.streams import sine_episodes, sine_spec
 
 
