@@ -19,7 +19,7 @@ from asm_gym.detection import check_per_hour
 from asm_gym.detection.conformal import check_hours
 from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.recordings import NOMINAL_ROLES
+from asm_gym.evaluation.scoring import NOMINAL_ROLES
 from asm_gym.evaluation.tables import ConsoleTable, markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM

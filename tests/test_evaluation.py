@@ -15,7 +15,18 @@ from scipy import stats
 from asm_gym.detection import conformal_threshold
 from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation import metrics, scoring
-from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult, ideal_metrics
+from asm_gym.evaluation.comparison import (
+    BenchmarkResult,
+    Detectability,
+    MonitorResult,
+    auroc_bound,
+    earliest,
+    ideal_metrics,
+    noise_floor,
+    power_bound,
+    separation,
+    visible_kinds,
+)
 from asm_gym.evaluation.detection_tables import (
     UNLIKELY,
     brief_monitors_table,
@@ -24,15 +35,6 @@ from asm_gym.evaluation.detection_tables import (
     kinds_table,
     lead_table,
     monitors_table,
-)
-from asm_gym.evaluation.ideal import (
-    Detectability,
-    auroc_bound,
-    earliest,
-    noise_floor,
-    power_bound,
-    separation,
-    visible_kinds,
 )
 from asm_gym.evaluation.metrics import (
     Delays,

@@ -13,7 +13,7 @@ from rich.console import Console
 from stable_baselines3 import SAC
 
 from asm_gym.episode import Episode, EpisodeLabel
-from asm_gym.evaluation.recordings import NOMINAL_ROLES, Recordings
+from asm_gym.evaluation.scoring import NOMINAL_ROLES, Recordings
 from asm_gym.rollouts import collect, progress
 from asm_gym.rollouts.run_folder import claimed, locked, make_missing
 from asm_gym.rollouts.staging import environment

@@ -1,4 +1,14 @@
-"""Monitors side by side with the ideal observer, whom no monitor can surpass."""
+"""Monitors side by side with the ideal observer, whom no monitor can surpass.
+
+The twin of a faulty episode has the same seed and sensor noise but no fault, so d_t = x_t - x'_t is the effect on the
+stream. An observer who knew both courses would form the likelihood ratio under the sensor noise σ. Its logarithm is
+N(±S/2, S):
+
+    S_T = Σ_{t ≤ T} Σ_i (d_ti / σ_i)²
+    AUROC = Φ(√(S/2)),    power at the false-alarm rate α: Φ(√S - Φ⁻¹(1 - α))
+
+(Neyman and Pearson 1933; Van Trees 1968, section 2.2: a known signal in white noise.) No detector does better.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +16,122 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
 
-from asm_gym.evaluation.defaults import RATES
-from asm_gym.evaluation.ideal import Detectability, auroc_bound, mean_power, visible_kinds
+from asm_gym.episode import Episode
+from asm_gym.evaluation.defaults import RATES, REPORTED_RATE
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
 from asm_gym.evaluation.resampling import Calibration, by_episode
-from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
+from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode, onset_row, window_steps
 from asm_gym.evaluation.statistics import Share
 from asm_gym.monitors.calibration import AlarmRate
 
+Array = NDArray[np.floating[Any]]
+
+RESOLUTION = 1e-3
+"""Noise of a channel without any, as a share of its spread: commands are exact, but nobody predicts them exactly."""
+VISIBLE = 0.5
+"""A kind counts where the ideal observer finds at least this share of its faults at a false-alarm rate of 1 %."""
 IDEAL = "ideal observer"
+
+
+class Detectability(NamedTuple):
+    """What the ideal observer could detect of one faulty episode.
+
+    Attributes:
+        task, kind, severity, seed: identify the episode.
+        separation: S at the end of the window.
+        delay: time from the onset until the observer is sure [s]; None if never.
+    """
+
+    task: str
+    kind: str
+    severity: str
+    seed: int
+    separation: float
+    delay: float | None
+
+
+def noise_floor(noise: Array, streams: list[Array]) -> NDArray[np.float64]:
+    """Return (D,) noise: the sensors' own ``noise`` (D,), at least ``RESOLUTION`` of the spread of ``streams``."""
+    spread = np.concatenate(streams).astype(np.float64).std(axis=0)
+    floor: NDArray[np.float64] = np.maximum(np.maximum(noise, RESOLUTION * spread), 1e-9)
+    return floor
+
+
+def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[np.float64]:
+    """Return (T - onset,) S from the onset up to each step; the shorter episode decides T.
+
+    Args:
+        faulty: (T, D).
+        twin: (T', D), of the same seed.
+        noise: (D,) standard deviations, all positive.
+        onset: the first step with the fault.
+
+    Raises:
+        ValueError: the two differ before the onset, so they are no twins.
+    """
+    length = min(len(faulty), len(twin))
+    if not np.array_equal(faulty[: min(onset, length)], twin[: min(onset, length)]):
+        raise ValueError(f"the episodes differ before the onset at step {onset}: they are not twins")
+    difference = np.asarray(faulty[onset:length], np.float64) - twin[onset:length]
+    # A reading that is not finite is seen at once.
+    gain = np.where(np.isfinite(difference), (difference / noise) ** 2, np.inf).sum(axis=1)
+    summed: NDArray[np.float64] = np.cumsum(gain)
+    return summed
+
+
+def auroc_bound(separation: Array | float) -> NDArray[np.float64]:
+    """Return the largest AUROC of any detector at this S."""
+    bound: NDArray[np.float64] = norm.cdf(np.sqrt(np.asarray(separation, np.float64) / 2))
+    return bound
+
+
+def power_bound(separation: Array | float, rate: float) -> NDArray[np.float64]:
+    """Return the largest probability of detection at this S and false-alarm ``rate``."""
+    bound: NDArray[np.float64] = norm.cdf(np.sqrt(np.asarray(separation, np.float64)) - norm.isf(rate))
+    return bound
+
+
+def earliest(separation: Array, rate: float = REPORTED_RATE, power: float = 0.95) -> int | None:
+    """Return the first step since the onset at which the power reaches ``power``; None if never."""
+    enough = np.flatnonzero(power_bound(separation, rate) >= power)
+    return int(enough[0]) if enough.size else None
+
+
+def mean_power(faults: Sequence[Detectability], rate: float) -> float:
+    """Return the share of these faults that the ideal observer finds at a false-alarm ``rate``."""
+    return float(np.mean(power_bound(np.array([d.separation for d in faults]), rate)))
+
+
+def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], window_s: float) -> list[Detectability]:
+    """Return what an ideal observer could detect of the faulty episodes, whose nominal twins it knows."""
+    twins = {(e.labelled.task, e.labelled.seed): e.stream for e in nominal}
+    noises: dict[str, Any] = {}
+    found = []
+    for episode in faulty:
+        label, dt = episode.labelled, episode.spec.dt
+        if label.task not in noises:
+            own = [e.stream for e in nominal if e.labelled.task == label.task]
+            noises[label.task] = noise_floor(episode.spec.noise, own)
+        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], onset_row(episode) or 0)
+        window = summed[: window_steps(window_s, dt)]
+        sure, most = earliest(window), float(window[-1]) if len(window) else 0.0
+        delay = None if sure is None else (sure + 1) * dt
+        found.append(Detectability(label.task, label.kind, label.severity, label.seed, most, delay))
+    return found
+
+
+def visible_kinds(detectability: Sequence[Detectability]) -> dict[tuple[str, str], bool]:
+    """Return whether an ideal observer could detect each kind and severity, in order of appearance."""
+    kinds: dict[tuple[str, str], list[Detectability]] = {}
+    for one in detectability:
+        kinds.setdefault((one.kind, one.severity), []).append(one)
+    return {kind: mean_power(own, REPORTED_RATE) >= VISIBLE for kind, own in kinds.items()}
 
 
 @dataclass(frozen=True, eq=False)

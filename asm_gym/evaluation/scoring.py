@@ -1,4 +1,4 @@
-"""Fit monitors on nominal recordings, and score all other recordings."""
+"""Recordings by role: fit monitors on nominal ones, and score all others."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import asm_gym
+from asm_gym.data.crashes import crashes
 from asm_gym.detection import conformal_episodes
-from asm_gym.episode import Episode
-from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult
+from asm_gym.episode import Episode, load_episode
+from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
-from asm_gym.evaluation.ideal import detectability_of
-from asm_gym.evaluation.recordings import read
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
+
+NOMINAL_ROLES = ("fit", "calibration", "nominal")
+"""Roles of episodes without a fault."""
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
 """Rooms and files of the package whose code decides what a monitor learns."""
@@ -32,6 +34,62 @@ AT_ONCE = 256
 
 Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 """``[task(item) for item in items]``, by whichever workers."""
+
+
+class Recordings(NamedTuple):
+    """The recordings of a run.
+
+    Attributes:
+        roles: recordings by role, without failed nominal episodes, and without scenes in which the robot crashes.
+        left_out: numbers of nominal episodes that failed, and of scenes with a crash.
+        twins: every episode of the role nominal: a faulty one equals its twin until the onset.
+    """
+
+    roles: dict[str, list[Episode]]
+    left_out: tuple[int, int]
+    twins: list[Episode]
+
+    @classmethod
+    def of(cls, recordings: Sequence[Episode]) -> Recordings:
+        """Sort by role. Raises ValueError where there is nothing normal to learn from or to test on."""
+        healthy = [r for r in recordings if r.labelled.role in NOMINAL_ROLES and r.success]
+        reference = [r.labelled.role != "nominal" for r in healthy]
+        found = crashes(healthy, [r.labelled.task for r in healthy], reference, torques=False)
+        crashed = {(healthy[n].labelled.task, healthy[n].labelled.seed) for n in found}
+        roles: dict[str, list[Episode]] = {}
+        failed = 0
+        for recording in recordings:
+            label = recording.labelled
+            # An alarm in a failed episode would be no false one.
+            if label.role in NOMINAL_ROLES and not recording.success:
+                failed += 1
+            elif (label.task, label.seed) not in crashed:
+                roles.setdefault(label.role, []).append(recording)
+        for role in NOMINAL_ROLES:
+            if not roles.get(role):
+                raise ValueError(
+                    f"none of the {role} episodes succeeded without a crash: "
+                    "there is nothing normal to learn or to test on"
+                )
+        return cls(roles, (failed, len(crashed)), [r for r in recordings if r.labelled.role == "nominal"])
+
+
+@lru_cache(maxsize=1)
+def read(paths: tuple[Path, ...]) -> Recordings:
+    """Load these files by role; the last ones are cached for the next monitor."""
+    return Recordings.of([load_episode(path) for path in paths])
+
+
+def recorded(run: Path) -> Recordings:
+    """Load every recording of a run of ``asm-gym evaluate`` but the harmless variations.
+
+    Raises:
+        ValueError: there is none.
+    """
+    paths = [p for role in (*NOMINAL_ROLES, "faulty") for p in sorted((run / "episodes").glob(f"*/{role}/*.npz"))]
+    if not paths:
+        raise ValueError(f"{run} holds no recordings: run asm-gym evaluate first")
+    return read(tuple(paths))
 
 
 def benchmark(

@@ -20,8 +20,8 @@ from asm_gym.detection import conformal_episodes, conformal_threshold
 from asm_gym.episode import Episode
 from asm_gym.evaluation import defaults
 from asm_gym.evaluation.metrics import detected, false_alarms, time_matched_auroc
-from asm_gym.evaluation.recordings import recorded
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
+from asm_gym.evaluation.scoring import recorded
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.monitors import NeuralASM
