@@ -17,7 +17,7 @@ from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, s
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.skills import learn_to_act
 from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
-from asm_gym.policies.memory_policy import ENOUGH, FORGETS, CommandReadout, StreamReader
+from asm_gym.policies.memory_policy import ENOUGH, FORGETS, CommandReadout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec
 
@@ -136,12 +136,6 @@ def test_a_memory_file_is_a_policy_and_acts_the_same(pilot, tmp_path):
         observation, *_ = env.step(actions[0])
 
 
-def test_learning_to_act_leaves_the_surprise_as_it_was(pilot):
-    episodes = taught(Point(), 30)
-    plain = NeuralASM(episodes[0].spec, **SMALL).fit(episodes)
-    np.testing.assert_array_equal(plain.score(episodes[0]).value, pilot.score(episodes[0]).value)
-
-
 def told(shares: list[float], dt: float = 0.05) -> NDArray[np.float64]:
     """What a gripper is told while these are expected, from -1 to 1."""
     readout, grip, actions = CommandReadout(Point(dt)), None, []
@@ -160,17 +154,6 @@ def test_a_gripper_changes_once_the_sum_of_what_speaks_for_it_reaches_the_bound(
     found = told([1.0] + [1.0 - 2 * sure] * (waits + 1))[1:]
     np.testing.assert_array_equal(found, [1.0] * waits + [-1.0])
     assert reached.any()
-
-
-def test_objects_of_other_tasks_read_zero(lift):
-    lift.reset(seed=0)
-    own = lift.unwrapped.measured_spec
-    ball = Channel("ball_pos", 3, group="object")
-    both = replace(own, channels=(*own.channels[:-1], ball, own.channels[-1]))
-    row = StreamReader(both, lift)(None, np.zeros(7, np.float32))
-    np.testing.assert_array_equal(row[both.slices["ball_pos"]], np.zeros(3))
-    cube = lift.unwrapped.measured[own.slices["cube_pos"]]
-    np.testing.assert_allclose(row[both.slices["cube_pos"]], cube, rtol=1e-6)
 
 
 def memory_of(spec: StreamSpec) -> NeuralASM:

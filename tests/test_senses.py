@@ -19,13 +19,6 @@ def streams():
     return made
 
 
-def test_of_slow_channels_the_change_is_sensed_too_and_of_all_it_is_judged(streams):
-    senses = StreamScaler.fit(SPEC, streams)
-    assert senses.slow.tolist() == [0]
-    assert senses.size == 4
-    assert senses.changes == slice(4, 7)
-
-
 def test_values_and_changes_are_standardised_by_hand(streams):
     senses = StreamScaler.fit(SPEC, streams)
     row, before, earlier = np.array([[1.0, 2.0, 3.0, 0.5], [0.9, 0.0, 0.0, 0.0], [0.7, 9.0, 9.0, 9.0]])[:, None]
