@@ -27,13 +27,9 @@ Rule = Callable[[int, np.random.Generator, int], Floats]
 
 
 class Hostile(StatefulPolicy):
-    """Acts by a rule, whatever it observes.
+    """Acts by a ``rule``, whatever it observes, at a share ``speed`` of the full action.
 
-    Args:
-        env: one whose actions are changes of the hand's pose, the grip last.
-        seed: of the episode.
-        speed: share of the full action.
-        rule: of its actions.
+    The environment's actions are changes of the hand's pose, the grip last.
     """
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, rule: Rule) -> None:

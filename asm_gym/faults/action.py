@@ -34,11 +34,7 @@ class ActionFault(HookedFault):
 
     @abstractmethod
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
-        """Return what arrives instead of the numbers that were ``commanded``, k steps since the onset.
-
-        Args:
-            memory: empty at the onset, and the fault's own.
-        """
+        """Return what arrives instead of what was ``commanded``, k steps since the onset; ``memory`` is its own."""
 
     def hook(self, env: Interface, clock: Clock) -> Callable[[Action], Action]:
         memory: list[Action] = []

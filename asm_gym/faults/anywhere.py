@@ -23,16 +23,10 @@ from asm_gym.validation import as_float32, check_choice
 
 
 class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """The ``Interface`` of an environment that is not robosuite's.
+    """The ``Interface`` of an environment that is not robosuite's, with Box actions and observations in Boxes.
 
     The readings are the observation, and ``info["stream"]`` where the environment has one, whose sensors must then be
     the numbers of the observation. An action that a fault has changed is clipped to its space.
-
-    Args:
-        env: takes Box actions, and observes a Box or a dict of such.
-
-    Raises:
-        TypeError: other spaces.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -155,14 +149,7 @@ def sigmas(env: Interface, streams: list[NDArray[np.float32]]) -> NDArray[np.flo
 def faults_anywhere(
     kind: str, env: Interface, sigma: NDArray[np.float64], severity: str, onset: int, seed: int
 ) -> tuple[Fault, ...]:
-    """Return the faults of one kind and severity for the episode with this seed.
-
-    Args:
-        sigma: (X,) of each sensor, as ``sigmas`` makes it; one that never moves is left out.
-
-    Raises:
-        ValueError: an unknown kind or severity, or no sensor that moves.
-    """
+    """Return the faults of one kind and severity for the episode with this seed, by ``sigmas`` (X,) of the sensors."""
     check_choice("kind of fault", kind, KINDS)
     check_choice("severity", severity, SEVERITIES)
     moving = np.flatnonzero(sigma > 0)

@@ -88,17 +88,9 @@ class ForceField(BodyFault):
 
 
 class Collision(ForceField):
-    """An obstacle that appears in the way: a stiff wall, across the direction in which the body moves at the onset.
+    """A stiff wall that appears across the way of a ``body``, ``gap`` [m] before it: F = k·depth - d·v while inside.
 
-    A penalty contact on the body itself, F = k·depth - d·v while the body is inside: what a collision does to the arm,
-    without a shape that would have to be compiled into the model.
-
-    Args:
-        body: what runs into it.
-        gap: from the body to the wall at the onset [m].
-        stiffness: k [N/m].
-        damping: d, on the way in [N s/m].
-        newtons: the most it pushes back with [N].
+    With ``stiffness`` k [N/m] and ``damping`` d [N s/m] on the way in, it pushes back with ``newtons`` at most.
     """
 
     body: str = HAND
@@ -121,14 +113,7 @@ class Collision(ForceField):
 
 
 class CablePull(ForceField):
-    """A cable that has caught: elastic, and taut from the onset on.
-
-    Args:
-        body: what it is tied to.
-        stiffness: [N/m].
-        slack: how far the body may go before the cable is taut [m].
-        newtons: the most it pulls with [N].
-    """
+    """An elastic cable that has caught: with ``stiffness`` [N/m] after ``slack`` [m], and ``newtons`` at most."""
 
     body: str = HAND
     stiffness: float = within(300.0, low=0, high=1e5)
@@ -146,13 +131,9 @@ class CablePull(ForceField):
 
 
 class HeldByPerson(ForceField):
-    """A person holds the arm: a spring and damper to a hand that sways.
+    """A person holds the arm with ``newtons`` at most: spring [N/m] and damper [N s/m] to a hand that sways.
 
-    Args:
-        body: where it is held.
-        stiffness, damping: of the grip [N/m, N s/m].
-        newtons: the most a person holds with [N].
-        sway: how far the person's hand moves [m], at about half a hertz.
+    The hand moves by ``sway`` [m], at about half a hertz.
     """
 
     stiffness: float = within(500.0, low=0, high=1e5)

@@ -17,12 +17,9 @@ from asm_gym.faults.base import LONGEST, Clock, Floats, HookedFault, Interface, 
 
 
 class SensorFault(HookedFault):
-    """One that acts on numbers of one channel.
+    """One that acts on an ``element`` of a ``channel`` that is measured, such as ``wrist_force``; on all where None.
 
-    Args:
-        channel: a channel that is measured, such as ``joint_position`` or ``wrist_force``; in environments that are not
-            robosuite's ``observation``, or a key of it, as ``StreamSpec.from_spaces`` names them.
-        element: which of its numbers; all where None.
+    In environments that are not robosuite's the channel is ``observation``, or a key of it.
     """
 
     anywhere = True
@@ -51,10 +48,9 @@ class SensorFault(HookedFault):
 
     @abstractmethod
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Any:
-        """Return what is read instead of the ``true`` readings (n,), at the k-th control step since the onset.
+        """Return what is read instead of the ``true`` readings (n,), k steps since the onset.
 
-        Args:
-            memory: holds the readings before the onset at first, and is the fault's own.
+        The fault's own ``memory`` holds the readings before the onset at first.
         """
 
     def hook(self, env: Interface, clock: Clock) -> Callable[[Floats], None]:

@@ -15,12 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class Swaying:
-    """Sways smoothly: each number of the action a sine of its own, and coloured noise.
-
-    Args:
-        env: takes finite Box actions.
-        seed: of phases, amplitudes and noise.
-    """
+    """Sways smoothly in a finite Box of actions: each number a sine of its own, and coloured noise."""
 
     WIDTH, NOISE, COLOUR = 0.4, 0.05, 0.7
     """Shares of half the range of an action; how much of the noise stays from step to step."""
