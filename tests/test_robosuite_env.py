@@ -155,6 +155,7 @@ def test_a_bad_action_is_refused(lift, action):
     [
         ({"robot": "Pandora"}, "'Pandora'.*Panda, Sawyer"),
         ({"control_freq": 40}, "divide.*500.*40"),
+        ({"stream_freq": 30}, "one of 20, 100, 500, got 30"),
         ({"horizon": 0}, "horizon.*0"),
         ({"stream": ("joint", "smell")}, "'smell'.*joint, torque"),
         ({"camera": "backview"}, "'backview'.*frontview"),

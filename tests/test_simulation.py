@@ -236,9 +236,3 @@ def test_a_row_hook_can_take_over_within_the_step():
     np.testing.assert_array_equal(rows[:4], felt)  # the last row of a step is the step's own
     commanded = rows[:, env.stream_spec.slices["action"]]
     np.testing.assert_array_equal(commanded[:, 0], [1, 1, 0, 0, 0])
-
-
-@pytest.mark.parametrize("rate", [30, 50, 250, 1000])
-def test_a_stream_rate_that_does_not_fit_is_refused_with_those_that_do(rate):
-    with pytest.raises(ValueError, match=rf"one of 20, 100, 500, got {rate}"):
-        gym.make("asm_gym/Lift-v0", stream_freq=rate)

@@ -112,17 +112,10 @@ class Proprioception:
                 if not len(at):
                     continue
                 unit = _TURNING[sensor.unit] if sensor.group == "gripper" and not slides else sensor.unit
-                channels.append(
-                    Channel(
-                        (f"robot{i}_" if len(parts) > 1 else "") + sensor.name,
-                        len(at),
-                        unit,
-                        sensor.noise,
-                        sensor.group,
-                        resolution=sensor.resolution,
-                        stops=stops if sensor.name == "joint_position" else (),
-                    )
-                )
+                name = (f"robot{i}_" if len(parts) > 1 else "") + sensor.name
+                ends = stops if sensor.name == "joint_position" else ()
+                about = len(at), unit, sensor.noise, sensor.group
+                channels.append(Channel(name, *about, resolution=sensor.resolution, stops=ends))
                 where += [(names.index(sensor.source), int(k)) for k in at]
         self.channels = tuple(channels)
         self.where = np.array(where, np.int64)

@@ -21,15 +21,13 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Args:
         make: a class derived from ``robosuite.environments.manipulation.manipulation_env.ManipulationEnv``.
-        robots: as robosuite takes it, ``"Panda"``; where it is not said, the class decides.
-        arguments: of the class, such as ``controller_configs`` and ``control_freq``.
+        arguments: of the class, such as ``robots``, ``controller_configs`` and ``control_freq``.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
 
     def __init__(self, make: type[Any], **arguments: Any) -> None:
         self.robosuite_env: Any = make(**{"ignore_done": True, "control_freq": 20, **HEADLESS, **arguments})
-        """The simulator underneath."""
         self.dt = 1.0 / self.robosuite_env.control_freq
         self._seeded = False
         sensed = self.robosuite_env._get_observations(force_update=True)
@@ -45,9 +43,7 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         robots = "+".join(robot.name for robot in self.robosuite_env.robots)
         self.stream_spec = StreamSpec((*channels, action), self.dt, robots)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Another scene; the same for the same ``seed``."""
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
