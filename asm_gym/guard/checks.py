@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from copy import deepcopy
-from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -16,15 +16,6 @@ from asm_gym.validation import check_number, short_repr
 LOG = logging.getLogger("asm_gym.safety")
 
 STALE = "monitor: it was fitted while it watched; reset() takes it over"
-
-
-@runtime_checkable
-class Watches(Protocol):
-    """What a guard needs of a monitor."""
-
-    def initial_state(self, batch: int = 1) -> Any: ...
-
-    def observe(self, state: Any, stream: Any) -> Any: ...
 
 
 class Fitted(NamedTuple):
@@ -69,7 +60,7 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
         ValueError: it is for another stream (the message names what differs), or would never alarm.
         RuntimeError: it is not calibrated.
     """
-    if not isinstance(monitor, Watches):
+    if not all(callable(getattr(monitor, name, None)) for name in ("initial_state", "observe")):
         raise TypeError(f"monitor must have initial_state() and observe(), got {short_repr(monitor)}")
     monitor.spec.require(watched, "the monitor")
     return check_number("the monitor's threshold", monitor.threshold)
@@ -77,7 +68,7 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
 
 def check_answer(monitor: Monitor) -> None:
     """Raise TypeError where a user's monitor answers a row with anything but a state and a surprise."""
-    if not isinstance(monitor, Watches) or isinstance(monitor, CalibratedMonitor):
+    if not hasattr(monitor, "observe") or isinstance(monitor, CalibratedMonitor):
         return
     try:
         tried = deepcopy(monitor)  # one that keeps count of its rows must not count this one

@@ -240,10 +240,9 @@ class Engine:
 
     def _known_to_decide(self, believed: Believed, failures: Mapping[int, str], refused: Mask) -> Mask:
         """Return (n,) where there is something to decide, whatever surprise and severity are."""
-        decides, incidents = refused.copy(), self._diagnostician.incidents
-        known = *believed.lost, *believed.contradictions, *failures, *self._rows.repairs, *incidents
-        if known:
-            decides[list(known)] = True
+        decides, repairs, incidents = refused.copy(), self._rows.repairs, self._diagnostician.incidents
+        if believed.lost or believed.contradictions or failures or repairs or incidents:
+            decides[[*believed.lost, *believed.contradictions, *failures, *repairs, *incidents]] = True
         return decides
 
     def _decide(self, robot: int, row: _Row) -> Outcome:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +22,6 @@ CAREFUL_S = 1.0
 """For so long [s], counted while the policy acts."""
 
 Mask = NDArray[np.bool_]
-
-
-@runtime_checkable
-class KnowsHealthyForces(Protocol):
-    """A monitor whose calibration episodes have shown what healthy motion feels like."""
-
-    healthy_: tuple[float, ...]
-    """(N,) the most that it reached, of each number that an arm feels [N m], [N]; empty where that is not known."""
-
-    familiar_: FamiliarSpeed | None
-    """How fast it went at each place; None where that is not known."""
 
 
 class EpisodeLimits:
@@ -109,7 +97,7 @@ def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> C
     """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones."""
     if contact_limits is None or isinstance(contact_limits, ContactLimits):
         return contact_limits
-    return ContactLimits(healthy=monitor.healthy_ if isinstance(monitor, KnowsHealthyForces) else ())
+    return ContactLimits(healthy=getattr(monitor, "healthy_", ()))
 
 
 def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed | None:
@@ -120,7 +108,7 @@ def familiar_to(monitor: Monitor, limits: ContactLimits | None) -> FamiliarSpeed
     """
     if limits is None or not limits.by_place:
         return None
-    known = monitor.familiar_ if isinstance(monitor, KnowsHealthyForces) else None
+    known: FamiliarSpeed | None = getattr(monitor, "familiar_", None)
     if known is None:
         raise ValueError(
             "by_place needs a monitor that knows how fast the hand healthily goes where: "

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,6 @@ class Observation(NamedTuple):
     expected: NDArray[np.float32] | None  # (n, A) what is likely to be commanded next; None where nobody asks
     failures: Mapping[int, str]  # what failed, by robot
     latency: float  # of the monitor [s]
-
-
-@runtime_checkable
-class NamedTupleLike(Protocol):
-    """A named tuple."""
-
-    def _make(self, parts: Iterable[Any]) -> Any: ...
 
 
 class Observer:
@@ -160,7 +153,7 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
     """
     if isinstance(old, tuple):
         parts = [choose(mask, n, o) for n, o in zip(new, old, strict=True)]
-        return old._make(parts) if isinstance(old, NamedTupleLike) else tuple(parts)
+        return getattr(old, "_make", tuple)(parts)
     if not isinstance(old, np.ndarray) or len(old) != len(mask):
         raise TypeError(f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}")
     return np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
