@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Sequence
 from typing import Any, SupportsFloat
 
@@ -12,7 +11,6 @@ from gymnasium.utils import RecordConstructorArgs
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
 from asm_gym.faults.anywhere import FaultyInterface
-from asm_gym.policies.reflexes import Begun, Hold
 from asm_gym.validation import short_repr, typed
 
 
@@ -93,54 +91,3 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self._running.popitem()[1].close()
         if self.env.has_wrapper_attr("undo_faults"):
             self.env.get_wrapper_attr("undo_faults")()
-
-
-class OracleReflex(gym.Wrapper[Any, Any, Any, Any]):
-    """Hold in every step in which one of ``faults`` acts: the bound of what a reflex to an alarm can do.
-
-    Args:
-        env: of this package, with the faults injected inside.
-        faults: what to react to.
-        beyond: contact force [N] to react to as well: the arm holds from the physics substep after the one that
-            exceeds it, and for ``OracleReflex.STAYS_S`` after the last.
-    """
-
-    STAYS_S = 0.5
-
-    def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault] = (), beyond: float = math.inf) -> None:
-        super().__init__(env)
-        self._faults, self._hold, self._beyond = tuple(faults), Hold(env), beyond
-        self._arm: Any = env.unwrapped
-        self._state: Begun | None = None
-
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        self._steps, self._pressed, self._state = 0, -math.inf, None
-        return self.env.reset(**kwargs)
-
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        pressed = self._steps - self._pressed <= self.STAYS_S * self._arm.metadata["render_fps"]
-        holds = pressed or any(fault.active(self._steps) for fault in self._faults)
-        if holds:
-            self._state = self._state or self._hold.begin(action)
-            action, self._state = self._hold.predict(None, self._state)
-        else:
-            self._state = None
-        self._action, self._holds = action, holds
-        if math.isfinite(self._beyond):
-            self._arm.substep_hooks.append(self._feel)
-        try:
-            *rest, info = self.env.step(action)
-        finally:
-            if self._feel in self._arm.substep_hooks:
-                self._arm.substep_hooks.remove(self._feel)
-        self._steps += 1
-        return *rest, info | {"overridden": holds}
-
-    def _feel(self, substep: int) -> None:
-        """Hold from the next physics substep on where the contact force of this one is too high."""
-        if self._arm.simulation.contact_forces[-1] <= self._beyond:
-            return
-        self._pressed = self._steps
-        if not self._holds:
-            self._holds = self._arm.holding = True
-            self._arm.command(self._action)
