@@ -255,9 +255,9 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         felt = None if info is None else felt_by(self._robots, info)
         acts = bool(self._engine.overriding[0])
         failures = {0: failure} if failure else None
-        said = self._engine.judge(np.array(row)[None], executed, felt, failures, ends_step=info is not None)
-        self._rows.append(said)
-        if info is None and self._engine.overriding[0] and not (acts or said.intervened[0]):
+        judged = self._engine.judge(np.array(row)[None], executed, felt, failures, ends_step=info is not None)
+        self._rows.append(judged)
+        if info is None and self._engine.overriding[0] and not (acts or judged.intervened[0]):
             self._command(self._executed)
             self._limit_contact()
             self.env.get_wrapper_attr("command")(self._executed)

@@ -253,14 +253,14 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
             self._members.set_attr("contact_limits", list(limits))
         self._limits = limits
 
-    def _report(self, infos: dict[str, Any], said: RowReport, executed: NDArray[np.float32], present: Mask) -> None:
+    def _report(self, infos: dict[str, Any], report: RowReport, executed: NDArray[np.float32], present: Mask) -> None:
         """Add ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        self._alarms += said.alarm
+        self._alarms += report.alarm
         found: dict[str, Any] = {
-            "asm_surprise": said.surprise.value,
-            "asm_alarm": said.alarm,
-            "asm_intervened": said.intervened,
-            "cost": said.alarm.astype(np.float64),
+            "asm_surprise": report.surprise.value,
+            "asm_alarm": report.alarm,
+            "asm_intervened": report.intervened,
+            "cost": report.alarm.astype(np.float64),
             "cost_sum": self._alarms.astype(np.float64),
         }
         if self._full:
@@ -268,7 +268,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
             if self._engine.running is not None:
                 n, running = self.num_envs, self._engine.running
                 asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}
-            found["asm"] = LazyInfo(lambda: side_by_side(said, self._spec) | asm)
+            found["asm"] = LazyInfo(lambda: side_by_side(report, self._spec) | asm)
         infos.update(found | {f"_{key}": present for key in found})
 
 
