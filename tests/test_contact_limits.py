@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
 
 from asm_gym import collect
 from asm_gym.detection.contact_limits import UNKNOWN, ContactLimits, FamiliarSpeed, healthy_forces
@@ -11,7 +10,7 @@ from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
-from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
 from tests.fakes import SPEC, CueMonitor
 
@@ -87,23 +86,6 @@ def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_
         limits.follow(rows, yes, no)
     assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
     assert told[20] == ContactLimits()
-
-
-def test_side_by_side_robots_are_stopped_as_each_alone():
-    envs = VectorNeuralASMSafety(
-        SyncVectorEnv([lambda: gym.make("asm_gym/Lift-v0")] * 2), NeuralASM.pretrained("panda")
-    )
-    envs.reset(seed=[0, 1])
-    action = np.array([[0, 0, -1, 0, 0, 0, -1], [0, 0, 0.2, 0, 0, 0, -1]], np.float32)
-    forces, alarms = np.zeros(2), np.zeros(2, bool)
-    for _ in range(40):
-        *_, info = envs.step(action)
-        forces = np.maximum(forces, info["contact_force"])
-        alarms |= info["asm"]["reason"] == "contact"
-    assert forces[0] < 400.0
-    assert forces[1] < 20.0
-    assert alarms.tolist() == [True, False]
-    envs.close()
 
 
 def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twenty_and_saved(tmp_path, lift):

@@ -138,17 +138,6 @@ def test_a_memory_that_is_fitted_while_it_watches_is_an_alarm_until_it_is_taken_
 # ---------------------------------------------------------------- the box
 
 
-@pytest.mark.parametrize("many", [False, True])
-def test_no_action_leaves_the_box(many):
-    inner = SyncVectorEnv([FakeEnv, FakeEnv]) if many else FakeEnv()
-    env = (VectorNeuralASMSafety if many else NeuralASMSafety)(inner, FadingMonitor(), on_alarm="hold")
-    env.reset(seed=0)
-    wide = np.array([50.0, -50.0, 0.5], np.float32)
-    env.step(np.stack([wide, wide]) if many else wide)
-    inside = inner.envs[0] if many else inner
-    np.testing.assert_array_equal(inside.unwrapped.actions, [[1.0, -1.0, 0.5]])
-
-
 @pytest.mark.parametrize(
     "action",
     [np.ones(3) + 1j, np.ma.masked_array(np.ones(3), [0, 1, 0]), np.array(["1", "0", "0"]), ["1", "0", "0"]],
