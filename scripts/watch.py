@@ -24,8 +24,7 @@ from rich.console import Console
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import LogLayout, read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of
-from asm_gym.evaluation.rerun_view import write_rerun
+from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of, write_rerun
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
