@@ -31,7 +31,15 @@ from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.skills import name_skills, named_skills
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.expression import FREE, Backpropagated, Expresser, ExpressionMemory
+from asm_gym.scripts.reproduce.expression import (
+    FREE,
+    Backpropagated,
+    Expresser,
+    ExpressionMemory,
+    mean_demonstrations,
+    reached,
+    recalled,
+)
 from asm_gym.scripts.reproduce.handwriting import STEPS, check_letters, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, shown
 from asm_gym.scripts.reproduce.two_links import (
@@ -97,29 +105,14 @@ def lessons(seed: int, config: Config) -> Lessons:
     train, calibration, tests = (
         demonstrations(letters, n, rng) for n in (config.writings, config.calibration, config.tests)
     )
-    names = [letter.name for letter in letters]
-    means = np.stack([np.mean([e.stream[:, HAND] for e in train if e.info["skill"] == k], axis=0) for k in names])
-    return Lessons(train, calibration, tests, means)
+    return Lessons(train, calibration, tests, mean_demonstrations(train, HAND))
 
 
-def reached(course: Course, given: Lessons) -> Record:
+def written(course: Course, given: Lessons) -> Record:
     """Return the distance from the letter [cm], whole and once there was time to react, and the share of right ones."""
-    truth = np.stack([e.stream[:, HAND] for e in given.tests], axis=1)
-    distance = np.linalg.norm(course.path - truth, axis=2)
-    to_each = np.linalg.norm(course.path[CUE:, :, None] - given.means[:, CUE:].transpose(1, 0, 2)[:, None], axis=3)
-    names = sorted({str(e.info["skill"]) for e in given.tests})
-    nearest = to_each.mean(axis=0).argmin(axis=1)
-    right = [names[k] == e.info["skill"] for k, e in zip(nearest, given.tests, strict=True)]
-    late = distance[EVENT + WINDOW // 2 :].mean()
-    return {"cm": float(distance[CUE:].mean()), "late_cm": float(late), "right": float(np.mean(right))}
-
-
-def predicted(model: Expresser, given: Lessons, cue: int) -> Record:
-    """Return the error of the hand [cm] in the next row, or after a cue from memory alone."""
-    rows = np.stack([e.stream for e in given.tests], axis=1).astype(np.float64)
-    first = cue if cue < STEPS else 1
-    found = model.express(rows, cue)[first:, :, HAND] - rows[first:, :, HAND]
-    return {"cm": float(np.linalg.norm(found, axis=2).mean())}
+    cm, right = reached(course.path, given.tests, given.means, CUE, HAND)
+    late, _ = reached(course.path, given.tests, given.means, EVENT + WINDOW // 2, HAND)
+    return {"cm": cm, "late_cm": late, "right": right}
 
 
 def noticed(courses: Mapping[str, Course], threshold: float) -> Record:
@@ -148,25 +141,27 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
     def note(measure: str, **values: Any) -> None:
         made.append({"model": name, "seed": seed, "measure": measure, **values})
 
+    def express(model: Expresser) -> None:
+        for measure, cue in (("next row", STEPS), ("recalled", CUE)):
+            note(measure, cm=recalled(model, given.tests, given.means, cue, HAND)[0])
+
     if name == "gru":
         gru = Backpropagated.learned(given.train, "gru", rng=np.random.default_rng(seed), updates=config.updates, **GRU)
         with torch.no_grad():
             course = closed_loop(RecurrentDriver(gru, cues.shape[1]), cues, WAYS[0], seed)
-        note("next row", **predicted(gru, given, STEPS))
-        note("recalled", **predicted(gru, given, CUE))
-        note(WAYS[0], **reached(course, given))
+        express(gru)
+        note(WAYS[0], **written(course, given))
         return made, {WAYS[0]: course}
     sizes: dict[str, Any] = {"hidden_size": UNITS[name], "association_size": 64}
     asm = NeuralASM(SPEC, dynamics=name, seed=seed, epochs=config.epochs, free_running_probability=FREE, **sizes)
     asm = asm.fit(given.train).calibrate(given.calibration, RATE)
-    memory, energy = ExpressionMemory(asm.senses_, asm.model.network), asm.model.free_energy(given.calibration[::4])
-    note("next row", **predicted(memory, given, STEPS))
-    note("recalled", **predicted(memory, given, CUE))
+    express(ExpressionMemory(asm.senses_, asm.model.network))
+    energy = asm.model.free_energy(given.calibration[::4])
     courses = {}
     for way in WAYS:
         driver = MemoryDriver(asm, cues.shape[1])
         courses[way] = closed_loop(driver, cues, way, seed, energy, asm.threshold)
-        note(way, **reached(courses[way], given))
+        note(way, **written(courses[way], given))
     note("surprise", **noticed(courses, asm.threshold))
     named = name_skills(asm, given.train)
     for row in (CUE, EVENT, STEPS - 1):
@@ -182,11 +177,11 @@ def tables(records: Sequence[Record], skills: int) -> list[Table]:
         return [(label, *(shown(records, value, model=m, **own) for m in models)) for label, own in labels.items()]
 
     every, memories, head = tuple(TITLES), tuple(UNITS), ("", *TITLES.values())
-    written = {f"written, {way}": {"measure": way} for way in WAYS}
+    by_way = {f"written, {way}": {"measure": way} for way in WAYS}
     known = {m: {"measure": m} for m in ("next row", "recalled")}
     late = {f"{way}, from half a second after the event": {"measure": way} for way in WAYS}
-    expressed = [*rows("cm", known | written, every), *rows("late_cm", late, every)]
-    right = rows("right", written, every)
+    expressed = [*rows("cm", known | by_way, every), *rows("late_cm", late, every)]
+    right = rows("right", by_way, every)
     names = {r: {"measure": "named", "row": r} for r in (CUE, EVENT, STEPS - 1)}
     named = rows("right", {f"after {r + 1} rows": own for r, own in names.items()}, memories)
     words = {"surprise": "AUROC of surprise", "energy": "AUROC of F", "found": "found within a second"}
