@@ -77,7 +77,6 @@ def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
     name = study.__name__.rpartition(".")[2]
 
     def work(config: Any, console: Console) -> None:
-        _ = getattr(config, "tasks", ())  # a run without recordings is refused before anything is written
         config.out.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
         with threadpool_limits(1):  # several threads slow products this small down
