@@ -71,7 +71,7 @@ def added() -> Added:
 
 
 def knowing(rows: Added, task: Callable[[Any], Result], item: Any) -> Result:
-    """Return ``task(item)``, in a process that is first told of these rows."""
+    """Return ``task(item)``, in a process that first adds these rows."""
     for where, own in rows.items():
         target(where).update(own)
     return task(item)

@@ -138,7 +138,7 @@ class Diagnosis:
 
     Args:
         completion: of the memory that was surprised.
-        readout: tells families apart.
+        readout: gives the probabilities of families.
     """
 
     completion: Completion

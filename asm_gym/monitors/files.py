@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,16 +103,7 @@ RETIRED = "feedback"
 """A hyperparameter of older files that made no difference once a memory was fitted."""
 
 
-class Restorable(Protocol):
-    """Anything that takes over a checkpoint of its own kind."""
-
-    def restore(self, saved: Checkpoint) -> Self: ...
-
-
-R = TypeVar("R", bound=Restorable)
-
-
-def restored(path: str | Path, saved: Checkpoint, make: Callable[..., R]) -> R:
+def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> Any:
     """Return the monitor of a checkpoint, as ``make(spec, **hyperparameters)`` makes it before it is fitted.
 
     Raises:

@@ -56,7 +56,7 @@ class NeuralASM(CalibratedMonitor):
             that is to watch any policy leaves it out.
         dynamics: how the temporal network carries on the past: ``"traces"`` of what was sensed and done, or
             ``"settling"``, the temporal predictive coding network of the papers, whose state is inferred on every row.
-        excuses: knocks, joints at their stops and fingers that move are told from faults (``detection.events``):
+        excuses: knocks, joints at their stops and fingers that move are no faults (``detection.events``):
             for a memory that is to watch any policy, of which some strike things.
         values: torques, and other values that the rest of a row predicts, are judged beside changes
             (``monitors.values``): for a push that is held, in logs of real arms.

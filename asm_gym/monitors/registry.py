@@ -79,7 +79,8 @@ class MonitorKind:
 
     def load(self, path: str | Path) -> CalibratedMonitor:
         """Read what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
-        return restored(path, read_checkpoint(path, self.model_class.kind), self)
+        monitor: CalibratedMonitor = restored(path, read_checkpoint(path, self.model_class.kind), self)
+        return monitor
 
     @property
     def _whole(self) -> bool:
@@ -234,4 +235,5 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
-    return restored(path, saved, _under(kind, saved.header.get("detection", kind.detection)))
+    monitor: CalibratedMonitor = restored(path, saved, _under(kind, saved.header.get("detection", kind.detection)))
+    return monitor
