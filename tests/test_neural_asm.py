@@ -161,7 +161,6 @@ def test_an_interrupted_fit_leaves_the_memory_as_it_was():
         ("learning_rate", np.nan),
         ("sensory_precision", np.inf),
         ("free_running_probability", 1.5),
-        ("gains", (0.2, 0.0)),
         ("shrinkage", -0.1),
         ("seed", -1),
     ],
