@@ -88,11 +88,11 @@ class _Spoilt(StatefulPolicy):
 
 
 HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
-    "down": lambda *of: Hostile(*of, _towards(0.0, 0.0, -1.0)),
+    "down": lambda env, seed, speed: Hostile(env, seed, speed, _towards(0.0, 0.0, -1.0)),
     "aside and down": lambda env, seed, speed: Hostile(env, seed, speed, _towards(0.0, seed % 2 * 2.0 - 1.0, -1.0)),
-    "forward": lambda *of: Hostile(*of, _towards(1.0, 0.0, -0.3)),
-    "bang-bang": lambda *of: Hostile(*of, _bang_bang()),
-    "uniform": lambda *of: Hostile(*of, lambda step, rng, size: rng.uniform(-1.0, 1.0, size)),
+    "forward": lambda env, seed, speed: Hostile(env, seed, speed, _towards(1.0, 0.0, -0.3)),
+    "bang-bang": lambda env, seed, speed: Hostile(env, seed, speed, _bang_bang()),
+    "uniform": lambda env, seed, speed: Hostile(env, seed, speed, lambda step, rng, size: rng.uniform(-1.0, 1.0, size)),
     "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
     "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
     "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),

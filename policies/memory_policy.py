@@ -81,12 +81,13 @@ class StreamReader:
     """
 
     def __init__(self, spec: StreamSpec, env: gym.Env[Any, Any]) -> None:
-        dt, inner = control_period(env), env.unwrapped
-        self._inner: Any = inner if hasattr(inner, "measured_spec") else None
-        if self._inner and spec.dt != dt:
+        dt, unwrapped = control_period(env), env.unwrapped
+        inner: Any = unwrapped if hasattr(unwrapped, "measured_spec") else None
+        self._inner = inner
+        if inner and spec.dt != dt:
             raise ValueError(f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s")
         own = StreamSpec.from_spaces
-        theirs = self._inner.measured_spec if self._inner else own(env.observation_space, env.action_space, dt)
+        theirs = inner.measured_spec if inner else own(env.observation_space, env.action_space, dt)
         _check_fit(spec, theirs)
         self.spec = spec
         shared = [name for name in spec.slices if name in theirs.slices]

@@ -30,6 +30,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     """Physics, controllers and sensors of the loaded model."""
     felt_channels: tuple[Channel, ...]
     """Channels that contact limits apply to, of one arm after another."""
+    _action: NDArray[np.float32]
     _actions: Actions
     _objects: ObjectSensors
     _senses: Senses

@@ -98,15 +98,15 @@ class Expert(StatefulPolicy):
     """Usual hand speed [action units]."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        self.inner: Any = env.unwrapped
-        self.robosuite: Any = self.inner.robosuite_env
+        inner: Any = env.unwrapped
+        self.inner, self.robosuite = inner, inner.robosuite_env
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
         self.read = ObservationReader(env)
         size = int(np.prod(env.action_space.shape or ()))
-        self.moves = np.setdiff1d(np.arange(size), self.inner.gripper_actions)
+        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)
         """Indices of the action that move arms."""
-        self._careful = set(self.inner.robots) != {"Panda"}
+        self._careful = set(inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
 
     @abstractmethod
