@@ -67,7 +67,7 @@ WRAPPERS = {
     ), ("monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate")),
     "overlay": (
         lambda **more: SurpriseOverlay(NeuralASMSafety(FakeEnv(), CueMonitor()), **more),
-        ("caption", "seconds"),
+        ("caption",),
     ),
 }  # fmt: skip
 

@@ -108,9 +108,9 @@ def test_a_cause_is_named_only_where_it_is_sure(family: str, probability: float,
     assert "unknown" not in line
 
 
-def test_the_chart_is_in_units_of_the_threshold_and_as_long_as_asked():
-    env = played([report(8.0)] * 40, seconds=2.0)
-    assert np.array_equal(env.render()[120:], strip_chart(200, 72, [Step(2.0, False, False)] * 20, 20))
+def test_the_chart_is_in_units_of_the_threshold_and_five_seconds_long():
+    env = played([report(8.0)] * 80)
+    assert np.array_equal(env.render()[120:], strip_chart(200, 72, [Step(2.0, False, False)] * 50, 50))
 
 
 def test_reset_clears_every_trace_of_the_last_episode():

@@ -19,13 +19,16 @@ from PIL import Image, ImageDraw, ImageFont
 
 from asm_gym.episode import spans
 from asm_gym.spec import control_period
-from asm_gym.validation import check_number, check_text
+from asm_gym.validation import check_text
 
 SURE = 0.9
 """Least probability at which a cause is named."""
 
 PAPER, INK, FAINT, RULE = "#14171c", "#f2f2f2", "#a0a8b2", "#343a42"
 CURVE, ALARM, FAULT = "#56B4E9", "#FF4B3E", "#E69F00"
+
+SECONDS = 5.0
+"""Time that the chart shows [s]."""
 
 LOW, HIGH = 0.03, 30.0
 """The vertical axis, in thresholds."""
@@ -50,11 +53,10 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Args:
         env: an environment with ``render_mode="rgb_array"``.
         caption: a name for the episode, such as the condition.
-        seconds: time the chart shows [s].
     """
 
-    def __init__(self, env: gym.Env[Any, Any], caption: str = "", seconds: float = 5.0) -> None:
-        RecordConstructorArgs.__init__(self, caption=caption, seconds=seconds)
+    def __init__(self, env: gym.Env[Any, Any], caption: str = "") -> None:
+        RecordConstructorArgs.__init__(self, caption=caption)
         gym.Wrapper.__init__(self, env)
         if env.render_mode != "rgb_array":
             raise ValueError(
@@ -63,7 +65,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         self.caption = caption and check_text("caption", caption)
         self._dt = control_period(env)
-        self._shown = max(2, round(check_number("seconds", seconds, above=0, high=3600) / self._dt))  # steps
+        self._shown = max(2, round(SECONDS / self._dt))  # steps
         self._clear()
 
     def _clear(self) -> None:

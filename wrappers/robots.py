@@ -195,49 +195,39 @@ def body_memory(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any], watched: Stre
     return shipped_memory(inner, watched, str(controller))
 
 
-def policy_for(on_alarm: Any, env: gym.Env[Any, Any]) -> Policy:
-    """Return the user's own policy that acts during an alarm in ``env``.
+def policy_for(on_alarm: Any, env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any]) -> Policy:
+    """Return the user's own policy that acts during an alarm in ``env``, or in all its members.
 
     Args:
-        on_alarm: a policy, or what makes one for an environment: a class such as ``BackOff``, or a function.
+        on_alarm: a policy; for a single environment also what makes one: a class such as ``BackOff``, or a function.
 
     Raises:
         ValueError: no policy, or a reflex that was made for another environment, whose arm it would move.
     """
-    made: Any = on_alarm
-    refused = "on_alarm must be a name, have a predict(), or make such a policy, got "
-    if isinstance(on_alarm, type) or (callable(on_alarm) and not hasattr(on_alarm, "predict")):
-        try:
+    made, many = on_alarm, isinstance(env, VectorEnv)
+    takes = (
+        "a name or one policy with a predict() that all environments share"
+        if many
+        else ("a name, have a predict(), or make such a policy")
+    )
+    try:
+        if not many and callable(on_alarm) and (isinstance(on_alarm, type) or not hasattr(on_alarm, "predict")):
             made = on_alarm(env)
-        except TypeError as error:
-            raise ValueError(f"{refused}{short_repr(on_alarm)}: {error}") from error
-    if not callable(getattr(made, "predict", None)):
-        raise ValueError(f"{refused}{short_repr(made)}")
-    if isinstance(made, Hold) and not made.explicit and made.env.unwrapped is not env.unwrapped:
-        name = type(made).__name__
+    except TypeError as error:
+        raise ValueError(f"on_alarm must be {takes}, got {short_repr(on_alarm)}: {error}") from error
+    if isinstance(made, type) or not callable(getattr(made, "predict", None)):
+        raise ValueError(f"on_alarm must be {takes}, got {short_repr(made)}")
+    name = type(made).__name__
+    bound = isinstance(made, Reflex) and not (isinstance(made, Hold) and made.explicit)  # to one environment
+    if many and bound:
+        raise ValueError(f"one {name} cannot act in several environments: give its name instead")
+    if bound and isinstance(made, Hold) and made.env.unwrapped is not env.unwrapped:
         raise ValueError(
             f"this {name} was made for another environment, and would move that: give the class, on_alarm={name}, "
             "or a function of the environment that makes it"
         )
     policy: Policy = made
     return policy
-
-
-def shared_policy(policy: Any) -> Policy:
-    """Return a policy that acts in all environments.
-
-    Raises:
-        ValueError: it is none, or knows one environment.
-    """
-    if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
-        raise ValueError(
-            f"on_alarm must be a name or one policy with a predict() that all environments share, got "
-            f"{short_repr(policy)}"
-        )
-    if isinstance(policy, Reflex) and not (isinstance(policy, Hold) and policy.explicit):
-        raise ValueError(f"one {type(policy).__name__} cannot act in several environments: give its name instead")
-    shared: Policy = policy
-    return shared
 
 
 def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> Any:

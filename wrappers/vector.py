@@ -21,7 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
-from asm_gym.wrappers.robots import askable, body_memory, felt_by, robots_of_many, shared_policy
+from asm_gym.wrappers.robots import askable, body_memory, felt_by, policy_for, robots_of_many
 
 Mask = NDArray[np.bool_]
 
@@ -126,7 +126,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         self._robots, self._places = robots_of_many(self.env, monitor.spec)
-        policies = () if isinstance(chosen, str) else [shared_policy(chosen)] * self.num_envs
+        policies = () if isinstance(chosen, str) else [policy_for(chosen, self.env)] * self.num_envs
         self._engine = Engine(self._robots, monitor, self._options, policies)
         self._monitor = self._next = monitor
         self._taken_up = Fitted.of(monitor, self._spec)
