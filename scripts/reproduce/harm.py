@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -24,7 +24,6 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
-from asm_gym.policies.reflexes import Begun, Hold
 from asm_gym.rollouts.staging import environment, policy_for, staged
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
 from asm_gym.scripts.options import option
@@ -33,7 +32,6 @@ from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.tasks import env_id
 from asm_gym.wrappers import NeuralASMSafety
 
-IDEAL = "ideal reflex"
 GUARDS: dict[str, dict[str, Any] | None] = {
     POLICY_ALONE: None,
     "default": {},
@@ -41,9 +39,8 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "no limits": {"contact_limits": None},
     "hold": {"on_alarm": "hold"},
     "terminate": {"on_alarm": "terminate"},
-    IDEAL: None,
 }
-"""Settings of the wrapper by name; None for no wrapper. The ideal reflex knows the simulator's own contact force."""
+"""Settings of the wrapper by name; None for no wrapper."""
 TASKS = ("Lift", "Stack", "Door", "PickPlaceCan")
 """Tasks of hostile and untrained policies."""
 EXPERTS = (*TASKS, "NutAssemblySquare", "Wipe")
@@ -169,49 +166,9 @@ def cases(config: Config) -> list[tuple[Case, int]]:
 # ------------------------------------------------------------------ measurement
 
 
-class IdealReflex(gym.Wrapper[Any, Any, Any, Any]):
-    """Hold from the physics substep after one with more than ``EXCESS``, and for half a second after the last."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self._arm: Any = env.unwrapped
-        self._hold = Hold(env)
-
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        self._left = 0
-        self._state: Begun | None = None
-        return self.env.reset(**kwargs)
-
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        holds = self._holds = self._left > 0
-        if holds:
-            self._state = self._state or self._hold.begin(action)
-            action, self._state = self._hold.predict(None, self._state)
-        else:
-            self._state = None
-        self._action, self._left = action, max(0, self._left - 1)
-        self._arm.substep_hooks.append(self._feel)
-        try:
-            *rest, info = self.env.step(action)
-        finally:
-            self._arm.substep_hooks.remove(self._feel)
-        return *rest, info | {"overridden": holds}
-
-    def _feel(self, substep: int) -> None:
-        """Hold from the next physics substep on where the contact force of this one is too high."""
-        if self._arm.simulation.contact_forces[-1] <= EXCESS:
-            return
-        self._left = self._arm.metadata["render_fps"] // 2
-        if not self._holds:
-            self._holds = self._arm.holding = True
-            self._arm.command(self._action)
-
-
 def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]:
     """Return the environment under one of ``GUARDS``."""
     settings = GUARDS[guard]
-    if guard == IDEAL:
-        return IdealReflex(env)
     if settings is None:
         return env
     memory = NeuralASM.pretrained(f"{case.config.robot}".lower() + ("" if case.rate == 20 else f"_{case.rate}hz"))
