@@ -48,7 +48,6 @@ from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire, wide_enough
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
-from asm_gym.validation import check_number
 
 COMPARED = ("W_C", "W_F", "W_D")
 """The synapses that are learned."""
@@ -83,10 +82,6 @@ class Config(kit.Config):
     """Writings of each letter."""
     epochs: int = option(40, quick=3, least=1)
     """Passes over them."""
-    iterations: tuple[int, ...] = option(
-        (1, 5, 20, 60), quick=(1, 5), least=1, check=partial(check_number, "iterations", low=1, whole=True)
-    )
-    """Inference steps at which angles are measured after learning."""
 
 
 class Changes(NamedTuple):
@@ -199,8 +194,7 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     moments, steps = one_after_another(taught, 16, rng), -(-sum(len(t.senses) for t in taught) // 16)
     for epoch in range(config.epochs + 1):
         if epoch in checkpoints(config.epochs):
-            counts = {ITERATIONS, *config.iterations} if epoch == config.epochs else {ITERATIONS}
-            records += angles(weights, probe, sorted(counts), epoch)
+            records += angles(weights, probe, epoch)
             records.append(_reached("local", weights, judged, epoch))
         if epoch < config.epochs:
             streams.run(islice(moments, steps), cosine_decay(RATES["local"], epoch / config.epochs), 0.0)
@@ -208,17 +202,16 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     return [{"seed": seed, **r} for r in records]
 
 
-def angles(weights: Weights, probe: Batch, iterations: Sequence[int], epoch: int) -> list[Record]:
+def angles(weights: Weights, probe: Batch, epoch: int) -> list[Record]:
     """Return the angles [°] between the local change and each gradient, of all synapses and of each array."""
     records = []
-    for count in iterations:
-        read, alone = (local(weights, probe, count, alone) for alone in (False, True))
-        for target in TARGETS:
-            theirs, ours = exact(weights, probe, count, target), alone if target == "alone" else read
-            for name in (*COMPARED, "all"):
-                value = min(1.0, cosine(ours, theirs, COMPARED if name == "all" else (name,)))
-                where = {"epoch": epoch, "iterations": count, "target": target, "array": name}
-                records.append({**where, "degrees": math.degrees(math.acos(value))})
+    read, alone = (local(weights, probe, ITERATIONS, alone) for alone in (False, True))
+    for target in TARGETS:
+        theirs, ours = exact(weights, probe, ITERATIONS, target), alone if target == "alone" else read
+        for name in (*COMPARED, "all"):
+            value = min(1.0, cosine(ours, theirs, COMPARED if name == "all" else (name,)))
+            where = {"epoch": epoch, "target": target, "array": name}
+            records.append({**where, "degrees": math.degrees(math.acos(value))})
     return records
 
 
@@ -252,22 +245,19 @@ def run(config: Config) -> Findings:
     """Run every seed."""
     records = kit.together(kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config))
     epochs = checkpoints(config.epochs)
-    before, counts = kit.by("epoch", epochs), kit.by("iterations", config.iterations)
+    before, ways = kit.by("epoch", epochs), kit.by("learned_by", RATES)
     targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
-    ways, usual = kit.by("learned_by", RATES), {"array": "all", "iterations": ITERATIONS}
-    arrays, error = kit.by("array", COMPARED), {"target": "error", "iterations": ITERATIONS}
     angle = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
     missed = "Mean squared error of the next row [variance], before so many epochs"
-    last: Record = {"array": "all", "epoch": config.epochs}
+    arrays = kit.by("array", COMPARED)
     tables = [
-        kit.grid(angle, records, "degrees", targets, before, 0, **usual),
-        kit.grid("Of each array, to the second", records, "degrees", arrays, before, 0, **error),
-        kit.grid("By inference steps, after learning", records, "degrees", targets, counts, 0, **last),
+        kit.grid(angle, records, "degrees", targets, before, 0, array="all"),
+        kit.grid("Of each array, to the second", records, "degrees", arrays, before, 0, target="error"),
         kit.grid(missed, records, "mse", ways, before, 3),
     ]
     with figure(height=3.3, width=8) as fig:
         left, right = fig.subplots(1, 2)
-        curves(left, records, "degrees", ("epoch", epochs), targets, **usual)
+        curves(left, records, "degrees", ("epoch", epochs), targets, array="all")
         curves(right, records, "mse", ("epoch", epochs), ways)
         left.axhline(90, color="#999999", linewidth=1)
         left.set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
