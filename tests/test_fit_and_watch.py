@@ -244,23 +244,6 @@ def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lines", "message"),
-    [
-        ([], "no row came"),
-        (["\n"], "no row came"),
-        (["[1, 2]"], r"line 1 must hold 5 numbers, got the shape \(2,\)"),
-        (["{"], "line 1 is no row of numbers"),
-        (['["a", 1, 2, 3, 4]'], "line 1 is no row of numbers"),
-        (['{"q": [1, 2]}'], "line 1 is no row of numbers: it lacks torque, cmd"),
-        (['{"q": [1, 2, 3], "torque": 1, "cmd": [1, 2]}'], "q must hold 2 numbers, got 3"),
-    ],
-)
-def test_a_line_that_is_no_row_is_refused_with_its_number(lines, message, memory):
-    with pytest.raises(ValueError, match=message):
-        follow(lines, load_monitor(memory), print)
-
-
-@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["fit", "nowhere"], "there is no nowhere"),

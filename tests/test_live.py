@@ -58,6 +58,10 @@ def test_nested_json_and_units_are_read_as_from_a_file():
     [
         (["time,q_0,q_1,torque", "1,2,3,4"], "line 1 is no row of numbers, and no header: it lacks cmd"),
         (["q_0,q_0", "1,2"], "columns of the same name"),
+        (["[1, 2]"], r"line 1 must hold 4 numbers, got the shape \(2,\)"),
+        (["{"], "line 1 is no row of numbers"),
+        (['{"q": [1, 2]}'], "line 1 is no row of numbers: it lacks torque, cmd"),
+        (['{"q": [1, 2, 3], "torque": 1, "cmd": 1}'], "q must hold 2 numbers, got 3"),
         ([*csv_lines()[:2], "0.1,1,2"], "line 3 is no row of numbers: it has 3 cells, the header 6"),
         ([*csv_lines()[:2], "0.1,1,2,x,fine,3"], "line 3 is no row of numbers"),
         ([*csv_lines()[:3], csv_lines()[1]], r"line 4 is no row of numbers: time must increase, got 0 s after 0\.02"),
