@@ -41,18 +41,14 @@ class Check(NamedTuple):
 
 
 CHECKS = {
-    "logs": Check(
-        "report,ros", "tests/test_logs.py tests/test_live.py tests/test_log_formats.py", "mcap pandas polars"
-    ),
+    "logs": Check("report,ros", "tests/test_logs.py tests/test_live.py", "mcap pandas polars"),
     "dds": Check("report,dds", "tests/test_dds.py"),
     "rerun": Check("report,rerun", "tests/test_rerun.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py"),
-    "agents": Check("agents", "tests/test_learners.py tests/test_learners_train.py"),
-    "learners": Check("learners", "tests/test_learners.py tests/test_learners_train.py"),
-    "tianshou": Check("agents", "tests/test_learners_train.py", "tianshou"),
-    "rllib": Check(
-        "cluster", "tests/test_learners.py tests/test_learners_train.py", "ray[rllib] torch", pins="gymnasium"
-    ),
+    "agents": Check("agents", "tests/test_learners.py"),
+    "learners": Check("learners", "tests/test_learners.py"),
+    "tianshou": Check("agents", "tests/test_learners.py", "tianshou"),
+    "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
     "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
     "notebooks": Check("robosuite,report,notebooks", "tests/test_docs.py -k notebook"),
     "hub": Check("hub", "tests/test_hub.py"),
