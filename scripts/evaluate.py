@@ -69,7 +69,7 @@ class Args(Options):
     steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
     """Length of an episode, in an environment by its id; by default its own."""
     monitors: tuple[str, ...] = option(
-        tuple(name for name in MONITORS if name != "memory_skill"), quick=_QUICK, least=1, check=check_monitor_name
+        tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name
     )
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
     faults: tuple[str, ...] = option((), metavar="KIND")

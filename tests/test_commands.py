@@ -109,12 +109,12 @@ def test_a_misspelt_command_is_answered_with_the_nearest_one(typed, near, capsys
 
 
 def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("abstract", "failure"))
+    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("abstract", "harm"))
     ran: list[str] = []
     for module in (first, last):
         monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
     monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", ("abstract", "failure"))
+    monkeypatch.setattr(reproduce, "INDEPENDENT", ("abstract", "harm"))
     assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
     assert "--seeds" in capsys.readouterr().err
     assert not ran

@@ -10,15 +10,11 @@ import re
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.pretraining.exam import Marks
 from asm_gym.scripts.cli import main as cli
-from asm_gym.scripts.reproduce import INDEPENDENT, failure, hours, kit, memorise_and_recall
-from asm_gym.scripts.reproduce.failure import AGENTS, Config, Verdict, Weakened, inconsistency, labels
-from asm_gym.spec import Channel, StreamSpec
+from asm_gym.scripts.reproduce import INDEPENDENT, hours, kit, memorise_and_recall
 
 
 def test_a_difference_is_paired_by_seed_and_has_students_interval():
@@ -48,9 +44,6 @@ def test_spread_is_over_seeds_and_not_over_measurements():
         ("local_learning --hidden 1", "at least the number of channels, 4, got 1"),
         ("speed_accuracy --speeds 1 9", "speed must be .* 4"),
         ("speed_accuracy --budgets 30", "30 steps of inference a second is less than one for each of 60 rows"),
-        ("failure --tasks Wipe", "Lift, Stack, Door"),
-        ("failure --false-alarm-rate 0", "false_alarm_rate"),
-        ("one_energy --run nowhere", "run asm-gym evaluate first"),
         ("everything", "unknown study 'everything'; known: all, memorise_and_recall"),
     ],
 )
@@ -78,7 +71,7 @@ def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
     with (tmp_path / f"{study}.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     table = (tmp_path / f"{study}.md").read_text()
-    if study in ("failure", "harm"):  # which count episodes; the others have means over seeds and a figure
+    if study == "harm":  # which counts episodes; the others have means over seeds and a figure
         assert rows
         assert "|" in table
     else:
@@ -86,58 +79,6 @@ def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
         assert "±" in table
         assert "±" in capsys.readouterr().out
         assert (tmp_path / f"{study}.png").read_bytes().startswith(b"\x89PNG")
-
-
-# ------------------------------------------------------------------ failures of agents
-
-
-def verdict(failed, how, half, alarmed=math.inf):
-    return Verdict(failed, how, [0.0, half, half], alarmed)
-
-
-VERDICTS = [
-    verdict(False, "as it is", 1.0),
-    verdict(False, "as it is", 2.0, alarmed=0.9),
-    verdict(True, "as it is", 3.0, alarmed=0.6),
-    verdict(False, "weakened", 1.5),
-    verdict(True, "weakened", 4.0, alarmed=0.4),
-    verdict(True, "disturbed", 1.75),
-]
-
-
-def test_failures_are_separated_from_successes_by_rank_and_counted_by_when_they_were_known():
-    assert failure.separated(VERDICTS, 1).value == pytest.approx(8 / 9)  # one of nine pairs is the wrong way round
-    assert failure.separated(VERDICTS, 0).value == 0.5
-    assert np.isnan(failure.separated([v for v in VERDICTS if v.failed], 1).value)
-    (row,) = failure.table({"one": VERDICTS}, Config()).rows
-    assert row[2].startswith("0.889 (")
-    assert row[4:] == ("1 of 3", "2 of 3", "1 of 2")
-
-
-def test_inconsistency_adds_up_the_changes_of_commands():
-    spec = StreamSpec((Channel("sense", 1), Channel("action", 4, group="action")), dt=0.1)
-    stream = np.random.default_rng(0).normal(size=(30, 5))
-    changes = np.linalg.norm(np.diff(stream[:, 1:], axis=0), axis=1)
-    np.testing.assert_allclose(inconsistency(Episode.from_stream(stream, spec))[-1], changes.sum(), rtol=1e-6)
-
-
-def test_an_agent_is_weakened_anew_by_each_seed_and_alike_by_the_same(monkeypatch):
-    rng = np.random.default_rng(0)
-    agent = NetworkPolicy([(rng.normal(size=(2, 3)).astype(np.float32), np.zeros(2, np.float32))], "relu", "tanh")
-    monkeypatch.setattr(failure, "make_policy", lambda name, env: agent)
-    policy, actions = Weakened(None, "agent"), [agent.predict(np.ones(3))[0]]
-    for seed in (1, 2, 1):
-        policy.set_random_seed(seed)
-        actions.append(policy.predict(np.ones(3))[0])
-    np.testing.assert_array_equal(actions[1], actions[3])
-    assert len({tuple(a) for a in actions}) == 3
-
-
-def test_roles_and_repetitions_share_no_seed_and_every_disturbance_has_its_turn():
-    args = Config(tasks=tuple(AGENTS), episodes=8)
-    made = [*labels(args, 0), *labels(args, 1)]
-    assert len({(x.task, x.seed) for x in made}) == len(made) == 2 * 3 * 5 * 8
-    assert len({(x.task, x.kind) for x in made if x.role == "disturbed"}) == 12
 
 
 # ------------------------------------------------------------------ false alarms an hour

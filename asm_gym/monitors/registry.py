@@ -120,7 +120,6 @@ MONITORS: Registry[MonitorKind] = Registry(
         "external_torque_limit": _rival("baselines.limits:ExternalTorqueLimit", "largest"),
         "force_limit": _rival("baselines.limits:ForceLimit", "squares"),
         "channel_limit": _rival("baselines.limits:ChannelLimit", "largest"),
-        "memory_skill": MonitorKind("asm_gym.monitors.skill_surprise:SkillModel"),
     },
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged

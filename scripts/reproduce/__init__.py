@@ -16,13 +16,11 @@ INDEPENDENT = {
     "abstract": "one network, six skills, no label: the abstract",
     "local_learning": "local updates against backpropagation through time",
     "speed_accuracy": "more inference, or slower movements, for more accuracy",
-    "failure": "does surprise tell that a policy will fail",
     "harm": "harm avoided against success kept, under any policy",
 }
 STUDIES = {
     **INDEPENDENT,
     "hours": "alarms an hour of a shipped memory, as promised?",
-    "one_energy": "faults by the energy that inference descends",
     "real_arms": "faults in recordings of real arms, once downloaded",
 }
 """Every study; all but the independent ones need recordings."""
