@@ -68,9 +68,7 @@ class Args(Options):
     """Policy: scripted, sway, or the path of an agent."""
     steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
     """Length of an episode, in an environment by its id; by default its own."""
-    monitors: tuple[str, ...] = option(
-        tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name
-    )
+    monitors: tuple[str, ...] = option(tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name)
     """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
     faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all; development or test for the halves of robosuite's."""
