@@ -25,6 +25,7 @@ from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
+from asm_gym.rollouts.collect import environment, record_missing
 from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
@@ -33,7 +34,6 @@ from asm_gym.rollouts.pretraining.healthy import Lessons, calibrate_body, health
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment, record_missing
 from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import Options, option

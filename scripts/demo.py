@@ -2,7 +2,7 @@
 
 The demo first shows what the shipped memory of the body notices, with nothing fitted. Then it collects nominal
 episodes, fits and calibrates a memory of the task, and runs nominal and faulty episodes with the policy alone and under
-the safety wrapper, paired by seed. It prints one table, and writes a report with figures and a video, the memory and
+the safety wrapper, paired by seed. It prints one table, and writes a report with figures, the memory and
 every number as JSON.
 """
 
@@ -30,14 +30,13 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import ConsoleTable, tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.collect import collect
-from asm_gym.rollouts.film import can_record_video, record_video, watch_pair
+from asm_gym.rollouts.collect import collect, play, staged
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.staging import play, staged
 from asm_gym.rollouts.trial import RolloutConfig, Trial
+from asm_gym.rollouts.watched import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import Options, option
 from asm_gym.tasks import TASKS, env_id
@@ -55,8 +54,6 @@ class Args(Options):
     """Name of a task."""
     on_alarm: Literal["graded", "hold", "terminate"] = option("graded", known=("graded", "hold", "terminate"))
     """Response of the wrapper to an alarm; graded depends on the cause."""
-    video: bool = True
-    """Make no video; there is none where this machine cannot render."""
     workers: int = option(os.cpu_count() or 1, least=1)
     """Processes."""
     out: Path = option(Path("runs/demo"), metavar="FOLDER")
@@ -153,7 +150,6 @@ def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
     console.print(shipped_memory(args), highlight=False)
-    can_show = args.video and can_record_video(console)
     memory, expert = fit(args, console)
     todo = trials(args)
     with stage("testing, policy alone and wrapped", console, {}) as progress:
@@ -169,11 +165,7 @@ def demonstrate(args: Args, console: Console) -> None:
         f"nominal episodes raise an alarm by chance (95 %). The expert succeeded in {expert.k} of {expert.n} episodes."
     )
     console.print(result)
-    examples, video = [typical(m.watched) for m in rows], None
-    if can_show:
-        shown = [t for t in todo if (t.kind, t.seed) in {(e.kind, e.seed) for e in examples}]
-        with stage("recording a video", console, {}) as progress:
-            video = record_video(shown, RolloutConfig(), NeuralASM.load(memory), args.out / "demo.mp4", progress)
+    examples = [typical(m.watched) for m in rows]
     details = {**asdict(args), "out": str(args.out)}
     numbers = {"arguments": details, "versions": versions("numba"), "window_s": WINDOW_S, "expert_success": expert}
     write_json(args.out / "demo.json", numbers | {"results": [as_json(m) for m in rows]})
@@ -191,8 +183,8 @@ def demonstrate(args: Args, console: Console) -> None:
     )
     details = {"command": f"asm-gym demo {args.task} --seed {args.seed}", **details}
     report = args.out / "report.html"
-    write_report(report, f"asm-gym demo: {args.task}", intro, [table], drawn, video, details)
-    console.print(f"Wrote {report} and {memory}" + (f" and {video}" if video else ""))
+    write_report(report, f"asm-gym demo: {args.task}", intro, [table], drawn, details)
+    console.print(f"Wrote {report} and {memory}")
 
 
 main = partial(run, "demo", Args, demonstrate)

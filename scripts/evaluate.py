@@ -28,11 +28,11 @@ from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.rollouts.collect import record_missing
 from asm_gym.rollouts.corpus import VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map, parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
-from asm_gym.rollouts.staging import record_missing
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, evaluation_trials
 from asm_gym.scripts.command import one_line, run
 from asm_gym.scripts.options import Options, option

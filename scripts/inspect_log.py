@@ -19,7 +19,6 @@ from asm_gym.data.inspection import Inspection, inspected
 from asm_gym.data.logs import LogLayout, read_tables
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation import figures
-from asm_gym.evaluation.log_figure import log_figure
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 from asm_gym.scripts.options import check_options, option
 from asm_gym.validation import check_number
@@ -55,7 +54,7 @@ def inspect(args: Args, console: Console) -> int:
         found = [inspected(name, columns, args.rate) for name, columns in islice(tables, args.logs)]
         more = next(tables, None) is not None
     for log in found:
-        picture = figures.save(log_figure(log), args.out / f"{Path(log.name).stem or 'log'}.png")
+        picture = figures.save(figures.log_figure(log), args.out / f"{Path(log.name).stem or 'log'}.png")
         for line in [log.caption(), *table(log.facts), *(f"- {line}" for line in log.remarks()), f"Wrote {picture}"]:
             say(line)
     for line in [*(f"Note: {note}." for note in notes), *(differences(found[0], other) for other in found[1:])]:

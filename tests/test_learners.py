@@ -28,8 +28,8 @@ def test_the_callback_logs_what_learning_met(tmp_path):
     agent.set_logger(logger.configure(str(tmp_path), ["csv", "json"]))
     agent.learn(32, callback=callback)
     # Alarms in rows 2, 3 and 6; the reflex acts from the step after the first on, and goes on after the second.
-    assert [(e.surprise, e.alarms, e.cost) for e in callback.ended] == [(10.0, 2, 3.0)] * 4
-    assert callback.ended[0].override_s == pytest.approx(4 * 0.05)
+    assert [(e["surprise"], e["alarms"], e["cost"]) for e in callback.ended] == [(10.0, 2, 3.0)] * 4
+    assert callback.ended[0]["override_s"] == pytest.approx(4 * 0.05)
     rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
     assert (rows[-1]["safety/cost"], rows[-1]["safety/surprise"]) == (3.0, 10.0)
     with pytest.raises(KeyError, match="wrap the environment in NeuralASMSafety"):
@@ -53,7 +53,7 @@ def test_a_callback_finds_out_the_control_period():
     callback = SafetyCallback()
     guarded = watched(range(20), length=20, on_alarm="hold")
     sb3.PPO("MlpPolicy", guarded, n_steps=20, batch_size=20).learn(20, callback=callback)
-    assert callback.ended[0].override_s == pytest.approx(19 * 0.05)
+    assert callback.ended[0]["override_s"] == pytest.approx(19 * 0.05)
 
 
 STEPS = 256
@@ -71,7 +71,7 @@ def test_stable_baselines_learns_and_meets_every_cost(kind: str):
     agent = getattr(sb3, kind)("MlpPolicy", watched(), seed=0, **how)
     before = [p.detach().clone() for p in agent.policy.parameters()]
     agent.learn(STEPS, callback=callback)
-    assert sum(e.cost for e in callback.ended) == COST
+    assert sum(e["cost"] for e in callback.ended) == COST
     assert any((p != q).any() for p, q in zip(before, agent.policy.parameters(), strict=True))
 
 

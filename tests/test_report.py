@@ -1,8 +1,7 @@
-"""The report, its figures and its film, read back from the files and the figures' own artists."""
+"""The report and its figures, read back from the files and the figures' own artists."""
 
 from __future__ import annotations
 
-import base64
 import dataclasses
 import re
 from html.parser import HTMLParser
@@ -134,23 +133,20 @@ class _Page(HTMLParser):
 
 def test_a_report_holds_everything_and_fetches_nothing(traces, tmp_path: Path):
     table = tabulate("Detection", CONDITION_COLUMNS, by_condition(traces, 1.0))
-    film = tmp_path / "film.mp4"
-    film.write_bytes(b"a film")
     drawn = {"A figure": figures_of(traces)["roc"]}
-    out = write_report(tmp_path / "report.html", "Lift", "First.\n\nSecond.", [table], drawn, film, {"seed": 0})
+    out = write_report(tmp_path / "report.html", "Lift", "First.\n\nSecond.", [table], drawn, {"seed": 0})
     source = out.read_text(encoding="utf-8")
     page = _Page(source)
     assert [s["aria-label"] for s in page.all("svg")] == ["A figure"]
-    assert base64.b64decode(page.all("video")[0]["src"].removeprefix("data:video/mp4;base64,")) == film.read_bytes()
     assert [len(page.all(tag)) for tag in ("table", "caption", "p", "script", "link")] == [1, 1, 2, 0, 0]
     assert not re.search(r"https?://|@import|url\((?!#)", source)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["film.mp4", "report.html"]  # nothing unfinished
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html"]  # nothing unfinished
 
 
 def test_whatever_is_written_is_escaped(tmp_path: Path):
     evil = '<script>alert("x")</script> $title & co'
     table = Table(evil, (evil, "b"), [(evil, evil)])
-    out = write_report(tmp_path / "r.html", evil, evil, [table], {evil: Figure()}, None, {evil: evil})
+    out = write_report(tmp_path / "r.html", evil, evil, [table], {evil: Figure()}, {evil: evil})
     page = _Page(out.read_text(encoding="utf-8"))
     assert not page.all("script")
     assert page.all("svg")[0]["aria-label"] == evil

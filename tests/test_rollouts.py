@@ -15,8 +15,8 @@ from stable_baselines3 import SAC
 from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.scoring import NOMINAL_ROLES, Recordings
 from asm_gym.rollouts import collect, progress
+from asm_gym.rollouts.collect import environment
 from asm_gym.rollouts.run_folder import claimed, locked, make_missing
-from asm_gym.rollouts.staging import environment
 from asm_gym.scripts.cli import main
 from tests.fakes import FakeEnv
 from tests.streams import sine_episodes

@@ -9,9 +9,9 @@ from rich.console import Console
 
 from asm_gym import collect
 from asm_gym.faults import FrozenEncoder, Push
-from asm_gym.rollouts.film import watch
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
+from asm_gym.rollouts.watched import watch
 from asm_gym.scripts import command, demo
 from asm_gym.scripts.cli import main
 
@@ -21,7 +21,7 @@ TINY = {"fit_episodes": 6, "calibration_episodes": 19, "nominal_episodes": 2, "f
 
 def tiny(out: Path) -> None:
     """Little of the demo."""
-    demo.demonstrate(demo.Args(**TINY, workers=2, video=False, out=out), Console())
+    demo.demonstrate(demo.Args(**TINY, workers=2, out=out), Console())
 
 
 CONDITIONS = "nominal", "frozen encoder", "push", "weak joint", "collision"
@@ -77,7 +77,7 @@ def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(fo
     ],
 )
 def test_a_bad_argument_is_refused_before_anything_is_written(arguments, message, tmp_path, capsys):
-    assert main(["demo", *arguments, "--no-video", "--out", str(tmp_path / "out")]) == 2
+    assert main(["demo", *arguments, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

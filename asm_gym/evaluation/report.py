@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import re
@@ -34,7 +33,6 @@ def write_report(
     intro: str,
     tables: Sequence[Table],
     drawn: Mapping[str, Figure],
-    video: Path | None = None,
     details: Mapping[str, object] | None = None,
 ) -> Path:
     """Write the report; the file appears when it is complete.
@@ -45,15 +43,10 @@ def write_report(
         intro: plain text; an empty line starts a new paragraph.
         tables: in order.
         drawn: figures by caption.
-        video: an MP4 file.
         details: how to make the report again: arguments, seed, versions.
     """
     path = Path(path)
     parts = [f"<p>{escape(p)}</p>" for p in intro.split("\n\n") if p.strip()]
-    if video is not None:
-        source = f"data:video/mp4;base64,{base64.b64encode(video.read_bytes()).decode('ascii')}"
-        film = f'<video controls muted loop playsinline preload="metadata" src="{source}"></video>'
-        parts.append(f'<section class="film"><h2>Film</h2>\n{film}</section>')
     if tables:
         parts.append("<section><h2>Results</h2>\n" + "\n".join(map(_table, tables)) + "</section>")
     if drawn:

@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 from asm_gym.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
 from asm_gym.files import written_whole
+from asm_gym.rollouts.collect import environment, record_missing
 from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment, record_missing
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 

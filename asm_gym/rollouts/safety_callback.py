@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -10,26 +10,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from asm_gym.episode import spans
 
 
-class EpisodeSafety(NamedTuple):
-    """What the guard reported in one episode.
-
-    Attributes:
-        surprise: the greatest, in thresholds.
-        alarms: how often one began.
-        cost: steps in alarm.
-        override_s: for how long something else than the policy acted [s].
-    """
-
-    surprise: float
-    alarms: int
-    cost: float
-    override_s: float
-
-
 class SafetyCallback(BaseCallback):
-    """Log the mean of each number of the episodes that have ended: ``safety/surprise``, ``/alarms``, ``/cost``, …
+    """Log the mean over the episodes that have ended, to stable-baselines3's logger.
 
-    They go to stable-baselines3's logger, and from there to TensorBoard, CSV, or Weights and Biases.
+    ``safety/surprise``: the greatest, in thresholds. ``safety/alarms``: how often one began. ``safety/cost``: steps in
+    alarm. ``safety/override_s``: for how long something else than the policy acted [s].
 
     Args:
         dt: control period of the environments [s]; by default the first of them tells.
@@ -38,12 +23,13 @@ class SafetyCallback(BaseCallback):
     def __init__(self, dt: float | None = None) -> None:
         super().__init__()
         self.dt = dt
-        self.ended: list[EpisodeSafety] = []
-        """All episodes that have ended."""
+        self.ended: list[dict[str, float]] = []
+        """The numbers of all episodes that have ended."""
 
     def _on_training_start(self) -> None:
-        self._dt = self._control_period() if self.dt is None else self.dt
         self._steps: list[list[tuple[float, bool, float, bool]]] = [[] for _ in range(self.training_env.num_envs)]
+        if self.dt is None:
+            self.dt = self._control_period()
 
     def _control_period(self) -> float:
         """Return ``asm_gym.spec.control_period`` of environments that may be in other processes."""
@@ -66,7 +52,12 @@ class SafetyCallback(BaseCallback):
 
     def _end_episode(self, steps: list[Any]) -> None:
         surprise, alarm, cost, overridden = zip(*steps, strict=True)
-        episode = EpisodeSafety(max(surprise), len(spans(np.array(alarm))), sum(cost), self._dt * sum(overridden))
+        episode = {
+            "surprise": max(surprise),
+            "alarms": float(len(spans(np.array(alarm)))),
+            "cost": sum(cost),
+            "override_s": (self.dt or 0.0) * sum(overridden),
+        }
         self.ended.append(episode)
-        for name, value in episode._asdict().items():
-            self.logger.record_mean(f"safety/{name}", float(value))
+        for name, value in episode.items():
+            self.logger.record_mean(f"safety/{name}", value)

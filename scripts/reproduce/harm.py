@@ -24,7 +24,7 @@ from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
-from asm_gym.rollouts.staging import environment, policy_for, staged
+from asm_gym.rollouts.collect import environment, policy_for, staged
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
 from asm_gym.scripts.options import option
 from asm_gym.scripts.reproduce import kit

@@ -31,9 +31,9 @@ from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style
 from asm_gym.policies.scripted.geometry import Vector, move
+from asm_gym.rollouts.collect import environment, record_stream
 from asm_gym.rollouts.pretraining.healthy import HELD_OUT, held_out
 from asm_gym.rollouts.seeds import role_seeds
-from asm_gym.rollouts.staging import environment, record_stream
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_number
