@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -40,7 +41,8 @@ _LATEST: dict[str, tuple[str, Any]] = {}
 
 def _latest(name: str, key: object, make: Callable[[], Any]) -> Any:
     """Return what was made last if it was made of the same; else make it."""
-    text = repr(key)  # the caller's own lists and dicts may change
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        text = repr(key)  # the caller's own lists, dicts and arrays may change
     if name not in _LATEST or _LATEST[name][0] != text:
         _LATEST.pop(name, None)  # two environments at a time would take twice the memory
         _LATEST[name] = text, make()
