@@ -71,15 +71,6 @@ def test_held_at_speed_the_joints_stop_where_they_are(robot, controller):
     env.close()
 
 
-def test_a_torque_controller_that_was_given_strength_is_braked():
-    strong = {"type": "JOINT_TORQUE", "input_max": 1, "input_min": -1, "output_max": 10.0, "output_min": -10.0}
-    env = guarded(made(controller=strong | {"interpolation": None, "torque_limits": None}))
-    speed, farthest, last = motion(env)
-    assert speed > 0.5
-    assert_stays(speed, farthest, last)
-    env.close()
-
-
 class Halved(gym.ActionWrapper):
     def action(self, action):
         return 0.5 * action + 0.5
