@@ -1,12 +1,16 @@
 """Compile functions, cached on disk for the whole folder they belong to.
 
 The cache lies beside the code, else in the user's cache; ``NUMBA_CACHE_DIR`` names another place. Where none can be
-written to, each process compiles anew.
+written to, it lies in a temporary folder of this process and its workers.
 """
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -33,7 +37,9 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
     try:
         dispatcher: Any = numba.njit(cache=True, **how)(function)
     except RuntimeError:  # numba found no folder that it may write to
-        dispatcher = numba.njit(**how)(function)
+        numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="asm-gym-numba-")
+        atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
+        dispatcher = numba.njit(cache=True, **how)(function)
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.

@@ -127,8 +127,3 @@ def env_spec(name: str) -> EnvSpec:
         with needed_for(name):
             import_module(module)
     return gym.spec(identifier)
-
-
-def is_task(name: str) -> bool:
-    """Return whether it is one of robosuite's."""
-    return name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS

@@ -27,9 +27,6 @@ from asm_gym.policies.base import StatefulPolicy
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import typed
 
-OBJECT = "object"
-"""The group of objects; those of other tasks are out of play, and read 0."""
-
 FORGETS = 1.6
 """τ [s]."""
 
@@ -69,60 +66,6 @@ class CommandReadout:
         return action, grip
 
 
-class StreamReader:
-    """Rows of one spec, made of what an environment measures.
-
-    Args:
-        spec: of the rows.
-        env: one of this package's, or any whose observation and action are Boxes.
-
-    Raises:
-        ValueError: the environment does not measure what the spec names, or is of another robot or rate.
-    """
-
-    def __init__(self, spec: StreamSpec, env: gym.Env[Any, Any]) -> None:
-        dt, unwrapped = control_period(env), env.unwrapped
-        inner: Any = unwrapped if hasattr(unwrapped, "measured_spec") else None
-        self._inner = inner
-        if inner and spec.dt != dt:
-            raise ValueError(f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s")
-        own = StreamSpec.from_spaces
-        theirs = inner.measured_spec if inner else own(env.observation_space, env.action_space, dt)
-        _check_fit(spec, theirs)
-        self.spec = spec
-        shared = [name for name in spec.slices if name in theirs.slices]
-        self._from, self._to = (
-            np.array([i for n in shared for i in range(s.size)[s.slices[n]]], np.intp) for s in (theirs, spec)
-        )
-
-    def __call__(self, observation: Any, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the row (D,) that is sensed now, after ``action`` (A,)."""
-        measured = self._inner.measured if self._inner else np.concatenate([np.ravel(observation), np.ravel(action)])
-        row = np.zeros(self.spec.size, np.float32)
-        row[self._to] = measured[self._from]
-        return row
-
-
-def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
-    """Raise ValueError unless an environment that measures ``theirs`` has what a memory of ``spec`` reads.
-
-    Further channels, another order, and objects of other tasks do not matter.
-    """
-    objects = [c.name for c in spec.channels if c.group == OBJECT]
-    absent = [f"{name}: missing" for name in objects]
-    lines = [
-        line
-        for line in spec.difference(theirs)
-        if line not in absent and not line.endswith(": new") and not line.startswith(("order: ", "dt: "))
-    ]
-    if spec.source and theirs.source and spec.source != theirs.source:
-        lines.append(f"robot: {spec.source} against {theirs.source}")
-    if objects and not any(name in theirs.slices for name in objects):
-        lines.append(f"objects: {', '.join(objects)} are known, none of which is here")
-    if lines:
-        raise ValueError("the memory does not fit this environment:\n  " + "\n  ".join(lines))
-
-
 class ActingState(NamedTuple):
     """Where the policy is: a value."""
 
@@ -150,9 +93,24 @@ class NeuralASMPolicy(StatefulPolicy):
 
     @typed
     def __init__(self, memory: NeuralASM, env: gym.Env[Any, Any]) -> None:
+        inner: Any = env.unwrapped
+        self._measures = inner if hasattr(inner, "measured_spec") else None
+        spec, dt, space = memory.spec, control_period(env), env.action_space
+        if not isinstance(space, spaces.Box):
+            raise ValueError(f"a memory drives a Box action space, got {space}")
+        if not len(spec.motor):
+            raise ValueError(f"this memory predicts no command: its stream has no action, only {list(spec.slices)}")
+        if len(spec.motor) != int(np.prod(space.shape)):
+            raise ValueError(f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}")
+        if self._measures and spec.dt != dt:
+            raise ValueError(f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s")
+        theirs = inner.measured_spec if self._measures else StreamSpec.from_spaces(env.observation_space, space, dt)
+        _check_fit(spec, theirs)
+        shared = [name for name in spec.slices if name in theirs.slices]
+        self._from, self._to = (
+            np.array([i for n in shared for i in range(s.size)[s.slices[n]]], np.intp) for s in (theirs, spec)
+        )
         self.memory = memory
-        self._size = require_motor(memory.spec, env)
-        self._read = StreamReader(memory.spec, env)
         self._readout = CommandReadout(env)
         memory.initial_state()
 
@@ -162,23 +120,34 @@ class NeuralASMPolicy(StatefulPolicy):
         return cls(NeuralASM.load(path), env)
 
     def begin(self, observation: Any) -> ActingState:
-        return ActingState(self.memory.initial_state(), np.zeros(self._size, np.float32))
+        return ActingState(self.memory.initial_state(), np.zeros(len(self.memory.spec.motor), np.float32))
 
     def act(self, observation: Any, state: ActingState, deterministic: bool) -> tuple[NDArray[np.float32], ActingState]:
         """Return the action (A,) that the memory expects, and the next state; nothing is drawn at random."""
-        row = self._read(observation, state.action)
-        memory, _ = self.memory.observe(state.memory, row[None])
+        sensed = [np.ravel(observation), np.ravel(state.action)]
+        measured = self._measures.measured if self._measures else np.concatenate(sensed)
+        row = np.zeros((1, self.memory.spec.size), np.float32)
+        row[0, self._to] = measured[self._from]
+        memory, _ = self.memory.observe(state.memory, row)
         action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
         return action, ActingState(memory, action, grip)
 
 
-def require_motor(spec: StreamSpec, env: gym.Env[Any, Any]) -> int:
-    """Return how many numbers are commanded; raise ValueError unless the spec holds the environment's actions."""
-    space = env.action_space
-    if not isinstance(space, spaces.Box):
-        raise ValueError(f"a memory drives a Box action space, got {space}")
-    if not len(spec.motor):
-        raise ValueError(f"this memory predicts no command: its stream has no action, only {', '.join(spec.slices)}")
-    if len(spec.motor) != int(np.prod(space.shape)):
-        raise ValueError(f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}")
-    return len(spec.motor)
+def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
+    """Raise ValueError unless an environment that measures ``theirs`` has what a memory of ``spec`` reads.
+
+    Further channels, another order, and objects of other tasks do not matter.
+    """
+    objects = [c.name for c in spec.channels if c.group == "object"]
+    harmless = {f"{name}: missing" for name in objects}
+    lines = [
+        line
+        for line in spec.difference(theirs)
+        if line not in harmless and not line.endswith(": new") and not line.startswith(("order: ", "dt: "))
+    ]
+    if spec.source and theirs.source and spec.source != theirs.source:
+        lines.append(f"robot: {spec.source} against {theirs.source}")
+    if objects and not any(name in theirs.slices for name in objects):
+        lines.append(f"objects: {', '.join(objects)} are known, none of which is here")
+    if lines:
+        raise ValueError("the memory does not fit this environment:\n  " + "\n  ".join(lines))

@@ -57,10 +57,10 @@ class NetworkPolicy:
         check_choice("activation", activation, ACTIVATIONS)
         check_choice("squash", squash, SQUASHES)
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
-        if not self.layers or self.layers[0][0].ndim != 2:
-            got = self.layers[0][0].shape if self.layers else "none"
-            raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {got}")
-        size = self.observation_size = int(self.layers[0][0].shape[1])
+        shapes = [W.shape for W, _ in self.layers]
+        if not shapes or len(shapes[0]) != 2:
+            raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {shapes}")
+        size = inputs = self.observation_size = int(shapes[0][1])
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
                 raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
@@ -69,11 +69,8 @@ class NetworkPolicy:
             size = len(W)
         self.action_size = size
         self.activation, self.squash = activation, squash
-        inputs = self.observation_size
-        self.mean, self.scale = (
-            np.full(inputs, usual, np.float32) if given is None else np.asarray(given, np.float32)
-            for given, usual in ((mean, 0.0), (scale, 1.0))
-        )
+        self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
+        self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
         for what, array in {"mean": self.mean, "scale": self.scale}.items():
             if array.shape != (inputs,) or not np.isfinite(array).all():
                 raise ValueError(f"{what} must be {inputs} finite numbers, got {array.shape}")
@@ -128,11 +125,7 @@ class NetworkPolicy:
 
     @classmethod
     def load(cls, path: str | Path) -> NetworkPolicy:
-        """Read what ``save`` wrote.
-
-        Raises:
-            ValueError: the file is damaged, or no agent.
-        """
+        """Read what ``save`` wrote; raise ValueError where the file is damaged, or no agent."""
         saved = read_checkpoint(path, KIND)
         header, arrays = saved.header, saved.arrays
         try:
@@ -150,10 +143,7 @@ def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
     """Return what an agent's actions depend on beside the observation, as far as ``env`` says it."""
     inner: Any = env.unwrapped
     found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
-    if hasattr(inner, "robots"):
-        found["robots"] = list(inner.robots)
-    if hasattr(inner, "controller"):
-        found["controller"] = inner.controller
-        if "render_fps" in inner.metadata:
-            found["control_freq"] = int(inner.metadata["render_fps"])
+    if hasattr(inner, "robots") and hasattr(inner, "controller"):
+        rate = int(inner.metadata["render_fps"])
+        found |= {"robots": list(inner.robots), "controller": inner.controller, "control_freq": rate}
     return found

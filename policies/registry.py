@@ -18,7 +18,6 @@ from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
 from asm_gym.policies.scripted.sway import Arm, Pusher, Swaying
-from asm_gym.policies.scripted.two_arm_lift import TwoArmLiftExpert
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
 from asm_gym.tasks import TaskSpec
@@ -29,7 +28,6 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Stack": StackExpert,
     "Door": DoorExpert,
     "Wipe": WipeExpert,
-    "TwoArmLift": TwoArmLiftExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
     **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
 }

@@ -42,11 +42,8 @@ POLICIES = {
 }
 """The first of the algorithms that use a module's policies, and their activation by default."""
 
-DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError),
-    *(LookupError, TypeError, AttributeError, ValueError),
-)
-"""Errors of reading an archive whose members are not what they should be."""
+DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, LookupError, TypeError, AttributeError)
+"""Errors, besides ValueError, of reading an archive whose members are not what they should be."""
 
 
 def read_archive(path: Path) -> NetworkPolicy:
@@ -71,13 +68,11 @@ def read_archive(path: Path) -> NetworkPolicy:
         options = {k: v for k, v in (data.get("policy_kwargs") or {}).items() if k not in (":type:", ":serialized:")}
         unknown = sorted(set(options) - set(NETWORK_OPTIONS))
         if unknown:
-            raise ValueError(
-                f"its policy_kwargs hold {', '.join(unknown)}; only {', '.join(NETWORK_OPTIONS)} are understood"
-            )
+            raise ValueError(f"its policy_kwargs hold {unknown}; only {', '.join(NETWORK_OPTIONS)} are understood")
         if "activation_fn" in options:
             activation = str(options["activation_fn"]).rstrip("'>").rsplit(".", 1)[-1].lower()
         return network(algorithm, tensors, activation)
-    except DAMAGE as error:
+    except (*DAMAGE, ValueError) as error:
         why = str(error) or type(error).__name__
         raise ValueError(f"{path} is not an agent that can be read: {why}") from error
 
@@ -100,18 +95,12 @@ def _tensors(pth: bytes) -> Tensors:
 
 
 def network(algorithm: str, tensors: Tensors, activation: str, **kwargs: Any) -> NetworkPolicy:
-    """Build the network from the tensors of a policy of stable-baselines3.
-
-    Args:
-        algorithm: ``"SAC"``, ``"TD3"`` (as DDPG) or ``"PPO"`` (as A2C).
-        kwargs: handed to ``NetworkPolicy``.
-    """
+    """Build the network of ``"SAC"``, ``"TD3"`` (as DDPG) or ``"PPO"`` (as A2C) from the tensors of its policy."""
     hidden, last, squash = {
         "TD3": ("actor.mu", (), "tanh"),
         "SAC": ("actor.latent_pi", ("actor.mu",), "tanh"),
         "PPO": ("mlp_extractor.policy_net", ("action_net",), "clip"),
     }[algorithm]
-    end = ".weight"
-    numbers = [k[len(hidden) + 1 : -len(end)] for k in tensors if k.startswith(f"{hidden}.") and k.endswith(end)]
-    names = [*(f"{hidden}.{n}" for n in sorted(map(int, numbers))), *last]
+    numbers = [k.removeprefix(f"{hidden}.").removesuffix(".weight") for k in tensors]
+    names = [*(f"{hidden}.{n}" for n in sorted(map(int, filter(str.isdecimal, numbers)))), *last]
     return NetworkPolicy([(tensors[f"{n}.weight"], tensors[f"{n}.bias"]) for n in names], activation, squash, **kwargs)

@@ -37,7 +37,7 @@ from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, evaluation_
 from asm_gym.scripts.command import one_line, run
 from asm_gym.scripts.options import Options, option
 from asm_gym.stream_source import StreamSource
-from asm_gym.tasks import ROBOTS, env_id, is_task
+from asm_gym.tasks import ROBOTS, TASKS, env_id
 from asm_gym.validation import check_choice, check_number
 
 _HARMLESS = (*HARMLESS, *EXECUTIONS)
@@ -129,7 +129,7 @@ class Args(Options):
     @property
     def elsewhere(self) -> bool:
         """Whether the environment is not one of robosuite's tasks."""
-        return not all(map(is_task, self.tasks))
+        return not all(name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS for name in self.tasks)
 
     @property
     def config(self) -> RolloutConfig:

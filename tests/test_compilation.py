@@ -46,12 +46,19 @@ print(compilation.kept_in(energy.activate))
 """
 
 
-def test_code_is_kept_nowhere_where_neither_install_nor_home_can_be_written_to_unless_a_folder_is_named(tmp_path):
+def test_code_is_kept_in_a_temporary_folder_where_neither_install_nor_home_can_be_written_to_unless_one_is_named(
+    tmp_path,
+):
+    (tmp_path / "tmp").mkdir()
     env = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "HOME")}
-    for named, kept in (({}, "None"), ({"NUMBA_CACHE_DIR": str(tmp_path)}, str(tmp_path))):
+    for named, kept in (
+        ({"TMPDIR": str(tmp_path / "tmp")}, str(tmp_path / "tmp" / "asm-gym-numba-")),
+        ({"NUMBA_CACHE_DIR": str(tmp_path)}, str(tmp_path)),
+    ):
         run = [sys.executable, "-c", NOWHERE]
         done = subprocess.run(run, capture_output=True, text=True, env=env | named, check=True, cwd=ROOT)
         assert done.stdout.startswith(kept)
+    assert not any((tmp_path / "tmp").iterdir())
 
 
 OF_A_TYPE = """

@@ -16,7 +16,7 @@ from asm_gym.policies.scripted.pick_place import _ASKEW, _PALM, _SPARE, beside_w
 from tests.rates import attempt, failures, room_to_the_stops, too_few
 
 QUICK = (
-    *("Lift", "Stack", "Door", "Wipe", "TwoArmLift", "NutAssemblySquare", "NutAssemblyRound"),
+    *("Lift", "Stack", "Door", "Wipe", "NutAssemblySquare", "NutAssemblyRound"),
     *("PickPlaceCan", "PickPlaceMilk", "PickPlaceCereal"),
 )
 

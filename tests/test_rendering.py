@@ -1,17 +1,14 @@
-"""Pictures of a scene whose geometry is known, and the window for humans."""
+"""Pictures of a scene whose geometry is known."""
 
 from __future__ import annotations
 
-import contextlib
-import sys
 from typing import Any
 
 import mujoco
-import mujoco.viewer
 import numpy as np
 import pytest
 
-from asm_gym.envs.rendering import OffscreenRenderer, Window
+from asm_gym.envs.rendering import OffscreenRenderer
 from asm_gym.graphics import rendering_backend
 
 SCENE = """
@@ -62,64 +59,3 @@ def test_another_model_is_followed_and_closing_twice_is_harmless(renderer: Offsc
     renderer.close()
     renderer.close()
     np.testing.assert_array_equal(renderer.render(*scene()), red)
-
-
-class FakeViewer:
-    """Stands for MuJoCo's viewer; records the times it shows."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, **_: Any):
-        self.m: Any = model
-        self.data = data
-        self.shown: list[float] = []
-        self.cam, self.opt = mujoco.MjvCamera(), mujoco.MjvOption()
-
-    def is_running(self) -> bool:
-        return self.m is not None
-
-    def lock(self) -> contextlib.AbstractContextManager[None]:
-        return contextlib.nullcontext()
-
-    def sync(self):
-        self.shown.append(self.data.time)
-
-    def close(self):
-        self.m = None
-
-
-@pytest.fixture
-def viewers(monkeypatch: pytest.MonkeyPatch) -> list[FakeViewer]:
-    opened: list[FakeViewer] = []
-
-    def launch(*args: Any, **kwargs: Any) -> FakeViewer:
-        opened.append(FakeViewer(*args, **kwargs))
-        return opened[-1]
-
-    monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
-    return opened
-
-
-def test_a_window_shows_every_state_and_follows_another_model(viewers: list[FakeViewer]):
-    window = Window("aslant", 0.0)
-    for k in range(2):
-        model, data = scene()
-        for time in (0.1, 0.2):
-            data.time = time
-            window.show(model, data)
-        assert viewers[k].is_running()
-        assert len(viewers) == k + 1
-        assert viewers[k].shown == [0.1, 0.2]
-        assert viewers[k].data is not data, "what is done in the window must not reach the simulation"
-        assert viewers[k].cam.fixedcamid == model.camera("aslant").id
-    assert not viewers[0].is_running()
-    window.close()
-    window.close()
-    assert not viewers[1].is_running()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
-def test_without_a_display_the_error_says_what_is_missing(monkeypatch: pytest.MonkeyPatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(RuntimeError, match="DISPLAY"):
-        Window("above", 0.0).show(*scene())

@@ -5,10 +5,8 @@ from __future__ import annotations
 import atexit
 import os
 import sys
-import time
 import weakref
 from contextlib import suppress
-from copy import copy
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -16,8 +14,6 @@ from typing import Any
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
-RENDER_MODES = ("rgb_array", "human")
 
 _live: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -55,7 +51,10 @@ class OffscreenRenderer:
     def _open(self, model: mujoco.MjModel) -> None:
         self.close()
         self._gl = _gl_context(self.width, self.height)
-        close_at_exit(self)
+        _live.add(self)
+        # Before OpenGL is cleaned up: the last to be registered is the first to run, and OpenGL has registered its own.
+        atexit.unregister(_close_all)
+        atexit.register(_close_all)
         self._gl.make_current()
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
@@ -75,70 +74,9 @@ class OffscreenRenderer:
         self._gl = self._model = None
 
 
-class Window:
-    """A window that shows a copy of the simulation's state every ``dt`` [s]; a model's replacement opens a new one.
-
-    Once its user has closed it, it stays closed.
-    """
-
-    def __init__(self, camera: str, dt: float) -> None:
-        self.camera, self.dt = camera, dt
-        self._model: mujoco.MjModel | None = None
-        self._viewer: Any = None
-        self._next = 0.0
-
-    def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Bring the window up to date and wait until the next state is due; raise RuntimeError without a display."""
-        if self._model is not model:
-            self._open(model, data)
-        elif self._viewer.is_running():
-            mujoco.mj_copyData(self._data, model, data)
-            self._viewer.sync()
-        self._next = max(self._next + self.dt, time.perf_counter())
-        time.sleep(max(0.0, self._next - time.perf_counter()))
-
-    def _open(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self.close()
-        # MuJoCo waits for ever for a window that cannot be opened.
-        if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise RuntimeError(
-                "no window for render_mode='human': it needs a display with OpenGL, which the environment variable "
-                "DISPLAY or WAYLAND_DISPLAY names; render_mode='rgb_array' needs none."
-            )
-        self._data = copy(data)
-        launch = import_module("mujoco.viewer").launch_passive
-        self._viewer = launch(model, self._data, show_left_ui=False, show_right_ui=False)
-        close_at_exit(self)
-        with self._viewer.lock():
-            self._viewer.opt.geomgroup[0] = 0  # collision shapes
-            self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
-            self._viewer.cam.fixedcamid = camera_id(model, self.camera)
-        self._viewer.sync()
-        self._model = model
-
-    def close(self) -> None:
-        """Close the window; may be called more than once."""
-        if self._viewer is not None:
-            self._viewer.close()
-            # Its thread must be done before another window opens: GLFW serves one thread at a time.
-            deadline = time.monotonic() + 5.0
-            with suppress(mujoco.UnexpectedError):
-                while self._viewer.m is not None and time.monotonic() < deadline:
-                    time.sleep(0.01)
-        self._viewer = self._model = None
-
-
 def _close_all() -> None:
     for renderer in list(_live):
         renderer.close()
-
-
-def close_at_exit(renderer: Any) -> None:
-    """Close what uses OpenGL before OpenGL itself is cleaned up, if it still exists then."""
-    _live.add(renderer)
-    # The last to be registered is the first to run, and OpenGL has registered its own by now.
-    atexit.unregister(_close_all)
-    atexit.register(_close_all)
 
 
 def camera_id(model: mujoco.MjModel, name: str) -> int:

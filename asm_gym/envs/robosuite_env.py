@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
-from asm_gym.envs.rendering import RENDER_MODES, OffscreenRenderer, Window
+from asm_gym.envs.rendering import OffscreenRenderer
 from asm_gym.envs.robots import PHYSICS_FREQ, chains_of, free_first_joints, robots_for
 from asm_gym.envs.senses import Senses
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
@@ -41,7 +41,7 @@ class RobosuiteEnv(SteppedEnv):
     Args:
         task: a name in ``asm_gym.tasks.TASKS``.
         robot: the arm, one of ``asm_gym.tasks.ROBOTS``; for a task with two arms a pair, or one name for both.
-        render_mode: ``None``, ``"rgb_array"`` or ``"human"``.
+        render_mode: ``None`` or ``"rgb_array"``.
         observation: ``"flat"`` for one Box, ``"dict"`` for named arrays.
         control_freq: actions a second [Hz]; must divide 500.
         controller: one of ``asm_gym.envs.backend.CONTROLLERS``.
@@ -58,7 +58,7 @@ class RobosuiteEnv(SteppedEnv):
         ValueError: an unknown name, the wrong number of robots, or a rate that does not fit.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class RobosuiteEnv(SteppedEnv):
     ) -> None:
         self.task = task_spec(task)
         self.robots = robots_for(self.task, robot)
-        check_choice("render_mode", render_mode, (None, *RENDER_MODES))
+        check_choice("render_mode", render_mode, (None, "rgb_array"))
         check_choice("observation", observation, ("flat", "dict"))
         if isinstance(stream, str) or not isinstance(stream, Sequence):
             raise ValueError(f"stream must be a sequence of names, got {short_repr(stream)}")
@@ -112,7 +112,6 @@ class RobosuiteEnv(SteppedEnv):
         """The simulator underneath."""
         check_choice("camera", check_text("camera", camera), self.robosuite_env.sim.model.camera_names)
         self._renderer = OffscreenRenderer(camera, render_size[1], render_size[0])
-        self._window = Window(camera, 1.0 / control_freq)
         self._bind()
         self.hand_chains = chains_of(self.simulation.parts, self.simulation.model, self.sensor_noise)
         """Kinematic chains of the arms, as they were made."""
@@ -122,13 +121,9 @@ class RobosuiteEnv(SteppedEnv):
         """Indices of the action that command grippers."""
         self._build_spaces()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
-        """Refused: robosuite's own goes on reading the simulator that it was made from."""
-        raise TypeError(f"{self} cannot be copied: make another, by gym.make(env.spec)")
-
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        """Refused: a simulator has no bytes of its own."""
-        raise TypeError(f"{self} cannot be pickled: send a function that makes it, lambda: gym.make(...)")
+        """Refuse to be copied or pickled: a simulator has no bytes of its own."""
+        raise TypeError(f"{self} cannot be copied or pickled: make another, by gym.make(env.spec)")
 
     def _bind(self) -> None:
         """Take up the present model, which a hard reset replaces."""
@@ -199,8 +194,6 @@ class RobosuiteEnv(SteppedEnv):
         self._action = np.zeros(self._actions.size, np.float32)
         self._reading = self._read()
         self._ended = False
-        if self.render_mode == "human":
-            self.render()
         return self._senses.observation(self._reading.row), self._info(bool(env._check_success()))
 
     def _is_edited(self) -> bool:
@@ -238,8 +231,6 @@ class RobosuiteEnv(SteppedEnv):
         terminated = self.terminate_on_success and success
         truncated = self._steps_taken >= self.horizon or unstable
         self._ended = terminated or truncated
-        if self.render_mode == "human":
-            self.render()
         return self._senses.observation(self._reading.row), reward, terminated, truncated, info
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
@@ -259,24 +250,15 @@ class RobosuiteEnv(SteppedEnv):
         return self._reading.row.copy()
 
     def render(self) -> NDArray[Any] | None:
-        """Return a picture (height, width, 3) uint8; show it in a window where the ``render_mode`` is ``human``.
-
-        Raises:
-            RuntimeError: this machine has nothing to draw with.
-        """
-        state = self.simulation.model, self.simulation.data
+        """Return a picture (height, width, 3) uint8; raise RuntimeError where this machine has nothing to draw with."""
         if self.render_mode == "rgb_array":
-            return self._renderer.render(*state)
-        if self.render_mode == "human":
-            self._window.show(*state)
-        else:
-            gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
+            return self._renderer.render(self.simulation.model, self.simulation.data)
+        gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
         return None
 
     def close(self) -> None:
         """Free the renderer and the simulation; may be called more than once."""
         self._renderer.close()
-        self._window.close()
         if self.robosuite_env is not None:
             self.robosuite_env.close()
             self.robosuite_env = None
