@@ -13,7 +13,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.evaluation.tables import ConsoleTable, Table
 from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
 from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
@@ -41,27 +40,17 @@ class Args(Options):
             raise ValueError(f"rounds must be at most {ROUNDS}, got {self.rounds}")
 
 
-def contents(corpus: Corpus) -> Table:
-    """Count the episodes of each policy and task by role, and the hours of the healthy ones."""
-    rows = []
-    roles = "fit", "calibration", "nominal", "faulty"
-    for policy, task in dict.fromkeys((e.policy, e.label.task) for e in corpus.entries):
-        own = [e for e in corpus.entries if (e.policy, e.label.task) == (policy, task)]
-        counts = [str(sum(e.label.role == role for e in own)) for role in roles]
-        hours = sum(e.seconds for e in own if e.label.role != "faulty") / 3600
-        rows.append((f"{task}, {policy}", *counts, f"{hours:.2f}"))
-    return Table(f"Corpus {VERSION}: {len(corpus.entries)} episodes.", ("", *roles, "healthy hours"), rows)
-
-
 def make(args: Args, console: Console) -> None:
-    """Record what is missing, part by part, and print the contents."""
+    """Record what is missing, part by part, and print how much there is."""
     sources, total = (QUICK, 1) if args.quick else (PARTS, ROUNDS)
     with claimed(args.out, "recordings.json", {"corpus": VERSION, "quick": args.quick}):
         for part in args.part:
             for number in range(min(args.rounds, total)):
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
                     record_corpus(args.out, sources[part], number, total, args.workers, progress)
-    console.print(ConsoleTable(contents(Corpus.open(args.out))))
+    entries = Corpus.open(args.out).entries
+    hours = sum(e.seconds for e in entries if e.label.role != "faulty") / 3600
+    console.print(f"Corpus {VERSION} in {args.out}: {len(entries)} episodes, {hours:.2f} healthy hours")
 
 
 main = partial(run, "corpus", Args, make)

@@ -1,9 +1,8 @@
 """Watch a robot notice that something is wrong: the whole safety loop on one robosuite task.
 
-The demo first shows what the shipped memory of the body notices, with nothing fitted. Then it collects nominal
-episodes, fits and calibrates a memory of the task, and runs nominal and faulty episodes with the policy alone and under
-the safety wrapper, paired by seed. It prints one table, and writes a report with figures, the memory and
-every number as JSON.
+The demo collects nominal episodes, fits and calibrates a memory of the task, and runs nominal and faulty episodes with
+the policy alone and under the safety wrapper, paired by seed. It prints one table, and writes a report with figures,
+the memory and every number as JSON.
 """
 
 from __future__ import annotations
@@ -40,10 +39,9 @@ from asm_gym.rollouts.watched import watch_pair
 from asm_gym.scripts.command import run
 from asm_gym.scripts.options import Options, option
 from asm_gym.tasks import TASKS, env_id
-from asm_gym.wrappers import NeuralASMSafety
 
-PUSHED, PUSHED_AT = "robot0_link5", 40
-"""Link that is pushed, and the step in which it is before anything is learned."""
+PUSHED = "robot0_link5"
+"""Link that is pushed."""
 
 
 @dataclass(frozen=True)
@@ -99,31 +97,6 @@ def trials(args: Args) -> list[Trial]:
     ]
 
 
-def shipped_memory(args: Args) -> str:
-    """Return what the shipped memory notices of a healthy episode and of a push; where none fits, say so."""
-    seed = episode_seeds(args.seed, 1, stage=3)[0]
-    push = Push(body=PUSHED, newtons=20.0, direction=(0.0, 1.0, 0.0), onset=PUSHED_AT, duration=10)
-    surprises = []
-    for faults in ((), (push,)):
-        infos: list[dict[str, Any]] = []
-        trial = Trial(env_id(args.task), seed, faults=faults)
-        with staged(trial, RolloutConfig()) as env:
-            try:
-                guarded = NeuralASMSafety(env, on_alarm="monitor", on_overrun="ignore")
-            except ValueError:
-                return f"No shipped memory fits {args.task}."
-            play(trial, RolloutConfig(), guarded, infos.append)
-        surprises.append(np.array([info["asm"]["surprise"] for info in infos]) / guarded.threshold)
-    noticed = np.flatnonzero(surprises[1][PUSHED_AT:] > 1.0)
-    after = (
-        f"noticed after {1e3 * (noticed[0] + 1) * guarded.monitor.spec.dt:.0f} ms" if len(noticed) else "not noticed"
-    )
-    return (
-        f"{guarded.monitor!r} ships with the package. Healthy, surprise reaches {surprises[0].max():.0%} of its "
-        f"threshold; a push of 20 N is {after}."
-    )
-
-
 def fit(args: Args, console: Console) -> tuple[Path, Share]:
     """Fit, calibrate and save a memory of the task; return its file and how often the expert succeeded."""
     with stage("collecting nominal episodes", console, {}) as progress:
@@ -149,7 +122,6 @@ def as_json(m: DetectionMetrics) -> dict[str, Any]:
 def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
-    console.print(shipped_memory(args), highlight=False)
     memory, expert = fit(args, console)
     todo = trials(args)
     with stage("testing, policy alone and wrapped", console, {}) as progress:

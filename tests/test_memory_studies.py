@@ -59,10 +59,9 @@ def letters_of(count: int, each: int = 6) -> tuple[list, list]:
     return copybook(letters, each, rng), copybook(letters, 3, rng)
 
 
-@pytest.mark.parametrize("cell", ["gru", "lstm"])
-def test_a_recurrent_rival_offline_reads_its_own_predictions(cell):
+def test_the_recurrent_rival_offline_reads_its_own_predictions():
     train, tests = letters_of(2)
-    model = Backpropagated.learned(train, cell, 16, np.random.default_rng(0), updates=5)
+    model = Backpropagated.learned(train, 16, np.random.default_rng(0), updates=5)
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
     offline, row = model.express(streams, 20), np.arange(STEPS)[:, None, None]
     np.testing.assert_allclose(offline[:20], model.express(streams, STEPS)[:20], atol=1e-5)

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from asm_gym.episode import Episode
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.reproduce.real_arms import FAULTS, NEWTONS, SLIP, Job, Piece, examined, jacobian, with_fault
+from asm_gym.scripts.reproduce import real_arms
+from asm_gym.scripts.reproduce.real_arms import ARMS, FAULTS, NEWTONS, SLIP, Job, Piece, examined, jacobian, with_fault
 from tests.streams import pendulum_columns
 
 
-def tiago(folder: Path, rows: int = 1500) -> Path:
-    """Three files, as TIAGo's."""
-    columns = pendulum_columns(rows)
-    (folder / "tiago_figaroh").mkdir(parents=True)
-    for kind in ("position", "velocity", "effort"):
-        lines = [f"{t},{a},{b}" for t, (a, b) in zip(columns["time"], columns[kind], strict=True)]
-        text = "\n".join([f"t,- arm_1_joint_{kind},- arm_2_joint_{kind}", *lines])
-        (folder / "tiago_figaroh" / f"tiago_{kind}.csv").write_text(text + "\n")
-    return folder
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a recording of the UR10 alone."""
+    monkeypatch.setattr(real_arms, "read_joint_states", lambda path: pendulum_columns(1500))
+    place = tmp_path / "arms" / ARMS["ur10"].place
+    place.parent.mkdir(parents=True)
+    place.touch()
+    return tmp_path / "arms"
 
 
 def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
@@ -50,13 +48,20 @@ def test_a_push_does_the_work_of_its_force():
     assert force[2] == pytest.approx(0.0, abs=1e-3)
 
 
-def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(tmp_path, capsys):
-    folder = tiago(tmp_path / "arms")
-    out = ["--out", str(tmp_path / "out"), "--monitors", "association_values+evidence", "friction_rule"]
-    assert main(["reproduce", "real_arms", str(folder), *out, "--experiments", "tiago", "ur10"]) == 0
+def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folder, tmp_path, capsys):
+    out = [
+        "--out",
+        str(tmp_path / "out"),
+        "--workers",
+        "1",
+        "--monitors",
+        "association_values+evidence",
+        "friction_rule",
+    ]
+    assert main(["reproduce", "real_arms", str(folder), *out, "--experiments", "ur10", "panda"]) == 0
     text = (tmp_path / "out" / "real_arms.md").read_text()
-    assert "PAL TIAGo" in text
-    assert "ur10_exciting_trajectory.db3 is missing: it is unisa-acg" in text
+    assert "UR10" in text
+    assert "panda_exciting_trajectory.db3 is missing: it is unisa-acg" in text
     assert main(["reproduce", "real_arms", str(tmp_path), *out]) == 2
     assert "is missing: it is unisa-acg/inverse-dynamics-solver" in capsys.readouterr().err
 
@@ -70,22 +75,20 @@ PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIA
 </joint></robot>"""
 
 
-def test_the_study_gives_monitors_a_body_model_or_names_the_missing_file(tmp_path, capsys):
-    folder = tiago(tmp_path / "arms")
-    out = ["--out", str(tmp_path / "out"), "--experiments", "tiago", "--workers", "1"]
+def test_the_study_gives_monitors_a_body_model_or_names_the_missing_file(folder, tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out"), "--experiments", "ur10", "--workers", "1"]
     command = ["reproduce", "real_arms", str(folder), *out, "--monitors", "association_values, body"]
     assert main(command) == 2
-    assert "tiago.urdf is missing: it is in example-robot-data" in capsys.readouterr().err
+    assert "ur10_robot.urdf is missing: it is in example-robot-data" in capsys.readouterr().err
     (folder / "urdf").mkdir()
-    (folder / "urdf" / "tiago.urdf").write_text(PENDULUMS)
+    (folder / "urdf" / "ur10_robot.urdf").write_text(PENDULUMS)
     assert main(command) == 0
     assert "| association_values, body |" in (tmp_path / "out" / "real_arms.md").read_text()
 
 
-def test_every_monitor_meets_the_same_faults(tmp_path):
-    folder = tiago(tmp_path / "arms")
+def test_every_monitor_meets_the_same_faults(folder):
     one, other = (
-        [r["kind"] for r in examined(Job("tiago", m, 0, 1), folder)] for m in ("channel_limit", "friction_rule")
+        [r["kind"] for r in examined(Job("ur10", m, 0, 1), folder)] for m in ("channel_limit", "friction_rule")
     )
     assert one == other
     assert set(one) == {"step", "frozen", "slipped", "late", ""}

@@ -80,18 +80,6 @@ def read(paths: tuple[Path, ...]) -> Recordings:
     return Recordings.of([load_episode(path) for path in paths])
 
 
-def recorded(run: Path) -> Recordings:
-    """Load every recording of a run of ``asm-gym evaluate`` but the harmless variations.
-
-    Raises:
-        ValueError: there is none.
-    """
-    paths = [p for role in (*NOMINAL_ROLES, "faulty") for p in sorted((run / "episodes").glob(f"*/{role}/*.npz"))]
-    if not paths:
-        raise ValueError(f"{run} holds no recordings: run asm-gym evaluate first")
-    return read(tuple(paths))
-
-
 def benchmark(
     folder: Path, files: Sequence[Path], monitors: Sequence[str], rate: float, window_s: float, seed: int, each: Map
 ) -> BenchmarkResult:

@@ -146,7 +146,7 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
             note(measure, cm=recalled(model, given.tests, given.means, cue, HAND)[0])
 
     if name == "gru":
-        gru = Backpropagated.learned(given.train, "gru", rng=np.random.default_rng(seed), updates=config.updates, **GRU)
+        gru = Backpropagated.learned(given.train, rng=np.random.default_rng(seed), updates=config.updates, **GRU)
         with torch.no_grad():
             course = closed_loop(RecurrentDriver(gru, cues.shape[1]), cues, WAYS[0], seed)
         express(gru)

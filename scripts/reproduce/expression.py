@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
-from scipy.special import softmax
 
 from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
@@ -104,62 +102,22 @@ class ExpressionMemory:
 
 @dataclass(frozen=True)
 class Backpropagated:
-    """A recurrent network trained by backpropagation through time."""
+    """A GRU trained by backpropagation through time."""
 
     reader: StreamScaler
     network: recurrent.Recurrent
 
     @classmethod
     def learned(
-        cls, episodes: Sequence[Episode], cell: str, hidden: int, rng: np.random.Generator, updates: int, **how: float
+        cls, episodes: Sequence[Episode], hidden: int, rng: np.random.Generator, updates: int, **how: float
     ) -> Backpropagated:
         """Learn from whole episodes; the arguments are those of ``recurrent.train``."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        return cls(reader, recurrent.train(trajectories(reader, episodes), cell, hidden, updates, rng, **how))
+        return cls(reader, recurrent.train(trajectories(reader, episodes), hidden, updates, rng, **how))
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
         return to_rows(self.reader, Recalled(senses, commands, commands[-1]))
-
-
-class Hopfield(NamedTuple):
-    """A modern continuous Hopfield network that keeps every window of rows.
-
-        ξ = Σ_i softmax_i(-½ β ‖q - k_i‖²) v_i      q the last rows, k_i those of a window, v_i the row that followed
-
-    Source: Ramsauer et al. 2021 (ICLR), with a distance because keys differ in length.
-    """
-
-    reader: StreamScaler
-    keys: Rows  # (N, window · D)
-    values: Rows  # (N, D)
-    window: int
-    beta: float
-
-    @classmethod
-    def learned(cls, episodes: Sequence[Episode], window: int = 5, beta: float = 100.0) -> Hopfield:
-        """Keep every window of ``window`` rows with the row after it; the first windows begin with zeros."""
-        reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        keys, values = [], []
-        for e in episodes:
-            rows = (e.stream - reader.mean) / reader.spread
-            padded = np.concatenate([np.zeros((window, rows.shape[1])), rows])
-            keys += [padded[t : t + window].ravel() for t in range(1, len(rows))]
-            values += list(rows[1:])
-        return cls(reader, np.array(keys), np.array(values), window, beta)
-
-    def retrieve(self, query: Rows) -> Rows:
-        """Return the rows (B, D) after windows (B, window · D)."""
-        distance = cdist(query, self.keys, "sqeuclidean") / self.values.shape[1]  # β means the same for every stream
-        return np.asarray(softmax(-0.5 * self.beta * distance, axis=1) @ self.values)
-
-    def express(self, streams: Rows, cue: int) -> Rows:
-        rows = (streams - self.reader.mean) / self.reader.spread  # (T, B, D)
-        past, made = np.zeros((self.window, *rows.shape[1:])), np.zeros_like(rows)
-        for t in range(len(rows)):
-            made[t] = self.retrieve(past.transpose(1, 0, 2).reshape(rows.shape[1], -1)) if t else 0.0
-            past = np.concatenate([past[1:], rows[t : t + 1] if t < cue else made[t : t + 1]])
-        return np.asarray(self.reader.mean + self.reader.spread * made)
 
 
 def mean_demonstrations(train: Sequence[Episode], hand: slice = PEN) -> Rows:

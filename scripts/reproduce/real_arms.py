@@ -9,7 +9,7 @@ from its middle on. Pieces are of one trajectory: no table says how a monitor fa
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from asm_gym.data.bags import read_bag
 from asm_gym.data.selection import complete_parts, pieces
-from asm_gym.data.text import read_text
 from asm_gym.detection.scores import Largest
 from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.tables import Table
@@ -49,23 +48,13 @@ PIECE_S, FOLDS = 1.0, 4
 """Length of a piece [s], and folds of which one is tested at a time."""
 
 
-def _bag(path: Path) -> Columns:
-    """Read a ROS 2 bag of joint states."""
+def read_joint_states(path: Path) -> Columns:
+    """Return time, position [rad], velocity and effort (T, J) of a ROS 2 bag of joint states."""
     columns = read_bag(path)
     made: Columns = {"time": columns["time"]}
     for kind in ("position", "velocity", "effort"):
         made[kind] = np.column_stack([v for n, v in columns.items() if re.fullmatch(rf".*\.{kind}\[.*\]", n)])
     return made
-
-
-def _three_files(path: Path) -> Columns:
-    """Read one file each of positions, velocities and efforts, interpolated at the times of the first one."""
-    tables = [read_text(file) for file in sorted(path.glob("*.csv"))]
-    times = [table.pop("t") for table in tables]
-    due = times[0][(times[0] >= max(t[0] for t in times)) & (times[0] <= min(t[-1] for t in times))]
-    whole = {name: np.interp(due, t, v) for t, table in zip(times, tables, strict=True) for name, v in table.items()}
-    kinds = ("position", "velocity", "effort")
-    return {"time": due} | {kind: np.column_stack([v for n, v in whole.items() if n.endswith(kind)]) for kind in kinds}
 
 
 @dataclass(frozen=True)
@@ -74,16 +63,14 @@ class RealArm:
 
     Attributes:
         robot: its name.
-        place: file or folder below that of all recordings.
+        place: file below that of all recordings.
         source: where it is published: repository at a commit, path, licence.
-        read: function from its place to columns: time, position [rad], velocity, effort (T, J) each.
         urdf: file of its body model, in the folder ``urdf`` of that of all recordings.
     """
 
     robot: str
     place: str
     source: str
-    read: Callable[[Path], Columns]
     urdf: str
 
     def body(self, folder: Path) -> str:
@@ -100,15 +87,13 @@ class RealArm:
 
     def episode(self, folder: Path) -> Episode:
         """Return the recording."""
-        return Episode.from_table(self.read(folder / self.place), success=True)
+        return Episode.from_table(read_joint_states(folder / self.place), success=True)
 
 
 UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-FIGAROH = "thanhndv212/figaroh-examples @ c0b5c7f0 (Apache-2.0 by reference)"
 ARMS = {
-    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", UNISA, _bag, "panda.urdf"),
-    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", UNISA, _bag, "ur10_robot.urdf"),
-    "tiago": RealArm("PAL TIAGo", "tiago_figaroh", FIGAROH, _three_files, "tiago.urdf"),
+    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", UNISA, "panda.urdf"),
+    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", UNISA, "ur10_robot.urdf"),
 }
 
 

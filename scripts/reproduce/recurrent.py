@@ -1,18 +1,17 @@
-"""The recurrent rivals of the memory: a GRU and an LSTM, trained by backpropagation through time.
+"""The rival of the memory: a GRU, trained by backpropagation through time.
 
-    h_t = cell(h_{t-1}, [x_{t-1}, a_{t-1}])     â_t = A h_t     x̂_t = F h_t + G a_t + b       Σ ‖x - x̂‖² + ‖a - â‖²
+    h_t = GRU(h_{t-1}, [x_{t-1}, a_{t-1}])     â_t = A h_t     x̂_t = F h_t + G a_t + b       Σ ‖x - x̂‖² + ‖a - â‖²
 
-They read what the memory reads and predict what it predicts. Noise on their inputs while learning makes them recover
-from their own errors when they run on.
+It reads what the memory reads and predicts what it predicts. Noise on its inputs while learning makes it recover from
+its own errors when it runs on.
 
-Sources: Cho et al. 2014 (EMNLP); Hochreiter and Schmidhuber 1997 (Neural Computation 9(8)); Jaeger 2001 (GMD Report
-148) for the noise.
+Sources: Cho et al. 2014 (EMNLP); Jaeger 2001 (GMD Report 148) for the noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +22,6 @@ from asm_gym.memory.learning import Trajectory
 from asm_gym.monitors.baselines.torch_model import adam, descend
 
 Array = NDArray[np.float32]
-CELLS: dict[str, Any] = {"gru": nn.GRU, "lstm": nn.LSTM}
 BATCH = 16
 """Episodes of a batch."""
 
@@ -48,11 +46,11 @@ def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> lis
 
 
 class Recurrent(nn.Module):
-    """A cell (one of ``CELLS``) of ``hidden`` units, and its readouts of the numbers sensed and commanded."""
+    """A GRU of ``hidden`` units, and its readouts of the numbers sensed and commanded."""
 
-    def __init__(self, cell: str, hidden: int, sensory: int, motor: int) -> None:
+    def __init__(self, hidden: int, sensory: int, motor: int) -> None:
         super().__init__()
-        self.cell = CELLS[cell](sensory + motor, hidden)
+        self.cell = nn.GRU(sensory + motor, hidden)
         self.act = nn.Linear(hidden, motor)
         self.sense = nn.Linear(hidden + motor, sensory)
 
@@ -79,7 +77,6 @@ class Recurrent(nn.Module):
 
 def train(
     trajectories: Sequence[Trajectory],
-    cell: str,
     hidden: int,
     updates: int,
     rng: np.random.Generator,
@@ -90,7 +87,7 @@ def train(
 
     Args:
         trajectories: the episodes, of one length.
-        cell, hidden: of ``Recurrent``.
+        hidden: units.
         updates: number of batches.
         rng: draws everything random.
         noise: standard deviation of the noise on the rows it reads.
@@ -101,7 +98,7 @@ def train(
         torch.manual_seed(int(rng.integers(2**31)))
         own = torch.Generator().manual_seed(int(rng.integers(2**31)))
         sensory, motor = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1] - 1
-        network = Recurrent(cell, hidden, sensory, motor)
+        network = Recurrent(hidden, sensory, motor)
     optimiser, schedule = adam(network, updates, rate)
     done = 0
     while done < updates:
