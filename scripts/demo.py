@@ -29,7 +29,7 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import ConsoleTable, tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.collect import collect, play, staged
+from asm_gym.rollouts.collect import collect
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
