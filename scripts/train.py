@@ -1,7 +1,7 @@
 """Train a stable-baselines3 agent: cloned from an expert's episodes, then improved by its own (SAC).
 
 Demonstrations that were recorded are not recorded again. The best agent of the evaluations is written as arrays and
-JSON, beside the clone, and judged once more on seeds of its own.
+JSON, and judged once more on seeds of its own.
 """
 
 from __future__ import annotations
@@ -81,12 +81,12 @@ def train_agent(args: Args, console: Console) -> None:
         if not solved:
             raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
         with stage("cloning and learning", console, {}) as tick:
-            agent, curve = train(plan, args.out, solved, tick)
+            agent = train(plan, args.out, solved, tick)
         with stage("judging", console, {}), closing(plan.make()) as env:
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
             success = success_rate(agent.fit_to(env, "the agent"), env, seeds)
         minutes = round((time.perf_counter() - start) / 60, 1)
-        result = {"success": success, "episodes": args.final_episodes, "curve": curve, "minutes": minutes}
+        result = {"success": success, "episodes": args.final_episodes, "minutes": minutes}
         agent.save(args.out / "agent.npz", **result)
         (args.out / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     console.print(f"success {success:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")
