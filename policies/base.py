@@ -33,14 +33,10 @@ class Policy(Protocol):
 
 @runtime_checkable
 class Reflex(Policy, Protocol):
-    """A policy that is told of every step, and starts from the action executed last."""
+    """A policy that starts from the action executed last."""
 
     def reset(self) -> None:
         """Begin a new episode."""
-        ...
-
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        """Take in the row (D,) of a step, NaN where it is missing, the action (A,), and whether this reflex did it."""
         ...
 
     def begin(self, executed: NDArray[np.float32]) -> Any:

@@ -66,9 +66,6 @@ class Hold:
     def reset(self) -> None:
         """A new episode begins."""
 
-    def feel(self, row: NDArray[np.floating[Any]], executed: NDArray[np.float32], acting: bool) -> None:
-        """What was sensed in a step (D,), what was done (A,), and whether this reflex did it."""
-
     def begin(self, executed: NDArray[np.float32]) -> Begun:
         """The state to start from, after ``executed`` (A,)."""
         return Begun(np.array(executed, np.float32), 0)

@@ -1,18 +1,17 @@
-"""Limits on what an arm may feel and how fast its hand may go: on the arm, side by side, learned, and by place."""
+"""Limits on what an arm may feel and how fast its hand may go: on the arm, side by side, and learned."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from asm_gym import collect
-from asm_gym.detection.contact_limits import UNKNOWN, ContactLimits, FamiliarSpeed, healthy_forces
+from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
 from asm_gym.guard.limits import EpisodeLimits
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
-from tests.fakes import SPEC, CueMonitor
 
 
 def down(env, steps, seed=0):
@@ -77,13 +76,13 @@ def test_limits_of_another_arm_are_refused_at_construction(lift):
 
 def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
     spec, yes, no = lift.unwrapped.stream_spec, np.ones(1, bool), np.zeros(1, bool)
-    limits, rows = EpisodeLimits(robots_of(lift, spec)[0], spec, ContactLimits(), True, None), np.zeros((1, spec.size))
+    limits = EpisodeLimits(robots_of(lift, spec)[0], ContactLimits(), True)
     limits.begin(yes)
-    limits.follow(rows, yes, yes)
+    limits.follow(yes, yes)
     told = []
     for _ in range(21):
         told.append(limits.now[0])
-        limits.follow(rows, yes, no)
+        limits.follow(yes, no)
     assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
     assert told[20] == ContactLimits()
 
@@ -113,38 +112,3 @@ def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_
     np.testing.assert_allclose(monitor.healthy_[7:], np.abs(peaks).max(axis=0), rtol=1e-6)
     monitor.save(tmp_path / "limit.asm")
     assert load_monitor(tmp_path / "limit.asm").healthy_ == monitor.healthy_
-
-
-def sweep(speed):
-    """An episode in which the hand goes along x at ``speed``, from 0 to 0.3 m."""
-    steps = int(0.3 / (0.05 * speed)) + 1
-    stream = np.zeros((steps, HAND.size), np.float32)
-    stream[:, 0] = np.arange(steps) * 0.05 * speed
-    stream[:, 3] = speed
-    return stream
-
-
-HAND = StreamSpec((Channel("hand_position", 3, "m"), Channel("hand_velocity", 3, "m/s")), 0.05)
-
-
-def test_where_the_hand_has_been_it_may_go_as_fast_and_elsewhere_slowly():
-    known = FamiliarSpeed.learned([sweep(0.1), sweep(0.1)], HAND)
-    assert known.at(np.array([0.15, 0.0, 0.0])) == pytest.approx(1.2 * 0.1, rel=1e-5)
-    assert known.at(np.array([0.15, 0.1, 0.0])) == UNKNOWN
-    assert known.at(np.full(3, np.nan)) == UNKNOWN
-    again = FamiliarSpeed.restored(known.rows)
-    np.testing.assert_allclose(again.places, known.places, atol=1e-4)
-    assert FamiliarSpeed.restored([]) is None
-    assert FamiliarSpeed.learned([np.zeros((5, 5), np.float32)], SPEC) is None
-
-
-def test_by_place_needs_a_monitor_that_knows_places_and_slows_the_hand_where_it_never_was(lift):
-    limits = ContactLimits(by_place=True)
-    with pytest.raises(ValueError, match="by_place needs a monitor that knows"):
-        NeuralASMSafety(lift, CueMonitor(spec=lift.unwrapped.stream_spec), "hold", contact_limits=limits)
-    monitor = CueMonitor(spec=lift.unwrapped.stream_spec)
-    monitor.healthy_, monitor.familiar_ = (), FamiliarSpeed(np.array([[9.0, 9.0, 9.0]]), np.array([0.2]))
-    env = NeuralASMSafety(lift, monitor, "hold", contact_limits=limits)
-    env.reset(seed=0)
-    speeds = [env.step(np.array([0, 1, 0, 0, 0, 0, -1], np.float32))[4]["asm"]["severity"]["speed"] for _ in range(20)]
-    assert max(speeds[5:]) < 0.065

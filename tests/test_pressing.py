@@ -160,7 +160,7 @@ def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_m
     no, shares = np.zeros(spec.size, bool), np.full(spec.size, 1.0 / spec.size)
     rows = np.zeros((3, spec.size), np.float32)
     found = {"over": True, "knocked": False, "lost": False, "contradiction": None, "failed": False, "presses": False}
-    alarm = Alarm(rows, shares, no, **found, feels=True, force=force, speed=0.1, may_go_on=True, read=~no, completed=())
+    alarm = Alarm(rows, shares, no, **found, feels=True, force=force, speed=0.1, may_go_on=True, completed=())
     assert diagnostician.respond(0, alarm)[0].name == ("go on" if goes_on else "hold")
 
 

@@ -140,7 +140,7 @@ def test_without_a_reflex_too_an_action_that_is_not_finite_stays_out(on_alarm):
         np.testing.assert_array_equal(env.unwrapped.actions[-1], ACT)
 
 
-@pytest.mark.parametrize("when", ["begin", "feel", "predict"])
+@pytest.mark.parametrize("when", ["begin", "predict"])
 def test_a_reflex_that_raises_is_replaced_by_staying(when):
     class Clumsy(Hold):
         def fails(self, what):
@@ -150,9 +150,6 @@ def test_a_reflex_that_raises_is_replaced_by_staying(when):
         def begin(self, executed):
             self.fails("begin")
             return super().begin(executed)
-
-        def feel(self, row, executed, acting):
-            self.fails("feel")
 
         def predict(self, *args, **more):
             self.fails("predict")

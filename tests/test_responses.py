@@ -143,9 +143,9 @@ def test_a_sensor_that_the_policy_cannot_read_stops_nobody_and_is_said(caplog):
     with caplog.at_level("INFO", "asm_gym.safety"):
         said = infos(env, 80)
     assert "complete: surprise" in caplog.text
-    assert "(unread sensor lone, 0.9" in caplog.text
-    assert (said[21]["cause"]["part"], said[21]["case"], said[21]["response"]) == ("lone", "unread sensor", "complete")
-    assert [s["unread"] for s in said] == [()] * 21 + [("lone",)] * 59  # it is never well again: nothing tells of it
+    assert "(sensor lone, 0.9" in caplog.text
+    assert (said[21]["cause"]["part"], said[21]["case"], said[21]["response"]) == ("lone", "sensor", "complete")
+    assert [s["completed"] for s in said] == [()] * 21 + [("lone",)] * 59  # it is never well again: nothing tells of it
     assert not any(s["intervened"] or s["failure"] for s in said)
     np.testing.assert_array_equal(env.unwrapped.actions, [ACT] * 80)
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from asm_gym.spec import Channel, StreamSpec
-from asm_gym.validation import check_flag, check_number, check_numbers
+from asm_gym.validation import check_flag, check_number
 
 FELT = "external_torque", "wrist_force"
 """Ends of the names of the channels that limits are about."""
@@ -27,21 +27,6 @@ LEFT_OUT = 0.05
 
 MOST = 2.5
 """What was seen counts up to so many times the usual limits: 200 N, 100 N m."""
-
-CELL, NEAR = 0.02, 0.04
-"""Edge of the cubes in which speeds are learned, and distance within which a cube counts [m]."""
-
-QUANTILE = 0.95
-"""Of the speeds in a cube."""
-
-MORE = 1.2
-"""Faster by so many times than healthy episodes were is familiar still."""
-
-UNKNOWN = 0.05
-"""Speed where nothing is known [m/s]: the first blow on a stiff table stays below 100 N."""
-
-PLACE, VELOCITY = "hand_position", "hand_velocity"
-"""Channels that tell of one hand."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +38,6 @@ class ContactLimits:
         external_torque: of each joint [N m].
         hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Of
             OSC_POSE and JOINT_POSITION, whose actions are changes of where the arm is; others are not scaled.
-        by_place: the hand goes no faster than healthy episodes of this body and task did near where it is, and slowly
-            where they never were; ``hand_speed`` is the most. That needs a monitor that was calibrated since.
         healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
         stays: the arm stays from the physics substep on after a limit was passed; else it is only said.
@@ -66,7 +49,6 @@ class ContactLimits:
     wrist_force: float = 80.0
     external_torque: float = 40.0
     hand_speed: float = 0.15
-    by_place: bool = False
     healthy: tuple[float, ...] = ()
     stays: bool = True
 
@@ -75,7 +57,6 @@ class ContactLimits:
             check_number(name, getattr(self, name), above=0, infinite=True)
         for value in self.healthy:
             check_number("healthy", value, low=0)
-        check_flag("by_place", self.by_place)
         check_flag("stays", self.stays)
 
     def most(self, felt: Sequence[Channel]) -> NDArray[np.float64]:
@@ -121,47 +102,3 @@ def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpe
     shares = (reached / usual).max(axis=1)
     kept = shares <= np.quantile(shares, 1.0 - LEFT_OUT, method="higher" if len(shares) < 1.0 / LEFT_OUT else "lower")
     return tuple(np.minimum(reached[kept].max(axis=0), MOST * usual).tolist())
-
-
-class FamiliarSpeed(NamedTuple):
-    """How fast a hand has healthily gone at each place: the 95 % quantile in cubes of ``CELL``.
-
-    Attributes:
-        places: (n, 3) middles of cubes [m].
-        speeds: (n,) [m/s].
-    """
-
-    places: NDArray[np.float64]
-    speeds: NDArray[np.float64]
-
-    @classmethod
-    def learned(cls, streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> Self | None:
-        """Learn it from healthy episodes (T, D); None where their stream tells of no hand, or of two."""
-        if not streams or PLACE not in spec.slices or VELOCITY not in spec.slices:
-            return None
-        rows = np.concatenate([np.asarray(stream, np.float64) for stream in streams])
-        cells = np.floor(rows[:, spec.slices[PLACE]] / CELL).astype(np.int64)
-        speeds = np.linalg.norm(rows[:, spec.slices[VELOCITY]], axis=1)
-        finite = np.isfinite(speeds) & np.isfinite(rows[:, spec.slices[PLACE]]).all(axis=1)
-        known, which = np.unique(cells[finite], axis=0, return_inverse=True)
-        usual = [np.quantile(speeds[finite][which.ravel() == n], QUANTILE) for n in range(len(known))]
-        return cls((known + 0.5) * CELL, np.array(usual))
-
-    @classmethod
-    def restored(cls, rows: ArrayLike) -> Self | None:
-        """Return what ``rows`` says; None of nothing. Raises ValueError where it is something else."""
-        if not np.size(rows):
-            return None
-        saved = check_numbers("familiar speeds", rows, len(np.asarray(rows)), 4)
-        return cls(saved[:, :3], saved[:, 3])
-
-    @property
-    def rows(self) -> list[list[float]]:
-        """What a file keeps: place and speed, a row each."""
-        found: list[list[float]] = np.column_stack([self.places, self.speeds]).round(4).tolist()
-        return found
-
-    def at(self, place: NDArray[np.floating[Any]]) -> float:
-        """Return how fast a hand may go at ``place`` (3,) [m/s], by the fastest of the cubes within ``NEAR``."""
-        near = np.linalg.norm(self.places - place, axis=1) <= NEAR
-        return max(UNKNOWN, MORE * float(self.speeds[near].max())) if near.any() else UNKNOWN

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.guard.hand import Contradiction
-from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, UNREAD, Response
+from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
 from asm_gym.guard.robots import NO_COLUMNS, named
 from asm_gym.guard.severity import FAST, FREE_FORCE
 from asm_gym.memory.completion import Completion
@@ -51,7 +51,6 @@ class Alarm(NamedTuple):
     force: float  # contact force [N]
     speed: float  # of the fastest hand [m/s]
     may_go_on: bool  # the policy has not gone on in alarm for too long yet
-    read: Mask | None  # (D,) which columns the policy reads; None where senses cannot be completed
     completed: tuple[str, ...] | None  # the sensors that are completed; None where they cannot be
 
     @property
@@ -197,7 +196,7 @@ class Diagnostician:
         if alarm.presses:
             case = f"{'lasting ' if self._lasts(incident, PRESSING) else ''}{PRESSING}"
         else:
-            case = self._case(incident, family, cause, alarm.read)
+            case = "lasting contact" if family == "contact" and self._lasts(incident, family) else family
         name = self._table[case]
         if name == "go on" and self._blocked(family, cause, alarm.rows):
             # Whatever the policy goes on with, it does not move the arm, and presses.
@@ -207,14 +206,6 @@ class Diagnostician:
             name = self._table["unknown"] if case != "unknown" else "hold"
             name = "hold" if name in GOING_ON else name
         return case, name
-
-    def _case(self, incident: _Incident, family: str, cause: Cause | None, read: Mask | None) -> str:
-        """Return the row of the table for a cause of ``family``."""
-        if family == "contact" and self._lasts(incident, family):
-            return f"lasting {family}"
-        if family != "sensor" or cause is None or read is None:
-            return family
-        return family if read[cause.columns].any() else UNREAD
 
     def _cause(self, incident: _Incident, alarm: Alarm) -> Cause | None:
         """Return the cause; a contradiction names a sensor beyond doubt, though perhaps not which."""

@@ -20,7 +20,7 @@ from asm_gym.detection.events import EVENTS, FAULT, KNOCK
 from asm_gym.guard.arbiter import POLICY, REFLEX, Arbiter, Judged
 from asm_gym.guard.checks import STALE, Fitted, diagnosis_of
 from asm_gym.guard.diagnosis import Alarm, Diagnostician
-from asm_gym.guard.limits import EpisodeLimits, familiar_to, limits_of
+from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import Observation, Observer, joined
 from asm_gym.guard.options import GuardOptions
@@ -96,7 +96,7 @@ class Engine:
         self._rows = Rows(robots, spec, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, n, self._rows, options, recalls)
         limits, acts_on_them = limits_of(options.contact_limits, monitor), name != "monitor" and robots.rest.size > 0
-        self._limits = EpisodeLimits(robots, spec, limits, acts_on_them, familiar_to(monitor, limits))
+        self._limits = EpisodeLimits(robots, limits, acts_on_them)
         self.running = self._arbiter.running
         """The threshold that follows a policy; None where it does not."""
         self.confirmed = self._arbiter.confirmed
@@ -187,7 +187,8 @@ class Engine:
         severity, over, event, some = self._severity.weigh(
             believed.rows, self._nothing_felt if felt is None else felt, held, observed.surprise, active, decides
         )
-        unfelt = self._motions.feel(believed.rows, executed, intervened, active) if ends_step else NOTHING
+        if ends_step:
+            self._motions.feel(believed.rows, executed, intervened, active)
         if observed.expected is not None:
             self._motions.expect(observed.expected)
         report = RowReport(
@@ -204,17 +205,16 @@ class Engine:
             believed.lost,
             observed.latency,
         )
-        if some or unfelt or self._rows.repairs:
+        if some or self._rows.repairs:
             row = _Row(believed, observed, severity, over, event, executed, intervened, refused)
             outcomes = {i: self._decide(i, row) for i in np.flatnonzero(decides).tolist()}
             self._held = self._arbiter.state == REFLEX
-            unforgotten = self._forget(outcomes, active)
-            report = self._completed(report, outcomes, (unfelt, unforgotten))
+            report = self._completed(report, outcomes, self._forget(outcomes, active))
             self._rows.drop_repairs()
         if some or not self._limits.steady:
             policy = active & ~intervened
             pressed = policy & severity.presses
-            self._limits.follow(believed.rows, policy if ends_step else pressed, pressed)
+            self._limits.follow(policy if ends_step else pressed, pressed)
         return report if all(active.tolist()) else report.of(active)
 
     @property
@@ -269,7 +269,7 @@ class Engine:
             feels = bool(np.isfinite(row.severity.felt[i, 0]) or np.isfinite(force))
             shares, known, may_go_on = observed.surprise.attribution[i], self._rows.known(i), self._arbiter.may_go_on(i)
             found = over, knocked, lost, contradiction, failed, presses, feels, force, speed, may_go_on
-            response = self._response(i, Alarm(rows, shares, known, *found, self._rows.read, completed))
+            response = self._response(i, Alarm(rows, shares, known, *found, completed))
         intervened = bool(row.intervened[i])
         if not intervened and np.isfinite(value) and (warning := self._arbiter.judge_policy(i, alarm)):
             warnings.warn(warning, stacklevel=4)
@@ -302,17 +302,14 @@ class Engine:
             return NOTHING
         return dict.fromkeys(np.flatnonzero(acted_on).tolist(), said)
 
-    def _completed(
-        self, report: RowReport, outcomes: Mapping[int, Outcome], failures: Sequence[Mapping[int, str]]
-    ) -> RowReport:
+    def _completed(self, report: RowReport, outcomes: Mapping[int, Outcome], failures: Mapping[int, str]) -> RowReport:
         """Return a report with what was decided, completed, and failed meanwhile."""
         for i, outcome in outcomes.items():
             if outcome.alarm:
                 report.alarm[i], report.event[i] = True, outcome.event
-        repairs = {i: (repair.names, repair.unread) for i, repair in self._rows.repairs.items()}
-        state, failed = self._arbiter.state.copy(), dict(report.failure)
-        for some in failures:
-            failed |= {i: joined(failed.get(i, ""), said) for i, said in some.items()}
+        repairs = {i: repair.names for i, repair in self._rows.repairs.items()}
+        failed = {**report.failure, **{i: joined(report.failure.get(i, ""), said) for i, said in failures.items()}}
+        state = self._arbiter.state.copy()
         return report._replace(state=state, outcomes=outcomes, failure=failed, repairs=repairs)
 
     def _warn(self, robot: int, failure: str, instead: str) -> None:

@@ -113,24 +113,11 @@ class Motions:
         self._last[:] = executed
         return Command(executed, brakes, overridden, failures), refused
 
-    def feel(self, rows: Floats32, executed: Floats32, intervened: Mask, active: Mask) -> Mapping[int, str]:
-        """Let the reflexes feel rows (n, D) and what was executed (n, A); return what failed, by robot."""
-        failures = {}
+    def feel(self, rows: Floats32, executed: Floats32, intervened: Mask, active: Mask) -> None:
+        """Let the reflexes feel rows (n, D), and what was executed (n, A)."""
         r = self._reflexes
         if r is not None and r.feels:
             _feel(rows, r.torques, executed, intervened, active, r.torque, r.usual, r.path, r.steps)
-        if not self._policies:
-            return NOTHING
-        for i in np.flatnonzero(active):
-            policy = self._policies[i]
-            if not isinstance(policy, Reflex):
-                continue
-            try:
-                policy.feel(rows[i], executed[i], bool(intervened[i]))
-            except Exception as error:
-                failures[int(i)] = f"reflex: {error!r}"
-                self._warn(int(i), failures[int(i)], "it has not felt this row")
-        return failures
 
     def expect(self, expected: Floats32) -> None:
         """Take up what the memory expects to be commanded next (n, A)."""

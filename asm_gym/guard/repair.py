@@ -86,11 +86,6 @@ class Repair:
         return tuple(self._well)
 
     @property
-    def unread(self) -> tuple[str, ...]:
-        """Those of them that the policy does not read: it goes on without them, however long they are missing."""
-        return tuple(name for name, own in self._completion.sensors if name in self._well and not self._read[own].any())
-
-    @property
     def trusted(self) -> bool:
         """False once a sense that no other tells of is missing for long, any for very long, or too many at a time."""
         sensory = self._spec.sensory

@@ -52,7 +52,7 @@ class RowReport(NamedTuple):
     severity: Severity
     outcomes: Mapping[int, Outcome] = NOTHING
     failure: Mapping[int, str] = NOTHING
-    repairs: Mapping[int, tuple[tuple[str, ...], tuple[str, ...]]] = NOTHING  # not believed, and not observed either
+    repairs: Mapping[int, tuple[str, ...]] = NOTHING  # the sensors that are not believed
     lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
     latency: float = 0.0  # of the monitor [s]
 
@@ -70,10 +70,6 @@ class RowReport(NamedTuple):
             found[i] = outcome.alarm and (outcome.event != KNOCKED or outcome.reason == CONTACT)
         return found
 
-    def outcome(self, robot: int) -> Outcome:
-        """Return what became of the row of a robot."""
-        return self.outcomes.get(robot, NO_OUTCOME)
-
     def with_failures(self, failures: Mapping[int, str]) -> RowReport:
         """Return the same with what failed before the rows, by robot."""
         both = {i: joined(said, self.failure.get(i, "")) for i, said in failures.items()}
@@ -81,11 +77,12 @@ class RowReport(NamedTuple):
 
     def of(self, which: Mask) -> RowReport:
         """Return the same with nothing to say of all robots but those of ``which`` (n,)."""
-        mappings, arrays = ("outcomes", "failure", "repairs", "lost"), ("alarm", "intervened", "event", "state")
-        parts: dict[str, Any] = {
-            name: np.where(which, part := getattr(self, name), np.zeros_like(part)) for name in arrays
-        }
-        parts |= {name: {i: said for i, said in getattr(self, name).items() if which[i]} for name in mappings}
+        parts: dict[str, Any] = {}
+        for name in ("alarm", "intervened", "event", "state"):
+            values = getattr(self, name)
+            parts[name] = np.where(which, values, np.zeros_like(values))
+        for name in ("outcomes", "failure", "repairs", "lost"):
+            parts[name] = {i: value for i, value in getattr(self, name).items() if which[i]}
         return self._replace(surprise=self.surprise.silenced(~which), severity=self.severity.where(which), **parts)
 
     @classmethod
@@ -102,91 +99,62 @@ NO_OUTCOME = Outcome(False, "", 0, NO_RESPONSE, Decision())
 def report(
     rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, failed: str = ""
 ) -> dict[str, Any]:
-    """Return what to say of the rows of a step of one robot.
+    """Return what to say of the rows of a step of one robot; the wrapper adds ``alarms``, steps in alarm so far.
 
     Args:
         executed: (A,) the action that was done last; None before the first step.
         failed: what failed before the step; empty where nothing did.
-
-    Returns:
-        ``surprise``: the largest of this step; infinite where something failed. ``threshold``. ``alarm``, and its
-        ``reason``: ``"surprise"`` is over the threshold, a
-        ``"contact"`` limit was passed, hand and joints are in ``"contradiction"``, a number of the stream is
-        ``"missing"``, or a ``"failure"``. ``event``: ``"fault"`` of the body, its senses or its commands; ``"knock"``,
-        from which the policy goes on after a pause; ``"stop"``, a joint at its stop, which is no alarm; or empty.
-        ``intervened``: something else than the policy acted, in a part of this step at least. ``state``: who acts next,
-        one of ``asm_gym.guard.arbiter.State``. ``gave_up``: the episode ends. ``transition``: the name in
-        ``asm_gym.guard.arbiter.TRANSITIONS`` of what has led there, ``"override"``, ``"release"``, ``"trial"``,
-        ``"give_up"``, or how the policy goes on in alarm, ``"go on"``, ``"complete"``; empty where nothing changes.
-        They go to the log ``asm_gym.safety`` with the cause. ``failure``: what failed in this step, ``policy: …``,
-        ``stream: …``, ``monitor: …``, ``completion: …`` or ``reflex: …``; or empty. ``cause``: at an alarm, ``family``
-        (one of ``asm_gym.monitors.diagnosis.FAMILIES``), ``part``, ``probability`` of the family, ``probabilities`` of
-        all. ``severity``: how bad it is,
-        see ``asm_gym.guard.severity.Severity``. ``response``: what is done about it under ``"graded"``, and ``case``:
-        the row of the table that says so. ``executed_action``: the last one, a copy; beneath it ``contact_limits`` may
-        have slowed the hand down, as the stream says. ``attribution``: what each number of the stream adds to
-        surprise. ``surprises`` (k,) of all rows in this step. ``latency_us``: the longest time that the monitor took
-        for one. ``completed``: the sensors that are not believed now, ``unread``: those of them that stand in no
-        observation, so that the policy goes on without them, ``lost``: the numbers that were not finite. The wrapper
-        adds ``alarms``, steps in alarm in this episode so far.
     """
     surprises = np.array([row.surprise.value[robot] for row in rows])
     largest, last = int(surprises.argmax()), rows[-1]
-    outcomes = [row.outcome(robot) for row in rows]
+    outcomes = [row.outcomes.get(robot, NO_OUTCOME) for row in rows]
     caused = next((o.response for o in reversed(outcomes) if o.response.why), NO_RESPONSE)
-    worst, reasons = rows[largest].surprise, [o.reason for o in outcomes if o.reason]
-    completed, unread = last.repairs.get(robot, ((), ()))
+    reasons = [o.reason for o in outcomes if o.reason]
+    shares = rows[largest].surprise.attribution[robot].tolist()
     return {
-        "surprise": float(surprises[largest]),
+        "surprise": float(surprises[largest]),  # the largest of this step; infinite where something failed
         "threshold": float(last.threshold[robot]),
         "alarm": any(bool(row.alarm[robot]) for row in rows),
-        "reason": min(reasons, key=REASONS.index, default=""),
-        "event": EVENTS[max(int(row.event[robot]) for row in rows)],
-        "state": str(STATES[last.state[robot]]),
-        "intervened": any(bool(row.intervened[robot]) for row in rows),
-        "gave_up": any(bool(row.gave_up[robot]) for row in rows),
+        "reason": min(reasons, key=REASONS.index, default=""),  # of the alarm, the first of ``REASONS``
+        "event": EVENTS[max(int(row.event[robot]) for row in rows)],  # "fault", "knock", "stop" (no alarm), or empty
+        "state": str(STATES[last.state[robot]]),  # who acts next
+        "intervened": any(bool(row.intervened[robot]) for row in rows),  # another than the policy acted, in some row
+        "gave_up": any(bool(row.gave_up[robot]) for row in rows),  # the episode ends
+        # What has led to the state, a name in ``TRANSITIONS``, or how the policy goes on in alarm; empty for no change
         "transition": next((t for o in reversed(outcomes) if (t := o.decision.transition)), ""),
+        # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
         "failure": joined(failed, *(row.failure.get(robot, "") for row in rows)),
-        "cause": caused.cause,
-        "response": caused.name,
-        "case": caused.case,
-        "severity": last.severity.named(robot),
-        "executed_action": None if executed is None else np.array(executed),
-        "attribution": dict(zip(spec.labels, worst.attribution[robot].tolist(), strict=True)),
-        "surprises": surprises,
-        "latency_us": 1e6 * max(row.latency for row in rows),
-        "completed": completed,
-        "unread": unread,
-        "lost": last.lost.get(robot, ()),
+        "cause": caused.cause,  # of an alarm: family, part, probability of the family, probabilities of all
+        "response": caused.name,  # what is done about it under "graded"
+        "case": caused.case,  # the row of the table of responses that says so
+        "severity": last.severity.named(robot),  # how bad it is, see ``Severity``
+        "executed_action": None if executed is None else np.array(executed),  # before limits of the hand's speed
+        "attribution": dict(zip(spec.labels, shares, strict=True)),  # what each number adds to the largest surprise
+        "surprises": surprises,  # (k,) of all rows in this step
+        "latency_us": 1e6 * max(row.latency for row in rows),  # the longest time that the monitor took for a row
+        "completed": last.repairs.get(robot, ()),  # the sensors that are not believed now
+        "lost": last.lost.get(robot, ()),  # the numbers that were not finite
     }
 
 
 def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:
     """Return what ``report`` says of one row of each robot, in arrays whose first axis is n."""
     each = [report([row], i, spec) for i in range(len(row.alarm))]
-    found: dict[str, Any] = {key: _array([said[key] for said in each]) for key in each[0]}
-    for key in ("severity", "attribution"):
-        found[key] = {name: np.array([said[key][name] for said in each]) for name in each[0][key]}
+    found: dict[str, Any] = {}
+    for key, first in each[0].items():
+        values = [said[key] for said in each]
+        if key in ("severity", "attribution"):
+            found[key] = {name: np.array([value[name] for value in values]) for name in first}
+        elif isinstance(first, dict | tuple):
+            found[key] = np.empty(len(values), object)
+            found[key][:] = values
+        else:
+            found[key] = np.array(values)
     return found | {"executed_action": None, "surprises": row.surprise.value[:, None]}
 
 
-def _array(values: list[Any]) -> NDArray[Any]:
-    """Return values in an array, each of them one element."""
-    if not isinstance(values[0], dict | tuple):
-        return np.array(values)
-    array = np.empty(len(values), object)
-    array[:] = values
-    return array
-
-
 class LazyInfo(dict[str, Any]):
-    """A dict whose content is made when it is first read; copied or pickled it is a plain dict.
-
-    Args:
-        make: returns the content, from values that never change.
-    """
-
-    __slots__ = ("_make",)
+    """A dict whose content ``make`` returns when it is first read; copied or pickled it is a plain dict."""
 
     def __init__(self, make: Callable[[], Mapping[str, Any]]) -> None:
         self._make: Callable[[], Mapping[str, Any]] | None = make
@@ -201,20 +169,16 @@ class LazyInfo(dict[str, Any]):
         """Make the content now; what was written before stays."""
         make, self._make = self._make, None
         if make is not None:
-            written = dict.copy(self)
-            dict.clear(self)
-            dict.update(self, make(), **written)
+            dict.update(self, {**make(), **dict.copy(self)})
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         return dict, (dict(self),)
 
 
 def _filled_first(name: str) -> Callable[..., Any]:
-    own = getattr(dict, name)
-
     def method(self: LazyInfo, *args: Any, **kwargs: Any) -> Any:
         self.fill()
-        return own(self, *args, **kwargs)
+        return getattr(dict, name)(self, *args, **kwargs)
 
     return method
 

@@ -13,13 +13,10 @@ LASTING = {"contact": 1.0, "actuator": 2.5}
 has been pressed for most of that time and has not turned. Where the policy goes on in spite of another cause, and the
 arm is pressed so and does not move, it is a lasting contact."""
 
-UNREAD = "unread sensor"
-"""A sensor at fault of which nothing stands in the observation, so that the policy has never read it."""
-
 PRESSING = "pressing"
 """The arm presses harder than healthy motion does, whatever the cause is taken for."""
 
-CAUSES = (*FAMILIES, UNREAD, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
+CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
 """What a table of responses says something about."""
 
 GOING_ON = ("go on", "complete")
@@ -31,7 +28,6 @@ force; give way to what presses; go back along the path; stay, and end the episo
 
 DEFAULT: dict[str, str] = {
     "sensor": "complete",
-    UNREAD: "complete",
     "contact": "hold",
     "lasting contact": "comply",
     "actuator": "go on",

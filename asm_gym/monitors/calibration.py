@@ -23,7 +23,7 @@ from asm_gym.detection import (
 )
 from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import EPISODE, HOUR, check_hours
-from asm_gym.detection.contact_limits import FamiliarSpeed, healthy_forces
+from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.stream_model import StreamModel
@@ -100,7 +100,6 @@ class Calibrated:
         promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty where the stream has no such channels.
-        familiar_: speed of the hand at each place in them; None where the stream has no hand.
     """
 
     spec: StreamSpec
@@ -113,7 +112,6 @@ class Calibrated:
     blocks_: Blocks | None
     promised_: str
     healthy_: tuple[float, ...]
-    familiar_: FamiliarSpeed | None
 
     @typed
     def calibrate(
@@ -157,9 +155,7 @@ class Calibrated:
         self.threshold_, self.promised_ = threshold, asked.per
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
         warn_of_crashes(episodes, values, threshold, asked, each)
-        streams = [episode.stream for episode in episodes]
-        self.healthy_ = healthy_forces(streams, self.spec)
-        self.familiar_ = FamiliarSpeed.learned(streams, self.spec)
+        self.healthy_ = healthy_forces([episode.stream for episode in episodes], self.spec)
         return self
 
     @property
@@ -197,7 +193,7 @@ class Calibrated:
     def _require_fitted(self) -> None: ...
 
     def _uncalibrate(self) -> None:
-        self.threshold_ = self.maxima_ = self.blocks_ = self.familiar_ = None
+        self.threshold_ = self.maxima_ = self.blocks_ = None
         self.promised_, self.healthy_ = EPISODE, ()
 
     @property

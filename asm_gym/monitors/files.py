@@ -13,7 +13,6 @@ from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
-from asm_gym.detection.contact_limits import FamiliarSpeed
 from asm_gym.monitors.packing import packed, unpacked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
@@ -60,7 +59,6 @@ class SavedMonitor(NamedTuple):
             "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
             "about": dict(header["about"]),
             "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
-            "familiar_": FamiliarSpeed.restored(header.get("familiar", [])),
         }
         return cls(arrays, kept, calibrated, header["threshold"])
 
@@ -93,7 +91,6 @@ def write_monitor(path: str | Path, monitor: CalibratedMonitor) -> None:
         "skills": list(monitor.skills_),
         "about": monitor.about,
         "healthy": list(monitor.healthy_),
-        "familiar": [] if monitor.familiar_ is None else monitor.familiar_.rows,
         "shapes": {name: list(array.shape) for name, array in arrays.items()},
     }
     write_checkpoint(path, monitor.model.kind, header, packed(arrays))
