@@ -35,8 +35,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import Options, option
+from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice

@@ -30,8 +30,7 @@ from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import Options, option
+from asm_gym.scripts.command import Options, option, run
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import env_id
@@ -39,6 +38,7 @@ from asm_gym.tasks import task as task_spec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.robots import body_memory
 
+NAMES = "monitor", "safety", "env"
 PARTS = 10
 """Parts of a measurement; a ratio's spread is that of the ratios of their medians."""
 Rivals = dict[str, Callable[[], Any]]
@@ -48,7 +48,7 @@ Rivals = dict[str, Callable[[], Any]]
 class Args(Options):
     """Speeds as ratios against rivals."""
 
-    what: tuple[str, ...] = option(("monitor", "safety", "env"), least=1, known=lambda: BENCHMARKS, positional=True)
+    what: tuple[str, ...] = option(NAMES, least=1, known=NAMES, positional=True)
     """One call of observe(); the safety wrapper's share of a step; an environment's step against robosuite's."""
     task: str = option("Lift", check=env_id, metavar="TASK")
     """Task of the environments, with the Panda."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import make_dataclass
 from importlib import import_module
-from typing import Annotated, Any, Union
+from typing import Any
 
 from asm_gym import __version__
 from asm_gym.extras import needed_for
@@ -28,7 +27,6 @@ COMMANDS = {
     "reproduce": "run the studies behind the method's claims",
     "benchmark": "measure speeds as ratios against named rivals",
 }
-COMPLETION = "--tyro-print-completion"
 
 
 def usage(prog: str, lines: dict[str, str], *notes: str) -> str:
@@ -38,46 +36,24 @@ def usage(prog: str, lines: dict[str, str], *notes: str) -> str:
     return "\n".join([f"usage: {prog} [OPTIONS]", "", *parts, "", *notes])
 
 
-def module_of(command: str) -> Any:
-    """Return the module of a command, which has ``main(argv) -> int``."""
-    return import_module("asm_gym.scripts." + ("inspect_log" if command == "inspect" else command))
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit code, as ``asm_gym.scripts.command`` lists them."""
     name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
-    if name in ("-h", "--help", "help", "--version"):
-        notes = f"asm-gym {COMPLETION} bash (or zsh, tcsh) prints a completion script.", "asm-gym --version"
-        print(f"asm-gym {__version__}" if name == "--version" else usage("asm-gym COMMAND", COMMANDS, *notes))
+    if name == "--version":
+        print(f"asm-gym {__version__}")
+        return DONE
+    if name in ("-h", "--help", "help"):
+        print(usage("asm-gym COMMAND", COMMANDS, "asm-gym --version"))
         return DONE
 
     def work() -> int:
-        if name == COMPLETION:
-            print_completion([name, *rest])
         check_choice("command", name, COMMANDS)
         with needed_for("this command"):
-            run = module_of(name).main
-        code: int = run(rest)
+            module: Any = import_module("asm_gym.scripts." + ("inspect_log" if name == "inspect" else name))
+        code: int = module.main(rest)
         return code
 
     return exit_code(name if name in COMMANDS else "", work)
-
-
-def print_completion(argv: list[str]) -> None:
-    """Print tyro's completion script of all commands and studies; raises SystemExit when done."""
-    import tyro
-
-    from asm_gym.scripts import reproduce
-    from asm_gym.scripts.options import parser
-
-    def union(kinds: dict[str, Any]) -> Any:
-        annotated: Any = Annotated
-        return Union[tuple(annotated[kind, tyro.conf.subcommand(name=name)] for name, kind in kinds.items())]  # noqa: UP007
-
-    found = {name: parser(module_of(name).Args) for name in COMMANDS if name != "reproduce"}
-    studies = {study: parser(reproduce.options_of(study)) for study in reproduce.STUDIES}
-    found["reproduce"] = make_dataclass("reproduce", [("study", union(studies))])
-    tyro.cli(union(found), prog="asm-gym", args=argv, config=(tyro.conf.OmitSubcommandPrefixes,))
 
 
 if __name__ == "__main__":

@@ -23,8 +23,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import Options, option
+from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 

@@ -7,7 +7,8 @@
  130  interrupted by Ctrl-C; 143 by ``kill``: no worker process is left behind
 ====  ===================================================================================
 
-``PYTHONDEVMODE=1`` shows the traceback of a refusal.
+Options are the fields of a frozen dataclass, read by tyro; the string under a field is its help. ``PYTHONDEVMODE=1``
+shows the traceback of a refusal.
 """
 
 from __future__ import annotations
@@ -17,26 +18,142 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import gymnasium as gym
 
-from asm_gym.scripts.options import parser
+from asm_gym.validation import check_choice
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+T = TypeVar("T")
 Args = TypeVar("Args")
 DONE, BAD_NEWS, REFUSED = 0, 1, 2
-
 USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
 """Errors that a user can put right; a cluster that is not at its address is an OSError too."""
+_SAME: Any = object()
+_ANNOTATED: Any = Annotated
 
 
 class Terminated(KeyboardInterrupt):
     """The process received SIGTERM."""
+
+
+# ------------------------------------------------------------------ options
+
+
+def option(
+    default: T = MISSING,  # type: ignore[assignment]
+    *,
+    quick: T = _SAME,
+    least: float | None = None,
+    known: Iterable[str] = (),
+    check: Callable[[Any], object] | None = None,
+    metavar: str = "",
+    positional: bool = False,
+) -> T:
+    """Return a dataclass field that is an option of a command.
+
+    Args:
+        default: value; without one the option is required.
+        quick: default with ``--quick``.
+        least: lowest number, or the least length of a tuple.
+        known: names that the help lists; no others are accepted, unless ``check`` decides.
+        check: function that raises for a value, or for an element of a tuple, that is not accepted.
+        metavar: placeholder of the value in the help.
+        positional: whether the option is given without its name.
+    """
+    about = {"quick": quick, "least": least, "known": known, "check": check}
+    made: T = field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
+    return made
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Options that are checked when they are made: ValueError where one is too small or an unknown name."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value, about = getattr(self, each.name), each.metadata
+            if value is None:
+                continue
+            if (least := about.get("least")) is not None:
+                many = isinstance(value, Sequence)
+                name, number = (f"the number of {each.name}", len(value)) if many else (each.name, value)
+                if not number >= least:
+                    raise ValueError(f"{name} must be at least {least:g}, got {number}")
+            for one in value if isinstance(value, tuple) else (value,):
+                if check := about.get("check"):
+                    check(one)
+                elif known := about.get("known"):
+                    check_choice(each.name.removesuffix("s").replace("_", " "), one, known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Checked):
+    """Options of most commands."""
+
+    seed: int = option(0, least=0)
+    """Seed of all that is drawn: the same seed gives the same result."""
+    quick: bool = False
+    """Little of everything: to see that it runs, not to judge the figures."""
+
+
+def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Args:
+    """Return the options of a command; those not typed have their defaults, or with ``--quick`` their quick values.
+
+    Raises:
+        SystemExit: help was asked for, or options are unknown or unreadable; tyro printed why.
+        ValueError: the dataclass refuses a value.
+    """
+    import tyro
+
+    args = list(sys.argv[1:] if argv is None else argv)
+    text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
+    flags = (tyro.conf.FlagCreatePairsOff,)
+    readable = _readable(kind, "--quick" in args)
+    typed = tyro.cli(readable, args=args, prog=f"asm-gym {name}", description=text, config=flags)
+    return kind(**vars(typed))
+
+
+def _readable(kind: type[Any], quick: bool) -> Any:
+    """Return a subclass of ``kind`` that tyro reads: annotated, and not checked while it is read."""
+    import tyro
+
+    hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
+    marks: Any = tyro.conf
+    made: list[Any] = []
+    for each in fields(kind):
+        about, hint = each.metadata, hints[each.name]
+        shown = marks.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
+        hint = _ANNOTATED[hint, shown]
+        hint = marks.Positional[hint] if about.get("positional") else hint
+        default = about["quick"] if quick and about.get("quick", _SAME) is not _SAME else each.default
+        made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
+    unchecked = {"__post_init__": lambda self: None}
+    return make_dataclass(kind.__name__, made, bases=(kind,), frozen=True, namespace=unchecked)
+
+
+def _hint(about: Any) -> Callable[[str], str]:
+    """Return what the help says after an option's text: known names, its default and its quick value."""
+
+    def hint(default: str) -> str:
+        names, quick = about.get("known", ()), about.get("quick", _SAME)
+        parts = [f"known: {', '.join(names)}"] if names else []
+        if default not in ("", "None", "True", "False"):
+            parts.append("required" if default == "(required)" else f"default: {default}")
+        if quick is not _SAME:
+            parts.append(f"--quick: {' '.join(map(str, quick)) if isinstance(quick, tuple) else quick}")
+        return f"({'; '.join(parts)})" if parts else ""
+
+    return hint
+
+
+# ------------------------------------------------------------------ exit codes
 
 
 def run(
@@ -53,22 +170,6 @@ def run(
     from rich.console import Console
 
     return exit_code(name, lambda: work(parse(name, kind, argv), Console()))
-
-
-def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Args:
-    """Return the options of a command; those not typed have their defaults, or with ``--quick`` their quick values.
-
-    Raises:
-        SystemExit: help was asked for, or options are unknown or unreadable; tyro printed why.
-        ValueError: the dataclass refuses a value.
-    """
-    import tyro
-
-    args = list(sys.argv[1:] if argv is None else argv)
-    text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
-    flags = (tyro.conf.FlagCreatePairsOff,)
-    typed = tyro.cli(parser(kind, "--quick" in args), args=args, prog=f"asm-gym {name}", description=text, config=flags)
-    return kind(**vars(typed))
 
 
 def exit_code(name: str, work: Callable[[], int | None]) -> int:

@@ -17,8 +17,7 @@ from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, recor
 from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import Options, option
+from asm_gym.scripts.command import Options, option, run
 
 
 @dataclass(frozen=True)

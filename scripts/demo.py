@@ -36,8 +36,7 @@ from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.rollouts.watched import watch_pair
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import Options, option
+from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import TASKS, env_id
 
 PUSHED = "robot0_link5"

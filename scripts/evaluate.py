@@ -34,8 +34,7 @@ from asm_gym.rollouts.parallel import parallel_map, parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, evaluation_trials
-from asm_gym.scripts.command import one_line, run
-from asm_gym.scripts.options import Options, option
+from asm_gym.scripts.command import Options, one_line, option, run
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 from asm_gym.validation import check_choice, check_number

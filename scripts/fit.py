@@ -39,8 +39,7 @@ from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.command import Checked, option, run
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
@@ -55,7 +54,7 @@ ANY_EPISODE = 0.5
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Checked):
     """A memory from recordings."""
 
     data: Path = option(positional=True, metavar="DATA")
@@ -102,7 +101,7 @@ class Args:
     """Passes over the episodes, of a monitor that learns in passes."""
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         _ = self.promise  # refuses an impossible rate
         if self.out.is_dir():
             raise ValueError(f"out must be a file, and {self.out} is a folder")

@@ -19,8 +19,7 @@ from asm_gym.data.inspection import Inspection, inspected
 from asm_gym.data.logs import LogLayout, read_tables
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation import figures
-from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.command import BAD_NEWS, DONE, Checked, option, run
 from asm_gym.validation import check_number
 
 FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{:.2g}", "repeats": "{:.0%}"}
@@ -28,7 +27,7 @@ FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Checked):
     """What a log is."""
 
     log: Path = option(positional=True, metavar="LOG")
@@ -41,9 +40,6 @@ class Args:
     """Names of the columns of files without a header."""
     logs: int = option(3, least=1)
     """How many logs of a folder are shown."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 def inspect(args: Args, console: Console) -> int:

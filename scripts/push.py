@@ -13,8 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from asm_gym.monitors.hub import push
-from asm_gym.scripts.command import run
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option, run
 
 
 @dataclass(frozen=True)

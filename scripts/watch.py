@@ -31,8 +31,7 @@ from asm_gym.extras import needed_for, require
 from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import BAD_NEWS, DONE, run
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.command import BAD_NEWS, DONE, Checked, option, run
 from asm_gym.validation import check_number
 
 AT_ONCE = 64
@@ -43,7 +42,7 @@ SHOWN_ROWS = 20
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Checked):
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
@@ -66,9 +65,6 @@ class Args:
     """Without a row for so long a live source has died, which is an alarm."""
     figures: int = option(4, least=1)
     """How many of the most surprising episodes are drawn."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 def review(args: Args, monitor: Any, console: Console) -> int:

@@ -15,7 +15,7 @@ from typing import Literal
 import pytest
 
 from asm_gym.scripts import cli, command, reproduce
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.command import Checked, option
 
 ROOT = Path(__file__).resolve().parents[1]
 STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
@@ -28,7 +28,7 @@ def even(number: int) -> None:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Checked):
     """What a command of the tests takes."""
 
     folder: Path = option(Path("here"), positional=True, metavar="FOLDER")
@@ -47,9 +47,6 @@ class Options:
     """Little."""
     hidden: int = option(50, quick=5, least=1)
     """How many are hidden."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 def run(*argv: str, work=lambda args, console: None) -> int:
@@ -85,21 +82,6 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
         "How large.",
     ):
         assert part in shown
-
-
-def test_the_shell_completes_commands_studies_and_options(capsys, tmp_path):
-    assert cli.main(["--tyro-print-completion", "bash"]) == 0
-    script = tmp_path / "completion.sh"
-    script.write_text(capsys.readouterr().out)
-
-    def completed(*typed: str) -> list[str]:
-        words = f"COMP_WORDS=({' '.join(typed)}); COMP_CWORD={len(typed) - 1}"
-        ask = f"source {script}; {words}; _tyro_asm_gym; echo ${{COMPREPLY[@]}}"
-        return subprocess.run(["/bin/bash", "-c", ask], capture_output=True, text=True, check=True).stdout.split()
-
-    assert completed("asm-gym", "do") == ["doctor"]
-    assert completed("asm-gym", "reproduce", "loc") == ["local_learning"]
-    assert completed("asm-gym", "evaluate", "--mon") == ["--monitors"]
 
 
 @pytest.mark.parametrize(("typed", "near"), [("docter", "doctor"), ("reproduce abstrac", "abstract")])

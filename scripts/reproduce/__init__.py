@@ -47,7 +47,7 @@ def everything(argv: list[str]) -> int:
 
     command.parse("reproduce all", Config, argv)
     for name in INDEPENDENT:
-        command.parse(f"reproduce {name}", options_of(name), argv)
+        command.parse(f"reproduce {name}", _module(name).Config, argv)
     code = DONE
     for name in INDEPENDENT:
         code = max(code, _run(name, argv))
@@ -60,11 +60,6 @@ def _run(study: str, argv: list[str]) -> int:
     from asm_gym.scripts.reproduce import kit
 
     return kit.main(_module(study), argv)
-
-
-def options_of(study: str) -> Any:
-    """Return the dataclass of a study's options."""
-    return _module(study).Config
 
 
 def _module(study: str) -> Any:

@@ -29,7 +29,7 @@ from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.skills import name_skills, named_skills
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import (
     FREE,

@@ -26,7 +26,7 @@ from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
 from asm_gym.rollouts.collect import environment, policy_for, staged
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Record
 from asm_gym.tasks import env_id

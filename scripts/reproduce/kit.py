@@ -30,7 +30,7 @@ from asm_gym.rollouts import progress
 from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.scripts import command
-from asm_gym.scripts.options import check_options, option
+from asm_gym.scripts.command import Options, option
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -40,22 +40,15 @@ Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Options):
     """Options of every study."""
 
-    seed: int = option(0, least=0)
-    """First seed; repetitions take the seeds that follow."""
     seeds: int = option(3, quick=2, least=1)
-    """Number of repetitions."""
+    """Number of repetitions; they take the seeds that follow."""
     workers: int = option(2, least=1)
     """Processes."""
     out: Path = option(Path("runs/reproduce"), metavar="FOLDER")
-    """Folder of the results, and of the robosuite episodes, which are recorded once."""
-    quick: bool = False
-    """Little of everything: to see that it runs, not to judge the figures."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
+    """Folder of the results."""
 
     @property
     def repetitions(self) -> range:

@@ -42,7 +42,7 @@ from asm_gym.memory.traces import (
     sense,
 )
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import trajectories
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire, wide_enough

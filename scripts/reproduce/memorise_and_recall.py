@@ -20,7 +20,7 @@ import numpy as np
 from asm_gym.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.memory.dynamics import SETTLING
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,

@@ -28,7 +28,7 @@ from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.rollouts.collect import environment
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
 from asm_gym.tasks import env_id

@@ -26,7 +26,7 @@ from asm_gym.evaluation.figures import figure
 from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS
 from asm_gym.memory.energy import iterations_within
-from asm_gym.scripts.options import option
+from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows
 from asm_gym.scripts.reproduce.handwriting import DT, Letter, check_letters, copybook, repertoire, wide_enough, written
