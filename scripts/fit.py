@@ -45,12 +45,14 @@ from asm_gym.validation import check_number
 
 SILENCE_S = 2.0
 """A live source without a row for this long has ended [s]."""
-
 PIECE_S, SPARE = 5.0, 4
 """Longest pieces of a live recording [s], and how many more there are than the promise needs."""
-
 ANY_EPISODE = 0.5
 """A rate that one episode can promise: a promise by the hour needs hours."""
+CALIBRATION_SHARE = 0.5
+"""Share of the episodes that set the threshold, and are not learned from."""
+QUICK_EPISODES, QUICK_EPOCHS = 20, 5
+"""Most episodes and passes with ``--quick``."""
 
 
 @dataclass(frozen=True)
@@ -91,14 +93,6 @@ class Args(Checked):
     """Seed of the memory, and of which episodes it learns from."""
     quick: bool = False
     """Learn little, from few episodes: to see that everything runs."""
-    calibration_share: float = option(0.5, check=partial(check_number, "calibration_share", above=0, below=1))
-    """Share of the episodes that set the threshold, and are not learned from."""
-    most: int | None = option(None, quick=20)
-    """Episodes to learn from at most."""
-    in_time: bool = option(False)
-    """Learn from the heads of logs, and calibrate on their tails."""
-    epochs: int | None = option(None, quick=5)
-    """Passes over the episodes, of a monitor that learns in passes."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,16 +119,16 @@ def record_live(args: Args, say: Callable[[str], None]) -> Args:
     to = args.out.with_suffix(".jsonl")
     seconds, ended = record(lines_from(str(args.data), sys.stdin, SILENCE_S), to, args.minutes)
     say(f"{ended}, kept in {to}")
-    count = args.needed / args.calibration_share + SPARE if args.needed else 1
+    count = args.needed / CALIBRATION_SHARE + SPARE if args.needed else 1
     split = args.split or min(PIECE_S, seconds / count)
-    return replace(args, data=to, split=max(split, SHORTEST_S), in_time=True)
+    return replace(args, data=to, split=max(split, SHORTEST_S))
 
 
-def divide(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[Episode]]:
+def divide(args: Args, logs: list[list[Episode]], in_time: bool) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from, and to calibrate on. Raises ValueError where they are too few for the promise."""
-    episodes, by_episode = [part for log in logs for part in log], args.promise.per == EPISODE
-    if args.in_time or (args.split is not None and not by_episode):
-        fitting, calibration = split_in_time(logs, args.calibration_share)
+    by_episode = args.promise.per == EPISODE
+    if in_time or (args.split is not None and not by_episode):
+        fitting, calibration = split_in_time(logs, CALIBRATION_SHARE)
         if len(calibration) < args.needed:
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to calibrate on, got "
@@ -142,22 +136,22 @@ def divide(args: Args, logs: list[list[Episode]]) -> tuple[list[Episode], list[E
             )
     else:
         rate = args.false_alarm_rate if by_episode else ANY_EPISODE
-        fitting, calibration = split_at_random(episodes, rate, args.calibration_share, args.seed)
+        fitting, calibration = split_at_random([p for log in logs for p in log], rate, CALIBRATION_SHARE, args.seed)
     args.promise.check_hours(hours_of(calibration))
-    return fitting[: args.most], calibration
+    return fitting[: QUICK_EPISODES if args.quick else None], calibration
 
 
 def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
     """Return the hyperparameters that suit the recordings."""
-    known = monitor_class(args.monitor).hyperparameters
-    made: dict[str, Any] = {"seed": args.seed}
-    if args.epochs is not None and "epochs" in known:
-        made["epochs"] = args.epochs
-    if spec.source == "table" and "values" in known:
-        made["values"] = True  # an arm's log holds pushes that last, and torques
+    suitable: dict[str, Any] = {"seed": args.seed}
+    if args.quick:
+        suitable["epochs"] = QUICK_EPOCHS
+    if spec.source == "table":
+        suitable["values"] = True  # an arm's log holds pushes that last, and torques
     if args.urdf is not None:
-        made["urdf"] = read_urdf(args.urdf)
-    return made
+        suitable["urdf"] = read_urdf(args.urdf)
+    known = monitor_class(args.monitor).hyperparameters
+    return {name: value for name, value in suitable.items() if name in known}
 
 
 def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
@@ -174,15 +168,6 @@ def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
         yield f"the angles are taken for these joints of {args.urdf}, in this order: {joints}"
 
 
-def promise_in_words(args: Args, calibration: list[Episode]) -> str:
-    """Return how often the threshold lets normal operation alarm."""
-    hours = hours_of(calibration)
-    if args.promise.per != EPISODE:
-        return f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
-    hourly = args.false_alarm_rate * len(calibration) / hours
-    return f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {hourly:.3g} an hour at their length"
-
-
 def hours_of(episodes: list[Episode]) -> float:
     """Return their total length [h]."""
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
@@ -191,8 +176,8 @@ def hours_of(episodes: list[Episode]) -> float:
 def fit(args: Args, console: Console) -> None:
     """Read, learn, calibrate, save, and print a summary."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    if live_source(str(args.data)) is not None:
-        args = record_live(args, say)
+    live = live_source(str(args.data)) is not None
+    args = record_live(args, say) if live else args
     start = time.perf_counter()
     layout = LogLayout(None, args.rate, args.action, args.channels, args.label, args.columns, by_name=True)
     with stage("reading", console, {}) as progress, noted() as notes:
@@ -203,7 +188,7 @@ def fit(args: Args, console: Console) -> None:
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in with_shared_noise(found.episodes)]
     parts = [part for episode in bridged for part in complete_parts(episode)]
-    fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts])
+    fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live)
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(fitting, progress)
@@ -218,15 +203,19 @@ def fit(args: Args, console: Console) -> None:
     if len(parts) != len(found.episodes):
         hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
         say(f"Rows were lost: {len(found.episodes)} episodes were cut there, into {len(parts)} parts.{hint}")
-    promise = promise_in_words(args, calibration)
+    hours = hours_of(calibration)
+    promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
+    if args.promise.per == EPISODE:
+        hourly = args.false_alarm_rate * len(calibration) / hours
+        promise = (
+            f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {hourly:.3g} an hour at their length"
+        )
     say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promise}.")
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Fit, and return the exit code."""
-    return run("fit", Args, fit, argv)
+main = partial(run, "fit", Args, fit)
 
 
 if __name__ == "__main__":

@@ -84,9 +84,7 @@ def differences(first: Inspection, other: Inspection) -> str:
     return ""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Inspect, and return the exit code."""
-    return run("inspect", Args, inspect, argv)
+main = partial(run, "inspect", Args, inspect)
 
 
 if __name__ == "__main__":

@@ -145,9 +145,7 @@ def watch(args: Args, console: Console) -> int:
     return review(args, monitor, console)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Watch, and return the exit code."""
-    return run("watch", Args, watch, argv)
+main = partial(run, "watch", Args, watch)
 
 
 if __name__ == "__main__":
