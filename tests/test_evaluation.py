@@ -17,11 +17,10 @@ from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation import metrics, scoring
 from asm_gym.evaluation.comparison import (
     BenchmarkResult,
+    Bound,
     Detectability,
-    MonitorResult,
     auroc_bound,
     earliest,
-    ideal_metrics,
     noise_floor,
     power_bound,
     separation,
@@ -41,7 +40,6 @@ from asm_gym.evaluation.metrics import (
     DetectionMetrics,
     by_condition,
     delays_ms,
-    detected,
     false_alarms,
     hourly_alarms,
     placements,
@@ -129,7 +127,7 @@ def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
     at_once, late = a_trace([1, 20, 1, 1, 1], onset=1), a_trace([1, 1, 1, 20, 1], onset=1)
     never, nominal = a_trace([1, 1, 1, 1, 1], onset=1), a_trace([20, 20])
     assert delays_ms([late, at_once, never, nominal], window_s=0.3) == pytest.approx([100, 300, math.inf])
-    assert detected([late, at_once, never], window_s=0.2) == Share(1, 3)
+    assert DetectionMetrics("", [late, at_once, never], [], window_s=0.2).detected == Share(1, 3)
 
 
 def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
@@ -253,31 +251,32 @@ def visibility(separation, kind="push", severity="strong", delay=0.05):
     return Detectability("Lift", kind, severity, 0, separation, delay)
 
 
-TRACES = [
-    *(judged(p) for p in (1.0, 2.0, 3.0, 4.0)),
+NOMINAL = [judged(p) for p in (1.0, 2.0, 3.0, 4.0)]
+FAULTY = [
     judged(5.0, "push", "strong", onset=5),
     judged(2.5, "push", "mild", onset=5),
     judged(0.0, "noise", "mild", onset=5),
 ]
 ONE, FIVE = by_episode(0.01), by_episode(0.05)
-RESULT = MonitorResult(TRACES, [judged(9.0, "touch"), judged(0.0, "touch")], Calibration({ONE: 3.5, FIVE: 2.2}))
+TOUCHED = [judged(9.0, "touch"), judged(0.0, "touch")]
+RESULT = DetectionMetrics("asm", FAULTY, NOMINAL, 1.0, Calibration({ONE: 3.5, FIVE: 2.2}), TOUCHED)
 
 
 def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
     # Power at 1 %: Φ(√S - 2.326), one half at S = 5.41.
     found = [visibility(6.0), visibility(5.0, "touch"), visibility(100.0, "shove"), visibility(0.0, "shove")]
     assert list(visible_kinds(found).values()) == [True, False, True]
-    ideal = ideal_metrics("ideal", [visibility(2.0, delay=None), visibility(np.inf, delay=0.1)], 0.01)
+    ideal = Bound.of([visibility(2.0, delay=None), visibility(np.inf, delay=0.1)], 0.01)
     assert ideal.auroc == pytest.approx((0.8413447 + 1) / 2)  # Φ(√(2/2)) and 1
     assert ideal.delays == pytest.approx((100.0, math.inf, 1, 1))
 
 
 def test_scores_are_means_over_the_kinds_that_can_be_seen():
-    asm = RESULT.metrics("asm", 1.0, {("push", "strong"): True, ("push", "mild"): True, ("noise", "mild"): False})
+    asm = RESULT.only([("push", "strong"), ("push", "mild")])
     assert asm.auroc == pytest.approx((1.0 + 0.5) / 2)
     assert (asm.found[ONE], asm.found[FIVE]) == ((1, 2), (2, 2))
     assert metrics.attribution_accuracy(asm.faulty) == (1, 1)
-    assert [k.auroc for k in RESULT.metrics("asm", 1.0).kinds.values()] == [1.0, 0.5, 0.0]
+    assert [RESULT.only([(t.kind, t.severity)]).auroc for t in FAULTY] == [1.0, 0.5, 0.0]
 
 
 def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_nobody_sees():
@@ -300,7 +299,7 @@ def promised(calibrated, tested):
     """One monitor, by its maxima."""
     nominal = [ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(tested)]
     threshold = conformal_threshold(calibrated, 0.05)
-    one = MonitorResult(nominal, [], Calibration({FIVE: threshold}, calibrated))
+    one = DetectionMetrics("asm", [], nominal, 0.5, Calibration({FIVE: threshold}, calibrated))
     return kept_table(BenchmarkResult({"asm": one}, [], 0.05, 0.5)).rows[0][1]
 
 
@@ -350,9 +349,9 @@ def test_resamples_agree_with_the_results_that_they_are_about():
 
 def test_the_lead_over_a_monitor_that_judged_alike_is_nothing():
     faulty, nominal = scenes(np.random.default_rng(4), 1)
-    one = MonitorResult([*nominal, *faulty], [], Calibration({FIVE: 1.0}, np.linspace(0.5, 1.1, 60)))
+    one = DetectionMetrics("asm", faulty, nominal, 0.5, Calibration({FIVE: 1.0}, np.linspace(0.5, 1.1, 60)))
     seen = [Detectability("Lift", "push", "", t.seed, 100.0, 0.1) for t in faulty]
-    table = lead_table(BenchmarkResult({"asm": one, "twin": one}, seen, 0.05, 0.5))
+    table = lead_table(BenchmarkResult({"asm": one, "twin": replace(one, name="twin")}, seen, 0.05, 0.5))
     assert table.rows == [("twin", "+0.000 (+0.000 to +0.000), within chance", "+0.0 (+0.0 to +0.0), within chance")]
 
 

@@ -13,7 +13,7 @@ N(±S/2, S):
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -24,9 +24,9 @@ from scipy.stats import norm
 
 from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import RATES, REPORTED_RATE
-from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind, KindMetrics, false_alarms, in_words
-from asm_gym.evaluation.resampling import Calibration, by_episode
-from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode, onset_row, window_steps
+from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind
+from asm_gym.evaluation.resampling import by_episode
+from asm_gym.evaluation.scored_episode import onset_row, window_steps
 from asm_gym.evaluation.statistics import Share
 from asm_gym.monitors.calibration import AlarmRate
 
@@ -134,27 +134,24 @@ def visible_kinds(detectability: Sequence[Detectability]) -> dict[tuple[str, str
     return {kind: mean_power(own, REPORTED_RATE) >= VISIBLE for kind, own in kinds.items()}
 
 
-@dataclass(frozen=True, eq=False)
-class MonitorResult:
-    """The scores of one monitor on a run's episodes.
+class Bound(NamedTuple):
+    """The results of an ideal observer, which no monitor can surpass."""
 
-    Args:
-        traces: nominal and faulty episodes, judged at the run's own false-alarm rate.
-        harmless: episodes of harmless variations, likewise.
-        calibration: the monitor's thresholds.
-    """
+    name: str
+    auroc: float
+    found: Mapping[AlarmRate, Share]
+    delays: Delays | None
 
-    traces: Sequence[ScoredEpisode]
-    harmless: Sequence[ScoredEpisode]
-    calibration: Calibration
-
-    def metrics(self, name: str, window_s: float, visible: Mapping[Kind, bool] | None = None) -> DetectionMetrics:
-        """Sum up all kinds of fault, or those that are ``visible``."""
-        nominal = [t for t in self.traces if t.kind == NOMINAL]
-        faulty = [t for t in self.traces if t.onset is not None]
-        if visible is not None:
-            faulty = [t for t in faulty if visible.get((t.kind, t.severity), False)]
-        return DetectionMetrics(name, faulty, nominal, window_s, self.calibration)
+    @classmethod
+    def of(cls, faults: Sequence[Detectability], rate: float) -> Bound:
+        """Return the bound on these faults, at ``RATES`` and at a false-alarm ``rate``."""
+        n = len(faults)
+        return cls(
+            IDEAL,
+            auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults])))) if n else math.nan,
+            found={by_episode(r): Share(round(n * mean_power(faults, r)), n) for r in {*RATES, rate} if n},
+            delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in faults]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,14 +159,14 @@ class BenchmarkResult:
     """The scores of monitors on a run's episodes, and the bound of the ideal observer.
 
     Args:
-        monitors: by name.
+        monitors: by name, on all kinds of fault, judged at the run's own false-alarm rate.
         detectability: of every faulty episode.
         rate: the run's own false-alarm rate.
         window_s: an alarm within this time of the onset is a detection [s].
         left_out: numbers of nominal episodes in which the policy failed, and crashed.
     """
 
-    monitors: Mapping[str, MonitorResult]
+    monitors: Mapping[str, DetectionMetrics]
     detectability: Sequence[Detectability]
     rate: float
     window_s: float
@@ -185,45 +182,12 @@ class BenchmarkResult:
         """Whether the ideal observer could detect each kind and severity."""
         return visible_kinds(self.detectability)
 
-    @cached_property
-    def on_all(self) -> list[DetectionMetrics]:
-        """Each monitor on all kinds of fault."""
-        return [m.metrics(name, self.window_s) for name, m in self.monitors.items()]
+    def bound(self, kinds: Collection[Kind]) -> Bound:
+        """Return what the ideal observer detects of these kinds."""
+        return Bound.of([d for d in self.detectability if (d.kind, d.severity) in kinds], self.rate)
 
     @cached_property
     def on_visible(self) -> list[DetectionMetrics]:
         """Each monitor on the visible kinds of fault."""
-        return [m.metrics(name, self.window_s, self.visible) for name, m in self.monitors.items()]
-
-    @property
-    def ideal(self) -> KindMetrics:
-        """The bound over the visible kinds."""
-        return ideal_metrics(IDEAL, [d for d in self.detectability if self.visible[d.kind, d.severity]], self.rate)
-
-    @cached_property
-    def kinds(self) -> dict[str, dict[Kind, KindMetrics]]:
-        """Each monitor on each kind of fault, the ideal observer first."""
-        bound = {}
-        for kind in self.visible:
-            own = [d for d in self.detectability if (d.kind, d.severity) == kind]
-            bound[kind] = ideal_metrics(in_words(kind), own, self.rate)
-        return {IDEAL: bound} | {m.name: m.kinds for m in self.on_all}
-
-    def harmless_alarms(self) -> dict[str, dict[str, Share]]:
-        """Count the episodes of each harmless variation with an alarm, by monitor."""
-        found: dict[str, dict[str, Share]] = {}
-        for name, monitor in self.monitors.items():
-            kinds = dict.fromkeys(t.kind for t in monitor.harmless)
-            found[name] = {kind: false_alarms([t for t in monitor.harmless if t.kind == kind]) for kind in kinds}
-        return found
-
-
-def ideal_metrics(name: str, faults: Sequence[Detectability], rate: float) -> KindMetrics:
-    """Return the bound on the results of any monitor on these faults."""
-    n = len(faults)
-    return KindMetrics(
-        name=name,
-        auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults])))) if n else math.nan,
-        found={by_episode(r): Share(round(n * mean_power(faults, r)), n) for r in {*RATES, rate} if n},
-        delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in faults]),
-    )
+        kinds = [kind for kind, seen in self.visible.items() if seen]
+        return [m.only(kinds) for m in self.monitors.values()]

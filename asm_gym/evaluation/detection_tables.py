@@ -10,16 +10,16 @@ from scipy import stats
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import HOUR
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.comparison import BenchmarkResult
+from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult, Bound
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
-from asm_gym.evaluation.metrics import Delays, DetectionMetrics, KindMetrics, Outcomes, in_words
+from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Outcomes, in_words
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour, interval, rate_text
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Estimate, Rate, Share
 from asm_gym.evaluation.tables import Column, Table, count, percent, tabulate
 from asm_gym.monitors.calibration import AlarmRate
 
-Compared = DetectionMetrics | KindMetrics
+Compared = DetectionMetrics | Bound
 """A monitor, or the ideal observer, whose row has fewer cells."""
 
 UNLIKELY = 0.025
@@ -103,29 +103,32 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
 
 
 def _compared(result: BenchmarkResult) -> list[Compared]:
-    return [result.ideal, *result.on_visible]
+    return [result.bound([kind for kind, seen in result.visible.items() if seen]), *result.on_visible]
 
 
 def kinds_table(result: BenchmarkResult) -> Table:
     """Return AUROC and faults found of every kind."""
     rows = []
     for kind, seen in result.visible.items():
-        own = [kinds[kind] for kinds in result.kinds.values()]
-        found = (f"{k.auroc:.2f} / {percent(k.found.get(result.promise))}" for k in own)
+        own: list[Compared] = [result.bound([kind]), *(m.only([kind]) for m in result.monitors.values())]
+        found = (f"{m.auroc:.2f} / {percent(m.found.get(result.promise))}" for m in own)
         rows.append((in_words(kind) if seen else f"({in_words(kind)})", *found))
     return Table(
         f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no observer could "
         "detect it.",
-        ("Fault", *result.kinds),
+        ("Fault", IDEAL, *result.monitors),
         rows,
     )
 
 
 def harmless_table(result: BenchmarkResult, monitors: Sequence[str]) -> Table:
-    """Return the alarms of these monitors under harmless variations."""
-    alarms = result.harmless_alarms()
-    kinds = dict.fromkeys(kind for name in monitors for kind in alarms[name])
-    rows = [(kind.replace("_", " "), *(count(alarms[name].get(kind)) for name in monitors)) for kind in kinds]
+    """Return the episodes with an alarm under harmless variations, of these monitors."""
+    episodes = [result.monitors[name].harmless for name in monitors]
+    kinds = dict.fromkeys(t.kind for own in episodes for t in own)
+    rows = []
+    for kind in kinds:
+        alarms = (metrics.false_alarms([t for t in own if t.kind == kind]) for own in episodes)
+        rows.append((in_words((kind, "")), *(count(share) if share.n else "" for share in alarms)))
     return Table("Episodes with an alarm under harmless variations.", ("Variation", *monitors), rows)
 
 
@@ -160,7 +163,7 @@ def _lead(difference: Estimate, scale: float, digits: int) -> str:
 
 def kept_table(result: BenchmarkResult) -> Table:
     """Return the false alarms in nominal test episodes, beside the promise of each threshold."""
-    every = result.on_all
+    every = list(result.monitors.values())
     promises = sorted(
         {promise for m in every for promise in m.calibration.thresholds},
         key=lambda p: (p.per == HOUR, -p.rate if p.per == HOUR else p.rate),

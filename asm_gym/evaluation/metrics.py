@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -85,11 +85,6 @@ def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.fl
     return np.sort([math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found])
 
 
-def detected(traces: Sequence[ScoredEpisode], window_s: float) -> Share:
-    """Count the faults with an alarm raised within the window."""
-    return Share.of(np.isfinite(delays_ms(traces, window_s)))
-
-
 def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
     """Count the episodes with an alarm before the fault, or with any where there is none."""
     return Share.of([bool(t.false_alarms) for t in traces])
@@ -119,15 +114,6 @@ def typical(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
     return sorted(traces, key=lambda t: float(t.surprise[t.onset or 0 :].max(initial=0.0)))[len(traces) // 2]
 
 
-class KindMetrics(NamedTuple):
-    """Detection of faults of one kind and severity."""
-
-    name: str
-    auroc: float  # over matched steps
-    found: Mapping[AlarmRate, Share]
-    delays: Delays | None
-
-
 class Outcomes(NamedTuple):
     """How episodes ended under one response."""
 
@@ -154,6 +140,7 @@ class DetectionMetrics:
         nominal: episodes that the faulty ones are compared with.
         window_s: an alarm within this time of the onset is a detection [s].
         calibration: other thresholds to detect by.
+        harmless: episodes of harmless variations.
     """
 
     name: str
@@ -161,6 +148,11 @@ class DetectionMetrics:
     nominal: Sequence[ScoredEpisode]
     window_s: float
     calibration: Calibration = field(default_factory=Calibration)
+    harmless: Sequence[ScoredEpisode] = ()
+
+    def only(self, kinds: Collection[Kind]) -> DetectionMetrics:
+        """Return the same of these kinds and severities of fault."""
+        return replace(self, traces=[t for t in self.traces if (t.kind, t.severity) in kinds])
 
     @cached_property
     def draws(self) -> Draws:
@@ -177,35 +169,20 @@ class DetectionMetrics:
         """Episodes of the policy alone with a fault."""
         return [t for t in self.watched if t.onset is not None]
 
-    @cached_property
-    def kinds(self) -> dict[Kind, KindMetrics]:
-        """By kind and severity, in order of appearance."""
-        groups: dict[Kind, list[ScoredEpisode]] = {}
-        for trace in self.faulty:
-            groups.setdefault((trace.kind, trace.severity), []).append(trace)
-        return {
-            kind: KindMetrics(
-                name=in_words(kind),
-                auroc=time_matched_auroc(own, self.nominal, self.window_s),
-                found=self._found(own),
-                delays=Delays.of(delays_ms(own, self.window_s)),
-            )
-            for kind, own in groups.items()
-        }
-
-    def _found(self, faulty: Sequence[ScoredEpisode]) -> dict[AlarmRate, Share]:
-        windows = Windows(faulty, self.window_s)
-        return {promise: Share.of(windows.detected(q)) for promise, q in self.calibration.thresholds.items()}
-
     @property
     def auroc(self) -> float:
-        """Mean over kinds; NaN without faults."""
-        return float(np.mean([k.auroc for k in self.kinds.values()])) if self.kinds else math.nan
+        """Mean over kinds and severities of fault; NaN without faults."""
+        kinds: dict[Kind, list[ScoredEpisode]] = {}
+        for trace in self.faulty:
+            kinds.setdefault((trace.kind, trace.severity), []).append(trace)
+        each = [time_matched_auroc(own, self.nominal, self.window_s) for own in kinds.values()]
+        return float(np.mean(each)) if each else math.nan
 
     @cached_property
     def found(self) -> dict[AlarmRate, Share]:
         """All faults detected within the window, by the promised rate of false alarms."""
-        return self._found(self.faulty)
+        windows = Windows(self.faulty, self.window_s)
+        return {promise: Share.of(windows.detected(q)) for promise, q in self.calibration.thresholds.items()}
 
     @cached_property
     def delays(self) -> Delays | None:
@@ -215,7 +192,7 @@ class DetectionMetrics:
     @property
     def detected(self) -> Share:
         """Faults detected within the window."""
-        return detected(self.faulty, self.window_s)
+        return Share.of(np.isfinite(delays_ms(self.faulty, self.window_s)))
 
     @property
     def top_channels(self) -> list[tuple[str, int]]:

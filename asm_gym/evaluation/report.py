@@ -119,9 +119,9 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
     )
     drawn = {
         "ROC over all faults, each against nominal episodes of its task in the same steps.": figures.roc_figure(
-            result.on_all
+            list(result.monitors.values())
         ),
-        "How soon faults were found.": figures.delay_figure(result.on_all),
+        "How soon faults were found.": figures.delay_figure(list(result.monitors.values())),
     }
     write_report(folder / "report.html", "Who notices what", intro, tables, drawn, details=details)
 
@@ -130,7 +130,7 @@ def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:
     """Yield what each monitor made of each episode."""
     possible = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
     for monitor in result.monitors.values():
-        for trace in (*monitor.traces, *monitor.harmless):
+        for trace in (*monitor.nominal, *monitor.traces, *monitor.harmless):
             ideal = possible.get((trace.task, trace.kind, trace.severity, trace.seed))
             after, window = trace.detected_after, window_steps(result.window_s, trace.dt)
             yield {

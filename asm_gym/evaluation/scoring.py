@@ -17,8 +17,9 @@ import asm_gym
 from asm_gym.data.crashes import crashes
 from asm_gym.detection import conformal_episodes
 from asm_gym.episode import Episode, load_episode
-from asm_gym.evaluation.comparison import BenchmarkResult, MonitorResult, detectability_of
+from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
+from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
@@ -91,7 +92,7 @@ def benchmark(
     models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    score = partial(_results, folder=folder.resolve(), files=paths, rate=rate, seed=seed)
+    score = partial(_results, folder=folder.resolve(), files=paths, rate=rate, window_s=window_s, seed=seed)
     found = {name: result for results in each(score, list(models.values())) for name, result in results.items()}
     by_role, left_out, twins = read(paths)
     seen = detectability_of(twins, by_role.get("faulty", []), window_s)
@@ -99,15 +100,15 @@ def benchmark(
 
 
 def _results(
-    names: Sequence[str], folder: Path, files: tuple[Path, ...], rate: float, seed: int
-) -> dict[str, MonitorResult]:
+    names: Sequence[str], folder: Path, files: tuple[Path, ...], rate: float, window_s: float, seed: int
+) -> dict[str, DetectionMetrics]:
     roles = read(files).roles
-    return {name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate) for name in names}
+    return {name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate, window_s) for name in names}
 
 
 def judged(
-    name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float
-) -> MonitorResult:
+    name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float, window_s: float
+) -> DetectionMetrics:
     """Calibrate a fitted monitor, and score the nominal, faulty and harmless episodes."""
     monitor.calibrate(by_role["calibration"], rate)
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
@@ -119,8 +120,10 @@ def judged(
         monitor.blocks_,
     )
     threshold = calibration.thresholds[by_episode(rate)]
-    traces = traces_of(name, monitor, [*by_role["nominal"], *by_role.get("faulty", [])], threshold)
-    return MonitorResult(traces, traces_of(name, monitor, by_role.get("harmless", []), threshold), calibration)
+    nominal, faulty, harmless = (
+        traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty", "harmless")
+    )
+    return DetectionMetrics(name, faulty, nominal, window_s, calibration, harmless)
 
 
 @cache
