@@ -122,20 +122,17 @@ def _made(task: str, rate: int | None = None, **settings: Any) -> gym.Env[Any, A
     return gym.make(env_id(task), horizon=10**9, stream_freq=rate, disable_env_checker=True, **settings)
 
 
-def _memory(env: gym.Env[Any, Any]) -> NeuralASM:
-    """Return the shipped memory, with a threshold out of reach: no step is overridden."""
-    return body_memory(env, StreamSource(env).spec).with_threshold(1e300)
-
-
 def measure_safety(args: Args, console: Console) -> Table:
     """Compare a step under the wrapper with the same step without it, at 20 and 100 Hz and of several members."""
     envs: dict[str, Any] = {}
+    memories: dict[str, NeuralASM] = {}
     for rate, name in ((None, "20 Hz"), (100, "100 Hz")):
         envs[name], inner = _made(args.task, rate), _made(args.task, rate)
-        envs[f"{name}, guarded"] = NeuralASMSafety(inner, _memory(inner), monitor_freq=rate)
+        memories[name] = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)  # no step is overridden
+        envs[f"{name}, guarded"] = NeuralASMSafety(inner, memories[name], monitor_freq=rate)
     name = f"{args.members} members"
     envs[name], within = (SyncVectorEnv([partial(_made, args.task)] * args.members) for _ in range(2))
-    envs[f"{name}, guarded"] = VectorNeuralASMSafety(within, _memory(envs["20 Hz"]))
+    envs[f"{name}, guarded"] = VectorNeuralASMSafety(within, memories["20 Hz"])
     rivals: Rivals = {}
     for each, env in envs.items():
         env.reset(seed=args.seed)
@@ -147,24 +144,19 @@ def measure_safety(args: Args, console: Console) -> Table:
     return compared(f"A control step of {args.task}, shipped memory", "ms", seconds, unguarded)
 
 
-def _robosuite(task: str) -> Any:
-    """Return robosuite's own environment of a task."""
-    robosuite = import_robosuite()
-    arms = task_spec(task).arms
-    control = [robosuite.load_composite_controller_config(robot="Panda")] * arms
-    blind = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
-    robots = ["Panda"] * arms
-    env = robosuite.make(task, robots, controller_configs=control, reward_shaping=True, ignore_done=True, **blind)
-    env.reset()
-    return env
-
-
 def measure_env(args: Args, console: Console) -> Table:
     """Compare a control step with robosuite's, and with its physics alone."""
     ours, bare, floor = _made(args.task), _made(args.task, stream=(), sensor_noise=0.0), _made(args.task)
     for env in (ours, bare, floor):
         env.reset(seed=args.seed)
     simulation: Any = floor.get_wrapper_attr("simulation")
+    robosuite, robots = import_robosuite(), ["Panda"] * task_spec(args.task).arms
+    control = [robosuite.load_composite_controller_config(robot=robot) for robot in robots]
+    blind = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
+    theirs = robosuite.make(
+        args.task, robots, controller_configs=control, reward_shaping=True, ignore_done=True, **blind
+    )
+    theirs.reset()
     rng = np.random.default_rng(args.seed)
 
     def drive(step: Callable[[Any], Any]) -> Callable[[], Any]:
@@ -176,7 +168,7 @@ def measure_env(args: Args, console: Console) -> Table:
     rivals: Rivals = {
         "asm_gym": drive(ours.unwrapped.step),
         "asm_gym, no stream": drive(bare.unwrapped.step),
-        "robosuite": drive(_robosuite(args.task).step),
+        "robosuite": drive(theirs.step),
         "mj_step alone": partial(mujoco.mj_step, simulation.model, simulation.data, simulation.substeps),
     }
     seconds = take_turns(rivals, args.steps, args.seed, console)
@@ -195,10 +187,8 @@ def measure(args: Args, console: Console) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     texts = []
     for name in args.what:
-        wall, own = time.perf_counter(), time.process_time()
         table = BENCHMARKS[name](args, console)
-        share = (time.process_time() - own) / (time.perf_counter() - wall)
-        machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, {share:.1f} of one used"
+        machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
         table = replace(table, caption=f"{table.caption}. {machine}; ±: spread over {PARTS} parts.")
         console.print(ConsoleTable(table))
         texts.append(markdown(table))

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import platform
-import subprocess
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -46,19 +45,19 @@ class Check(NamedTuple):
 
 def run_checks() -> list[Check]:
     """Return every check, in the order in which one remedy helps the next."""
-    libraries = LIBRARIES.items() if sys.platform == "linux" else ()
     no_picture, no_encoder = rendering_problem(), encoder_problem()
     return [
         python(),
         *map(package, PACKAGES),
-        compiled_code(),
-        *(
-            Check(n, "found" if loads(n) else "missing", "" if loads(n) else f"apt-get install {p}")
-            for n, p in libraries
-        ),
+        *(library(name) for name in LIBRARIES if sys.platform == "linux"),
         Check("rendering", no_picture or f"MUJOCO_GL={rendering_backend()} draws", GET_RENDERING if no_picture else ""),
         Check("H.264 encoder", no_encoder or "found", GET_ENCODER if no_encoder else ""),
     ]
+
+
+def library(name: str) -> Check:
+    """Check whether a library can be loaded."""
+    return Check(name, "found") if loads(name) else Check(name, "missing", f"apt-get install {LIBRARIES[name]}")
 
 
 def python() -> Check:
@@ -87,31 +86,13 @@ def package(name: str) -> Check:
     return Check(name, f"{version}, but needs {wanted}", f"python -m pip install '{name}{wanted}'", needed=True)
 
 
-def compiled_code() -> Check:
-    """Check whether compiled code is kept, and whether there is some already."""
-    code = (
-        "from asm_gym.compilation import kept_in, must_compile; from asm_gym.monitors.row_kernel import observe_rows;"
-        "print(int(must_compile(observe_rows)), kept_in(observe_rows) or '')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["no error message"])[-1]
-        return Check("compiled code", last, REINSTALL, needed=True)
-    missing, _, folder = done.stdout.strip().partition(" ")
-    if not folder:
-        return Check("compiled code", "kept nowhere: no folder can be written to", "set NUMBA_CACHE_DIR")
-    return Check(
-        "compiled code", *((f"not yet in {folder}", "asm-gym warmup") if missing == "1" else (f"in {folder}",))
-    )
-
-
 def report(args: Args, console: Console) -> int:
     """Print the table and its verdict; return the exit code."""
-    table, missing = Table("check", "state", "found", "what to do"), []
-    for check in run_checks():
+    table, checks = Table("check", "state", "found", "what to do"), run_checks()
+    for check in checks:
         state = "[green]ok" if not check.remedy else "[red]needed" if check.needed else "[yellow]optional"
         table.add_row(check.name, state, escape(check.found), escape(check.remedy))
-        missing += [check] if check.remedy else []
+    missing = [check for check in checks if check.remedy]
     console.print(table)
     if any(check.needed for check in missing):
         console.print("[red]asm-gym cannot run here yet:[/] do what stands on the right, from the top.")

@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +16,6 @@ from asm_gym.compilation import kept_in
 from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.row_kernel import observe_rows
-from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -28,40 +26,23 @@ class Args:
     """There are no options."""
 
 
-def learn() -> None:
-    """Compile what ``fit`` and ``calibrate`` call."""
-    spec = StreamSpec((Channel("x", 3, group="joint"), Channel("u", 1, group="action")), dt=0.05)
-    rng = np.random.default_rng(0)
-    episodes = [Episode.from_stream(rng.normal(size=(30, 4)), spec) for _ in range(8)]
-    small = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1).fit(episodes[:4])
-    small.calibrate(episodes[4:], false_alarm_rate=0.5)
-
-
-def observe() -> None:
-    """Compile what ``observe`` of a shipped memory calls, of one stream and of several."""
-    asm = NeuralASM.pretrained("panda")
-    for batch in (1, 2):
-        asm.observe(asm.initial_state(batch), np.zeros((batch, asm.spec.size)))
-
-
-def step() -> None:
-    """Compile what a guarded step of an environment of this package calls."""
-    env: gym.Env[Any, Any] = gym.make("asm_gym/Lift-v0")
-    with NeuralASMSafety(env, on_overrun="ignore") as guarded:
-        guarded.reset(seed=0)
-        for _ in range(3):
-            guarded.step(np.zeros(env.action_space.shape or (), np.float32))
-
-
 def warm_up(args: Args, console: Console) -> None:
-    """Compile each part, and print where the code is kept."""
+    """Observe, learn and guard a little, and print where the compiled code is kept."""
     start = time.perf_counter()
-    parts = {"the memory": observe, "learning": learn}
-    if find_spec("robosuite"):
-        parts["guarded steps"] = step
-    for name, part in parts.items():
-        with stage(f"compiling {name}", console, {}):
-            part()
+    with console.status("compiling"):
+        asm = NeuralASM.pretrained("panda")
+        for batch in (1, 2):
+            asm.observe(asm.initial_state(batch), np.zeros((batch, asm.spec.size)))
+        spec = StreamSpec((Channel("x", 3, group="joint"), Channel("u", 1, group="action")), dt=0.05)
+        rng = np.random.default_rng(0)
+        episodes = [Episode.from_stream(rng.normal(size=(30, 4)), spec) for _ in range(8)]
+        small = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1).fit(episodes[:4])
+        small.calibrate(episodes[4:], false_alarm_rate=0.5)
+        if find_spec("robosuite"):
+            with NeuralASMSafety(gym.make("asm_gym/Lift-v0"), on_overrun="ignore") as guarded:
+                guarded.reset(seed=0)
+                for _ in range(3):
+                    guarded.step(np.zeros(guarded.action_space.shape or (), np.float32))
     where = kept_in(observe_rows) or "memory only"
     console.print(f"Compiled after {time.perf_counter() - start:.0f} s; kept in {where}", soft_wrap=True, markup=False)
 

@@ -45,7 +45,6 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         monkeypatch.setattr(metadata, "version", installed)
         monkeypatch.setattr(graphics, "draws_a_frame", lambda backend: backend in draws)
         monkeypatch.setattr(sys, "platform", "linux")
-        monkeypatch.setattr(doctor, "compiled_code", lambda: doctor.Check("compiled code", "in a folder"))
 
     return make
 
@@ -133,15 +132,6 @@ def test_an_ffmpeg_that_is_missing_or_has_no_h264_is_reported(monkeypatch: pytes
     monkeypatch.undo()
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", os.path.join(os.path.dirname(__file__), "no_such_ffmpeg"))
     assert "no video" in graphics.encoder_problem()
-
-
-def test_code_that_is_still_to_be_compiled_is_named_with_the_command_that_compiles_it(
-    monkeypatch: Any, tmp_path: Any
-) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    check = doctor.compiled_code()
-    assert (check.needed, check.remedy) == (False, "asm-gym warmup")
-    assert check.found.startswith(f"not yet in {tmp_path}")
 
 
 def test_the_doctor_imports_nothing_that_it_checks() -> None:
