@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +49,22 @@ PIECE_S, FOLDS = 1.0, 4
 """Length of a piece [s], and folds of which one is tested at a time."""
 
 
+class RealArm(NamedTuple):
+    """A recording of an arm that did nothing wrong."""
+
+    robot: str
+    place: str  # file below the folder of all recordings
+    urdf: str  # file of its body model, in the folder ``urdf`` of that of all recordings
+
+
+SOURCE = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
+"""Where the recordings are published: repository at a commit, licence."""
+ARMS = {
+    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", "panda.urdf"),
+    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", "ur10_robot.urdf"),
+}
+
+
 def read_joint_states(path: Path) -> Columns:
     """Return time, position [rad], velocity and effort (T, J) of a ROS 2 bag of joint states."""
     columns = read_bag(path)
@@ -55,46 +72,6 @@ def read_joint_states(path: Path) -> Columns:
     for kind in ("position", "velocity", "effort"):
         made[kind] = np.column_stack([v for n, v in columns.items() if re.fullmatch(rf".*\.{kind}\[.*\]", n)])
     return made
-
-
-@dataclass(frozen=True)
-class RealArm:
-    """A recording of an arm that did nothing wrong.
-
-    Attributes:
-        robot: its name.
-        place: file below that of all recordings.
-        source: where it is published: repository at a commit, path, licence.
-        urdf: file of its body model, in the folder ``urdf`` of that of all recordings.
-    """
-
-    robot: str
-    place: str
-    source: str
-    urdf: str
-
-    def body(self, folder: Path) -> str:
-        """Return the text of its body model."""
-        path = folder / "urdf" / self.urdf
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} is missing: it is in example-robot-data 6.0.0 (PyPI)")
-        return read_urdf(path)
-
-    def missing(self, folder: Path) -> str:
-        """Return where the recording is published, if it is not in the folder; empty if it is."""
-        path = folder / self.place
-        return "" if path.exists() else f"{path} is missing: it is {self.source}"
-
-    def episode(self, folder: Path) -> Episode:
-        """Return the recording."""
-        return Episode.from_table(read_joint_states(folder / self.place), success=True)
-
-
-UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-ARMS = {
-    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", UNISA, "panda.urdf"),
-    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", UNISA, "ur10_robot.urdf"),
-}
 
 
 # ------------------------------------------------------------------ faults added to recordings
@@ -208,27 +185,22 @@ class Job(NamedTuple):
 
 def run(config: Config) -> Findings:
     """Run the experiments whose recordings are in the folder."""
-    missing = {name: why for name in config.experiments if (why := ARMS[name].missing(config.folder))}
-    found = [name for name in config.experiments if name not in missing]
+    places = {name: config.folder / ARMS[name].place for name in config.experiments}
+    missing = [f"{place} is missing: it is {SOURCE}" for place in places.values() if not place.exists()]
+    found = [name for name, place in places.items() if place.exists()]
     if not found:
-        raise FileNotFoundError("; ".join(missing.values()))
-    jobs = [
-        Job(name, monitor, seed, fold)
-        for name in found
-        for monitor in config.monitors
-        for seed in config.repetitions
-        for fold in range(FOLDS)
-    ]
+        raise FileNotFoundError("; ".join(missing))
+    jobs = list(starmap(Job, product(found, config.monitors, config.repetitions, range(FOLDS))))
     records = kit.together(kit.each("watching", partial(examined, folder=config.folder), jobs, config))
     first, *others = (table(where(records, experiment=name), ARMS[name], config.monitors) for name in found)
-    left_out = "".join(f" Left out: {why}." for why in missing.values())
+    left_out = "".join(f" Left out: {why}." for why in missing)
     return Findings(records, [replace(first, caption=first.caption + left_out), *others])
 
 
 def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, and for each fault in it."""
     arm = ARMS[job.experiment]
-    whole = arm.episode(folder)
+    whole = Episode.from_table(read_joint_states(folder / arm.place), success=True)
     effort = whole.stream[:, whole.spec.slices["effort"]].astype(np.float64)
     ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
     cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
@@ -237,7 +209,7 @@ def examined(job: Job, folder: Path) -> list[Record]:
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
     learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
-    monitor = fitted(job, learned, arm.body(folder) if job.monitor in WITH_BODY else "")
+    monitor = fitted(job, learned, folder / "urdf" / arm.urdf)
     threshold = max(float(s.value.max()) for s in monitor.score_episodes(calibration))
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
     watched = [("", cut[i]) for i in tested]
@@ -249,12 +221,16 @@ def examined(job: Job, folder: Path) -> list[Record]:
     return [job._asdict() | judged(kind, v, whole.spec.dt) for (kind, _), v in zip(watched, ratios, strict=True)]
 
 
-def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
+def fitted(job: Job, episodes: Sequence[Episode], urdf: Path) -> Any:
     """Return the monitor of a job, fitted but not calibrated: no rate could be promised of so few pieces."""
     spec, name = episodes[0].spec, WITH_BODY.get(job.monitor, job.monitor)
     if job.monitor == RULE:
         return CalibratedMonitor(FrictionRule(spec), Largest(spec), seed=job.seed).fit(list(episodes))
-    settings = SETTINGS.get(name, {}) | ({"urdf": urdf} if urdf else {})
+    settings = SETTINGS.get(name, {})
+    if job.monitor in WITH_BODY:
+        if not urdf.is_file():
+            raise FileNotFoundError(f"{urdf} is missing: it is in example-robot-data 6.0.0 (PyPI)")
+        settings = settings | {"urdf": read_urdf(urdf)}
     return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
 
 
