@@ -48,7 +48,7 @@ def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_i
     columns = pendulum_columns(3000)
     columns["effort"][:, 1] = 0.05 * np.random.default_rng(1).normal(size=3000)  # nothing tells it
     cut = pieces(Episode.from_table(columns), 1.0)
-    model = ValueAssociation(cut[0].spec, changes=False).fit(cut, np.random.default_rng(0), lambda done, total: None)
+    model = ValueAssociation(cut[0].spec).fit(cut, np.random.default_rng(0), lambda done, total: None)
     assert forces(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
     assert motion(cut[0].spec).tolist() == [0, 1, 2, 3]
     assert model.learned_["R2_values"][5] < 0.5

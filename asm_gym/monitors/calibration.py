@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.crashes import CRASH, crashes
 from asm_gym.detection import (
     Blocks,
     Detection,
@@ -37,8 +36,6 @@ MOST_BLIND = 0.6
 """Largest share of the channels that a monitor may be blind to."""
 MOST_NAMED = 6
 """Channels that a message names."""
-RAISED = 1.5
-"""Factor of the threshold from which on crashes are reported."""
 
 
 class AlarmRate(NamedTuple):
@@ -154,7 +151,6 @@ class Calibrated:
         require_sight(self.detection, self.model.error_columns, self.spec, threshold)
         self.threshold_, self.promised_ = threshold, asked.per
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
-        warn_of_crashes(episodes, values, threshold, asked, each)
         self.healthy_ = healthy_forces([episode.stream for episode in episodes], self.spec)
         return self
 
@@ -230,34 +226,3 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
     if len(blind) > MOST_BLIND * len(np.unique(errors[errors >= 0])):
         raise ValueError(message)
     LOG.warning(message)
-
-
-def warn_of_crashes(
-    episodes: Sequence[Episode], values: Sequence[Array], threshold: float, asked: AlarmRate, each: Sequence[str]
-) -> None:
-    """Log a warning where crashes among nominal episodes have raised the threshold, which hides milder faults.
-
-    Args:
-        episodes, values: of the calibration set, and their surprise (T,).
-        threshold, asked: the threshold, and the rate that it keeps.
-        each: task of each episode; where empty, its own label names the task.
-    """
-    tasks = list(each) or [e.label.task if e.label else str(e.info.get("skill", "")) for e in episodes]
-    hit = crashes(episodes, tasks)
-    if not hit:
-        return
-    others = [n for n in range(len(episodes)) if n not in hit]
-    try:
-        own = [each[n] for n in others if each]
-        without = asked.threshold_of([values[n] for n in others], episodes[0].spec.dt, own)
-    except ValueError:  # too few are left for a promise
-        without = float(np.max([values[n].max() for n in others]))
-    if threshold <= RAISED * without:
-        return
-    worst = max(hit, key=lambda n: float(values[n].max()))
-    LOG.warning(
-        "%d of %d episodes press more than %g times as hard as is usual; with them the threshold is %.3g, without "
-        "%.3g. The worst is episode %d, %.1f times as hard: look at it, and leave out what is not healthy, as "
-        "asm_gym.harmless(episodes) does",
-        *(len(hit), len(episodes), CRASH, threshold, without, worst, hit[worst]),
-    )

@@ -109,7 +109,6 @@ MONITORS: Registry[MonitorKind] = Registry(
         **_with_evidence(
             {
                 "logpzo": _rival("baselines.logpzo:LogpZO", "moving_mean"),
-                "lstm_vae": _rival("baselines.recurrent:LSTMVAE", "squares"),
                 "gru": _rival("baselines.recurrent:GRU", "mahalanobis"),
                 "kalman": _rival("baselines.linear:Kalman", "mahalanobis"),
                 "association_linear": _rival("baselines.linear:LinearAssociation", "mahalanobis"),

@@ -1,7 +1,6 @@
 r"""Ridge regression of values: each group of senses from the values and changes of the others, without its own past.
 
     x̂_g,t = D_g [x_{¬g,t}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]       judged: torques, and what a cross-fitted R² of 1/2 tells
-    Δ̂_g,t = E_g [x_{t-l}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]        judged where it exceeds 0.99
     φ      friction and weight, see ``arm_inputs``
     ε      = (x - x̂) / s_x √max(1, h/h̃)                      s_x: the cross-fitted spread
     h      = zᵀ (ZᵀZ/N + λ)⁻¹ z,  h̃ its cross-fitted median    z: what x is expected from
@@ -32,7 +31,7 @@ from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
 from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_flag, typed
+from asm_gym.validation import typed
 
 Floats = NDArray[np.float64]
 
@@ -40,8 +39,8 @@ FOLDS = 5
 PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
 """Of standardised inputs."""
 
-PREDICTED, CERTAIN = 0.5, 0.99
-"""R² from which on a value and a change are judged."""
+PREDICTED = 0.5
+"""R² from which on a value is judged."""
 
 FAINTEST = 1e-4
 """Least spread of what is left of a standardised number."""
@@ -60,20 +59,18 @@ class _Fitted(NamedTuple):
 
 
 class ValueAssociation(ScaledModel):
-    """Ridge regression of values and of changes that are nearly certain; it has no context.
+    """Ridge regression of values; it has no context. Where nothing predicts a value, all are judged.
 
     Args:
         spec: the stream it is to expect.
-        changes: whether changes are judged too.
         urdf: text of a body model, as ``read_urdf`` reads it: what links weigh, and their inertia, in place of sines.
     """
 
     kind = "association_values"
 
     @typed
-    def __init__(self, spec: StreamSpec, changes: bool = True, urdf: str = "") -> None:
+    def __init__(self, spec: StreamSpec, urdf: str = "") -> None:
         super().__init__(spec, rows_apart(spec.dt))
-        self.changes = check_flag("changes", changes)
         self.urdf = urdf
         self._derived = Derived.of(spec, urdf)
 
@@ -81,8 +78,8 @@ class ValueAssociation(ScaledModel):
     def error_columns(self) -> NDArray[np.intp]:
         if not self.learned_:
             return self.spec.sensory
-        judged: NDArray[np.intp] = np.concatenate([self._values, self._steps])
-        return self.spec.sensory[judged]
+        columns: NDArray[np.intp] = self.spec.sensory[self._values]
+        return columns
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
@@ -96,34 +93,26 @@ class ValueAssociation(ScaledModel):
         inputs = np.hstack([values, steps, before, (derived - middle) / width, commands])
         check_inputs(inputs.shape[1])
         fold = _folds([len(p[0]) for p in parts])
-        own = self._own(values=True)
+        own = self._own()
         given = _crossfitted(inputs, values, fold, senses.groups, own)
-        progress(1, 2)
-        judged, certain, moved = self._judged(given.R2), np.zeros(0, np.intp), given
-        if self.changes or not len(judged):
-            moved = _crossfitted(inputs, steps, fold, senses.groups, self._own(values=False))
-            certain = np.flatnonzero(moved.R2 > CERTAIN)
-        progress(2, 2)
-        if not len(judged) + len(certain):
-            certain = np.arange(len(self.spec.sensory))  # nothing predicts a value: all changes are judged
-        left = np.concatenate([given.left[judged], moved.left[certain]])
+        progress(1, 1)
+        judged = self.judged(given.R2)
+        judged = judged if len(judged) else np.arange(len(given.R2))
         judging = np.unique(senses.groups[judged]) if inputs.shape[1] <= MOST_INPUTS else ()
         far = [_far(inputs, fold, own[g]) for g in judging]
         learned = {
             "derived_mean": middle,
             "derived_spread": width,
             "judged_values": judged * 1.0,
-            "judged_changes": certain * 1.0,
             "R2_values": given.R2,
             "D": given.weights[judged],
-            "E": moved.weights[certain],
-            "remainder": np.maximum(left, FAINTEST),
+            "remainder": np.maximum(given.left[judged], FAINTEST),
             "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
         }
         return self.restore({**senses.arrays, **learned})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        self._values, self._steps = (learned[f"judged_{what}"].astype(np.intp) for what in ("values", "changes"))
+        self._values = learned["judged_values"].astype(np.intp)
         return super().restore(learned, skills)
 
     def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
@@ -132,8 +121,7 @@ class ValueAssociation(ScaledModel):
         found = self.learned_
         derived = (derived - found["derived_mean"]) / found["derived_spread"]
         inputs = np.hstack([values, steps, before, derived, commands])
-        values, steps = values[:, self._values], steps[:, self._steps]
-        errors = np.hstack([(values - inputs @ found["D"].T) / self._farther(inputs), steps - inputs @ found["E"].T])
+        errors = (values[:, self._values] - inputs @ found["D"].T) / self._farther(inputs)
         return state, ModelOutput(known * errors / found["remainder"], no_context(rows))
 
     def _read(self, read: ScaledRows) -> tuple[Floats, Floats, Floats, Floats, Floats]:
@@ -148,7 +136,7 @@ class ValueAssociation(ScaledModel):
         )
         return values, steps, before, derived, np.asarray(read.commands, np.float64)
 
-    def _judged(self, R2: Floats) -> NDArray[np.intp]:
+    def judged(self, R2: Floats) -> NDArray[np.intp]:
         """Return which values are judged, by their cross-fitted R² (X,)."""
         place = {int(column): k for k, column in enumerate(self.spec.sensory)}
         judged = R2 > PREDICTED
@@ -166,15 +154,14 @@ class ValueAssociation(ScaledModel):
             found[:, groups == group] = np.sqrt(np.maximum(1.0, ((inputs @ far) * inputs).sum(axis=1)))[:, None]
         return found
 
-    def _own(self, values: bool) -> list[NDArray[np.intp]]:
+    def _own(self) -> list[NDArray[np.intp]]:
         """Return the inputs of each group that hold its own values, which it is not predicted from."""
         X, groups = len(self.spec.sensory), self.senses_.groups
         found = []
         for g in range(int(groups.max()) + 1):
             own = np.flatnonzero(groups == g)
-            withheld = [own, X + own, 3 * X + np.flatnonzero(self._derived.sources[:, own].any(axis=1))]
-            # A value is predicted from this row alone; a change from the values before, not from those now.
-            withheld.append(2 * X + np.arange(X) if values else np.arange(X))
+            derived = 3 * X + np.flatnonzero(self._derived.sources[:, own].any(axis=1))
+            withheld = [own, X + own, derived, 2 * X + np.arange(X)]  # a value is predicted from this row alone
             found.append(np.unique(np.concatenate(withheld)).astype(np.intp))
         return found
 

@@ -50,7 +50,8 @@ class Values(NamedTuple):
     def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self:
         """Fit it to nominal episodes; ``urdf`` is the text of a body model, or empty."""
         monitor = _monitor(episodes[0].spec, seed, urdf).fit(episodes)
-        if not len(monitor.learned_["judged_values"]):
+        assert isinstance(monitor.model, ValueAssociation)
+        if not len(monitor.model.judged(monitor.learned_["R2_values"])):
             return cls()
         senses = _senses(monitor)
         if senses.inputs > MOST_INPUTS:
@@ -122,7 +123,7 @@ class Values(NamedTuple):
 
 def _monitor(spec: StreamSpec, seed: int, urdf: str) -> CalibratedMonitor:
     detection = EvidenceDetection(spec, shrinkage=1.0, habituates=False)
-    return CalibratedMonitor(ValueAssociation(spec, changes=False, urdf=urdf), detection, seed=seed)
+    return CalibratedMonitor(ValueAssociation(spec, urdf=urdf), detection, seed=seed)
 
 
 def _senses(monitor: CalibratedMonitor) -> StreamScaler:

@@ -1,19 +1,15 @@
-"""Recurrent baselines, trained by backpropagation through time: a GRU, and a variational autoencoder.
+"""A recurrent baseline, trained by backpropagation through time: a GRU.
 
-    GRU        h_t = GRU(h_{t-1}, [v_{t-1}, Δ_{t-1}, u_t])    Δ̂_t, log σ²_t = linear(h_t)    Gaussian log likelihood
-    LSTMVAE    z_t = encoder(v_t, Δ_t), v̂_t, Δ̂_t = decoder(z_t)    its prior moves on with the episode
-
-The threshold of the LSTM-VAE's authors, which depends on the latent state, is left out.
+    h_t = GRU(h_{t-1}, [v_{t-1}, Δ_{t-1}, u_t])    Δ̂_t, log σ²_t = linear(h_t)    Gaussian log likelihood
 
 Sources: Cho et al. 2014 (EMNLP); Malhotra et al. 2015 (ESANN) for the Mahalanobis distance of a recurrent network's
-prediction errors; Park, Hoshi and Kemp 2018 (IEEE RA-L 3(3)), “A multimodal anomaly detector for robot-assisted feeding
-using an LSTM-based variational autoencoder”.
+prediction errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -102,98 +98,3 @@ def _loss(module: nn.Module, inputs: Tensor, changes: Tensor, real: Tensor) -> T
     error = nn.functional.huber_loss(normalised, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR)
     loss: Tensor = (error + 0.5 * log_variance).mean(dim=-1)
     return (loss * real).sum() / real.sum()
-
-
-CORRUPTION = 0.1
-"""Standard deviation of the noise that the encoder's inputs are corrupted with."""
-
-
-class _VAEState(NamedTuple):
-    encoder: NDArray[np.float32]  # (B, 2, H) hidden state and cell
-    decoder: NDArray[np.float32]  # (B, 2, H)
-    history: RowHistory
-
-
-class _VAEModule(nn.Module):
-    def __init__(self, size: int, hidden: int, latent: int) -> None:
-        super().__init__()
-        self.encoder = nn.LSTM(size, hidden, batch_first=True)
-        self.to_latent = nn.Linear(hidden, 2 * latent)
-        self.decoder = nn.LSTM(latent, hidden, batch_first=True)
-        self.out = nn.Linear(hidden, 2 * size)
-
-    def encode(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor, Any]:
-        hidden, state = self.encoder(x, state)
-        mean, log_variance = self.to_latent(hidden).chunk(2, dim=-1)
-        return mean, log_variance.clamp(-8.0, 4.0), state
-
-    def decode(self, z: Tensor, state: Any = None) -> tuple[Tensor, Tensor, Any]:
-        hidden, state = self.decoder(z, state)
-        mean, log_variance = self.out(hidden).chunk(2, dim=-1)
-        return mean, log_variance.clamp(-8.0, 4.0), state
-
-
-class LSTMVAE(TorchModel):
-    """A recurrent variational autoencoder of values and changes; its context is its latent state.
-
-    Args:
-        spec: the stream it is to expect.
-        hidden_size: H, units of the encoder, and of the decoder.
-        latent_size: numbers of the latent state.
-    """
-
-    kind = "lstm_vae"
-
-    @typed
-    def __init__(self, spec: StreamSpec, hidden_size: int = 128, latent_size: int = 32) -> None:
-        super().__init__(spec)
-        self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
-        self.latent_size = check_number("latent_size", latent_size, low=1, whole=True)
-
-    def module(self, senses: StreamScaler) -> nn.Module:
-        return _VAEModule(senses.size, self.hidden_size, self.latent_size)
-
-    @property
-    def error_columns(self) -> NDArray[np.intp]:
-        return np.concatenate([self.spec.sensory, self.senses_.slow])
-
-    def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
-    ) -> None:
-        assert isinstance(module, _VAEModule)
-        # The centre of the prior moves through the latent space as the episode goes on.
-        centre = torch.linspace(-1.0, 1.0, max(len(r.senses) for r in readings))[None, :, None]
-
-        def loss(chosen: NDArray[np.intp], training: bool) -> Tensor:
-            x, real = padded([readings[i].senses for i in chosen])
-            noise = 1.0 if training else 0.0
-            mean, log_variance, _ = module.encode(x + noise * CORRUPTION * torch.randn_like(x))
-            z = mean + noise * torch.exp(0.5 * log_variance) * torch.randn_like(mean)
-            rebuilt, spread, _ = module.decode(z)
-            likelihood = 0.5 * (spread + (x - rebuilt) ** 2 * torch.exp(-spread)).sum(dim=-1)
-            prior = (mean - centre[:, : x.shape[1]]) ** 2
-            divergence = 0.5 * (log_variance.exp() + prior - 1.0 - log_variance).sum(dim=-1)
-            return ((likelihood + divergence) * real).sum() / real.sum()
-
-        train_on_episodes(module, loss, len(readings), rng, progress)
-
-    def start(self, batch: int) -> _VAEState:
-        nothing = np.zeros((batch, 2, self.hidden_size), np.float32)
-        return _VAEState(nothing, nothing, super().start(batch))
-
-    def predict(self, state: _VAEState, rows: NDArray[np.float64]) -> tuple[_VAEState, ModelOutput]:
-        assert isinstance(self.module_, _VAEModule)
-        history, r, _ = read_next(self.senses_, state.history, rows)
-        z, _, encoder = self.module_.encode(torch.as_tensor(r.senses)[:, None], _cell(state.encoder))
-        mean, log_variance, decoder = self.module_.decode(z, _cell(state.decoder))
-        error = r.seen * (r.senses - mean.numpy()[:, 0]) * np.exp(-0.5 * log_variance.numpy()[:, 0])
-        return _VAEState(_kept(encoder), _kept(decoder), history), ModelOutput(error, z.numpy()[:, 0])
-
-
-def _cell(state: NDArray[np.float32]) -> tuple[Tensor, ...]:
-    """Return hidden state and cell (1, B, H) of a state (B, 2, H)."""
-    return tuple(torch.as_tensor(np.ascontiguousarray(state[:, n]))[None] for n in range(2))
-
-
-def _kept(state: tuple[Tensor, Tensor]) -> NDArray[np.float32]:
-    return np.stack([part.numpy()[0] for part in state], axis=1)
