@@ -72,7 +72,7 @@ def test_bad_input_is_named(asm):
         learn_ceilings(asm, sine_episodes(3, seed=0))
     with pytest.raises(ValueError, match="episode 119 was learned from"):
         learn_ceilings(asm, [*sine_episodes(119, seed=3), sine_episodes(50)[0]])
-    with pytest.raises(ValueError, match="episodes 0 and 120 overlap"):
+    with pytest.raises(ValueError, match="episodes 0 and 120 are the same"):
         learn_ceilings(asm, [*(hours := sine_episodes(120, seed=3)), hours[0]])
     with pytest.raises(RuntimeError, match="call fit"):
         learn_ceilings(NeuralASM(sine_spec(), **SMALL), sine_episodes(120, seed=0))

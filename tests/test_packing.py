@@ -1,4 +1,4 @@
-"""Weights of 8 bits and roots of covariances: what rounding loses, and packing does not."""
+"""Weights of 8 bits: what rounding loses, and packing does not."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,7 @@ def weights(seed=0):
     rng = np.random.default_rng(seed)
     W = (rng.normal(size=(40, 30)) * np.exp(3 * rng.normal(size=(40, 1)))).astype(np.float32)
     W[3], W[4, 5:], W[6, 7] = 0, 0, 1e-12
-    rows = rng.normal(size=(50, 20)) @ np.diag(10.0 ** rng.uniform(-3, 0, 20))
-    rows[:, 3] = 0.7 * rows[:, 2]  # nothing else is ever seen of it
-    return {"V": W, "moments": rows.T @ rows / 50, "D": W.copy(), "mean": np.arange(3.0)}
+    return {"V": W, "D": W.copy(), "mean": np.arange(3.0)}
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -27,7 +25,7 @@ def test_rounding_moves_a_weight_by_half_a_step_at_most_and_packing_by_nothing(s
     np.testing.assert_array_equal(after["V"] == 0, before["V"] == 0)
     np.testing.assert_array_equal(after["D"], before["D"])
     kept = packed(after)
-    assert set(kept) == {"V.bits", "V.scale", "moments.root", "moments.scale", "mean", "D"}
+    assert set(kept) == {"V.bits", "V.scale", "mean", "D"}
     back = unpacked(kept)
     assert set(back) == set(after)
     for name, array in after.items():
@@ -64,5 +62,5 @@ def test_a_rounded_memory_is_the_same_when_it_is_read_and_smaller(tmp_path):
         again, other = NeuralASM.load(tmp_path / name), sine_episodes(1, seed=2)[0]
         assert again.threshold == one.threshold
         np.testing.assert_array_equal(again.score(other).value, one.score(other).value)
-    assert (tmp_path / "small").stat().st_size < 0.6 * (tmp_path / "large").stat().st_size
+    assert (tmp_path / "small").stat().st_size < 0.8 * (tmp_path / "large").stat().st_size
     assert small.threshold == pytest.approx(memory.threshold, rel=0.05)

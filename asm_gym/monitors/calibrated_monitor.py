@@ -26,7 +26,7 @@ from asm_gym.monitors.stream_model import (
     parameter_names,
     side_by_side,
 )
-from asm_gym.monitors.training_data import Marks, check_nominal, sketch
+from asm_gym.monitors.training_data import Hashes, check_nominal, hashes_of
 from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
 
 
@@ -49,7 +49,7 @@ class CalibratedMonitor(Calibrated):
 
     Attributes:
         about: JSON values to save with it, such as its ``name``.
-        learned_from_, ceilings_from_: marks of the episodes of ``fit`` and of ``learn_ceilings``; None before.
+        learned_from_, ceilings_from_: hashes of the episodes of ``fit`` and of ``learn_ceilings``; None before.
     """
 
     model: StreamModel
@@ -61,8 +61,8 @@ class CalibratedMonitor(Calibrated):
         self.spec, self.model, self.detection = model.spec, model, detections[0]
         self.detections = {d.name: d for d in detections}
         self._uncalibrate()
-        self.learned_from_: Marks | None = None
-        self.ceilings_from_: Marks | None = None
+        self.learned_from_: Hashes | None = None
+        self.ceilings_from_: Hashes | None = None
         self.about: dict[str, Any] = {}
 
     def __repr__(self) -> str:
@@ -141,7 +141,8 @@ class CalibratedMonitor(Calibrated):
         self._uncalibrate()
         if not warm_start:
             self.learned_from_ = self.ceilings_from_ = None
-        self._remember(episodes)
+        before = np.zeros(0) if self.learned_from_ is None else self.learned_from_
+        self.learned_from_ = np.union1d(before, hashes_of(episodes))
         model: Any = self.model
         with threadpool_limits(1):  # products this small are slower on several threads
             if warm_start:
@@ -250,11 +251,6 @@ class CalibratedMonitor(Calibrated):
         other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
         other.detection = other.detections[self.detection.name]
         return other
-
-    def _remember(self, episodes: Sequence[Episode]) -> None:
-        """Mark episodes as learned from, so that no promise by the hour is made of them."""
-        before = np.zeros(0) if self.learned_from_ is None else self.learned_from_
-        self.learned_from_ = np.union1d(before, sketch(episodes))
 
     def _require_fitted(self) -> None:
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):

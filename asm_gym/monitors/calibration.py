@@ -26,7 +26,7 @@ from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.stream_model import StreamModel
-from asm_gym.monitors.training_data import Marks, check_fresh, check_nominal
+from asm_gym.monitors.training_data import Hashes, check_fresh, check_nominal
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
@@ -102,8 +102,8 @@ class Calibrated:
     spec: StreamSpec
     model: StreamModel
     detection: Detection
-    learned_from_: Marks | None
-    ceilings_from_: Marks | None
+    learned_from_: Hashes | None
+    ceilings_from_: Hashes | None
     threshold_: float | None
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
@@ -132,7 +132,7 @@ class Calibrated:
 
         Raises:
             ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
-                by the hour also episodes that overlap, or that ``fit`` has learned from. Or not exactly one rate.
+                by the hour also an episode given twice, or that ``fit`` has learned from. Or not exactly one rate.
         """
         self._require_fitted()
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)

@@ -14,7 +14,7 @@ from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.episode import Episode
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import model_outputs
-from asm_gym.monitors.training_data import check_fresh, check_nominal, sketch
+from asm_gym.monitors.training_data import check_fresh, check_nominal, hashes_of
 from asm_gym.validation import typed
 
 AT_ONCE = 400
@@ -33,7 +33,7 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
         episodes: healthy ones that ``fit`` has not seen, 100 at least, and one hit or so in each 50 at most.
 
     Raises:
-        ValueError: too few, or bad ones; such as overlap, or as ``fit`` has learned from.
+        ValueError: too few, or bad ones; one given twice, or that ``fit`` has learned from.
         TypeError: its detection is not that of evidence.
     """
     monitor._require_fitted()
@@ -48,7 +48,7 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
     learned = monitor.detection.with_ceilings(maxima, anew=monitor.ceilings_from_ is None)
     monitor.detection = learned
     monitor.detections = {**monitor.detections, learned.name: learned}
-    monitor.ceilings_from_ = sketch(episodes)
+    monitor.ceilings_from_ = hashes_of(episodes)
     monitor._uncalibrate()
     return monitor
 
