@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-import platform
-import re
 import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -25,7 +23,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     """A file to write that takes its place when the block ends well; a reader sees the old one or the new one.
 
-    A process that is killed leaves a hidden file, which the next one to write there removes. Missing folders are made.
+    A process that is killed leaves a hidden file that ends in ``.unfinished``. Missing folders are made.
 
     Raises:
         ValueError: something stands there that is no file, such as a device; the path names no file.
@@ -34,9 +32,7 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is no regular file, and is not replaced by one")
     path.parent.mkdir(parents=True, exist_ok=True)
-    mark = f".{path.name}.{re.sub(r'[^A-Za-z0-9-]', '-', platform.node())}."
-    _remove_left_behind(path.parent, mark)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f"{mark}{os.getpid()}.", suffix=UNFINISHED)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=UNFINISHED)
     try:
         with named(path), os.fdopen(handle, "wb") as file:
             yield file
@@ -78,21 +74,3 @@ def _checked(path: str | Path) -> Path:
     if not Path(path).name or "\x00" in str(path):
         raise ValueError(f"a path must name a file, got {short_repr(str(path))}")
     return Path(path)
-
-
-def _remove_left_behind(folder: Path, mark: str) -> None:
-    """Removes what processes of this machine that run no longer began to write under this name."""
-    for entry in os.scandir(folder):
-        if entry.name.startswith(mark) and entry.name.endswith(UNFINISHED):
-            owner = entry.name.removeprefix(mark).split(".")[0]
-            if owner.isdigit() and not _runs(int(owner)):
-                Path(entry.path).unlink(missing_ok=True)
-
-
-def _runs(process: int) -> bool:
-    with suppress(PermissionError):  # it runs, and is somebody else's
-        try:
-            os.kill(process, 0)
-        except (ProcessLookupError, OverflowError):
-            return False
-    return True

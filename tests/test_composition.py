@@ -216,3 +216,40 @@ def test_a_threshold_that_no_fault_could_pass_names_the_channels():
     blind = blind_to(monitor.detection, columns, monitor.spec, middle)
     assert set(blind) == {monitor.spec.labels[columns[k]] for k in range(len(columns)) if reach[k] <= middle}
     assert blind_to(object(), columns, monitor.spec, 1e9) == []  # a detection that does not know
+
+
+class NoModel:
+    """Has none of a model's methods."""
+
+
+def returning(name, change):
+    """Return a class of models whose ``predict`` gives ``change(state, output)``."""
+
+    def predict(self, state, rows):
+        return change(*Persistence.predict(self, state, rows))
+
+    return type(name, (Persistence,), {"kind": name, "predict": predict})
+
+
+Lopsided = returning("lopsided", lambda state, output: (state, output._replace(errors=output.errors[:, 1:])))
+Stateless = returning("stateless", lambda state, output: output)
+NotFinite = returning("not_finite", lambda state, output: (state, output._replace(errors=output.errors * np.nan)))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("NoModel", "is no model: it has no kind, fit, start, predict, restore; derive from"),
+        ("Lopsided", r"predict of lopsided must give errors \(\d+, 12\), got \(\d+, 11\)"),
+        ("Stateless", "must give a state and a ModelOutput, got ModelOutput"),
+        ("NotFinite", "must give errors that are finite where the rows are"),
+    ],
+)
+def test_a_class_that_is_no_proper_model_is_refused_in_a_line(name, message):
+    before = dict(MONITORS)
+    try:
+        with pytest.raises(ValueError, match=message):
+            make_monitor(f"tests.test_composition:{name}", sine_spec()).fit(sine_episodes(20))
+    finally:
+        MONITORS.clear()
+        MONITORS.update(before)

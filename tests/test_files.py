@@ -1,24 +1,12 @@
-"""Files: complete or not there, nothing left behind by the dead, nothing read that is no file."""
+"""Files: complete or not there, nothing read that is no file."""
 
 import os
-import signal
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from asm_gym.files import regular_file, written_whole
-
-KILLED = """
-import os, signal, sys
-from asm_gym.files import written_whole
-with written_whole(sys.argv[1]) as file:
-    file.write(b"half")
-    file.flush()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
 
 
 def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path):
@@ -34,22 +22,6 @@ def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path):
     with pytest.raises(KeyboardInterrupt), written_whole(path) as file:
         raise KeyboardInterrupt
     assert [p.name for p in path.parent.iterdir()] == ["x.asm"]
-
-
-def test_what_a_killed_process_began_is_removed_by_the_next_and_what_a_living_one_writes_is_not(tmp_path):
-    path = tmp_path / "x.asm"
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(path)], check=False)
-    assert killed.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    assert left.read_bytes() == b"half"
-    other = tmp_path / "x.asm2"
-    with written_whole(path) as outer, written_whole(path) as inner:  # two at once
-        outer.write(b"1")
-        inner.write(b"2")
-        assert len(list(tmp_path.iterdir())) == 2, "both of this process, and no longer that of the dead one"
-    with written_whole(other) as file:
-        file.write(b"3")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.asm", "x.asm2"]
 
 
 def test_a_pipe_a_device_or_a_folder_is_neither_read_nor_replaced(tmp_path):

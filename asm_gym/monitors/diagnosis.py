@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from asm_gym.memory.completion import PENALTY, Completion
 from asm_gym.spec import MOTOR
@@ -105,7 +106,8 @@ class Readout:
 
     def __call__(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the probabilities (N, C) of ``CLASSES`` for evidence (N, F)."""
-        return softmax((evidence - self.mean) / self.spread @ self.weights.T + self.bias)
+        p: NDArray[np.float64] = softmax((evidence - self.mean) / self.spread @ self.weights.T + self.bias, axis=-1)
+        return p
 
     @classmethod
     def shipped(cls) -> Self:
@@ -123,13 +125,6 @@ def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses
     if diagnoses > SETTLED_AFTER and belief.max() >= SETTLED:
         return belief
     return belief + max(1 / diagnoses, 0.1) * (newest - belief)
-
-
-def softmax(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the softmax along the last axis."""
-    powers = np.exp(x - x.max(axis=-1, keepdims=True))
-    found: NDArray[np.float64] = powers / powers.sum(axis=-1, keepdims=True)
-    return found
 
 
 @dataclass(frozen=True, eq=False)

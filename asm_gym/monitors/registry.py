@@ -10,7 +10,6 @@ from asm_gym.checkpoint import kind_of, read_checkpoint
 from asm_gym.detection import Detection, EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.estimators import adapted
 from asm_gym.monitors.files import restored
 from asm_gym.monitors.stream_model import made, parameter_names
 from asm_gym.registries import Registry, target
@@ -148,7 +147,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
 def check_monitor_name(name: str) -> None:
     """Raise ValueError unless there is such a monitor, or such a model and detection.
 
-    A model or estimator that goes by ``module:class`` is imported and registered by its kind; nothing else is imported.
+    A model that goes by ``module:class`` is imported and registered by its kind; nothing else is imported.
     """
     model, plus, detection = name.partition("+")
     if ":" in model and model not in MONITORS:
@@ -164,14 +163,11 @@ def check_monitor_name(name: str) -> None:
 
 def _model_class(own: Any, name: str) -> Any:
     """Return a class of models or of whole monitors. Raises ValueError where a method is missing."""
-    if hasattr(own, "score_samples") and hasattr(own, "fit") and not hasattr(own, "kind"):
-        return adapted(own)
     whole = isinstance(own, type) and issubclass(own, CalibratedMonitor)
     missing = [n for n in ("kind", "fit", *(() if whole else ("start", "predict", "restore"))) if not hasattr(own, n)]
     if missing:
         raise ValueError(
-            f"{name} is no model: it has no {', '.join(missing)}; derive from "
-            "asm_gym.monitors.stream_model.StreamModel, or give an estimator with fit and score_samples"
+            f"{name} is no model: it has no {', '.join(missing)}; derive from asm_gym.monitors.stream_model.StreamModel"
         )
     return own
 
