@@ -17,7 +17,7 @@ from rich.console import Console
 
 from asm_gym.detection import check_per_hour
 from asm_gym.detection.conformal import check_hours
-from asm_gym.episode import Episode, load_episode
+from asm_gym.episode import load_episode
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import NOMINAL_ROLES
 from asm_gym.evaluation.tables import ConsoleTable, markdown
@@ -30,7 +30,7 @@ from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.exam import Exam, Marks, card, examine, summary, usual_force
-from asm_gym.rollouts.pretraining.healthy import Lessons, calibrate_body, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions
 from asm_gym.rollouts.seeds import role_seeds
@@ -110,17 +110,13 @@ class Args(Options):
         ]
 
 
-def record_lessons(args: Args, console: Console) -> Lessons:
-    """Record the lessons that are missing, and select what is healthy."""
+def learn(args: Args, console: Console) -> NeuralASM:
+    """Record what is missing of lessons and of the experts' healthy hours; fit, calibrate and save the memory."""
     wanted = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress)
-    return healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
-
-
-def record_hours(args: Args, console: Console) -> list[Episode]:
-    """Record the missing episodes of the experts, read those of a corpus, and return what was solved."""
+    lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
     seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes) for task in args.shown}
     trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
     with stage("healthy hours", console, {}) as progress:
@@ -128,12 +124,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     found = [load_episode(file) for file in files]
     if args.corpus is not None:
         found += Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)
-    return [episode for episode in found if episode.success]
-
-
-def learn(args: Args, console: Console) -> NeuralASM:
-    """Record what is missing; fit, calibrate and save the memory."""
-    lessons, hours = record_lessons(args, console), record_hours(args, console)
+    hours = [episode for episode in found if episode.success]
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     with stage("learning", console, {}) as progress:
         memory = learn_body(lessons, inner.stream_spec, args.seed, progress)
@@ -159,12 +150,11 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
     usual: dict[str, float] = {}  # of each task, by its expert, who comes first
     for exam in args.exams:
         config = replace(args.config, policy=exam.policy)
-        folder = args.out / "exams" / exam.policy
         inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
         kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
         trials = exam.trials(args.exam_episodes, kinds, args.seed)
         with stage(exam.name, console, {}) as progress:
-            files = record_missing(trials, config, folder, args.workers, progress)
+            files = record_missing(trials, config, args.out / "exams" / exam.policy, args.workers, progress)
             recordings = [load_episode(file) for file in files]
             expected = usual.setdefault(exam.task, usual_force(recordings))
             marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))
