@@ -111,7 +111,7 @@ def choose_object(env: Any, task: TaskSpec) -> None:
 
 
 def speed_up_contacts(env: Any) -> None:
-    """Replace robosuite's ``check_contact`` and ``_check_grasp``, on which rewards rest, for the loaded model.
+    """Replace the methods of robosuite on which rewards rest, for the loaded model.
 
     Robosuite puts the names of geoms together at every call, and looks up two for each contact and pair of groups;
     these compare ids in one pass.
@@ -149,7 +149,23 @@ def speed_up_contacts(env: Any) -> None:
             return any(check_grasp(each, object_geoms) for each in gripper.values())
         return all(check_contact(pad, object_geoms) for pad in pads(gripper))
 
-    env.check_contact, env._check_grasp = check_contact, check_grasp
+    @lru_cache
+    def grip_site(gripper: Any) -> NDArray[np.float64]:
+        return np.asarray(data.site(gripper.important_sites["grip_site"]).xpos)
+
+    @lru_cache
+    def place(target: Any, kind: str) -> NDArray[np.float64]:
+        name = getattr(target, "root_body", None)  # of a model
+        return np.asarray(data.body(name).xpos if name else getattr(data, kind)(target).xpos)
+
+    def gripper_to_target(gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False) -> Any:
+        """Way from a gripper, or from the nearest of several, to a target; or its length."""
+        grippers = gripper.values() if isinstance(gripper, dict) else (gripper,)
+        ways = [place(target, target_type) - grip_site(each) for each in grippers]
+        way = ways[0] if len(ways) == 1 else min(ways, key=np.linalg.norm)
+        return np.linalg.norm(way) if return_distance else way
+
+    env.check_contact, env._check_grasp, env._gripper_to_target = check_contact, check_grasp, gripper_to_target
 
 
 class ObjectSensors:

@@ -247,6 +247,16 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
 
 
 @compiled
+def average(samples: Floats, count: int, arms: Ints, columns: Ints, mean: Floats) -> None:
+    """Write the mean (N,) of the first ``count`` substeps of N columns, each of its arm."""
+    for n in range(len(columns)):
+        total = 0.0
+        for k in range(count):
+            total += samples[arms[n], k, columns[n]]
+        mean[n] = total / count
+
+
+@compiled
 def edited(live: Floats, frozen: Floats, rows: Ints) -> bool:
     """Whether two arrays (N, M) differ in any of ``rows``."""
     for r in rows:

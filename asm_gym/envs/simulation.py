@@ -187,7 +187,8 @@ class Simulation:
     @property
     def mean_felt(self) -> NDArray[np.float64]:
         """(N,) the mean of ``felt``."""
-        mean: NDArray[np.float64] = np.ascontiguousarray(self.felt).mean(axis=0)
+        mean: NDArray[np.float64] = np.empty(len(self._columns))
+        kernels.average(self._samples, self._done - self._row_began, self._limited[0], self._columns, mean)
         return mean
 
     @property
