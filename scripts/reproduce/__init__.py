@@ -15,6 +15,7 @@ INDEPENDENT = {
     "memorise_and_recall": "one network learns skills, recalls each from a cue",
     "abstract": "one network, six skills, no label: the abstract",
     "local_learning": "local updates against backpropagation through time",
+    "speed_accuracy": "more inference, or slower movements, for more accuracy",
     "harm": "harm avoided against success kept, under any policy",
 }
 STUDIES = {
