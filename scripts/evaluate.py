@@ -43,7 +43,7 @@ _HARMLESS = (*HARMLESS, *EXECUTIONS)
 ROLES = ("fit", "calibration", "nominal", "faulty", "harmless")
 
 _QUICK = (
-    *("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence"),
+    *("neural_asm", "association_linear+evidence", "kalman+evidence"),
     *("logpzo", "external_torque_limit", "force_limit"),
 )
 """Monitors that are fitted in seconds."""

@@ -12,7 +12,7 @@ from asm_gym.monitors import make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes
 
-NAMES = ("neural_asm", "association_linear+evidence", "window_pca+evidence", "kalman+evidence")
+NAMES = ("neural_asm", "association_linear+evidence", "kalman+evidence")
 
 
 def fresh(name, spec):

@@ -124,7 +124,7 @@ def pushed(tmp_path, monkeypatch):
 
 def test_monitors_are_judged_by_a_corpus(pushed, tmp_path):
     asked = ["--corpus", str(pushed), "--workers", "1", "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]
-    assert evaluate([*asked, "--monitors", "kalman+evidence", "window_pca"]) == 0
+    assert evaluate([*asked, "--monitors", "kalman+evidence", "association_linear"]) == 0
     text = (tmp_path / "out/results.md").read_text()
     assert re.search(r"\| kalman\+evidence \| 1.000 \(1.000–1.000\) \|.* 100 % \(100–100\)", text)
     assert "within chance" in text

@@ -11,7 +11,7 @@ from asm_gym.episode import EpisodeLabel, load_episode
 from asm_gym.scripts import command
 from asm_gym.scripts.evaluate import Args, main, trials_of
 
-MONITORS = ("neural_asm", "kalman+evidence", "window_pca", "force_limit")
+MONITORS = ("neural_asm", "kalman+evidence", "association_linear", "force_limit")
 SMALL = [
     *("--tasks", "Lift", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
     *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "24"),

@@ -17,7 +17,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import Calibrated
-from asm_gym.monitors.files import SavedMonitor, write_monitor
+from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
 from asm_gym.monitors.stream_model import (
     ErrorPlaces,
     StreamModel,
@@ -219,12 +219,12 @@ class CalibratedMonitor(Calibrated):
         Raises:
             ValueError: something is missing, or does not fit together.
         """
-        found = SavedMonitor.of(saved)
-        self.with_learned(found.arrays, tuple(saved.header["skills"]))
-        vars(self).update(found.kept)
+        arrays, kept, calibrated = saved_parts(saved)
+        self.with_learned(arrays, tuple(saved.header["skills"]))
+        vars(self).update(kept)
         if saved.header["detection"] == self.detection.name:
-            self.threshold_ = found.threshold_below(self.detection.reach)
-            vars(self).update(found.calibrated)
+            self.threshold_ = threshold_below(saved.header["threshold"], self.detection.reach)
+            vars(self).update(calibrated)
         return self
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,52 +24,43 @@ MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks"
 """Names of the arrays that ``calibrate``, ``fit`` and ``learn_ceilings`` keep in a checkpoint."""
 
 
-class SavedMonitor(NamedTuple):
-    """A checkpoint of a monitor.
+def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, Any]]:
+    """Return the learned arrays of a checkpoint, by name, and two sets of attributes of its monitor.
 
-    Attributes:
-        arrays: what its model and its detections have learned, by name.
-        kept: attributes of the monitor that it holds under any detection.
-        calibrated: attributes of the monitor that hold under the detection that it was calibrated with.
-        threshold: as it was written.
+    The first holds under any detection, the second under the one that the monitor was calibrated with.
+
+    Raises:
+        KeyError, ValueError: something is missing, not declared, or out of range.
     """
+    header, saved = saved.header, saved._replace(arrays=unpacked(saved.arrays))
+    undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
+    if undeclared:
+        raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
+    arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
+    blocks, promised = arrays.pop(BLOCKS, None), header.get("promised", EPISODE)
+    check_choice("promise", promised, (EPISODE, HOUR))
+    calibrated = {
+        "maxima_": arrays.pop(MAXIMA, None),
+        "blocks_": None if blocks is None else Blocks.restored(blocks),
+        "promised_": promised,
+    }
+    kept = {
+        "learned_from_": arrays.pop(LEARNED_FROM, None),
+        "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
+        "about": dict(header["about"]),
+        "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
+    }
+    return arrays, kept, calibrated
 
-    arrays: Arrays
-    kept: dict[str, Any]
-    calibrated: dict[str, Any]
-    threshold: object
 
-    @classmethod
-    def of(cls, saved: Checkpoint) -> Self:
-        """Read a checkpoint. Raises KeyError or ValueError where something is missing or not declared."""
-        header, saved = saved.header, saved._replace(arrays=unpacked(saved.arrays))
-        undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
-        if undeclared:
-            raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
-        arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
-        blocks, promised = arrays.pop(BLOCKS, None), header.get("promised", EPISODE)
-        check_choice("promise", promised, (EPISODE, HOUR))
-        calibrated = {
-            "maxima_": arrays.pop(MAXIMA, None),
-            "blocks_": None if blocks is None else Blocks.restored(blocks),
-            "promised_": promised,
-        }
-        kept = {
-            "learned_from_": arrays.pop(LEARNED_FROM, None),
-            "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
-            "about": dict(header["about"]),
-            "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
-        }
-        return cls(arrays, kept, calibrated, header["threshold"])
-
-    def threshold_below(self, reach: float) -> float | None:
-        """Return the threshold. Raises ValueError where surprise, which never comes to ``reach``, cannot exceed it."""
-        if self.threshold is None:
-            return None
-        number = check_number("threshold", self.threshold, low=0.0)
-        if number >= reach:
-            raise ValueError(f"threshold must be below {reach:g}, all that errors can add up to, got {number:g}")
-        return number
+def threshold_below(threshold: object, reach: float) -> float | None:
+    """Return a saved threshold. Raises ValueError where surprise, which never comes to ``reach``, cannot exceed it."""
+    if threshold is None:
+        return None
+    number = check_number("threshold", threshold, low=0.0)
+    if number >= reach:
+        raise ValueError(f"threshold must be below {reach:g}, all that errors can add up to, got {number:g}")
+    return number
 
 
 def write_monitor(path: str | Path, monitor: CalibratedMonitor) -> None:

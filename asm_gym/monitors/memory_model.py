@@ -43,6 +43,7 @@ class MemoryModel(StreamModel):
 
     Attributes:
         senses_: how it reads a row.
+        network_: the weights; None before ``fit``.
         motor_: the motor association; None before ``learn_to_act``.
         completion_: completes missing senses; None where they are too many, and once some were lost.
         compiled_: what the row kernel computes with; None before ``fit``.
@@ -63,26 +64,20 @@ class MemoryModel(StreamModel):
         self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
         self.lag = rows_apart(spec.dt)
         self.shortest = 1 + self.lag
-        self._network: TemporalNetwork | None = None
+        self.network_: TemporalNetwork | None = None
         self.compiled_: LearnedMemory | None = None
         self.motor_: Motor | None = None
         self.completion_: Completion | None = None
 
     @property
-    def network_(self) -> TemporalNetwork | None:
-        """The weights; None before ``fit``."""
-        return self._network
-
-    @network_.setter
-    def network_(self, network: TemporalNetwork) -> None:
-        names = [self.learned_[n] for n in ("W_K", "b_K")] if self.skills_ else [np.zeros((0, 0)), np.zeros(0)]
-        self._network, self.compiled_ = network, LearnedMemory.of(network, self.senses_, (names[0], names[1]))
-
-    @property
     def network(self) -> TemporalNetwork:
         """The weights of a fitted model."""
-        assert self._network is not None
-        return self._network
+        assert self.network_ is not None
+        return self.network_
+
+    def _take(self, network: TemporalNetwork) -> None:
+        names = [self.learned_[n] for n in ("W_K", "b_K")] if self.skills_ else [np.zeros((0, 0)), np.zeros(0)]
+        self.network_, self.compiled_ = network, LearnedMemory.of(network, self.senses_, (names[0], names[1]))
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams, lag = [e.stream for e in episodes], self.lag
@@ -131,7 +126,7 @@ class MemoryModel(StreamModel):
         super().restore(learned, skills)
         self.senses_, self.motor_ = senses, Motor.found(learned, senses)
         self.completion_ = Completion.found(learned, senses)
-        self.network_ = dynamics.network(dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how)
+        self._take(dynamics.network(dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how))
         return self
 
     def start(self, batch: int) -> MemoryState:
@@ -163,7 +158,7 @@ class MemoryModel(StreamModel):
             read = reading.inputs[learned], reading.changes[learned]
             now = follow_drift(self.network.association, *read, rate)
             self.learned_ = {**self.learned_, "U": now.U, "D": now.D}
-            self.network_ = self.network.with_association(now)
+            self._take(self.network.with_association(now))
         return learned
 
     def free_energy(self, healthy: Sequence[Episode]) -> FreeEnergy:

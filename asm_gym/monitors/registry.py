@@ -112,12 +112,10 @@ MONITORS: Registry[MonitorKind] = Registry(
                 "kalman": _rival("baselines.linear:Kalman", "mahalanobis"),
                 "association_linear": _rival("baselines.linear:LinearAssociation", "mahalanobis"),
                 "association_values": _rival("value_association:ValueAssociation", "mahalanobis"),
-                "window_pca": _rival("baselines.linear:WindowPCA", "squares"),
             }
         ),
         "external_torque_limit": _rival("baselines.limits:ExternalTorqueLimit", "largest"),
         "force_limit": _rival("baselines.limits:ForceLimit", "squares"),
-        "channel_limit": _rival("baselines.limits:ChannelLimit", "largest"),
     },
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged

@@ -165,7 +165,7 @@ class Config(kit.Config):
     monitors: tuple[str, ...] = option(
         (
             *("neural_asm", "association_values+evidence", "association_linear+evidence", "kalman+evidence"),
-            *("window_pca+evidence", "gru+evidence", RULE, "channel_limit"),
+            *("gru+evidence", RULE),
         ),
         quick=("association_values+evidence", RULE),
         least=1,

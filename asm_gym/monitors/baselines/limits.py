@@ -1,4 +1,4 @@
-"""What robots are guarded by today: fixed limits on forces, torques, and each channel.
+"""What robots are guarded by today: fixed limits on forces and torques.
 
     ε = (x - centre) / scale        of the channels that are limited; the threshold on it is calibrated
 
@@ -6,7 +6,6 @@ force_limit            force of the wrist [N] less the hand's own weight, the me
                        move of Will and Grossman 1975
 external_torque_limit  external torque of each joint, from a momentum observer, over its nominal spread: Haddadin, De
                        Luca and Albu-Schäffer 2017, Eq. 15 (observer) and 31 (a threshold for each joint)
-channel_limit          distance of each channel from the middle of its nominal range, in halves of that range
 """
 
 from __future__ import annotations
@@ -41,12 +40,12 @@ class _Limit(StreamModel):
     shortest = 1
     held_out = 0  # so few numbers are not learned by heart
     channel = ""
-    """End of their names; empty for all senses."""
+    """End of their names."""
 
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec)
         named = [i for name, s in spec.slices.items() if name.endswith(self.channel) for i in range(spec.size)[s]]
-        self._columns = np.array(named, np.intp) if self.channel else spec.sensory
+        self._columns = np.array(named, np.intp)
         if not len(self._columns):
             raise ValueError(f"this stream has no {self.channel}; it has: {', '.join(spec.slices)}")
 
@@ -88,13 +87,3 @@ class ExternalTorqueLimit(_Limit):
 
     def range_of(self, rows: Floats) -> tuple[Floats, Floats]:
         return rows.mean(axis=0), np.maximum(rows.std(axis=0), 1e-6)
-
-
-class ChannelLimit(_Limit):
-    """A limit on each channel."""
-
-    kind = "channel_limit"
-
-    def range_of(self, rows: Floats) -> tuple[Floats, Floats]:
-        low, high = rows.min(axis=0), rows.max(axis=0)
-        return (low + high) / 2, np.maximum((high - low) / 2, 1e-9)

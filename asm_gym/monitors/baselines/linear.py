@@ -1,16 +1,13 @@
-"""Linear baselines: a Kalman filter, principal components of a window, ridge regression, and a rule of friction.
+"""Linear baselines: a Kalman filter, ridge regression, and a rule of friction.
 
     Kalman      x_t = A x_{t-1} + B u_t + c + w, w ~ N(0, Q)      y_t = x_t + v, v ~ N(0, R)     ε: innovations
-    WindowPCA   w_t = [x_{t-R+1}, …, x_t] standardised            ε_t = w_t - W Wᵀ w_t, of x_t
     ridge       ε_t = (Δ_t - D a_t)/s                             D, s, a_t: association without hidden units
     friction    r_j = mean over 0.1 s of τ_j - (c_0 + c_1 v_j + Σ_w c_w tanh(v_j/w s_j))    ε = r_j / spread_j
 
 R is the sensor noise that the stream's spec states; A, B, c by ridge regression; Q is what is left of the residuals.
-W: the leading eigenvectors of the windows' covariance, as many as hold most of the variance. What the memory's hidden
-units, precision and temporal network are worth is what it finds beyond ``LinearAssociation``.
+What the memory's hidden units, precision and temporal network are worth is what it finds beyond ``LinearAssociation``.
 
-Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in innovations; Jackson and Mudholkar 1979
-(Technometrics 21(3)) for residuals of principal components; Ku et al. 1995 for windows; Hoerl and Kennard 1970.
+Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in innovations; Hoerl and Kennard 1970.
 """
 
 from __future__ import annotations
@@ -99,55 +96,6 @@ class Kalman(StreamModel):
         estimate = expected + innovation @ self.learned_["gain"].T
         error = innovation / self.learned_["deviation"]
         return _Filtered(estimate, state.steps + 1), ModelOutput(error, no_context(rows))
-
-
-class _Window(NamedTuple):
-    rows: Floats  # (B, R - 1, D) the newest last, standardised; what was not finite is the mean
-    steps: NDArray[np.int64]  # (B,)
-
-
-class WindowPCA(StreamModel):
-    """The residual of each sense beyond the principal components of a few rows; it has no context.
-
-    Args:
-        spec: the stream it is to expect.
-        rows: R, of a window.
-        kept: share in (0, 1] of the variance that the components hold.
-    """
-
-    kind = "window_pca"
-
-    @typed
-    def __init__(self, spec: StreamSpec, rows: int = 5, kept: float = 0.999) -> None:
-        super().__init__(spec)
-        self.rows = check_number("rows", rows, low=1, whole=True)
-        self.kept = check_number("kept", kept, above=0.0, high=1.0)
-        self.shortest = self.rows
-
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        check_inputs(self.rows * self.spec.size)
-        mean, spread = _scale(np.concatenate([e.stream for e in episodes]).astype(np.float64))
-        windows = np.concatenate([_windows((e.stream - mean) / spread, self.rows) for e in episodes])  # (N, R D)
-        values, vectors = np.linalg.eigh(windows.T @ windows / len(windows))
-        count = int(np.searchsorted(np.cumsum(values[::-1]), self.kept * values.sum())) + 1
-        W = np.ascontiguousarray(vectors[:, ::-1][:, :count])
-        senses = windows.shape[1] - self.spec.size + self.spec.sensory
-        left = windows[:, senses] - (windows @ W) @ W[senses].T
-        deviation = np.maximum(np.sqrt(np.mean(left**2, axis=0)), FAINTEST)
-        return self.restore({"mean": mean, "spread": spread, "components": W, "deviation": deviation})
-
-    def start(self, batch: int) -> _Window:
-        return _Window(np.zeros((batch, self.rows - 1, self.spec.size)), np.zeros(batch, np.int64))
-
-    def predict(self, state: _Window, rows: Floats) -> tuple[_Window, ModelOutput]:
-        scaled = (rows - self.learned_["mean"]) / self.learned_["spread"]
-        known = np.isfinite(scaled)
-        window = np.concatenate([state.rows, np.where(known, scaled, 0.0)[:, None]], axis=1)  # (B, R, D)
-        flat, W = window.reshape(len(rows), -1), self.learned_["components"]
-        senses = (self.rows - 1) * self.spec.size + self.spec.sensory
-        left = (flat[:, senses] - (flat @ W) @ W[senses].T) / self.learned_["deviation"]
-        judged = known[:, self.spec.sensory] & (state.steps >= self.rows - 1)[:, None]
-        return _Window(window[:, 1:], state.steps + 1), ModelOutput(np.where(judged, left, 0.0), no_context(rows))
 
 
 class LinearAssociation(ScaledModel):
@@ -259,8 +207,3 @@ def _positive(matrix: Floats) -> Floats:
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     nearest: Floats = (vectors * np.maximum(values, FAINTEST)) @ vectors.T
     return nearest
-
-
-def _windows(rows: Floats, count: int) -> Floats:
-    """Return the windows (T - R + 1, R D) of rows (T, D), the oldest row first."""
-    return np.hstack([rows[k : len(rows) - count + 1 + k] for k in range(count)])
