@@ -1,6 +1,6 @@
 """Upload a memory and its card to the Hugging Face hub, or to the server that HF_ENDPOINT names.
 
-asm_gym.monitors.hub.from_hub("OWNER/NAME") reads it there.
+asm_gym.monitors.shipped.from_hub("OWNER/NAME") reads it there.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.monitors.hub import push
+from asm_gym.monitors.shipped import push
 from asm_gym.scripts.command import option, run
 
 
@@ -24,15 +24,13 @@ class Args:
     """A calibrated monitor, such as asm-gym fit writes."""
     repo: str = option(positional=True, metavar="OWNER/NAME")
     """Repository on the hub; it is made where there is none."""
-    card: Path | None = option(None, metavar="FILE.md")
-    """What it was learned from, and how well it judges; by default what the file says of itself."""
     private: bool = False
     """Only you see a repository that is made."""
 
 
 def upload(args: Args, console: Console) -> None:
     """Upload, and print the address."""
-    where = push(args.memory, args.repo, args.card, args.private)
+    where = push(args.memory, args.repo, args.private)
     console.print(f"Uploaded to {where}", soft_wrap=True, highlight=False, markup=False)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.monitors.hub import CARD, FILE, from_hub
+from asm_gym.monitors.shipped import CARD, FILE, from_hub
 from asm_gym.scripts.cli import main
 from tests.streams import sine_episodes
 

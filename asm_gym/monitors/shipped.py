@@ -1,15 +1,23 @@
-"""Memories of a body that come with the package: one for each arm and rate, fitted on motor babbling.
+"""Memories that come with the package, one for each arm and rate, and memories on the Hugging Face hub.
 
-A file's header says whose body it is; nothing else is read to find the one that fits.
+A shipped file's header says whose body it is. Nothing is fetched from the hub unless it is asked for; ``HF_ENDPOINT``
+names another server of the same API, and ``hf auth login`` or ``HF_TOKEN`` says who you are.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from asm_gym.checkpoint import read_header
+from asm_gym.extras import require
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_choice, typed
+from asm_gym.validation import check_choice, check_text, typed
 
 SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 """Their folder.
@@ -18,6 +26,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 """
 USUAL = 20
 """Rows of a stream a second where each control step has one [Hz]."""
+FILE, CARD = "memory.asm", "README.md"
+"""Files in a repository of a memory on the hub."""
 
 
 def pretrained() -> dict[str, Path]:
@@ -69,3 +79,74 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "
         f"{make} for an arm of robosuite, asm-gym fit DATA for recordings, and hand it over as monitor"
     )
+
+
+@typed
+def push(path: str | Path, repo: str, private: bool = False) -> str:
+    """Upload a memory and its card to the hub, and return their address.
+
+    Args:
+        path: of a file that ``save`` wrote.
+        repo: ``owner/name``; it is made where there is none.
+        private: of a repository that is made.
+
+    Raises:
+        ImportError: huggingface_hub is not installed.
+        ValueError: the file is no monitor; the repository's name is none.
+        ConnectionError: the hub cannot be reached, or refuses; the message has its answer.
+    """
+    card = _card(path)
+    with _hub(repo) as hub:
+        api = hub.HfApi(endpoint=_endpoint())
+        api.create_repo(repo, private=private, exist_ok=True)
+        files = {FILE: Path(path).read_bytes(), CARD: card.encode()}
+        operations = [hub.CommitOperationAdd(name, content) for name, content in files.items()]
+        return str(api.create_commit(repo, operations, commit_message=f"Upload {Path(path).name}").commit_url)
+
+
+@typed
+def from_hub(repo: str, revision: str | None = None) -> CalibratedMonitor:
+    """Return a memory that ``push`` has put on the hub; it is downloaded once.
+
+    Args:
+        repo: ``owner/name``.
+        revision: a commit, a branch or a tag; None for the newest.
+
+    Raises:
+        ImportError, ConnectionError: as ``push``.
+    """
+    with _hub(repo) as hub:
+        path = hub.hf_hub_download(repo, FILE, revision=revision, endpoint=_endpoint())
+    return load_monitor(path)
+
+
+def _card(path: str | Path) -> str:
+    """Return a card in Markdown from the header of a file."""
+    header = read_header(path)
+    spec, about = StreamSpec.from_json(header["spec"]), header.get("about", {})
+    facts = {"kind": header["kind"], "threshold": header["threshold"], "channels": ", ".join(spec.slices), **about}
+    lines = [
+        "---\nlibrary_name: asm-gym\ntags: [robotics, anomaly-detection]\n---\n",
+        f"# A monitor of {spec.source or 'a stream'} at {1 / spec.dt:g} Hz\n",
+        'Load it by `asm_gym.monitors.shipped.from_hub("OWNER/NAME")`.\n',
+        *(f"- {name}: {value}" for name, value in facts.items() if isinstance(value, str | int | float)),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _endpoint() -> str | None:
+    return os.environ.get("HF_ENDPOINT") or None
+
+
+@contextmanager
+def _hub(repo: str) -> Iterator[Any]:
+    """Give the hub's library, whose errors become one line."""
+    hub = require("huggingface_hub", what="the hub")
+    check_text("repo", repo)
+    try:
+        yield hub
+    except Exception as error:
+        if type(error).__name__ == "HFValidationError":
+            raise ValueError(f"repo must be owner/name, got {repo!r}") from error
+        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise ConnectionError(f"the hub at {_endpoint() or 'huggingface.co'} on {repo}: {first}") from error
