@@ -17,31 +17,28 @@ from asm_gym.memory.recall import continued
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.training_data import check_nominal
-from asm_gym.validation import check_number, short_repr
 
 
 def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
     """Learn to tell which skill is running, from episodes that name it, and return the memory.
 
-    ``info["skill"]`` is the skill of a whole episode. Of one in which skills follow each other, ``info["skills"]``
-    names them in order, and ``info["changed"]`` says in which row each next one begins (a number, or a list of them).
-    Episodes with such changes let it follow a change sooner. Only ``surprise.skill`` depends on it.
+    ``info["skill"]`` is the skill of an episode. Only ``surprise.skill`` depends on it.
 
     Args:
         memory: fitted; it is changed.
         episodes: nominal ones.
 
     Raises:
-        ValueError: an episode names none, or rows in which nothing can change; or all name the same.
+        ValueError: an episode names none, or all name the same.
     """
     memory._require_fitted()
     check_nominal(episodes, memory.spec, memory.model.shortest)
     names, model = [], memory.model
     for n, episode in enumerate(episodes):
-        try:
-            names.append(skills_of(episode))
-        except ValueError as error:
-            raise ValueError(f"episode {n} {error}") from error
+        name = str(episode.info.get("skill", ""))
+        if not name:
+            raise ValueError(f"episode {n} does not say its skill: set info['skill']")
+        names.append(np.repeat(name, len(episode)))
     known, skills = np.unique(np.concatenate(names), return_inverse=True)
     if len(known) < 2:
         raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
@@ -72,31 +69,6 @@ def named_skills(memory: NeuralASM, stream: NDArray[np.floating[Any]]) -> NDArra
         state, _ = model.predict(state, row[None])
         named.append(memory.skills_[int(state.skill.argmax())])
     return np.array(named)
-
-
-def skills_of(episode: Episode) -> NDArray[np.str_]:
-    """Return the skill (T,) that runs in each row, as ``name_skills`` reads ``info``.
-
-    Raises:
-        ValueError: it names none; or not as many as begin; or they cannot begin there.
-    """
-    names = episode.info.get("skills")
-    if names is None:
-        name = str(episode.info.get("skill", ""))
-        if not name:
-            raise ValueError("does not say its skill: set info['skill']")
-        return np.repeat(name, len(episode))
-    if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) and name for name in names):
-        raise ValueError(f"must name its skills in order, info['skills'], got {short_repr(names)}")
-    changed = episode.info.get("changed", [])
-    rows = changed if isinstance(changed, list | tuple) else [changed]
-    begins = [0, *(check_number("info['changed']", row, low=1, whole=True) for row in rows)]
-    if len(begins) != len(names):
-        raise ValueError(f"names {len(names)} skills, and says of {len(begins) - 1} where they begin: info['changed']")
-    lengths = np.diff([*begins, len(episode)])
-    if (lengths < 1).any():
-        raise ValueError(f"has {len(episode)} rows, in which skills cannot begin at {', '.join(map(str, begins))}")
-    return np.repeat(names, lengths)
 
 
 def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 512) -> NeuralASM:
