@@ -20,7 +20,7 @@ from asm_gym.detection.conformal import check_hours
 from asm_gym.episode import load_episode
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import NOMINAL_ROLES
-from asm_gym.evaluation.tables import ConsoleTable, markdown
+from asm_gym.evaluation.tables import markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
@@ -170,7 +170,7 @@ def babble(args: Args, console: Console) -> None:
         if marks:
             table = card(marks, memory, WINDOW_S)
             (args.out / "card.md").write_text(f"{markdown(table)}\n\n{summary(marks)}\n", encoding="utf-8")
-            console.print(ConsoleTable(table))
+            console.print(table)
             console.print(summary(marks))
     console.print(
         f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it"

@@ -28,7 +28,7 @@ import asm_gym  # noqa: F401  (registers the environments)
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import Spread
-from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
+from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -190,7 +190,7 @@ def measure(args: Args, console: Console) -> None:
         table = BENCHMARKS[name](args, console)
         machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
         table = replace(table, caption=f"{table.caption}. {machine}; ±: spread over {PARTS} parts.")
-        console.print(ConsoleTable(table))
+        console.print(table)
         texts.append(markdown(table))
     file = args.out / "benchmark.md"
     file.write_text("\n\n".join(texts) + "\n", encoding="utf-8")

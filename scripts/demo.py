@@ -26,7 +26,7 @@ from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_ala
 from asm_gym.evaluation.report import write_json, write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share
-from asm_gym.evaluation.tables import ConsoleTable, tabulate
+from asm_gym.evaluation.tables import tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.collect import collect
@@ -129,7 +129,7 @@ def demonstrate(args: Args, console: Console) -> None:
     rows = by_condition(traces, WINDOW_S)
     title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
     table = tabulate(title, CONDITION_COLUMNS, rows)
-    console.print("", ConsoleTable(table), "")
+    console.print("", table, "")
     low, high = map(int, binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE))
     result = (
         f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of {args.nominal_episodes} "

@@ -23,7 +23,6 @@ from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_
 from asm_gym.evaluation.detection_tables import brief_monitors_table, harmless_table, kept_table, kinds_table
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.scoring import benchmark
-from asm_gym.evaluation.tables import ConsoleTable
 from asm_gym.faults import anywhere
 from asm_gym.faults.suite import HARMLESS, SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
@@ -192,7 +191,7 @@ def evaluate(args: Args, console: Console) -> None:
     if any(monitor.harmless for monitor in result.monitors.values()):
         tables.append(harmless_table(result, list(result.monitors)[:1]))
     for table in tables:
-        console.print(ConsoleTable(table))
+        console.print(table)
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")
 
 

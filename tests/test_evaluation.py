@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +13,7 @@ from scipy import stats
 
 from asm_gym.detection import conformal_threshold
 from asm_gym.episode import EpisodeLabel
-from asm_gym.evaluation import metrics, scoring
+from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import (
     BenchmarkResult,
     Bound,
@@ -47,9 +46,9 @@ from asm_gym.evaluation.metrics import (
 )
 from asm_gym.evaluation.resampling import Calibration, Windows, by_episode, interval, resample
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail
-from asm_gym.evaluation.scoring import CODE, code_digest, fitted
+from asm_gym.evaluation.scoring import fitted
 from asm_gym.evaluation.statistics import Rate, Share, auroc, wilson_interval
-from asm_gym.evaluation.tables import Column, ConsoleTable, Table, tabulate
+from asm_gym.evaluation.tables import Column, Table, tabulate
 from tests.streams import sine_episodes
 
 
@@ -362,7 +361,7 @@ def recordings():
     return [replace(episode, label=EpisodeLabel("Sines", "fit", seed=n)) for n, episode in enumerate(sine_episodes(8))]
 
 
-def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path, monkeypatch):
+def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
     first = fitted(tmp_path, "kalman", recordings(), 0)
     (kept,) = (tmp_path / "monitors").glob("*")
     written = kept.stat().st_mtime_ns
@@ -372,33 +371,9 @@ def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path, mon
     kept.write_bytes(kept.read_bytes()[:100])
     fitted(tmp_path, "kalman", recordings(), 0)
     assert kept.stat().st_size > 1000
-    monkeypatch.setattr(scoring, "code_digest", lambda: "01234567")
-    with pytest.warns(UserWarning, match="kalman was fitted by other code"):
-        fitted(tmp_path, "kalman", recordings(), 0)
-    with warnings.catch_warnings(action="error"):
-        fitted(tmp_path, "kalman", recordings(), 0)
-
-
-def test_any_change_of_what_learns_is_other_code_and_nothing_else_is(tmp_path):
-    for name in (*CODE, "faults"):
-        path = tmp_path / name if name.endswith(".py") else tmp_path / name / "deeper" / "part.py"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("a = 1")
-    before = code_digest.__wrapped__(tmp_path)
-    (tmp_path / "faults" / "deeper" / "part.py").write_text("a = 2")
-    assert code_digest.__wrapped__(tmp_path) == before
-    (tmp_path / "detection" / "deeper" / "part.py").write_text("a = 2")
-    assert code_digest.__wrapped__(tmp_path) != before
 
 
 # ------------------------------------------------------------------ tables
-
-
-def printed(table: Table, width: int) -> str:
-    console = Console(width=width, color_system=None)
-    with console.capture() as caught:
-        console.print(ConsoleTable(table))
-    return caught.get()
 
 
 def test_a_new_column_is_a_heading_and_a_function():
@@ -408,11 +383,10 @@ def test_a_new_column_is_a_heading_and_a_function():
         Table("t", ("a", "b"), [("x",)])
 
 
-def test_a_terminal_shows_a_row_in_a_line_and_a_narrow_one_a_cell_in_a_line():
-    headings = ("guard", "harm of hostile policies avoided", "in the worst cell", "healthy [episodes]")
-    table = Table("Harm avoided", headings, [("default", "99.7 %", "91.8 %", "1156 of 1200")])
-    assert any("99.7 %" in line and "1156 of 1200" in line for line in printed(table, 200).splitlines())
-    for width in (36, 60, 100):
-        assert max(map(len, printed(table, width).splitlines())) <= width
-        assert {"default", "hostile", "[episodes]"} <= set(printed(table, width).replace(":", " ").split())
-    assert "  in the worst cell: 91.8 %" in printed(table, 36).splitlines()
+def test_a_terminal_shows_a_row_in_a_line():
+    headings = ("guard", "harm of hostile policies avoided", "healthy [episodes]")
+    console = Console(width=120, color_system=None)
+    with console.capture() as caught:
+        console.print(Table("Harm avoided", headings, [("default", "99.7 %", "1156 of 1200")]))
+    assert any("99.7 %" in line and "1156 of 1200" in line for line in caught.get().splitlines())
+    assert "healthy [episodes]" in caught.get()

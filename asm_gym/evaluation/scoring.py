@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, lru_cache, partial
@@ -127,34 +126,26 @@ def judged(
 
 
 @cache
-def code_digest(package: Path = Path(asm_gym.__file__).parent, names: Sequence[str] = CODE) -> str:
-    """Return a digest of the code in these rooms and files of the package."""
-    made = hashlib.sha256()
-    for place in (package / name for name in names):
+def code_digest() -> str:
+    """Return a digest of the code that decides what a monitor learns."""
+    package, made = Path(asm_gym.__file__).parent, hashlib.sha256()
+    for place in (package / name for name in CODE):
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
     return made.hexdigest()[:8]
 
 
-def fitted(
-    folder: Path, name: str, recordings: Sequence[Episode], seed: int, settings: Mapping[str, Any] | None = None
-) -> CalibratedMonitor:
-    """Return the monitor fitted on these episodes; kept in the folder by episodes, settings and code.
-
-    Warns, and fits anew, where the folder has one that other code has fitted.
-    """
-    spec = recordings[0].spec
+def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
+    """Return the monitor fitted on these episodes; kept in the folder by episodes, settings and code."""
     model = name.removesuffix(EVIDENCE)
-    made = make_monitor(name, spec, seed=seed, **(settings or {}))
+    made = make_monitor(name, recordings[0].spec, seed=seed)
     learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
     path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"
     with suppress(FileNotFoundError, ValueError):  # a damaged one is fitted anew
         return monitor_class(name).load(path)
-    if any(other != path for other in path.parent.glob(f"{model}-{digest}*.asm")):
-        warnings.warn(f"{model} was fitted by other code than today's: it is fitted anew", stacklevel=2)
-    monitor = made.fit(recordings)
     path.parent.mkdir(parents=True, exist_ok=True)
+    monitor = made.fit(recordings)
     monitor.save(path)
     return monitor
 

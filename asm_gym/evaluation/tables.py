@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
 from rich.table import Table as RichTable
 
@@ -28,6 +27,15 @@ class Table:
             if len(row) != len(self.headings):
                 raise ValueError(f"the table has {len(self.headings)} columns, but a row of {len(row)}: {list(row)}")
 
+    def __rich__(self) -> RichTable:
+        """Return the table for a terminal; rich calls this."""
+        made = RichTable(title=escape(self.caption))
+        for n, heading in enumerate(self.headings):
+            made.add_column(escape(heading), justify="right" if n else "left", overflow="fold")
+        for row in self.rows:
+            made.add_row(*(escape(str(cell)) for cell in row))
+        return made
+
 
 class Column(NamedTuple, Generic[Subject]):
     """A heading, and the function that gives its cell."""
@@ -40,34 +48,6 @@ def tabulate(caption: str, columns: Sequence[Column[Subject]], subjects: Iterabl
     """Make a row for each subject."""
     rows = [tuple(column.cell(subject) for column in columns) for subject in subjects]
     return Table(caption, [column.heading for column in columns], rows)
-
-
-@dataclass(frozen=True)
-class ConsoleTable:
-    """A table for a terminal; one that is too narrow for the words of a row gets one line per cell."""
-
-    table: Table
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render; rich calls this."""
-        headings, rows = self.table.headings, self.table.rows
-        columns = zip(headings, *rows, strict=True)
-        widest = [max(map(len, " ".join(map(str, cells)).split() or [""])) for cells in columns]  # word of each column
-        if sum(widest) + 3 * len(widest) + 1 > options.max_width:
-            paragraphs = [f"[italic]{escape(self.table.caption)}[/]"]
-            for name, *cells in rows:
-                paragraphs.append(f"[bold]{escape(str(name))}[/]")
-                named = zip(headings[1:], cells, strict=True)
-                paragraphs += [f"  {escape(heading)}: {escape(str(cell))}" for heading, cell in named if str(cell)]
-            yield "\n".join(paragraphs)
-            return
-        made = RichTable(title=escape(self.table.caption))
-        for heading, width in zip(headings, widest, strict=True):
-            how: Any = "right" if made.columns else "left"
-            made.add_column(escape(heading), justify=how, min_width=width)
-        for row in rows:
-            made.add_row(*(escape(str(cell)) for cell in row))
-        yield made
 
 
 def markdown(table: Table) -> str:

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.figures import look, save
 from asm_gym.evaluation.statistics import Estimate, Spread
-from asm_gym.evaluation.tables import ConsoleTable, Table, markdown
+from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.rollouts import progress
 from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import versions
@@ -76,7 +76,7 @@ def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
             found = study.run(config)
         written = write(config.out / name, found, config, time.perf_counter() - start)
         for table in found.tables:
-            console.print(ConsoleTable(table))
+            console.print(table)
         console.print(f"Wrote {config.out / name}{', '.join(written)}")
 
     return command.run(f"reproduce {name}", study.Config, work, argv)
