@@ -32,19 +32,6 @@ class Policy(Protocol):
 
 
 @runtime_checkable
-class Reflex(Policy, Protocol):
-    """A policy that starts from the action executed last."""
-
-    def reset(self) -> None:
-        """Begin a new episode."""
-        ...
-
-    def begin(self, executed: NDArray[np.float32]) -> Any:
-        """Return the state to start from, after ``executed`` (A,)."""
-        ...
-
-
-@runtime_checkable
 class Seeded(Protocol):
     """What draws at random and can be told to draw the same again, as every stable-baselines3 model can."""
 

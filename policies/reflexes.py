@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium as gym
 import numpy as np
@@ -19,13 +19,6 @@ class HoldsItself(Protocol):
 
     keeps_holding: bool
     """Set, no step unsets ``holding``: for wrappers in between that make several steps of one."""
-
-
-class Begun(NamedTuple):
-    """Where a reflex is."""
-
-    executed: NDArray[np.float32]  # (A,) the action executed last before it began; its grip is kept
-    steps: int  # that it has acted
 
 
 class Hold:
@@ -63,27 +56,22 @@ class Hold:
         if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
             self._grip = self._grip[:0]
 
-    def reset(self) -> None:
-        """A new episode begins."""
-
-    def begin(self, executed: NDArray[np.float32]) -> Begun:
-        """The state to start from, after ``executed`` (A,)."""
-        return Begun(np.array(executed, np.float32), 0)
+    def begin(self, executed: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The state to start from, after ``executed`` (A,), whose grip is kept."""
+        return np.array(executed, np.float32)
 
     def predict(
         self,
         observation: Any,
-        state: Begun | None = None,
+        state: NDArray[np.float32] | None = None,
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Begun | None]:
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
         """The next action (A,)."""
         action = self._rest.copy() if self.explicit else self.move()
-        if state is None:
-            return action, None
-        if not self.explicit:
-            action[self._grip] = state.executed[self._grip]
-        return action, Begun(state.executed, state.steps + 1)
+        if state is not None and not self.explicit:
+            action[self._grip] = state[self._grip]
+        return action, state
 
     def move(self) -> NDArray[np.float32]:
         """The next action (A,); the gripper's part of it does not count."""

@@ -39,7 +39,7 @@ def warm_up(args: Args, console: Console) -> None:
         small = NeuralASM(spec, hidden_size=8, association_size=8, epochs=1).fit(episodes[:4])
         small.calibrate(episodes[4:], false_alarm_rate=0.5)
         if find_spec("robosuite"):
-            with NeuralASMSafety(gym.make("asm_gym/Lift-v0"), on_overrun="ignore") as guarded:
+            with NeuralASMSafety(gym.make("asm_gym/Lift-v0")) as guarded:
                 guarded.reset(seed=0)
                 for _ in range(3):
                     guarded.step(np.zeros(guarded.action_space.shape or (), np.float32))

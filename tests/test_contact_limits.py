@@ -30,7 +30,7 @@ def down(env, steps, seed=0):
 
 def test_a_hand_that_rams_the_table_is_stopped_by_default(lift):
     alone, _ = down(lift, 60)
-    guarded = NeuralASMSafety(lift, NeuralASM.pretrained("panda"), on_overrun="ignore")
+    guarded = NeuralASMSafety(lift, NeuralASM.pretrained("panda"))
     force, said = down(guarded, 100)
     assert alone > 500.0
     assert force < 0.5 * alone

@@ -187,7 +187,7 @@ def test_a_knock_that_presses_too_hard_is_held_by_the_limits_all_the_same():
             return state, Surprise(np.zeros(len(stream)), nothing, raw=np.full(len(stream), 9.0), excuse=kind)
 
     lift = gym.make("asm_gym/Lift-v0")
-    guarded = NeuralASMSafety(lift, Deaf([], spec=lift.unwrapped.stream_spec), "hold", on_overrun="ignore")
+    guarded = NeuralASMSafety(lift, Deaf([], spec=lift.unwrapped.stream_spec), "hold")
     guarded.reset(seed=0)
     down = np.array([0, 0, -1.0, 0, 0, 0, -1.0], np.float32)
     said = []

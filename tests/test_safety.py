@@ -114,7 +114,6 @@ OTHER = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("
         ({}, {"release_below": 0.0}, ValueError, "release_below"),
         ({}, {"release_below": 1.1}, ValueError, "release_below"),
         ({}, {"max_override": 0}, ValueError, "max_over"),
-        ({}, {"on_overrun": "panic"}, ValueError, r"on_overrun.*warn.*alarm"),
     ],
 )
 def test_what_makes_no_sense_is_refused(monitor, options, error, message):
@@ -253,27 +252,6 @@ def test_an_alarm_that_is_back_at_once_has_not_gone_and_ends_the_episode():
     assert "".join("h" if i["asm"]["intervened"] else "p" for i in infos) == "pppp" + "hhpp" * 3 + "h"
     later = NeuralASMSafety(FakeEnv(length=60), CueMonitor([3, 9, 15, 21, 27]), release_after=2, max_override=6)
     assert not any(i["asm"]["gave_up"] for i in run(later, 40))
-
-
-def test_an_overrun_warns_once_or_counts_as_an_alarm(monkeypatch):
-    class Slow(CueMonitor):
-        def observe(self, state, stream):
-            clock[0] += 0.2 if state == 3 else 0.01
-            return super().observe(state, stream)
-
-    clock = [0.0]
-    monkeypatch.setattr("asm_gym.guard.observer.time.perf_counter", lambda: clock[0])
-    with pytest.warns(UserWarning, match=r"took 200\.0 ms for a row that lasts 50\.0 ms"):
-        infos = run(NeuralASMSafety(FakeEnv(), Slow()), 6)
-    assert not any(i["asm"]["alarm"] for i in infos)
-    assert infos[4]["asm"]["latency_us"] == pytest.approx(2e5)
-    infos = run(NeuralASMSafety(FakeEnv(), Slow(), on_overrun="alarm"), 6)
-    assert [i["asm"]["alarm"] for i in infos[1:]] == [False, False, False, True, False, False]
-    assert infos[4]["asm"]["surprise"] == np.inf
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        infos = run(NeuralASMSafety(FakeEnv(), Slow(), on_overrun="ignore"), 6)
-    assert not any(i["asm"]["alarm"] for i in infos)
 
 
 def test_recall_does_what_the_memory_expects_and_needs_one_that_expects():
@@ -459,7 +437,7 @@ def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_epi
 @pytest.mark.parametrize("on_alarm", ["monitor", "hold"])
 def test_a_policy_so_strange_that_most_of_its_steps_alarm_is_named_once_with_what_to_do(on_alarm):
     strange = ScriptedMonitor(dict.fromkeys(range(0, 4000, 2), 2.0) | dict.fromkeys(range(0, 4000, 3), 2.0))
-    env = NeuralASMSafety(FakeEnv(8000), strange, on_alarm=on_alarm, release_after=1, on_overrun="ignore")
+    env = NeuralASMSafety(FakeEnv(8000), strange, on_alarm=on_alarm, release_after=1)
     with pytest.warns(UserWarning, match=r"of the first 200 rows under this policy alarm: .* warm_start=True") as said:
         episode(env, 4000)
     assert len(said) == 1
@@ -469,4 +447,4 @@ def test_a_fault_that_passes_makes_no_policy_strange():
     passing = ScriptedMonitor(dict.fromkeys(range(20, 110), 2.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        episode(NeuralASMSafety(FakeEnv(400), passing, on_alarm="monitor", on_overrun="ignore"), 300)
+        episode(NeuralASMSafety(FakeEnv(400), passing, on_alarm="monitor"), 300)

@@ -11,11 +11,11 @@ import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from asm_gym.guard.checks import shipped_memory
+from asm_gym.guard.checks import LOG
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.severity import nothing_felt
-from asm_gym.monitors import NeuralASM
-from asm_gym.policies.base import Policy, Reflex
+from asm_gym.monitors import NeuralASM, pretrained_for
+from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import check_number, short_repr
@@ -192,7 +192,9 @@ def body_memory(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any], watched: Stre
         controller = inner.call("get_wrapper_attr", "controller")[0] if known else ""
     else:
         controller = getattr(inner, "controller", "")
-    return shipped_memory(inner, watched, str(controller))
+    memory = NeuralASM.pretrained(pretrained_for(watched, str(controller)))
+    LOG.info("watching %s with %r", inner, memory)
+    return memory
 
 
 def policy_for(on_alarm: Any, env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any]) -> Policy:
@@ -218,7 +220,7 @@ def policy_for(on_alarm: Any, env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any])
     if isinstance(made, type) or not callable(getattr(made, "predict", None)):
         raise ValueError(f"on_alarm must be {takes}, got {short_repr(made)}")
     name = type(made).__name__
-    bound = isinstance(made, Reflex) and not (isinstance(made, Hold) and made.explicit)  # to one environment
+    bound = isinstance(made, Hold) and not made.explicit  # to one environment
     if many and bound:
         raise ValueError(f"one {name} cannot act in several environments: give its name instead")
     if bound and isinstance(made, Hold) and made.env.unwrapped is not env.unwrapped:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.motion import Command
 from asm_gym.guard.observer import joined
@@ -65,8 +65,6 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             ``adapt``, which changes it for all that use it.
         monitor_freq: rows watched a second [Hz], on environments whose ``stream_freq`` can be set, which it is. None
             for the rate that the environment's stream has.
-        on_overrun: where the monitor takes longer for a row than a row lasts, ``"warn"`` once, ``"alarm"``, or
-            ``"ignore"``, for simulations. The first row does not count.
         adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
             then holds ``ceiling`` and ``level`` too. Alarms above the ceiling, alarms that went on while the reflex
             acted, and episodes with ``confirm_alarm`` do not count as false. None for a threshold that stays.
@@ -87,7 +85,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
     Example:
         >>> import gymnasium as gym
         >>> from asm_gym import NeuralASMSafety
-        >>> env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"), on_overrun="ignore")  # the shipped memory of the Panda
+        >>> env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"))  # the shipped memory of the Panda
         >>> observation, info = env.reset(seed=0)
         >>> *_, info = env.step(env.action_space.sample())
         >>> info["asm"]["state"], bool(info["cost_sum"] >= info["cost"])
@@ -107,7 +105,6 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         truncate: bool = False,
         online_learning_rate: float = 0.0,
         monitor_freq: int | None = None,
-        on_overrun: Literal["warn", "alarm", "ignore"] = "warn",
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
@@ -121,7 +118,6 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             try_after=try_after,
             truncate=truncate,
             online_learning_rate=online_learning_rate,
-            on_overrun=on_overrun,
             adaptive_threshold=adaptive_threshold,
             responses=responses,
             contact_limits=contact_limits,
@@ -150,7 +146,6 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
-        check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         policies = () if isinstance(chosen, str) else (policy_for(chosen, self.env),)

@@ -25,6 +25,12 @@ LOG = logging.getLogger("asm_gym.safety")
 MOSTLY_AFTER = 200
 """Rows under the policy after which it is said that most of them alarm."""
 
+MOSTLY = (
+    "{} of the first {} rows under this policy alarm: something is wrong all the time, or the memory does not know "
+    'this policy, task or set-up. Look with on_alarm="monitor" which channels info["asm"]["attribution"] names; if all '
+    "is well, record episodes of it, and monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
+)
+
 Mask = NDArray[np.bool_]
 
 
@@ -138,12 +144,12 @@ class Arbiter:
         self.confirmed = np.zeros(count, bool)
         """(n,) an alarm in this episode was no false one: it went on while the reflex acted, or the user says so."""
         self.counts = np.zeros((len(COUNTS), count), np.int64)
-        """(10, n) rows and strikes, in the order of ``COUNTS``."""
+        """(10, n) in the order of ``COUNTS``."""
         self.largest = np.full(count, -np.inf)
         """(n,) the largest surprise in this episode, while the policy acted."""
         self.response = [""] * count
         """To the last alarm of each."""
-        self._wait = np.full(count, self._rule.try_after or math.inf)  # rows of override before a trial
+        self._wait = np.full(count, self._rule.try_after)  # rows of override before a trial
         self._on_trial = np.zeros(count, bool)
 
     def begin(self, which: Mask) -> None:
@@ -156,14 +162,13 @@ class Arbiter:
         self.counts[:ROWS, which] = 0
         self.state[which], self.largest[which] = POLICY, -np.inf
         self.confirmed[which] = self._on_trial[which] = False
-        self._wait[which] = self._rule.try_after or math.inf
-        for robot in np.flatnonzero(which):
-            self.response[robot] = ""
+        self._wait[which] = self._rule.try_after
+        self.response[:] = ["" if new else name for new, name in zip(which, self.response, strict=True)]
 
     @property
     def most_impulse(self) -> float:
         """How much an arm may press in an episode [N s]."""
-        return (self._rule.impulse or math.inf) if self._acts else math.inf
+        return self._rule.impulse
 
     def may_go_on(self, robot: int) -> bool:
         """Return whether the policy may go on in alarm, for all the time that it did."""
@@ -173,15 +178,8 @@ class Arbiter:
         """Count a row under the policy; return what is to be said once, and early: most of what it does alarms."""
         self.counts[ROWS, robot] += 1
         self.counts[ALARMS, robot] += alarm
-        rows, alarms = self.counts[ROWS, robot], self.counts[ALARMS, robot]
-        if rows != MOSTLY_AFTER or 2 * alarms <= rows:
-            return ""
-        return (
-            f"{alarms} of the first {rows} rows under this policy alarm: something is wrong "
-            'all the time, or the memory does not know this policy, task or set-up. Look with on_alarm="monitor" which '
-            'channels info["asm"]["attribution"] names; if all is well, record episodes of it, and '
-            "monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
-        )
+        rows, alarms = self.counts[[ROWS, ALARMS], robot]
+        return MOSTLY.format(alarms, rows) if rows == MOSTLY_AFTER and 2 * alarms > rows else ""
 
     def decide(self, robot: int, row: Judged) -> Decision:
         """Return what a row leads to, and move the robot's state on."""
@@ -189,10 +187,9 @@ class Arbiter:
             self.largest[robot] = max(self.largest[robot], row.surprise)
         if not self._acts:
             return Decision()
-        situation = self._count(robot, row)
-        state = STATES[self.state[robot]]
-        transition = following(state, situation)
-        name = self._follow(robot, transition, row) or ("override" if row.refused else "")
+        transition = following(STATES[self.state[robot]], self._count(robot, row))
+        name = "" if transition is None else self._follow(robot, transition, row.response.name)
+        name = name or ("override" if row.refused else "")
         if name:
             why = f" ({row.response.why})" if row.response.why else ""
             LOG.info("%s: surprise %.3g, threshold %.3g%s", name, row.surprise, self.threshold[robot], why)
@@ -206,7 +203,7 @@ class Arbiter:
             self._wait[i] *= 2 if self._on_trial[i] else 1
             counts[RETURNED, i] += 1
         else:
-            counts[ACTED, i], self._wait[i], counts[RETURNED, i] = 0, rule.try_after or math.inf, 0
+            counts[ACTED, i], self._wait[i], counts[RETURNED, i] = 0, rule.try_after, 0
         counts[HELD, i] = counts[FREE, i] = counts[CALM, i] = 0
         self.state[i] = REFLEX
 
@@ -231,30 +228,28 @@ class Arbiter:
         if overriding and row.alarm and response.name not in ("", *GOING_ON):
             self.response[i] = response.name
         stopping = self.response[i] == "stop"  # a fault that is calm while nothing is asked of the robot has not gone
-        _, acted, held, free, returned, since, _, strikes, _, _ = counts[:, i].tolist()
+        calm, acted, held, free, returned, since, _, strikes, _, _ = counts[:, i].tolist()
         return Situation(
             alarm=row.alarm,
             presses=row.presses,
-            spent=strikes >= (rule.strikes or math.inf) or row.impulse > (rule.impulse or math.inf),
+            spent=strikes >= rule.strikes or row.impulse > rule.impulse,
             goes_on=goes_on and (response.name == "complete" or not overriding),
-            stops=stopping and held >= (rule.try_after or rule.release_after),
-            overdue=acted >= (rule.max_override or math.inf),
-            calm=not stopping and bool(counts[CALM, i] >= rule.release_after) and not response.touched,
+            stops=stopping and held >= rule.try_after,
+            overdue=acted >= rule.max_override,
+            calm=not stopping and calm >= rule.release_after and not response.touched,
             free=not (stopping or row.presses) and free >= rule.free_after << min(returned, 16),
             waited=not (stopping or row.presses) and held >= self._wait[i] and response.touched is None,
             settled=since > rule.release_after,
         )
 
-    def _follow(self, robot: int, transition: Transition | None, row: Judged) -> str:
+    def _follow(self, robot: int, transition: Transition, response: str) -> str:
         """Change the state; return what is to be said of it."""
-        if transition is None:
-            return ""
         if transition.to is State.REFLEX:
-            self.response[robot] = row.response.name
+            self.response[robot] = response
             self.take_over(robot)
         elif transition.to is not None:
             self.state[robot] = STATES.index(transition.to)
             if transition.to is State.TRIAL:
                 self.counts[SINCE, robot] = self.counts[CALM, robot] = 0
                 self._on_trial[robot] = transition.name == "trial"
-        return row.response.name if transition.name == "*" else transition.name
+        return response if transition.name == "*" else transition.name

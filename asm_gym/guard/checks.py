@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import logging
-from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
-import numpy as np
-
-from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM, pretrained_for
+from asm_gym.monitors import ExplainsItself, Monitor, NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, short_repr
@@ -38,8 +35,8 @@ class Fitted(NamedTuple):
     @property
     def stale(self) -> bool:
         """Whether it was fitted since."""
-        _, now, also_now = _parts(self.monitor)
-        return now is not self.parts[1] or also_now is not self.parts[2]
+        _, model, learned = _parts(self.monitor)
+        return model is not self.parts[1] or learned is not self.parts[2]
 
     def differs(self, other: Fitted) -> bool:
         """Return whether it is another monitor, or was fitted or calibrated in between."""
@@ -66,39 +63,9 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
     return check_number("the monitor's threshold", monitor.threshold)
 
 
-def check_answer(monitor: Monitor) -> None:
-    """Raise TypeError where a user's monitor answers a row with anything but a state and a surprise."""
-    if not hasattr(monitor, "observe") or isinstance(monitor, CalibratedMonitor):
-        return
-    try:
-        tried = deepcopy(monitor)  # one that keeps count of its rows must not count this one
-        answer: Any = tried.observe(tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))
-    except Exception as error:  # what fails is an alarm, and may be mended meanwhile
-        LOG.warning("the monitor failed at a row of zeros: %r", error)
-        return
-    if not (isinstance(answer, tuple) and len(answer) == 2 and hasattr(answer[1], "attribution")):
-        got = type(answer).__name__ if not isinstance(answer, tuple) else f"a tuple of {len(answer)}"
-        got = f"(state, {type(answer[1]).__name__})" if isinstance(answer, tuple) and len(answer) == 2 else got
-        raise TypeError(
-            "observe(state, stream) must return (state, Surprise(value (B,), attribution (B, D))), of "
-            f"asm_gym.monitors, got {got}"
-        )
-
-
 def diagnosis_of(monitor: Monitor) -> Diagnosis | None:
     """Return what names causes, and not only that something is wrong; None where nothing does."""
     return monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
-
-
-def shipped_memory(whose: object, watched: StreamSpec, controller: str = "") -> NeuralASM:
-    """Return the shipped memory of the body whose stream this is; which one it is goes to the log.
-
-    Raises:
-        ValueError: none fits; the message lists those that there are.
-    """
-    memory = NeuralASM.pretrained(pretrained_for(watched, controller))
-    LOG.info("watching %s with %r", whose, memory)
-    return memory
 
 
 class ExchangesMonitor:
@@ -116,7 +83,6 @@ class ExchangesMonitor:
 
     @monitor.setter
     def monitor(self, monitor: Monitor) -> None:
-        check_answer(monitor)
         check_monitor(monitor, self._spec)
         self._next = monitor
 

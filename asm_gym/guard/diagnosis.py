@@ -18,18 +18,10 @@ from asm_gym.memory.completion import Completion
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
 from asm_gym.spec import StreamSpec
 
-PRESSED_BY = 2.5
-"""Something presses where an external torque is so many of its completion's standard deviations off."""
-
-STILL = 0.02
-"""A joint that turns by no more than this does not [rad/s]."""
-
-
-CALM_S = 1.0
-"""After so long without an alarm, what comes next has a cause of its own [s]."""
-
-SURE = 0.5
-"""A family that is less probable is unknown."""
+PRESSED_BY = 2.5  # something presses where an external torque is so many standard deviations of its completion off
+STILL = 0.02  # a joint that turns by no more than this does not [rad/s]
+CALM_S = 1.0  # after so long without an alarm, what comes next has a cause of its own [s]
+SURE = 0.5  # a family that is less probable is unknown
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -55,12 +47,12 @@ class Alarm(NamedTuple):
 
     @property
     def certain(self) -> bool:
-        """Whether it is one whatever the surprise."""
+        """It is one whatever the surprise."""
         return self.contradiction is not None or self.failed or self.presses
 
     @property
     def only_lost(self) -> bool:
-        """Whether nothing is wrong but missing numbers."""
+        """Nothing is wrong but missing numbers."""
         return self.lost and not (self.certain or self.over or self.knocked or self.speed > FAST)
 
 
@@ -75,9 +67,21 @@ class _Incident:
     diagnoses: int = 0
     latest: dict[str, Cause] = field(default_factory=dict)  # the newest diagnosis of each family
 
-    def age(self) -> None:
-        """One row more since each cause was first found."""
+    def next(self, alarm: bool) -> None:
+        """Count a row more since each cause was first found."""
+        self.calm = 0 if alarm else self.calm + 1
         self.since = {family: rows + 1 for family, rows in self.since.items()}
+
+    def believed(self, newest: Cause) -> Cause:
+        """Return the cause by all diagnoses, the newest of which counts a tenth at least."""
+        self.diagnoses += 1
+        probabilities = np.array([newest.probabilities[name] for name in FAMILIES])
+        belief = self.belief = averaged(self.belief, probabilities, self.diagnoses)
+        family = FAMILIES[int(belief.argmax())]
+        self.latest[newest.family] = newest
+        all_of_them = dict(zip(FAMILIES, belief.tolist(), strict=True))
+        found = self.latest.get(family, newest)
+        return found._replace(family=family, probability=float(belief.max()), probabilities=all_of_them)
 
 
 class ContactEstimator:
@@ -135,15 +139,13 @@ class Diagnostician:
 
     def __init__(self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool) -> None:
         self._spec, self._diagnosis, self._table, self._asked = spec, diagnosis, table, asked
-        measured = diagnosis is not None and named(spec, "external_torque").size > 0
-        self._contact = ContactEstimator(diagnosis.completion) if measured and diagnosis is not None else None
+        self._contact = None
+        if diagnosis is not None and named(spec, "external_torque").size:
+            self._contact = ContactEstimator(diagnosis.completion)
         self.incidents: dict[int, _Incident] = {}
         """Of the robots that have not been calm for long enough."""
-
-    @property
-    def rows(self) -> int:
+        self.rows = WINDOW + 1 + round(LASTING["actuator"] / spec.dt)
         """How many rows it looks back."""
-        return WINDOW + 1 + round(LASTING["actuator"] / self._spec.dt)
 
     def begin(self, robot: int) -> None:
         """A new episode of a robot."""
@@ -154,12 +156,11 @@ class Diagnostician:
         incident = self.incidents.get(robot)
         if incident is None:
             return NO_RESPONSE
-        incident.calm += 1
+        touched = self._touched(incident, rows)
+        incident.next(alarm=False)
         if incident.calm > CALM_S / self._spec.dt and (incident.since or policy_acts):
             self.begin(robot)
             return NO_RESPONSE
-        touched = self._touched(robot, rows)
-        incident.age()
         return NO_RESPONSE._replace(touched=touched)
 
     def respond(self, robot: int, alarm: Alarm) -> tuple[Response, NDArray[np.intp]]:
@@ -171,9 +172,9 @@ class Diagnostician:
         if alarm.knocked and not alarm.certain:  # it presses no more: the arm is braked until the contact has gone
             incident.touched, incident.calm = True, 0
             name = "hold" if self._asked else ""
-            return Response(name, _named("contact"), self._touched(robot, alarm.rows), "contact"), NO_COLUMNS
-        incident.calm, touched = 0, self._touched(robot, alarm.rows)
-        incident.age()
+            return Response(name, _named("contact"), self._touched(incident, alarm.rows), "contact"), NO_COLUMNS
+        touched = self._touched(incident, alarm.rows)
+        incident.next(alarm=True)
         cause = self._cause(incident, alarm)
         family = cause.family if cause is not None and cause.probability >= SURE else "unknown"
         incident.touched = alarm.presses or (cause is not None and cause.family == "contact")
@@ -183,9 +184,7 @@ class Diagnostician:
         if cause is None or family != cause.family:
             said |= {"family": family, "part": ""}
         columns = cause.columns if cause is not None and name == "complete" else NO_COLUMNS
-        if not self._asked:
-            return Response("", said, touched), columns
-        return Response(name, said, touched, case), columns
+        return Response(name, said, touched, case) if self._asked else Response("", said, touched), columns
 
     def uncompleted(self, response: Response) -> Response:
         """Return what is done where the sensors at fault cannot be completed."""
@@ -193,10 +192,9 @@ class Diagnostician:
 
     def _looked_up(self, incident: _Incident, family: str, cause: Cause | None, alarm: Alarm) -> tuple[str, str]:
         """Return the row of the table that holds, and the response."""
-        if alarm.presses:
-            case = f"{'lasting ' if self._lasts(incident, PRESSING) else ''}{PRESSING}"
-        else:
-            case = "lasting contact" if family == "contact" and self._lasts(incident, family) else family
+        case = PRESSING if alarm.presses else family
+        if case in (PRESSING, "contact") and self._lasts(incident, case):
+            case = f"lasting {case}"
         name = self._table[case]
         if name == "go on" and self._blocked(family, cause, alarm.rows):
             # Whatever the policy goes on with, it does not move the arm, and presses.
@@ -221,12 +219,11 @@ class Diagnostician:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
             warnings.warn(f"diagnosis: {error!r}; the cause counts as unknown", stacklevel=2)
             return None
-        return _believed(incident, newest)
+        return incident.believed(newest)
 
-    def _touched(self, robot: int, rows: NDArray[np.float32]) -> bool | None:
+    def _touched(self, incident: _Incident, rows: NDArray[np.float32]) -> bool | None:
         """Return whether what touched the body still does; None where nobody knows."""
-        incident = self.incidents.get(robot)
-        if not self._asked or incident is None or not incident.touched or self._contact is None or len(rows) < 2:
+        if not self._asked or not incident.touched or self._contact is None or len(rows) < 2:
             return None
         if not self._contact.presses(rows[-2:]):
             return False
@@ -238,29 +235,13 @@ class Diagnostician:
         joint = cause.part if family == "actuator" and cause is not None else ""
         return self._contact is not None and len(rows) >= needed and self._contact.blocked(rows[-needed:], joint)
 
-    def _lasts(self, incident: _Incident, family: str) -> bool:
-        longest = LASTING.get("contact" if family == PRESSING else family, np.inf)
-        return incident.since.get(family, 0) >= longest / self._spec.dt
+    def _lasts(self, incident: _Incident, case: str) -> bool:
+        return incident.since.get(case, 0) >= LASTING["contact"] / self._spec.dt
 
 
 def _named(family: str, part: str = "") -> dict[str, Any]:
     """Return what ``info`` says of a cause beyond doubt."""
     return as_info(None) | {"family": family, "part": part, "probability": 1.0}
-
-
-def _believed(incident: _Incident, newest: Cause) -> Cause:
-    """Return the cause by all diagnoses of an incident, the newest of which counts a tenth at least."""
-    incident.diagnoses += 1
-    probabilities = np.array([newest.probabilities[name] for name in FAMILIES])
-    belief = incident.belief = averaged(incident.belief, probabilities, incident.diagnoses)
-    family = FAMILIES[int(belief.argmax())]
-    incident.latest[newest.family] = newest
-    said = incident.latest.get(family, newest)
-    return said._replace(
-        family=family,
-        probability=float(belief.max()),
-        probabilities=dict(zip(FAMILIES, belief.tolist(), strict=True)),
-    )
 
 
 def _may_go_on(name: str, cause: Cause | None, alarm: Alarm) -> bool:

@@ -10,6 +10,7 @@ from their encoders can contradict nothing.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,26 +22,13 @@ from asm_gym.guard.robots import NO_COLUMNS
 from asm_gym.memory.completion import sensors_of
 from asm_gym.spec import StreamSpec
 
-LIMIT = 6.0
-"""Of |m|, in standard deviations of what the hand's channels say."""
-
-OVER_S = 0.2
-"""What the running mean is over, about [s]."""
-
-ONE = 2.0
-"""No single row takes the mean further than so many times the limit, lest it last."""
-
-WINDOW = 10
-"""Rows by which the sensor at fault is told from others."""
-
-LEFT = 30.0
-"""Of |z|², nine numbers: what no sensor at fault leaves more of."""
-
-SURER = 10.0
-"""How much more of |z|², in all of these rows, the next best sensor leaves; else a moment more is waited for."""
-
-TURNS = 0.2
-"""The speed that is sensed of a joint is that of its angle where they differ by less [rad/s]."""
+LIMIT = 6.0  # of |m|, in standard deviations of what the hand's channels say
+OVER_S = 0.2  # what the running mean is over, about [s]
+ONE = 2.0  # no single row takes the mean further than so many times the limit, lest it last
+WINDOW = 10  # rows by which the sensor at fault is told from others
+LEFT = 30.0  # of |z|², nine numbers: what no sensor at fault leaves more of
+SURER = 10.0  # how much more of |z|², in all of these rows, the next best sensor leaves; else a moment is waited for
+TURNS = 0.2  # the speed that is sensed of a joint is that of its angle where they differ by less [rad/s]
 
 NEEDS = "joint_position", "joint_velocity", "hand_position", "hand_orientation"
 """Channels that it takes, of each arm."""
@@ -56,13 +44,14 @@ class Contradiction(NamedTuple):
     columns: NDArray[np.intp]  # (n,) of the stream, its own
 
 
+@dataclass
 class _Case:
     """What is known of a robot whose hand and joints contradict each other."""
 
-    def __init__(self, size: int) -> None:
-        self.left, self.waited = 0.0, 0
-        self.named: Contradiction | None = None
-        self.accused = np.zeros(size, bool)  # (D,) what was named, as long as they contradict each other
+    accused: Mask  # (D,) what was named, as long as they contradict each other
+    left: float = 0.0  # running mean of |z|² that this does not explain
+    waited: int = 0  # rows in which no sensor was surely the one at fault
+    named: Contradiction | None = None
 
 
 class HandAgainstJoints:
@@ -79,19 +68,16 @@ class HandAgainstJoints:
         def columns(*names: str) -> NDArray[np.intp]:
             return np.concatenate([np.arange(spec.size)[spec.slices[prefix + name]] for name in names])
 
-        self._chains, self._size, self._dt = chains, spec.size, spec.dt
+        self._size, self._dt = spec.size, spec.dt
         self._q, self._v = columns("joint_position"), columns("joint_velocity")
         self._x = columns("hand_position", "hand_orientation")
-        self._at: NDArray[np.intp] = np.concatenate([self._q, self._v, self._x])
-        self._geometry = tuple(
-            np.stack([np.asarray(part, np.float64) for part in parts])
-            for parts in zip(*((c.axes, c.anchors, c.hand) for c in chains), strict=True)
-        )
+        self._at = columns(*NEEDS)
+        parts = ("axes", "anchors", "hand")
+        self._geometry = tuple(np.stack([np.asarray(getattr(c, part), np.float64) for c in chains]) for part in parts)
         self._late = np.array([c.late_s for c in chains])
         self._weights = np.stack([1.0 / (c.noise * spec.noise[self._x]) for c in chains])  # (n, 9)
         self._gain = min(1.0, spec.dt / OVER_S)
-        self._cap = ONE * LIMIT / self._gain
-        sensors = {int(c): (name, own) for name, own in sensors_of(spec) for c in own}
+        sensors = {int(c): Contradiction(*sensor) for sensor in sensors_of(spec) for c in sensor[1]}
         self._suspects = [sensors[int(c)] for c in (*self._q, *self._x)]
         self._mean, self._size_of = np.zeros((n, HAND)), np.zeros(n)  # m, and |m|; -1 where a number is missing
         self._whole = np.zeros(n, np.int64)  # rows since a number was missing
@@ -99,7 +85,7 @@ class HandAgainstJoints:
         self._kept = np.zeros(n, np.int64)  # how many of them there are
         self._good = np.zeros((n, len(self._q)))  # angles that were believed last
         self._cases: dict[int, _Case] = {}
-        how = self._at, *self._geometry, self._late, self._weights, self._gain, self._cap, LIMIT
+        how = self._at, *self._geometry, self._late, self._weights, self._gain, ONE * LIMIT / self._gain, LIMIT
         state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
         self.arguments: tuple[Any, ...] = *how, *state
         """Of ``compare``, after the rows."""
@@ -107,27 +93,26 @@ class HandAgainstJoints:
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
         self._mean[which], self._whole[which], self._kept[which], self._good[which] = 0.0, 0, 0, 0.0
-        for robot in np.flatnonzero(which):
-            self._cases.pop(int(robot), None)
+        self._cases = {robot: case for robot, case in self._cases.items() if not which[robot]}
 
     def contradicting(self, some: bool) -> list[int]:
         """Return which robots' last rows contradict themselves; ``some`` do by ``compare``."""
-        for robot in [robot for robot in self._cases if 0.0 <= self._size_of[robot] <= LIMIT] if self._cases else ():
-            del self._cases[robot]
+        if self._cases:
+            agree = (self._size_of >= 0.0) & (self._size_of <= LIMIT)
+            self._cases = {robot: case for robot, case in self._cases.items() if not agree[robot]}
         return np.flatnonzero(self._size_of > LIMIT).tolist() if some else []
 
     def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
         """Return what is wrong with a robot whose last row contradicts itself, beside what is ``missing`` (D,)."""
-        case = self._cases.setdefault(robot, _Case(self._size))
-        now = self._recent[robot, -1]
+        case = self._cases.setdefault(robot, _Case(np.zeros(self._size, bool)))
         wrong = missing | case.accused
-        known = wrong[self._q], wrong[self._x]
-        if known[0].any() or known[1].any():
-            left = min(self._explained(robot, now, *known)[1], ONE * LEFT / self._gain)
-            case.left += self._gain * (left - case.left)
+        free, unseen = wrong[self._q], wrong[self._x]
+        if free.any() or unseen.any():
+            left = self._explained(robot, self._recent[robot, -1], free, unseen)[1]
+            case.left += self._gain * (min(left, ONE * LEFT / self._gain) - case.left)
             if case.left <= LEFT:  # that explains it still; where nothing completes it, it is said again
                 return case.named if (case.accused & ~missing).any() else None
-        found = self._named(robot, case, *known)
+        found = self._named(robot, case, free, unseen)
         if found is not None:
             case.named, case.left, case.accused[found.columns] = found, 0.0, True
         return found
@@ -137,10 +122,9 @@ class HandAgainstJoints:
         J, right = len(self._q), np.zeros(self._size, bool)
         if self._whole[robot] < 2 or np.linalg.norm(self._mean[robot]) > LIMIT / 2:
             return right
-        before, now = self._recent[robot, -2:]
-        turned = (now[:J] - before[:J]) / self._dt
-        moves = np.abs(turned - (now[J : 2 * J] + before[J : 2 * J]) / 2) < TURNS
-        moves &= (now[:J] != before[:J]) | (now[J : 2 * J] != before[J : 2 * J])
+        angles, speeds = self._recent[robot, -2:, :J], self._recent[robot, -2:, J : 2 * J]
+        moves = np.abs((angles[1] - angles[0]) / self._dt - (speeds[1] + speeds[0]) / 2) < TURNS
+        moves &= (angles[1] != angles[0]) | (speeds[1] != speeds[0])
         right[self._q], right[self._v], right[self._x] = moves, moves, True
         return right
 
@@ -156,46 +140,39 @@ class HandAgainstJoints:
         if not free.any() or unseen.all() or not np.isfinite(now).all():
             return row
         angles = now[: len(self._q)]
-        found, _ = self._explained(robot, now, free, unseen, angles, error[self._q])
+        found, _ = self._explained(robot, now, free, unseen, (angles, error[self._q]))
         self._good[robot] = np.where(free, found, angles)
         row[self._q] = self._good[robot]
         return row
 
     def _named(self, robot: int, case: _Case, free: Mask, unseen: Mask) -> Contradiction | None:
         """Return the one sensor that explains most of the last rows; None while that could be another as well."""
-        rows = self._recent[robot, WINDOW - self._kept[robot] :]
-        left = np.zeros(len(self._suspects))
+        rows, left = self._recent[robot, WINDOW - self._kept[robot] :], np.zeros(len(self._suspects))
         for n in range(len(left)):
             wrong = np.append(free, unseen)
             wrong[n] = True
-            left[n] = sum(self._explained(robot, row, wrong[: len(free)], wrong[len(free) :])[1] for row in rows)
+            both = np.split(wrong, [len(free)])
+            left[n] = sum(self._explained(robot, row, *both)[1] for row in rows)
         best, next_best = np.argsort(left)[:2]
         case.waited += 1
         if left[next_best] - left[best] < SURER and case.waited * self._gain <= 1.0:
             return None
         case.waited = 0
-        explains = left[best] <= LEFT * len(rows)
-        return Contradiction(*self._suspects[best]) if explains else Contradiction("", NO_COLUMNS)
+        return self._suspects[best] if left[best] <= LEFT * len(rows) else Contradiction("", NO_COLUMNS)
 
     def _explained(
-        self,
-        robot: int,
-        row: Floats,
-        free: Mask,
-        unseen: Mask,
-        about: Floats | None = None,
-        error: Floats | None = None,
+        self, robot: int, row: Floats, free: Mask, unseen: Mask, known: tuple[Floats, Floats] | None = None
     ) -> tuple[Floats, float]:
         """Return (J,) angles of which those that are ``free`` are what the hand says, and |z|² of what it leaves.
 
-        What is known ``about`` them (J,), with the standard deviation ``error`` (J,) [rad], counts beside.
+        What is ``known`` of them beside (J,) counts by its standard deviations (J,) [rad].
         """
         J, geometry = len(self._q), (part[robot] for part in self._geometry)
         q = np.where(free, self._good[robot], row[:J])
-        known = (q, np.full(J, np.inf)) if about is None or error is None else (about, error)
+        about, error = (q, np.full(J, np.inf)) if known is None else known
         late = self._late[robot] * np.where(free, 0.0, row[J : 2 * J])
         weights = np.where(unseen, 0.0, self._weights[robot])
-        found, left = _fit(q - late, row[2 * J :], free, weights, known[0] - late, known[1], *geometry)
+        found, left = _fit(q - late, row[2 * J :], free, weights, about - late, error, *geometry)
         return found + late, float(left)
 
 

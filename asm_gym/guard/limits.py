@@ -11,14 +11,9 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.robots import Robots
 from asm_gym.monitors import Monitor
 
-CAREFUL = 1.0 / 3.0
-"""Share of the speed limit that a hand has after it has pressed too hard."""
-
-GENTLE = 0.5
-"""Share of the limits on forces that the arm has then; only a policy that presses anew presses as hard so soon."""
-
-CAREFUL_S = 1.0
-"""For so long [s], counted while the policy acts."""
+CAREFUL = 1.0 / 3.0  # share of the speed limit that a hand has after it has pressed too hard
+GENTLE = 0.5  # share of the limits on forces then; only a policy that presses anew presses as hard so soon
+CAREFUL_S = 1.0  # for so long [s], counted while the policy acts
 
 Mask = NDArray[np.bool_]
 

@@ -13,7 +13,8 @@ from asm_gym.compilation import compiled
 from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import Motion, Reflexes
 from asm_gym.guard.robots import NOTHING, Robots
-from asm_gym.policies.base import Policy, Reflex
+from asm_gym.policies.base import Policy
+from asm_gym.policies.reflexes import Hold
 from asm_gym.validation import as_float32, short_repr
 
 USUAL_GAIN = 0.1
@@ -36,10 +37,9 @@ class Motions:
     """Chooses what the robots do.
 
     Args:
-        robots: which.
         reflexes: act after an alarm; None where policies do, or nothing.
         policies: the user's own, for each robot, in the place of reflexes.
-        takes_over: lets the reflex of a robot act from now on, for its policy's action is none.
+        take_over: lets the reflex of a robot act from now on, for its policy's action is none.
         warn: says what failed, and what happens instead.
     """
 
@@ -51,32 +51,26 @@ class Motions:
         take_over: Callable[[int], None],
         warn: Callable[[int, str, str], None],
     ) -> None:
-        n, size = robots.count, robots.rest.size
         self._robots, self._reflexes, self._policies = robots, reflexes, policies
-        self._take_over, self._warn = take_over, warn
-        self._last = np.zeros((n, size), np.float32)  # executed last
-        self._before = np.zeros((n, size), np.float32)  # executed last before the override
-        self.nobody: Mask = np.zeros(n, bool)
+        self._take_over, self._warn, self._reacts = take_over, warn, reflexes is not None or bool(policies)
+        self._last = np.zeros((robots.count, robots.rest.size), np.float32)  # executed last
+        self._before = np.zeros_like(self._last)  # executed last before the override
+        self.nobody: Mask = np.zeros(robots.count, bool)
         """(n,) never written to."""
-        self._fresh = np.zeros(n, bool)  # the override has just begun
-        self._memory: dict[int, Any] = {}  # the policies' own states
-        self.begin(np.ones(n, bool))
+        self._memory: dict[int, Any] = {}  # the states of policies that are in an override
+        self.begin(~self.nobody)
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
         self._last[which] = self._before[which] = 0.0
-        self._fresh[which] = False
         if self._reflexes is not None:
             self._reflexes.begin(which)
-        for i in np.flatnonzero(which) if self._policies else ():
-            self._memory.pop(int(i), None)
-            policy = self._policies[i]
-            if isinstance(policy, Reflex):
-                policy.reset()
+        self._memory = {robot: state for robot, state in self._memory.items() if not which[robot]}
 
     def start(self, robot: int, executed: Floats32) -> None:
         """The override of a robot has begun, after it has ``executed`` (A,)."""
-        self._before[robot], self._fresh[robot] = executed, True
+        self._before[robot] = executed
+        self._memory.pop(robot, None)
 
     def choose(
         self, actions: Floats32, acts: Mask, idle: Mask, names: Sequence[str], seen: Callable[[int], Any]
@@ -100,14 +94,14 @@ class Motions:
             if idle[robot]:
                 executed[robot] = np.clip(0.0, robots.low, robots.high)
                 continue
-            said, reacts = "", self._reflexes is not None or bool(self._policies)
+            said = ""
             if refused[robot]:
                 said = f"policy: the action must be finite, got {short_repr(actions[robot].tolist())}"
                 self._warn(robot, said, "another is done instead")
-                if reacts:
+                if self._reacts:
                     self._take_over(robot)
                 self.start(robot, self._last[robot])
-            executed[robot], brakes[robot], failed = self._reaction(robot, names[robot] if reacts else None, seen)
+            executed[robot], brakes[robot], failed = self._reaction(robot, names[robot], seen)
             if said or failed:
                 failures[robot] = joined(said, failed)
         self._last[:] = executed
@@ -124,11 +118,11 @@ class Motions:
         if self._reflexes is not None:
             self._reflexes.expected = np.nan_to_num(expected)
 
-    def _reaction(self, robot: int, name: str | None, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
+    def _reaction(self, robot: int, name: str, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
         """Return what is done, whether the robot brakes, and what failed; where nothing reacts the robot stays."""
         robots, before = self._robots, self._before[robot]
         try:
-            motion = self._stay(before) if name is None else self._asked(robot, name, seen)
+            motion = self._asked(robot, name, seen) if self._reacts else self._stay(before)
             action = as_float32(motion.action).reshape(-1)
             if action.shape != robots.rest.shape or not np.isfinite(action).all():
                 raise ValueError(f"a finite action of {robots.rest.size} numbers was needed, got {action}")
@@ -143,19 +137,13 @@ class Motions:
         return np.clip(action, robots.low, robots.high), motion.brakes, ""
 
     def _asked(self, robot: int, name: str, seen: Callable[[int], Any]) -> Motion:
-        fresh = bool(self._fresh[robot])
         if self._reflexes is not None:
-            self._fresh[robot] = False
             return self._reflexes.move(robot, name)
-        policy = self._policies[robot]
-        if fresh:
-            # Reflexes start from what was last done; any other policy starts as in a new episode.
-            before = self._before[robot].copy()
-            self._memory[robot] = policy.begin(before) if isinstance(policy, Reflex) else None
-        action, memory = policy.predict(
-            seen(robot), state=self._memory.get(robot), episode_start=np.array([fresh]), deterministic=True
-        )
-        self._memory[robot], self._fresh[robot] = memory, False
+        policy, fresh, state = self._policies[robot], robot not in self._memory, self._memory.get(robot)
+        if fresh and isinstance(policy, Hold):  # any other policy starts as in a new episode
+            state = policy.begin(self._before[robot].copy())
+        given = {"state": state, "episode_start": np.array([fresh]), "deterministic": True}
+        action, self._memory[robot] = policy.predict(seen(robot), **given)
         return Motion(np.array(action), keeps_grip=False)
 
     def _stay(self, before: Floats32) -> Motion:
@@ -181,15 +169,7 @@ def _clip(actions: Any, low: Any, high: Any, acts: Any, idle: Any, executed: Any
 
 @partial(compiled, calls=(".",))
 def _feel(
-    rows: Any,
-    columns: Any,
-    executed: Any,
-    intervened: Any,
-    active: Any,
-    torque: Any,
-    usual: Any,
-    path: Any,
-    steps: Any,
+    rows: Any, columns: Any, executed: Any, intervened: Any, active: Any, torque: Any, usual: Any, path: Any, steps: Any
 ) -> None:
     """Take rows (n, D) into external torques (n, J), and what policies executed (n, A) into their paths."""
     for n in range(len(rows)):

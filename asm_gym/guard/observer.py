@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -34,14 +33,13 @@ class Observer:
         monitor: fitted and calibrated.
         count: n.
         rows: they know which surprise counts.
-        options: say what a late monitor is, and whether it learns on the job.
+        options: say whether it learns on the job.
         recalls: the monitor is asked what it expects to be commanded.
     """
 
     def __init__(self, monitor: Monitor, count: int, rows: Rows, options: GuardOptions, recalls: bool) -> None:
         self._monitor, self._count, self._size, self._rows = monitor, count, monitor.spec.size, rows
-        self._dt, self._on_overrun, self._rate = monitor.spec.dt, options.on_overrun, options.online_learning_rate
-        self._warm = self._said_late = False
+        self._rate = options.online_learning_rate
         self._copies = not isinstance(monitor, NeuralASM)  # another's arrays may be buffers that it uses again
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
@@ -80,13 +78,10 @@ class Observer:
         for i, value in enumerate(surprise.value.tolist()):
             if not value > -math.inf:  # NaN too
                 failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
-        late, everyone = latency > self._dt and self._late(latency), all(active.tolist())
-        self._warm = True
-        if everyone and not (late or failures or self._rows.repairs or self._learns is not None):
+        everyone = all(active.tolist())
+        if everyone and not (failures or self._rows.repairs or self._learns is not None):
             return Observation(surprise, expected, failures, latency)
         surprise = self._rows.counted(_infinite(surprise, failures), failures)
-        if late:
-            surprise = surprise._replace(value=np.full(self._count, np.inf))
         if self._learns is not None and not failures and not held.any():
             try:
                 self._learns.adapt(self._before, rows, surprise, self._rate)
@@ -113,14 +108,6 @@ class Observer:
         except Exception as error:
             return f"monitor: {error!r}"
         return ""
-
-    def _late(self, latency: float) -> bool:
-        """Return whether it is an alarm that the monitor took longer than a row lasts; the first row does not count."""
-        if self._warm and self._on_overrun == "warn" and not self._said_late:
-            self._said_late = True
-            said = f"the monitor took {1e3 * latency:.1f} ms for a row that lasts {1e3 * self._dt:.1f} ms"
-            warnings.warn(said, stacklevel=5)
-        return self._warm and self._on_overrun == "alarm"
 
     def _copied(self, surprise: Surprise) -> Surprise:
         """Return what another monitor than ours says in arrays of its own."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.reflexes import GRADED, REFLEXES
 from asm_gym.guard.responses import responses_from
 from asm_gym.policies.base import Policy
-from asm_gym.validation import check_choice, check_flag, check_number, short_repr
+from asm_gym.validation import check_flag, check_number, short_repr
 
 ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")
 """Names that ``on_alarm`` takes."""
@@ -30,28 +31,21 @@ with more than ``IMPULSE`` beyond healthy motion [N s]."""
 
 @dataclass(frozen=True)
 class ReleaseRule:
-    """When control is handed back, and when the episode ends; None for never."""
+    """When control is handed back, and when the episode ends, counted in rows; infinite for never."""
 
-    release_after: int = 10  # calm steps after which control is handed back
+    release_after: int = 10  # calm rows after which control is handed back
     release_below: float = 0.8  # share of the threshold, in (0, 1], that surprise must be under to count as calm
-    max_override: int | None = None
-    """Steps for which a reflex may act, those before a hand-back after which the alarm was soon back included."""
-    try_after: int | None = None
-    """Steps after which control is handed back on trial; after each trial that fails, twice as many."""
-    free_after: int = 5
-    """Steps without contact after which a contact is over; after each hand-back that was too early, twice as many."""
-    strikes: int | None = None  # how often the policy may pass a contact limit before the episode ends
-    impulse: float | None = None  # how much the arm may press in an episode, beyond healthy motion [N s]
-    go_on: int = 100  # steps in alarm for which the policy may go on in an episode; at all later alarms it is held
+    max_override: float = math.inf  # rows of a reflex, those before a hand-back after which the alarm was soon back too
+    try_after: float = math.inf  # rows until a trial; after each trial that fails, twice as many
+    free_after: int = 5  # rows without contact after which it is over; after each that was too early, twice as many
+    strikes: float = math.inf  # how often the policy may pass a contact limit before the episode ends
+    impulse: float = math.inf  # how much the arm may press in an episode, beyond healthy motion [N s]
+    go_on: float = math.inf  # rows in alarm for which the policy may go on in an episode; at later alarms it is held
 
 
 @dataclass(frozen=True)
 class GuardOptions:
-    """What the safety wrappers take beside environment and monitor; see ``NeuralASMSafety``.
-
-    Args:
-        on_alarm, release_after, release_below, max_override, try_after, truncate, responses, contact_limits,
-            adaptive_threshold, online_learning_rate, on_overrun: as there.
+    """What the safety wrappers take beside environment and monitor, as ``NeuralASMSafety`` describes it.
 
     Raises:
         ValueError: a number out of its range, an unknown name, or responses that let a pressing arm go on.
@@ -67,7 +61,6 @@ class GuardOptions:
     contact_limits: ContactLimits | str | None = "memory"
     adaptive_threshold: AdaptiveThreshold | None = None
     online_learning_rate: float = 0.0
-    on_overrun: str = "ignore"
 
     def __post_init__(self) -> None:
         if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:
@@ -89,7 +82,6 @@ class GuardOptions:
                 f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(self.adaptive_threshold)}"
             )
         check_number("online_learning_rate", self.online_learning_rate, low=0, high=1)
-        check_choice("on_overrun", self.on_overrun, ("warn", "alarm", "ignore"))
 
     def reaction(self, names_causes: bool) -> OnAlarm:
         """Return ``on_alarm``, or what None means for a monitor that names causes or does not.
@@ -103,7 +95,7 @@ class GuardOptions:
         return chosen
 
     def rule(self, graded: bool, dt: float, rows_per_step: int) -> ReleaseRule:
-        """Return when control is handed back, counted in rows.
+        """Return when control is handed back.
 
         Args:
             graded: limits of time, strikes and impulse hold where none are given.
@@ -111,10 +103,10 @@ class GuardOptions:
             rows_per_step: rows of the stream in a control step.
         """
 
-        def rows(steps: int | None, seconds: float) -> int | None:
-            if steps is None and graded:
-                steps = max(1, round(seconds / dt))
-            return None if steps is None else rows_per_step * steps
+        def rows(steps: int | None, seconds: float) -> float:
+            if steps is None and not graded:
+                return math.inf
+            return rows_per_step * (max(1, round(seconds / dt)) if steps is None else steps)
 
         return ReleaseRule(
             rows_per_step * self.release_after,
@@ -122,7 +114,7 @@ class GuardOptions:
             rows(self.max_override, GIVE_UP_AFTER_S),
             rows(self.try_after, TRY_AFTER_S),
             rows_per_step * ReleaseRule.free_after,
-            STRIKES if graded else None,
-            IMPULSE if graded else None,
-            (rows(None, GO_ON_S) or 0) if graded else rows_per_step * ReleaseRule.go_on,
+            STRIKES if graded else math.inf,
+            IMPULSE if graded else math.inf,
+            rows(None, GO_ON_S),
         )

@@ -20,15 +20,14 @@ Mask = NDArray[np.bool_]
 GRADED = "graded"
 """Not a reflex, but the one that severity and cause ask for."""
 
-PATH = 10
-"""How many actions a retreat undoes."""
+PATH = 10  # how many actions a retreat undoes
+COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
+TOLERATED, TOLERATED_ALONE = (
+    4.0,
+    2.0,
+)  # external torque that none gives way to [N m]: under "graded", and "comply" alone
 
-COMPLIANCE = 0.05
-"""How far a joint gives way in a second [rad / (N m s)]."""
-
-TOLERATED = {GRADED: 4.0}
-TOLERATED_ALONE = 2.0
-"""External torque that no joint gives way to [N m]: under ``"graded"``, and under ``"comply"`` by itself."""
+NO_TORQUE = "comply needs the channel external_torque: make the environment with stream group torque"
 
 
 class Motion(NamedTuple):
@@ -42,13 +41,8 @@ class Motion(NamedTuple):
 class Reflexes:
     """What the reflexes of n robots have felt.
 
-    Args:
-        robots: whose.
-        spec: of their streams.
-        on_alarm: the name of a reflex, or ``"graded"``.
-
     Raises:
-        ValueError: the robots cannot do it.
+        ValueError: the robots cannot do what ``on_alarm`` names: a reflex, or ``"graded"``.
     """
 
     def __init__(self, robots: Robots, spec: StreamSpec, on_alarm: str) -> None:
@@ -58,17 +52,15 @@ class Reflexes:
         """(J,) columns of external torques."""
         lacks = dict(robots.refused)
         if not self.torques.size:
-            lacks.setdefault(
-                "comply", "comply needs the channel external_torque: make the environment with stream group torque"
-            )
+            lacks.setdefault("comply", NO_TORQUE)
         for name in (on_alarm, "hold"):
-            if name in lacks and name != GRADED:
+            if name in lacks:
                 raise ValueError(lacks[name])
         self.possible = frozenset(name for name in wanted if name not in lacks)
         self.feels = bool(self.possible - {"hold", "recall"})
         """One of them depends on what was felt and done."""
         self.robots = robots
-        self.tolerated = TOLERATED.get(on_alarm, TOLERATED_ALONE)
+        self.tolerated = TOLERATED if on_alarm == GRADED else TOLERATED_ALONE
         # (n, J) external torque now, and what is usual while the policy acts [N m]
         self.torque, self.usual = np.zeros((n, len(self.torques))), np.zeros((n, len(self.torques)))
         # (n, PATH, A) what the policy did last, the newest last, and (n,) how much of it there is
@@ -114,10 +106,5 @@ def recall(felt: Reflexes, robot: int) -> Motion:
     return Motion(felt.expected[robot].copy(), keeps_grip=False)
 
 
-REFLEXES: dict[str, Callable[[Reflexes, int], Motion]] = {
-    "hold": hold,
-    "retract": retract,
-    "comply": comply,
-    "recall": recall,
-}
+REFLEXES: dict[str, Callable[[Reflexes, int], Motion]] = {f.__name__: f for f in (hold, retract, comply, recall)}
 """Reflexes by name."""

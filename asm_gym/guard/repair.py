@@ -14,29 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.guard.hand import HandAgainstJoints
-from asm_gym.guard.robots import NO_COLUMNS
 from asm_gym.memory.completion import Completion, Filling
 
-WELL_AFTER_S = 1.0
-"""A sense is well again once it has said what was expected for so long [s]."""
-
-WELL_WITHIN = 4.0
-"""Standard deviations of the completion's own error that this may be off."""
-
-UNTOLD = 0.5
-"""No other sense tells of one whose completion leaves more than this share of its spread."""
-
-TRUST_S = 1.0
-"""How long a sense that no other sense tells of is completed, by its last good value [s]."""
-
-LONGEST_S = 20.0
-"""No sense is completed for longer than this [s]."""
-
-MOST_MISSING = 0.5
-"""Where more than this share of the senses is missing, what is left tells too little of them."""
-
-FARTHEST = 6.0
-"""No completed number goes further than so many of its spreads from its mean."""
+WELL_AFTER_S = 1.0  # a sense is well again once it has said what was expected for so long [s]
+WELL_WITHIN = 4.0  # standard deviations of the completion's own error that this may be off
+UNTOLD = 0.5  # no other sense tells of one whose completion leaves more than this share of its spread
+TRUST_S = 1.0  # how long a sense that no other sense tells of is completed, by its last good value [s]
+LONGEST_S = 20.0  # no sense is completed for longer than this [s]
+MOST_MISSING = 0.5  # where more than this share of the senses is missing, what is left tells too little of them
+FARTHEST = 6.0  # no completed number goes further than so many of its spreads from its mean
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,8 +63,7 @@ class Repair:
         self._unchecked = 0  # rows in which something was completed that no other sense tells of
         self._before: Floats | None = None if before is None else np.array(before, np.float64)  # (D,) repaired
         self._good = self._before  # (D,) the last row before something was missing
-        self._raw = np.zeros(spec.size) if self._before is None else self._before
-        self._earlier = self._raw
+        self._raw = self._earlier = np.zeros(spec.size) if self._before is None else self._before
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -94,7 +79,7 @@ class Repair:
 
     @property
     def over(self) -> bool:
-        """Whether there is nothing left to repair."""
+        """There is nothing left to repair."""
         return not (self._well or self._returned.any() or self.settling) and self.trusted
 
     @property
@@ -140,9 +125,9 @@ class Repair:
 
     def _choose(self) -> None:
         """Take up which sensors are missing."""
-        columns = [own for name, own in self._completion.sensors if name in self._well]
         self.missing = np.zeros(self._spec.size, bool)
-        self.missing[np.concatenate([NO_COLUMNS, *columns])] = True
+        for name, own in self._completion.sensors:
+            self.missing[own] |= name in self._well
         self._filling: Filling = self._completion.filling(self.missing)
         spread = self._completion.senses.spread[self._filling.columns]
         self._untold = self._filling.error > UNTOLD * spread  # (M,)
@@ -166,16 +151,15 @@ class Repair:
 
     def _judge(self, repaired: Floats) -> None:
         """Count for how long each missing sensor has been well, and believe those that have been for long enough."""
-        columns, limit = self._filling.columns, WELL_WITHIN * self._filling.error
+        columns, raw, before = self._filling.columns, self._raw[self._filling.columns], self.names
         self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
-        close = np.abs(self._raw[columns] - repaired[columns]) <= limit  # False for what is not finite
-        repeats = (self._raw[columns] == self._earlier[columns]) & (self._spec.noise[columns] > 0)
+        close = np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error  # False for what is not finite
         for hand in self._hands:
             close &= ~hand.accused(self._robot)[columns]
-        back = np.isfinite(self._raw[columns]) & (close | self._untold)
-        fine, there = np.zeros(self._spec.size, bool), np.zeros(self._spec.size, bool)
-        fine[columns], there[columns] = close & ~repeats & ~self._untold, back
-        before = self.names
+        repeats = (raw == self._earlier[columns]) & (self._spec.noise[columns] > 0)
+        fine, there = np.zeros((2, self._spec.size), bool)
+        fine[columns] = close & ~repeats & ~self._untold
+        there[columns] = np.isfinite(raw) & (close | self._untold)
         for name, own in self._completion.sensors:
             if name not in self._well:
                 continue

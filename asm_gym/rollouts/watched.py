@@ -27,7 +27,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     monitor = _memory(memory, memory.stat().st_mtime_ns)
     infos: list[dict[str, Any]] = []
     with staged(trial, config) as env:
-        guarded = NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm, on_overrun="ignore")
+        guarded = NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm)
         success = play(trial, config, guarded, infos.append)
     asm = [info["asm"] for info in infos]
     rows = len(asm[0]["surprises"])  # of each control step
