@@ -39,7 +39,7 @@ def kalman():
 
 @pytest.mark.parametrize("detection", DETECTIONS)
 def test_any_model_goes_under_any_detection(detection):
-    monitor = make_monitor("kalman", sine_spec(), detection=detection).fit(sine_episodes(30))
+    monitor = make_monitor(f"kalman+{detection}", sine_spec()).fit(sine_episodes(30))
     monitor.calibrate(sine_episodes(60, 1), 0.05)
     surprise = monitor.score(frozen(sine_episodes(1, 2)[0], 3, 20))
     np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value)
@@ -51,7 +51,6 @@ def test_a_name_with_a_plus_is_a_model_under_a_detection():
     for name, detection in (("kalman+evidence", "evidence"), ("force_limit+squares", "squares")):
         assert monitor_class(name).detection == detection
     assert make_monitor("kalman+evidence", sine_spec()).detection.name == "evidence"
-    assert make_monitor("kalman", sine_spec(), detection="evidence").detection.name == "evidence"
     with pytest.raises(ValueError, match="unknown detection 'oracle'; known: evidence"):
         make_monitor("kalman+oracle", sine_spec())
     with pytest.raises(ValueError, match="unknown monitor 'oracle"):

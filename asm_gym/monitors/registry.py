@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from asm_gym.checkpoint import kind_of, read_checkpoint
-from asm_gym.detection import Detection, EvidenceDetection
+from asm_gym.detection import EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.files import restored
@@ -87,35 +87,28 @@ class MonitorKind:
         return issubclass(self.model_class, CalibratedMonitor)
 
 
-def _rival(model: str, own: str) -> MonitorKind:
-    return MonitorKind(f"asm_gym.monitors.{model}", own, own)
-
-
-def _with_evidence(rows: dict[str, MonitorKind]) -> dict[str, MonitorKind]:
-    """Return each row, followed by the same model under the detection of the Neural ASM."""
-    return {n: k for name, row in rows.items() for n, k in ((name, row), (name + EVIDENCE, _under(row, "evidence")))}
-
-
-def _under(kind: MonitorKind, detection: str) -> MonitorKind:
-    return replace(kind, detection=detection)
-
+_RIVALS = {
+    "logpzo": ("baselines.logpzo:LogpZO", "moving_mean"),
+    "gru": ("baselines.recurrent:GRU", "mahalanobis"),
+    "kalman": ("baselines.linear:Kalman", "mahalanobis"),
+    "association_linear": ("baselines.linear:LinearAssociation", "mahalanobis"),
+    "association_values": ("value_association:ValueAssociation", "mahalanobis"),
+    "external_torque_limit": ("baselines.limits:ExternalTorqueLimit", "largest"),
+    "force_limit": ("baselines.limits:ForceLimit", "squares"),
+}
+"""The model of each rival, and the detection that its authors judged it by."""
 
 MONITORS: Registry[MonitorKind] = Registry(
     "monitor",
     "asm_gym.monitors.registry:MONITORS",
     {
         "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
-        **_with_evidence(
-            {
-                "logpzo": _rival("baselines.logpzo:LogpZO", "moving_mean"),
-                "gru": _rival("baselines.recurrent:GRU", "mahalanobis"),
-                "kalman": _rival("baselines.linear:Kalman", "mahalanobis"),
-                "association_linear": _rival("baselines.linear:LinearAssociation", "mahalanobis"),
-                "association_values": _rival("value_association:ValueAssociation", "mahalanobis"),
-            }
-        ),
-        "external_torque_limit": _rival("baselines.limits:ExternalTorqueLimit", "largest"),
-        "force_limit": _rival("baselines.limits:ForceLimit", "squares"),
+        **{n: MonitorKind(f"asm_gym.monitors.{model}", own, own) for n, (model, own) in _RIVALS.items()},
+        **{
+            n + EVIDENCE: MonitorKind(f"asm_gym.monitors.{m}", own)
+            for n, (m, own) in _RIVALS.items()
+            if "limit" not in n
+        },
     },
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
@@ -139,7 +132,7 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
         raise ValueError(f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}")
     row = MonitorKind(model, detection, detection)
     MONITORS.register(name, row)
-    MONITORS[name + EVIDENCE] = _under(row, "evidence")
+    MONITORS[name + EVIDENCE] = replace(row, detection="evidence")
 
 
 def check_monitor_name(name: str) -> None:
@@ -180,25 +173,19 @@ def monitor_class(name: str) -> MonitorKind:
     """
     check_monitor_name(name)
     model, _, detection = name.partition("+")
-    kind = MONITORS[name] if name in MONITORS else _under(MONITORS[model], detection)
+    kind = MONITORS[name] if name in MONITORS else replace(MONITORS[model], detection=detection)
     with needed_for(f"monitor {name}"):
         _ = kind.model_class, kind.detection_classes
     return kind
 
 
 @typed
-def make_monitor(
-    name: str,
-    spec: StreamSpec,
-    detection: str | Detection | None = None,
-    **hyperparameters: Any,
-) -> CalibratedMonitor:
+def make_monitor(name: str, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
     """Return a monitor by name, not yet fitted.
 
     Args:
         name: for example ``neural_asm``, or ``gru+evidence``, which is ``gru`` with the detection ``evidence``.
         spec: the stream to watch.
-        detection: judges the model's errors, by name or your own; where None, that of the name.
         **hyperparameters: of that monitor.
 
     Raises:
@@ -210,11 +197,10 @@ def make_monitor(
         >>> make_monitor("kalman+evidence", spec, ridge=1e-3).detection.name
         'evidence'
     """
-    kind = monitor_class(name if not isinstance(detection, str) else f"{name.partition('+')[0]}+{detection}")
+    kind = monitor_class(name)
     for parameter in hyperparameters:
         check_choice(f"hyperparameter of {name}", parameter, kind.hyperparameters)
-    made = kind(spec, **hyperparameters)
-    return made if detection is None or isinstance(detection, str) else made.with_detection(detection)
+    return kind(spec, **hyperparameters)
 
 
 @typed
@@ -227,5 +213,7 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(kind_of(path))
     saved = read_checkpoint(path, kind.model_class.kind)
-    monitor: CalibratedMonitor = restored(path, saved, _under(kind, saved.header.get("detection", kind.detection)))
+    monitor: CalibratedMonitor = restored(
+        path, saved, replace(kind, detection=saved.header.get("detection", kind.detection))
+    )
     return monitor
