@@ -27,6 +27,7 @@ from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Rows = NDArray[np.floating[Any]]
 
 SLOW = 0.3
 """A channel is slow where a step's change is under this share of its spread."""
@@ -58,21 +59,13 @@ class ScaledRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StreamScaler:
-    """Standardises rows of a stream.
-
-    Args:
-        spec: of the stream.
-        mean: (D,) of the training rows [unit of each channel].
-        spread: (D,) their standard deviation.
-        change: (D,) standard deviation of the change over ``lag`` rows.
-        lag: l, how many rows later the change of a row is taken.
-    """
+    """Standardises rows of a stream."""
 
     spec: StreamSpec
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    change: NDArray[np.float64]
-    lag: int = 1
+    mean: Floats  # (D,) of the training rows [unit of each channel]
+    spread: Floats  # (D,) their standard deviation
+    change: Floats  # (D,) standard deviation of the change over ``lag`` rows
+    lag: int = 1  # l
 
     @classmethod
     def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]], lag: int = 1) -> Self:
@@ -123,17 +116,12 @@ class StreamScaler:
         """I."""
         return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
 
-    def read_episode(self, stream: NDArray[np.floating[Any]]) -> ScaledRows:
+    def read_episode(self, stream: Rows) -> ScaledRows:
         """Read all rows of an episode (T, D); nothing has moved before the first ``lag``."""
         before = np.concatenate([stream[: self.lag], stream[: -self.lag]])
         return self.read(stream, before, np.concatenate([before[: self.lag], before[: -self.lag]]))
 
-    def read(
-        self,
-        rows: NDArray[np.floating[Any]],
-        before: NDArray[np.floating[Any]],
-        earlier: NDArray[np.floating[Any]],
-    ) -> ScaledRows:
+    def read(self, rows: Rows, before: Rows, earlier: Rows) -> ScaledRows:
         """Read rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
         x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
         sensory, motor = self.spec.sensory, self.spec.motor

@@ -36,37 +36,19 @@ CHAIN = 3
 
 
 class Derived(NamedTuple):
-    """Inputs that are derived from speeds and angles.
+    """Inputs that are derived from speeds and angles."""
 
-    Attributes:
-        speeds: (S,) senses that are speeds, or whose changes are.
-        from_steps: speeds are changes of positions.
-        angles: (J,) senses that are angles, along the chain.
-        radians: (J,) in one of their units.
-        pairs: (2, P) of sines and cosines of single angles, that are multiplied.
-        sources: (M, X) which senses each derived input is made of.
-        links: body model that replaces the sines; None without one.
-    """
-
-    speeds: NDArray[np.intp]
-    from_steps: bool
-    angles: NDArray[np.intp]
-    radians: Floats
-    pairs: NDArray[np.intp]
-    sources: NDArray[np.bool_]
-    links: BodyModel | None = None
+    speeds: NDArray[np.intp]  # (S,) senses that are speeds, or whose changes are
+    from_steps: bool  # speeds are changes of positions
+    angles: NDArray[np.intp]  # (J,) senses that are angles, along the chain
+    radians: Floats  # (J,) in one of their units
+    pairs: NDArray[np.intp]  # (2, P) of sines and cosines of single angles, that are multiplied
+    sources: NDArray[np.bool_]  # (M, X) which senses each derived input is made of
+    links: BodyModel | None = None  # replaces the sines
 
     @classmethod
     def of(cls, spec: StreamSpec, urdf: str = "") -> Self:
-        """Return what a stream has by the names of its channels.
-
-        Args:
-            spec: of the stream.
-            urdf: text of a body model, or empty.
-
-        Raises:
-            ValueError: the body model does not fit the stream.
-        """
+        """Return what a stream has by its channels' names. Raises ValueError where the body model ``urdf`` misfits."""
         place = {int(column): k for k, column in enumerate(spec.sensory)}
         moving, from_steps = speeds(spec)
         columns = _named(spec, POSITION)
@@ -97,12 +79,9 @@ class Derived(NamedTuple):
         return cls(at, from_steps, angles, radians, pairs, sources, links)
 
     def __call__(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> Floats:
-        """Return the derived inputs (N, M).
+        """Return the derived inputs (N, M) of ``values`` (N, X) with their ``spread`` (X,).
 
-        Args:
-            values: (N, X) in their units.
-            steps: (N, X) standardised changes; 1 is ``rate`` (X,) in a second.
-            spread: (X,) of the values.
+        ``steps`` (N, X) are standardised changes; 1 is ``rate`` (X,) in a second.
         """
         speed = steps[:, self.speeds] if self.from_steps else values[:, self.speeds] / spread[self.speeds]
         parts = [np.tanh(speed / width) for width in WIDTHS]

@@ -200,10 +200,8 @@ class Calibrated:
 def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> list[str]:
     """Return the labels of the senses whose errors alone could never pass the threshold, however large and lasting.
 
-    Args:
-        detection: its ``reach_of`` says how far each error can go; without one, nothing is known.
-        errors: (X,) column of each error in the stream; -1 for none.
-        spec, threshold: of the stream, and of its surprise.
+    ``errors`` (X,) are the columns of the errors in the stream, -1 for none. The detection's ``reach_of`` says how far
+    each error can go; without one, nothing is known.
     """
     if not hasattr(detection, "reach_of"):
         return []

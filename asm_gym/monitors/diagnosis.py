@@ -91,18 +91,12 @@ class Hypothesis(NamedTuple):
 
 @dataclass(frozen=True)
 class Readout:
-    """Softmax regression of the class of a cause on evidence.
+    """Softmax regression of the class of a cause on evidence."""
 
-    Args:
-        mean, spread: (F,) of the evidence it learned from.
-        weights: (C, F) for each of ``CLASSES``.
-        bias: (C,).
-    """
-
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    weights: NDArray[np.float64]
-    bias: NDArray[np.float64]
+    mean: NDArray[np.float64]  # (F,) of the evidence it learned from
+    spread: NDArray[np.float64]  # (F,)
+    weights: NDArray[np.float64]  # (C, F) for each of ``CLASSES``
+    bias: NDArray[np.float64]  # (C,)
 
     def __call__(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the probabilities (N, C) of ``CLASSES`` for evidence (N, F)."""
@@ -129,12 +123,7 @@ def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Names the cause of a surprise.
-
-    Args:
-        completion: of the memory that was surprised.
-        readout: gives the probabilities of families.
-    """
+    """Names the cause of a surprise, by the completion of the memory that was surprised."""
 
     completion: Completion
     readout: Readout

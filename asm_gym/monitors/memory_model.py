@@ -35,11 +35,8 @@ class MemoryModel(StreamModel):
     """The temporal network, association, and what is learned on top of them: motor association and names of skills.
 
     Args:
-        spec: the stream to predict.
-        hidden_size: H, hidden units of the temporal network.
-        association_size: hidden units of association, shared out among the groups of senses.
+        spec, hidden_size, association_size, dynamics: as of ``NeuralASM``.
         schedule: how to learn and to infer.
-        dynamics: how the past is carried on, one of ``memory.dynamics.DYNAMICS``.
 
     Attributes:
         senses_: how it reads a row.
@@ -52,12 +49,7 @@ class MemoryModel(StreamModel):
     kind = "neural_asm"
 
     def __init__(
-        self,
-        spec: StreamSpec,
-        hidden_size: int,
-        association_size: int,
-        schedule: Schedule,
-        dynamics: str = TRACES,
+        self, spec: StreamSpec, hidden_size: int, association_size: int, schedule: Schedule, dynamics: str = TRACES
     ) -> None:
         super().__init__(spec)
         self.dynamics = dynamics

@@ -95,11 +95,7 @@ class Values(NamedTuple):
     ) -> tuple[State, Surprise]:
         """Return the new state, and the greater surprise in each row (B, D), attributed as that one is.
 
-        Args:
-            state: before the rows.
-            rows: (B, D).
-            changes: the surprise that changes make.
-            divisor: (B,) by which knocks and stops excuse a surprise.
+        ``changes`` is the surprise that changes make; knocks and stops excuse a surprise by ``divisor`` (B,).
         """
         assert self.monitor is not None
         root = self.spread(state, rows)
