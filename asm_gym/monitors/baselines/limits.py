@@ -10,7 +10,6 @@ external_torque_limit  external torque of each joint, from a momentum observer, 
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Self
 
@@ -41,6 +40,7 @@ class _Limit(StreamModel):
     held_out = 0  # so few numbers are not learned by heart
     channel = ""
     """End of their names."""
+    scaled = False
 
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec)
@@ -54,8 +54,9 @@ class _Limit(StreamModel):
         return self._columns
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        centre, scale = self.range_of(np.concatenate([e.stream for e in episodes])[:, self._columns].astype(float))
-        return self.restore({"limit_centre": centre, "limit_scale": scale})
+        rows = np.concatenate([e.stream for e in episodes])[:, self._columns].astype(float)
+        scale = np.maximum(rows.std(axis=0), 1e-6) if self.scaled else np.ones(rows.shape[1])
+        return self.restore({"limit_centre": rows.mean(axis=0), "limit_scale": scale})
 
     def start(self, batch: int) -> RowHistory:
         return RowHistory.empty(batch, 1, self.spec.size)  # it only says how many streams there are
@@ -64,10 +65,6 @@ class _Limit(StreamModel):
         error = (rows[:, self._columns] - self.learned_["limit_centre"]) / self.learned_["limit_scale"]
         return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
 
-    @abstractmethod
-    def range_of(self, rows: Floats) -> tuple[Floats, Floats]:
-        """Return centre and scale (X,) of what was measured in nominal episodes (N, X)."""
-
 
 class ForceLimit(_Limit):
     """A limit on the largest force of the wrist in a step."""
@@ -75,15 +72,10 @@ class ForceLimit(_Limit):
     kind = "force_limit"
     channel = "wrist_force_peak"
 
-    def range_of(self, rows: Floats) -> tuple[Floats, Floats]:
-        return rows.mean(axis=0), np.ones(rows.shape[1])
-
 
 class ExternalTorqueLimit(_Limit):
-    """A limit on each joint's external torque."""
+    """A limit on each joint's external torque, in spreads of its nominal values."""
 
     kind = "external_torque_limit"
     channel = "external_torque_peak"
-
-    def range_of(self, rows: Floats) -> tuple[Floats, Floats]:
-        return rows.mean(axis=0), np.maximum(rows.std(axis=0), 1e-6)
+    scaled = True
