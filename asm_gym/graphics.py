@@ -1,4 +1,4 @@
-"""Whether this machine can draw without a screen, and encode a video that browsers play.
+"""Whether this machine can draw without a screen.
 
 Nothing looked for here is imported here: the answer has to come where ``import robosuite`` fails.
 """
@@ -14,7 +14,6 @@ from functools import cache
 BACKENDS = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
 """Values of ``MUJOCO_GL`` and their libraries; EGL first: it uses a GPU where there is one."""
 GET_RENDERING = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
-GET_ENCODER = "python -m pip install --force-reinstall imageio-ffmpeg (or: apt-get install ffmpeg)"
 
 # A lit white ball on black: a driver that draws nothing returns a frame of one colour.
 ONE_FRAME = """
@@ -62,15 +61,3 @@ def rendering_problem() -> str:
     """Return why nothing can be drawn here; empty where it can."""
     found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in BACKENDS.values())
     return "" if rendering_backend() else f"no video: {found}"
-
-
-def encoder_problem() -> str:
-    """Return why there is no ffmpeg with the H.264 encoder that browsers understand; empty where there is one."""
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
-
-        exe = get_ffmpeg_exe()
-        encoders = subprocess.run([exe, "-hide_banner", "-encoders"], capture_output=True, timeout=60, check=True)
-    except (ImportError, RuntimeError, OSError, subprocess.SubprocessError) as error:
-        return f"no video: {type(error).__name__}: {error}"
-    return "" if b"libx264" in encoders.stdout else f"{exe} has no libx264"

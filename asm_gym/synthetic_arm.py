@@ -33,18 +33,16 @@ def _gravity(position: Floats) -> Floats:
 
 
 @compiled
-def _advance(
-    position: Floats, velocity: Floats, command: Floats, load: float, inverse: Floats
-) -> tuple[Floats, Floats, Floats]:
+def _advance(q: Floats, v: Floats, command: Floats, load: float, inverse: Floats) -> tuple[Floats, Floats, Floats]:
     """Return position, velocity and torque (7,) after a control step."""
     torque = command
     for _ in range(SUBSTEPS):
-        compensated = _gravity(position)
-        torque = 60 * MASS * (command - velocity) + compensated
-        friction = 3 * MASS * velocity + 0.5 * MASS * np.tanh(20 * velocity)
-        velocity = velocity + DT / SUBSTEPS * (inverse @ (torque - load * compensated - friction))
-        position = position + DT / SUBSTEPS * velocity
-    return position, velocity, torque
+        compensated = _gravity(q)
+        torque = 60 * MASS * (command - v) + compensated
+        friction = 3 * MASS * v + 0.5 * MASS * np.tanh(20 * v)
+        v = v + DT / SUBSTEPS * (inverse @ (torque - load * compensated - friction))
+        q = q + DT / SUBSTEPS * v
+    return q, v, torque
 
 
 class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -73,23 +71,20 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
-        self._position, self._velocity, self._steps = np.zeros(JOINTS), np.zeros(JOINTS), 0
+        self._q, self._v, self._steps = np.zeros(JOINTS), np.zeros(JOINTS), 0
         self._load = 0.7 + 0.3 * self.np_random.uniform(0.5, 1.5)
-        observation = self._sense(_gravity(self._position))
+        observation = self._sense(_gravity(self._q))
         return observation, {"stream": np.concatenate([observation, np.zeros(JOINTS, np.float32)])}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move one step by the commanded velocities [rad/s]."""
         command = np.clip(np.asarray(action, np.float64), -3.0, 3.0)
-        self._position, self._velocity, torque = _advance(
-            self._position, self._velocity, command, self._load, self._inverse
-        )
+        self._q, self._v, torque = _advance(self._q, self._v, command, self._load, self._inverse)
         self._steps += 1
         observation = self._sense(torque)
         stream = np.concatenate([observation, np.asarray(action, np.float32)])
         return observation, 0.0, False, self._steps >= self.horizon, {"stream": stream}
 
     def _sense(self, torque: Floats) -> NDArray[np.float32]:
-        exact = np.concatenate([self._position, self._velocity, torque])
-        row: NDArray[np.float32] = (exact + self._noise * self.np_random.standard_normal(len(exact))).astype(np.float32)
-        return row
+        exact = np.concatenate([self._q, self._v, torque])
+        return np.asarray(exact + self._noise * self.np_random.standard_normal(len(exact)), np.float32)

@@ -17,8 +17,10 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
+import operator
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import SimpleNamespace, UnionType
@@ -179,10 +181,8 @@ def _kinds(call: Callable[..., Any]) -> dict[str, Any]:
     for name, parameter in inspect.signature(call).parameters.items():
         if parameter.kind in many or parameter.annotation is inspect.Parameter.empty:
             continue
-        try:
+        with suppress(NameError):  # imported for type checkers only
             found |= get_type_hints(SimpleNamespace(__annotations__={name: parameter.annotation}), namespace)
-        except NameError:  # imported for type checkers only
-            continue
     return found
 
 
@@ -217,13 +217,8 @@ def _is_sequence(value: Any) -> bool:
 
 
 def _within(number: float, **bounds: Unpack[Bounds]) -> bool:
-    low, high, above, below = bounds.get("low"), bounds.get("high"), bounds.get("above"), bounds.get("below")
-    return (
-        (low is None or number >= low)
-        and (high is None or number <= high)
-        and (above is None or number > above)
-        and (below is None or number < below)
-    )
+    compare = {"low": operator.ge, "high": operator.le, "above": operator.gt, "below": operator.lt}
+    return all(bound is None or compare[name](number, bound) for name, bound in bounds.items())
 
 
 def _described(what: str, **bounds: Unpack[Bounds]) -> str:

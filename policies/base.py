@@ -28,7 +28,6 @@ class Policy(Protocol):
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], PolicyState]:
         """The action for ``observation``, and the state to pass in next time."""
-        ...
 
 
 @runtime_checkable
@@ -37,7 +36,6 @@ class Seeded(Protocol):
 
     def set_random_seed(self, seed: int) -> None:
         """All that is drawn from now on follows from ``seed``."""
-        ...
 
 
 class StatefulPolicy(ABC):

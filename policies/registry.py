@@ -10,9 +10,8 @@ import gymnasium as gym
 
 from asm_gym.policies.base import Policy
 from asm_gym.policies.memory_policy import NeuralASMPolicy
-from asm_gym.policies.network import NetworkPolicy
+from asm_gym.policies.network import NetworkPolicy, read_archive
 from asm_gym.policies.reflexes import Hold
-from asm_gym.policies.sb3 import read_archive
 from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
@@ -44,14 +43,10 @@ SHIPPED = Path(__file__).resolve().parent / "agents"
 
 
 def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
-    """Register a policy, in this process and in its workers.
+    """Register a policy, in this process and in its workers; raise ValueError where the name is taken.
 
     Args:
         make: is called as ``make(env, seed=seed)``, with whatever else ``make_policy`` is given; or ``module:name``.
-
-    Raises:
-        ValueError: the name is taken.
-        ImportError: there is no such module.
 
     Example:
         >>> from asm_gym import make_policy, register_policy

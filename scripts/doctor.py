@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from asm_gym.extras import BROUGHT_BY, NOT_ON_3_13
-from asm_gym.graphics import GET_ENCODER, GET_RENDERING, encoder_problem, loads, rendering_backend, rendering_problem
+from asm_gym.graphics import GET_RENDERING, loads, rendering_backend, rendering_problem
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
@@ -45,13 +45,12 @@ class Check(NamedTuple):
 
 def run_checks() -> list[Check]:
     """Return every check, in the order in which one remedy helps the next."""
-    no_picture, no_encoder = rendering_problem(), encoder_problem()
+    no_picture = rendering_problem()
     return [
         python(),
         *map(package, PACKAGES),
         *(library(name) for name in LIBRARIES if sys.platform == "linux"),
         Check("rendering", no_picture or f"MUJOCO_GL={rendering_backend()} draws", GET_RENDERING if no_picture else ""),
-        Check("H.264 encoder", no_encoder or "found", GET_ENCODER if no_encoder else ""),
     ]
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from importlib import metadata
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -124,14 +123,6 @@ def test_python_3_13_is_told_why_it_has_no_robosuite(machine: Any, monkeypatch: 
     assert "3.12" in check.remedy
 
 
-def test_an_ffmpeg_that_is_missing_or_has_no_h264_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    for encoders, problem in ((b" V....D libx264  H.264", ""), (b" V....D mpeg4  MPEG-4", "has no libx264")):
-        monkeypatch.setattr(subprocess, "run", lambda *args, _out=encoders, **kwargs: SimpleNamespace(stdout=_out))
-        assert graphics.encoder_problem().endswith(problem)
-        assert bool(graphics.encoder_problem()) is bool(problem)
-    monkeypatch.undo()
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", os.path.join(os.path.dirname(__file__), "no_such_ffmpeg"))
-    assert "no video" in graphics.encoder_problem()
 
 
 def test_the_doctor_imports_nothing_that_it_checks() -> None:

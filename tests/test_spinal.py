@@ -32,12 +32,12 @@ def limits(most, stays=True):
 
 def test_what_is_felt_is_what_the_stream_says_the_mean_of(free):
     robot = begin(free)
-    felt, row = robot.felt, robot.measured
+    felt, row = robot.simulation.felt, robot.measured
     assert felt.shape == (25, 10)
     at = robot.measured_spec.slices
-    means = np.concatenate([row[at[c.name]] for c in robot.felt_channels])
-    noise = np.concatenate([[c.noise] * c.size for c in robot.felt_channels])
-    assert [c.size for c in robot.felt_channels] == [7, 3]
+    means = np.concatenate([row[at[c.name]] for c in robot.simulation.felt_channels])
+    noise = np.concatenate([[c.noise] * c.size for c in robot.simulation.felt_channels])
+    assert [c.size for c in robot.simulation.felt_channels] == [7, 3]
     np.testing.assert_allclose(felt.mean(axis=0), means, atol=6 * noise.max())
 
 
@@ -45,7 +45,7 @@ def test_what_is_felt_is_what_the_stream_says_the_mean_of(free):
 def test_passing_any_of_them_is_known_in_that_substep_and_counts_for_one_step(free, number):
     robot = begin(free)
     free.step(ACTION)
-    felt = np.abs(robot.felt[:, number])
+    felt = np.abs(robot.simulation.felt[:, number])
     robot = begin(free)
     most = np.full(10, WIDE)
     most[number] = np.median(felt)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from types import ModuleType
 from typing import Any
@@ -32,21 +30,15 @@ _CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("n
 def import_robosuite() -> Any:
     """Return robosuite, without the warnings it prints at import about optional parts."""
     logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
-    with _opencv_or_none():
-        return require("robosuite", what="a robosuite environment")
-
-
-@contextmanager
-def _opencv_or_none() -> Iterator[None]:
-    """Let robosuite be imported where opencv cannot be, for want of libGL: only its own viewer would use it."""
     try:
         import cv2  # noqa: F401
-    except ImportError:
+    except ImportError:  # for want of libGL: only robosuite's own viewer would use it
         sys.modules["cv2"] = ModuleType("cv2")
-        yield
-        del sys.modules["cv2"]
-    else:
-        yield
+        try:
+            return require("robosuite", what="a robosuite environment")
+        finally:
+            del sys.modules["cv2"]
+    return require("robosuite", what="a robosuite environment")
 
 
 def row_substeps(rate: int, control_freq: int) -> int:

@@ -36,7 +36,7 @@ class OffscreenRenderer:
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Return a picture (height, width, 3) uint8; raise RuntimeError where this machine has no OpenGL."""
-        self._camera.fixedcamid = camera_id(model, self.camera)
+        self._camera.fixedcamid = model.camera(self.camera).id
         if self._model is not model:
             self._open(model)
         self._gl.make_current()
@@ -77,15 +77,6 @@ class OffscreenRenderer:
 def _close_all() -> None:
     for renderer in list(_live):
         renderer.close()
-
-
-def camera_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the id of a camera; raise ValueError, listing those that exist, where there is none of this name."""
-    found = int(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name))
-    if found < 0:
-        known = (str(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i)) for i in range(model.ncam))
-        raise ValueError(f"unknown camera {name!r}; known: {', '.join(known)}")
-    return found
 
 
 def _gl_context(width: int, height: int) -> Any:

@@ -14,8 +14,7 @@ from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.rendering import OffscreenRenderer
 from asm_gym.envs.robots import PHYSICS_FREQ, chains_of, free_first_joints, robots_for
-from asm_gym.envs.senses import Senses
-from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS
+from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
 from asm_gym.spec import StreamSpec

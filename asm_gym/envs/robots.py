@@ -69,26 +69,16 @@ def is_compilable(robot: Any, arm: str) -> bool:
 def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
     """Return one row for each arm; the settings of controllers that do not run compiled stay 0."""
     n = len(parts)
-    one, each = (n,), (n, JOINTS)
-    whole, real = np.int64, np.float64
+    indices = ("joints", "site", "site_body", "root", "base", "wrench", "kind")
+    fields: dict[str, Any] = {name: np.zeros(n, np.int64) for name in indices}
+    fields |= {name: np.zeros((n, JOINTS), np.int64) for name in ("qpos", "dofs", "motors")}
+    fields |= {name: np.zeros((n, JOINTS)) for name in ("kp", "kd", "rest")}
     arms = Arms(
-        joints=np.zeros(one, whole),
-        qpos=np.zeros(each, whole),
-        dofs=np.zeros(each, whole),
-        motors=np.zeros(each, whole),
-        site=np.zeros(one, whole),
-        site_body=np.zeros(one, whole),
-        root=np.zeros(one, whole),
-        base=np.zeros(one, whole),
-        wrench=np.zeros(one, whole),
         bodies=_padded([bodies(model, robot) for robot, _ in parts]),
         tree=_padded([_carried_dofs(model, robot) for robot, _ in parts]),
-        kind=np.zeros(one, whole),
-        kp=np.zeros(each, real),
-        kd=np.zeros(each, real),
-        compensate=np.zeros(one, bool),
-        rest=np.zeros(each, real),
-        limits=np.tile([-np.inf, np.inf], (*each, 1)),
+        compensate=np.zeros(n, bool),
+        limits=np.tile([-np.inf, np.inf], (n, JOINTS, 1)),
+        **fields,
     )
     for a, (robot, arm) in enumerate(parts):
         _fill_indices(arms, a, model, robot, arm)

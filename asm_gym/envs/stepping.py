@@ -15,8 +15,7 @@ from asm_gym.envs.actions import Actions
 from asm_gym.envs.backend import ObjectSensors
 from asm_gym.envs.edits import SimulatorEdits
 from asm_gym.envs.robots import PHYSICS_FREQ
-from asm_gym.envs.senses import Reading, Senses
-from asm_gym.envs.sensors import Corruption
+from asm_gym.envs.sensors import Corruption, Reading, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import Channel
 
@@ -118,11 +117,6 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     def _read(self, within_step: bool = False) -> Reading:
         rest = self._action, self.corruptions, self.np_random
         return self._senses.read(self.simulation, self._objects, *rest, within_step=within_step)
-
-    @property
-    def felt(self) -> NDArray[np.float64]:
-        """(K, N) noiseless loads in each physics substep since the row began; see ``felt_channels``."""
-        return self.simulation.felt
 
     @property
     def motors(self) -> NDArray[np.intp]:

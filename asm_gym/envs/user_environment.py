@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from asm_gym.envs.backend import reseed
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
-UNITS = (("joint_pos", "rad"), ("joint_vel", "rad/s"), ("joint_acc", "rad/s2"), ("_pos", "m"))
-"""Of what robosuite senses, by how its name ends or what it holds; the first that fits."""
+UNITS = {"_cos": "1", "_sin": "1", "joint_pos": "rad", "joint_vel": "rad/s", "joint_acc": "rad/s2", "_pos": "m"}
+"""Of what robosuite senses, by what its name holds; the first that fits."""
 HEADLESS = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
 
 
@@ -34,8 +34,7 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         numbers = {k: np.size(v) for k, v in sensed.items() if not k.endswith("-state") and np.size(v)}
         own = tuple(robot.robot_model.naming_prefix for robot in self.robosuite_env.robots)
         self._all, self._own = tuple(numbers), tuple(k for k in numbers if k.startswith(own))
-        size = sum(numbers.values())
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (sum(numbers.values()),), np.float32)
         low, high = self.robosuite_env.action_spec
         self.action_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         channels = [Channel(k, numbers[k], _unit(k), group="joint" if "joint" in k else "sense") for k in self._own]
@@ -44,7 +43,6 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.stream_spec = StreamSpec((*channels, action), self.dt, robots)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Another scene; the same for the same ``seed``."""
         super().reset(seed=seed)
         if seed is not None or not self._seeded:
             reseed(self.robosuite_env, self.np_random)
@@ -53,12 +51,10 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return _row(sensed, self._all), self._info(sensed, np.zeros(self.action_space.shape or (), np.float32))
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """One control step with an action (A,) in the box of the robot's controllers."""
         sensed, reward, _, _ = self.robosuite_env.step(np.asarray(action, np.float64))
         return _row(sensed, self._all), float(reward), False, False, self._info(sensed, action)
 
     def close(self) -> None:
-        """End the simulation."""
         self.robosuite_env.close()
 
     def _info(self, sensed: dict[str, Any], action: NDArray[np.float32]) -> dict[str, Any]:
@@ -67,10 +63,8 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def _row(sensed: dict[str, Any], names: tuple[str, ...]) -> NDArray[np.float32]:
-    row: NDArray[np.float32] = np.concatenate([np.ravel(sensed[name]) for name in names]).astype(np.float32)
-    return row
+    return np.asarray(np.concatenate([np.ravel(sensed[name]) for name in names]), np.float32)
 
 
 def _unit(name: str) -> str:
-    trigonometric = name.endswith(("_cos", "_sin"))
-    return "1" if trigonometric else next((unit for part, unit in UNITS if part in name), "1")
+    return next((unit for part, unit in UNITS.items() if part in name), "1")

@@ -1,69 +1,40 @@
 """Timed perturbations with a ground-truth label: what goes wrong, when, for how long, and how badly."""
 
-from asm_gym.faults.action import (
-    ActionBias,
-    ActionDelay,
-    ActionDrop,
-    ActionNoise,
-    ActionRepeat,
-    ActionScale,
-    Adversary,
-    SignFlip,
-)
-from asm_gym.faults.actuator import Backlash, GripperOpens, JointFriction, StuckJoint, WeakGripper, WeakJoint
-from asm_gym.faults.base import Fault
-from asm_gym.faults.body import CablePull, Collision, HeldByPerson, Payload, Push, Touch
-from asm_gym.faults.object import Heavy, Missing, ObjectFriction, ObjectMass, Slip, Snatch, Teleport
-from asm_gym.faults.sensor import (
-    Bias,
-    Delay,
-    Drift,
-    Dropout,
-    Freeze,
-    FrozenEncoder,
-    Noise,
-    NoisySensors,
-    Scale,
-    Spikes,
-)
-
-__all__ = [
-    "ActionBias",
-    "ActionDelay",
-    "ActionDrop",
-    "ActionNoise",
-    "ActionRepeat",
-    "ActionScale",
-    "Adversary",
-    "Backlash",
-    "Bias",
-    "CablePull",
-    "Collision",
-    "Delay",
-    "Drift",
-    "Dropout",
-    "Fault",
-    "Freeze",
-    "FrozenEncoder",
-    "GripperOpens",
-    "Heavy",
-    "HeldByPerson",
-    "JointFriction",
-    "Missing",
-    "Noise",
-    "NoisySensors",
-    "ObjectFriction",
-    "ObjectMass",
-    "Payload",
-    "Push",
-    "Scale",
-    "SignFlip",
-    "Slip",
-    "Snatch",
-    "Spikes",
-    "StuckJoint",
-    "Teleport",
-    "Touch",
-    "WeakGripper",
-    "WeakJoint",
-]
+from asm_gym.faults.action import ActionBias as ActionBias
+from asm_gym.faults.action import ActionDelay as ActionDelay
+from asm_gym.faults.action import ActionDrop as ActionDrop
+from asm_gym.faults.action import ActionNoise as ActionNoise
+from asm_gym.faults.action import ActionRepeat as ActionRepeat
+from asm_gym.faults.action import ActionScale as ActionScale
+from asm_gym.faults.action import Adversary as Adversary
+from asm_gym.faults.action import SignFlip as SignFlip
+from asm_gym.faults.actuator import Backlash as Backlash
+from asm_gym.faults.actuator import GripperOpens as GripperOpens
+from asm_gym.faults.actuator import JointFriction as JointFriction
+from asm_gym.faults.actuator import StuckJoint as StuckJoint
+from asm_gym.faults.actuator import WeakGripper as WeakGripper
+from asm_gym.faults.actuator import WeakJoint as WeakJoint
+from asm_gym.faults.base import Fault as Fault
+from asm_gym.faults.body import CablePull as CablePull
+from asm_gym.faults.body import Collision as Collision
+from asm_gym.faults.body import HeldByPerson as HeldByPerson
+from asm_gym.faults.body import Payload as Payload
+from asm_gym.faults.body import Push as Push
+from asm_gym.faults.body import Touch as Touch
+from asm_gym.faults.object import Heavy as Heavy
+from asm_gym.faults.object import Missing as Missing
+from asm_gym.faults.object import ObjectFriction as ObjectFriction
+from asm_gym.faults.object import ObjectMass as ObjectMass
+from asm_gym.faults.object import Slip as Slip
+from asm_gym.faults.object import Snatch as Snatch
+from asm_gym.faults.object import Teleport as Teleport
+from asm_gym.faults.sensor import Bias as Bias
+from asm_gym.faults.sensor import Delay as Delay
+from asm_gym.faults.sensor import Drift as Drift
+from asm_gym.faults.sensor import Dropout as Dropout
+from asm_gym.faults.sensor import Freeze as Freeze
+from asm_gym.faults.sensor import FrozenEncoder as FrozenEncoder
+from asm_gym.faults.sensor import Noise as Noise
+from asm_gym.faults.sensor import NoisySensors as NoisySensors
+from asm_gym.faults.sensor import Scale as Scale
+from asm_gym.faults.sensor import Spikes as Spikes

@@ -139,14 +139,10 @@ def _always(drawn: Drawn) -> dict[str, Any]:
 
 
 def register_fault(name: str, make: Kind | str) -> None:
-    """Register a kind of fault, in this process and in its workers.
+    """Register a kind of fault, in this process and in its workers; raise ValueError where the name is taken.
 
     Args:
         make: is called with a ``Drawn`` and a severity, 0 to 2; or ``module:name`` of it.
-
-    Raises:
-        ValueError: the name is taken.
-        ImportError: there is no such module.
 
     Example:
         >>> from asm_gym import register_fault
@@ -172,9 +168,8 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
 
 def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:
     """Return the fault of one kind and severity for the episode with this seed."""
-    make = KINDS.find(kind)
     check_choice("severity", severity, SEVERITIES)
-    return make(draw(env, onset, seed), SEVERITIES.index(severity))
+    return KINDS.find(kind)(draw(env, onset, seed), SEVERITIES.index(severity))
 
 
 def harmless_variation(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> Fault:

@@ -25,8 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from asm_gym.episode import Episode
 from asm_gym.policies import rollout
-from asm_gym.policies.network import NetworkPolicy, describe
-from asm_gym.policies.sb3 import network
+from asm_gym.policies.network import NetworkPolicy, describe, network
 from asm_gym.rollouts.parallel import Progress
 
 ACTOR_SHARE = 0.05

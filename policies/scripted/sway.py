@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.base import PolicyState
+from asm_gym.policies.base import StatefulPolicy
 from asm_gym.spec import control_period
 
 Floats = NDArray[np.float64]
 
 
-class Swaying:
+class Swaying(StatefulPolicy):
     """Sways smoothly in a finite Box of actions: each number a sine of its own, and coloured noise."""
 
     WIDTH, NOISE, COLOUR = 0.4, 0.05, 0.7
@@ -41,7 +41,7 @@ class Swaying:
         self.width = self.WIDTH * self.rng.uniform(0.8, 1.2, self.size)
         self.frequency = 0.5 + 0.3 * np.linspace(0.0, 1.0, self.size)  # [Hz]
 
-    def act(self, observation: Any) -> Floats:
+    def intended(self, observation: Any) -> Floats:
         """Return the action (A,) before noise."""
         wave: Floats = self.middle + self.half * self.width * self.sine()
         return wave
@@ -51,16 +51,13 @@ class Swaying:
         now: Floats = np.sin(2 * np.pi * self.frequency * self.t + self.phase)
         return now
 
-    def predict(
-        self,
-        observation: Any,
-        state: PolicyState = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], PolicyState]:
+    def begin(self, observation: Any) -> None:
+        return None
+
+    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the action and the state as it was."""
         self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(self.size)
-        chosen = (self.act(observation) + self.noise).reshape(self.space.shape)
+        chosen = (self.intended(observation) + self.noise).reshape(self.space.shape)
         self.t += self.dt
         return np.clip(chosen, self.space.low, self.space.high).astype(np.float32), state
 
@@ -70,7 +67,7 @@ class Pusher(Swaying):
 
     POSE = np.array([-0.3, 0.4, 0.0, -0.6, 0.0, -0.4, 0.0])
 
-    def act(self, observation: Any) -> Floats:
+    def intended(self, observation: Any) -> Floats:
         towards = self.POSE + self.width * self.sine() - observation[:7]
         return np.asarray(1.5 * towards - 0.3 * observation[7:14], np.float64)
 
@@ -84,7 +81,7 @@ class Arm(Swaying):
         self.poses = 0.7 * np.cumsum(np.vstack([np.zeros(7), self.rng.uniform(-0.6, 0.6, (4, 7))]), axis=0)
         self.width = self.rng.uniform(0.02, 0.08, 7)
 
-    def act(self, observation: Any) -> Floats:
+    def intended(self, observation: Any) -> Floats:
         now, soon = self.reference(self.t), self.reference(self.t + self.dt)
         return np.asarray((soon - now) / self.dt + 4.0 * (now - observation[:7]), np.float64)
 
