@@ -343,10 +343,8 @@ def test_an_environment_without_a_body_is_not_told_to_babble():
 
 
 def test_an_argument_of_robosuite_is_refused_by_name():
-    with pytest.raises(TypeError, match=r"asm_gym/Lift-v0 takes robot=, got robots='Panda'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'robots'"):
         gym.make("asm_gym/Lift-v0", robots="Panda")
-    with pytest.raises(ValueError, match="makes Lift, got task='Door'"):
-        gym.make("asm_gym/Lift-v0", task="Door")
 
 
 def own_class():

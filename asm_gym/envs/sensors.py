@@ -194,12 +194,12 @@ class Senses:
         """Everything that is measured, whether or not the stream carries it."""
         chosen = tuple(c for c in spec.channels if c.group in groups)
         self.stream_spec = StreamSpec(chosen, dt, source) if chosen else None
-        self._carried = _indices(spec, [c.name for c in chosen])
+        self._carried = _columns(spec, [c.name for c in chosen])
         self._noise = spec.noise * noise
         self._steps = spec.resolution if noise else np.zeros(spec.size)
         self._needs_objects = "object" in groups
         names = [c.name for c in spec.channels if c.name.endswith(_OBSERVED) or c.group == "object"]
-        self._observed = _indices(spec, names)
+        self._observed = _columns(spec, names)
         self._slices = {name: spec.slices[name] for name in names}
         self._flat = flat
         self.sizes = {name: s.stop - s.start for name, s in self._slices.items()}
@@ -250,5 +250,5 @@ def _box(size: int) -> spaces.Space[Any]:
     return spaces.Box(-_BOUND, _BOUND, (size,), np.float32)
 
 
-def _indices(spec: StreamSpec, names: list[str]) -> NDArray[np.intp]:
+def _columns(spec: StreamSpec, names: list[str]) -> NDArray[np.intp]:
     return np.array([i for n in names for i in range(spec.size)[spec.slices[n]]], dtype=np.intp)
