@@ -17,7 +17,6 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
 KIND = "episode"
-
 ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
 """Arrays of a file, and the kinds of numbers that each may have."""
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, short_repr, typed
 
-MOTOR = "action"
-"""The group that holds the commanded action."""
+MOTOR = "action"  # the group that holds the commanded action
 
 
 @dataclass(frozen=True)

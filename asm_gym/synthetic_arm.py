@@ -18,7 +18,6 @@ from asm_gym.compilation import compiled
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 Floats = NDArray[np.float64]
-
 JOINTS, SUBSTEPS, DT = 7, 10, 0.01
 MASS = np.array([2.5, 2.5, 1.5, 1.5, 0.5, 0.5, 0.2])  # [kg m²]
 GRAVITY = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]

@@ -14,8 +14,7 @@ from asm_gym.extras import needed_for
 from asm_gym.registries import Registry
 from asm_gym.validation import check_choice, check_number, check_text
 
-ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
-"""Arms that the tasks are tested with."""
+ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")  # arms that the tasks are tested with
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,7 @@ TASKS = {
 }
 """Every task by its name."""
 
-OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")
-"""Tasks of ``register_task``, by name."""
+OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")  # tasks of ``register_task``, by name
 
 
 def register_task(

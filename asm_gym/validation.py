@@ -31,7 +31,6 @@ from numpy.typing import ArrayLike, NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
 SHOWN = 80  # characters of a refused value that a message shows
 
 

@@ -12,15 +12,9 @@ from numpy.typing import NDArray
 from asm_gym.policies.base import Policy, StatefulPolicy
 from asm_gym.policies.registry import make_policy
 
-BANG_STEPS = 10
-"""Control steps for which a bang-bang policy goes on in one direction."""
-
-TURNS_AT = 40
-"""Control step in which a healthy policy turns hostile."""
-
-LATE_STEPS = 10
-"""Delay of stale actions [control steps]."""
-
+BANG_STEPS = 10  # control steps for which a bang-bang policy goes on in one direction
+TURNS_AT = 40  # control step in which a healthy policy turns hostile
+LATE_STEPS = 10  # delay of stale actions [control steps]
 Floats = NDArray[np.floating[Any]]
 Rule = Callable[[int, np.random.Generator, int], Floats]
 """(A,) the action of a control step, by the generator of the episode and A."""

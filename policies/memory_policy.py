@@ -27,11 +27,8 @@ from asm_gym.policies.base import StatefulPolicy
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import typed
 
-FORGETS = 1.6
-"""τ [s]."""
-
-ENOUGH = 0.15
-"""θ: so long a command must be expected without a doubt [s]."""
+FORGETS = 1.6  # τ [s]
+ENOUGH = 0.15  # θ: so long a command must be expected without a doubt [s]
 
 
 class Grip(NamedTuple):

@@ -85,9 +85,7 @@ class NetworkPolicy(StatefulPolicy):
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
         shapes = [W.shape for W, _ in self.layers]
         if not shapes or len(shapes[0]) != 2:
-            raise ValueError(
-                f"a network needs at least one layer, with weights in two dimensions, got {shapes[0] if shapes else shapes}"
-            )
+            raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {shapes[:1]}")
         size = inputs = self.observation_size = int(shapes[0][1])
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:

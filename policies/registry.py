@@ -32,14 +32,11 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 }
 """The scripted expert of each task."""
 
-POLICIES = ("scripted", "hold", "sway")
-"""Names that ``make_policy`` knows, besides agents."""
-
+POLICIES = ("scripted", "hold", "sway")  # names that ``make_policy`` knows, besides agents
 REGISTERED: Registry[Callable[..., Policy]] = Registry("policy", "asm_gym.policies.registry:REGISTERED")
 """Policies that ``register_policy`` added."""
 
-SHIPPED = Path(__file__).resolve().parent / "agents"
-"""Trained agents that come with the package."""
+SHIPPED = Path(__file__).resolve().parent / "agents"  # trained agents that come with the package
 
 
 def register_policy(name: str, make: Callable[..., Policy] | str) -> None:

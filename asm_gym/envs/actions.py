@@ -13,8 +13,7 @@ from asm_gym.envs.robots import gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
 
-_CHANGES = ("OSC_POSE", "JOINT_POSITION")
-"""Controllers whose actions are changes of the arm's pose."""
+_CHANGES = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes of the arm's pose
 _LEAST, _MOST = np.float32(-1.0), np.float32(1.0)
 
 
@@ -33,8 +32,7 @@ class Actions:
         self._half = 0.5 * (high - self._low)
         self.space = spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
         self.size = int(self._low.size)
-        self.grippers = gripper_actions(env.robots)
-        """Indices of the numbers that command grippers."""
+        self.grippers = gripper_actions(env.robots)  # indices of the numbers that command grippers
 
     def checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action (A,) clipped to [-1, 1].

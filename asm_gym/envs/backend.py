@@ -20,8 +20,7 @@ from asm_gym.validation import check_choice, check_text
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
 
-IK_ROBOTS = ("Panda", "Sawyer")
-"""Arms that robosuite's inverse kinematics knows."""
+IK_ROBOTS = ("Panda", "Sawyer")  # arms that robosuite's inverse kinematics knows
 
 # Tasks that choose one of several objects for each episode: attributes with the objects and with the choice.
 _CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("nuts", "nut_id")}

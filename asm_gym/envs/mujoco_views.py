@@ -10,13 +10,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-JOINTS = 7
-"""The most joints an arm may have; shorter arms leave the rest unused."""
-
-FELT = JOINTS + 3
-"""Numbers that limits apply to: external torque of the joints, then force at the wrist."""
-
+JOINTS = 7  # the most joints an arm may have; shorter arms leave the rest unused
+FELT = JOINTS + 3  # numbers that limits apply to: external torque of the joints, then force at the wrist
 OSC_POSE, JOINT_POSITION = 0, 1
 
 

@@ -21,8 +21,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, short_repr
 
-LARGEST_PICTURE = 4096
-"""Height or width [pixels]."""
+LARGEST_PICTURE = 4096  # height or width [pixels]
 
 
 class RobosuiteEnv(SteppedEnv):
@@ -103,8 +102,7 @@ class RobosuiteEnv(SteppedEnv):
         self._ended = True
         self._steps_taken = 0
 
-        self.controller = controller
-        """Name of the arms' controller."""
+        self.controller = controller  # name of the arms' controller
         self.robosuite_env: Any = backend.make(
             self.task, self.robots, controller, control_freq, check_flag("reward_shaping", reward_shaping)
         )
@@ -116,8 +114,7 @@ class RobosuiteEnv(SteppedEnv):
         """Kinematic chains of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
         self.action_space = self._actions.space
-        self.gripper_actions = self._actions.grippers
-        """Indices of the action that command grippers."""
+        self.gripper_actions = self._actions.grippers  # indices of the action that command grippers
         self._build_spaces()
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:

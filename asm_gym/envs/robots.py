@@ -15,11 +15,8 @@ from asm_gym.envs.mujoco_views import JOINT_POSITION, JOINTS, OSC_POSE, Arms, In
 from asm_gym.tasks import ROBOTS, TaskSpec
 from asm_gym.validation import check_choice, check_text, short_repr
 
-PHYSICS_FREQ = 500
-"""Robosuite's physics rate [Hz]."""
-
-Part = tuple[Any, str]
-"""One of robosuite's robots, and the name of one of its arms."""
+PHYSICS_FREQ = 500  # robosuite's physics rate [Hz]
+Part = tuple[Any, str]  # one of robosuite's robots, and the name of one of its arms
 
 
 def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -23,14 +23,11 @@ if TYPE_CHECKING:
     from asm_gym.envs.backend import ObjectSensors
     from asm_gym.envs.simulation import Simulation
 
-Corruption = Callable[[NDArray[np.float64]], None]
-"""A sensor fault: edits a measured row in place."""
-
+Corruption = Callable[[NDArray[np.float64]], None]  # a sensor fault: edits a measured row in place
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
 """The channel groups of a stream by default, in the order of a row."""
 
-EXTRA_GROUPS = ("contact", "object")
-"""Groups that no real robot measures about itself."""
+EXTRA_GROUPS = ("contact", "object")  # groups that no real robot measures about itself
 
 
 class _Sensor(NamedTuple):
@@ -76,8 +73,7 @@ _SENSORS = (
     _Sensor("contact_force", "contact", "N", "mean", kernels.CONTACT),
     _Sensor("contact_force_peak", "contact", "N", "peak", kernels.CONTACT),
 )
-_TURNING = {"m": "rad", "m/s": "rad/s", "N": "N m"}
-"""Units of a gripper whose fingers turn."""
+_TURNING = {"m": "rad", "m/s": "rad/s", "N": "N m"}  # units of a gripper whose fingers turn
 
 
 class Proprioception:
@@ -102,8 +98,7 @@ class Proprioception:
             "site": views.site_xpos.ravel(),
             "body": data.xmat.ravel(),
         }
-        self.sources = tuple(sources.values())
-        """Arrays that the sensors read."""
+        self.sources = tuple(sources.values())  # arrays that the sensors read
         channels, where, names = [], [], list(sources)
         for i, (robot, arm) in enumerate(parts):
             indices, slides, stops = _indices(robot, arm)
@@ -123,8 +118,7 @@ class Proprioception:
                 channels.append(Channel(name, *about, resolution=sensor.resolution, stops=ends))
                 where += [(names.index(sensor.source), int(k)) for k in at]
         self.channels = tuple(channels)
-        self.where = np.array(where, np.int64)
-        """(P, 2) of each number its source and its index there."""
+        self.where = np.array(where, np.int64)  # (P, 2) of each number its source and its index there
 
 
 def _indices(robot: Any, arm: str) -> tuple[dict[str, NDArray[np.intp]], bool, tuple[tuple[float, float], ...]]:
@@ -155,8 +149,7 @@ _OBSERVED = (
     *("joint_position", "joint_velocity", "hand_position", "hand_orientation"),
     *("gripper_opening", "gripper_velocity"),
 )
-_BOUND = 100.0
-"""Observations are clipped to this, which keeps the Box true; nothing a task does comes near it."""
+_BOUND = 100.0  # observations are clipped to this, which keeps the Box true; nothing a task does comes near it
 
 
 class Reading(NamedTuple):

@@ -36,14 +36,12 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     _row_substeps: int
 
     def __init__(self, substeps: int) -> None:
-        self.substeps = substeps
-        """Physics substeps of a control step."""
+        self.substeps = substeps  # physics substeps of a control step
         self.corruptions: list[Corruption] = []
         """Sensor faults: each edits the measured row in place, after the noise."""
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         """Action faults: each replaces the commanded action."""
-        self.edits = SimulatorEdits()
-        """Changes of the simulator's numbers that will be undone."""
+        self.edits = SimulatorEdits()  # changes of the simulator's numbers that will be undone
         self.substep_hooks: list[Callable[[int], None]] = []
         """Called after every physics substep with its number in the control step; a hook may call ``measure()`` and
         ``command()``."""

@@ -15,16 +15,10 @@ from numpy.typing import NDArray
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.validation import check_choice, check_number, check_numbers, check_text
 
-Vector3 = tuple[float, float, float]
-"""In the world's axes."""
-
+Vector3 = tuple[float, float, float]  # in the world's axes
 Floats = NDArray[np.float64]
-
-MOST = 1e9
-"""No parameter is larger, so that nothing overflows."""
-
-LONGEST = 10_000
-"""The longest delay [control steps]."""
+MOST = 1e9  # no parameter is larger, so that nothing overflows
+LONGEST = 10_000  # the longest delay [control steps]
 
 
 Interface = Any

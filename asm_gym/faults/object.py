@@ -11,8 +11,7 @@ import numpy as np
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, Vector3, along, within
 
-_AWAY = np.array([8.0, 8.0, 0.5])
-"""Where a missing object lies [m]."""
+_AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
 
 
 def movable(env: RobosuiteEnv) -> dict[str, int]:

@@ -17,7 +17,6 @@ from asm_gym.registries import Registry, target
 from asm_gym.validation import check_choice
 
 SEVERITIES = ("mild", "medium", "strong")
-
 DEVELOPMENT, TEST = "development", "test"
 
 GROUPS: dict[str, tuple[str, ...]] = {

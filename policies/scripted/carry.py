@@ -23,7 +23,6 @@ from asm_gym.policies.scripted.geometry import (
 )
 
 REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
-
 _AHEAD = 1.0  # how far to turn the hand at once [rad]
 _ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
 _EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]

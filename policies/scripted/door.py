@@ -10,7 +10,6 @@ from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State
 from asm_gym.policies.scripted.geometry import UP, Pose, Vector, about, angle_between, move
 
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
-
 _TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
 _PRESSED = 1.55  # how far to ask for; its spring and the hand's give take some of it [rad]
 _BEFORE = 0.09  # how far in front of the handle to come from [m]

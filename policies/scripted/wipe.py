@@ -11,7 +11,6 @@ from asm_gym.policies.scripted.base import Expert, State
 from asm_gym.policies.scripted.geometry import Pose, Vector, gripping, move
 
 REACH, LOWER, WIPE, REST = range(4)
-
 _OVER = 0.06  # how high above the table the tool comes to the dirt [m]
 _PRESS = 0.2  # where the tool's face stands on the table's own plane and wipes, under about 23 N [action units]
 
