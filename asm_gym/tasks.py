@@ -69,7 +69,7 @@ OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")  # tasks of ``reg
 def register_task(
     name: str, make: Callable[..., gym.Env[Any, Any]] | type[Any] | str, horizon: int, **arguments: Any
 ) -> None:
-    """Register a user's environment as a task, here and in worker processes.
+    """Register a user's environment as a task, here and in worker processes; raise ValueError where the name is taken.
 
     Args:
         name: the Gymnasium id is ``asm_gym/<name>-v0``.
@@ -77,9 +77,6 @@ def register_task(
             sensors of a class of robosuite's environments become channels of the stream.
         horizon: control steps before an episode is truncated.
         arguments: of the environment: ``robots="Panda"``, ``controller_configs=…``.
-
-    Raises:
-        ValueError: the name is taken.
 
     Example:
         >>> import gymnasium as gym

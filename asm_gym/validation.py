@@ -1,14 +1,7 @@
 """Check arguments at the public boundary: refuse them in one line that names the argument and what it was.
 
-Numbers within bounds (NaN and booleans are none), names that exist, and arguments of the types that a function is
-annotated with:
-
-    @typed
-    def load_monitor(path: str | Path) -> CalibratedMonitor: ...
-
-    load_monitor(3)                    ArgumentTypeError: path must be str | Path, got 3
-
-``typed`` checks classes, methods of protocols, unions of them and items of sequences. It leaves numbers to
+Numbers lie within bounds (NaN and booleans are none), names exist, and ``typed`` compares arguments with a function's
+annotations: classes, methods of protocols, unions of them and items of sequences. It leaves numbers to
 ``check_number``, and skips names that a module imports for type checkers only.
 """
 

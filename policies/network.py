@@ -106,11 +106,7 @@ class NetworkPolicy(StatefulPolicy):
         self._low, self._high = np.full(size, -1.0, np.float32), np.ones(size, np.float32)
 
     def fit_to(self, env: gym.Env[Any, Any], whose: str) -> NetworkPolicy:
-        """Return this policy, bound to the action space of ``env``.
-
-        Raises:
-            ValueError: sizes differ, or the agent was trained in another environment; the message names both.
-        """
+        """Return this policy, bound to the actions of ``env``; raise ValueError where it was trained in another one."""
         spaces_of = {"observations": env.observation_space, "actions": env.action_space}
         for (what, space), size in zip(spaces_of.items(), (self.observation_size, self.action_size), strict=True):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
@@ -173,12 +169,7 @@ def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
 
 
 def read_archive(path: Path) -> NetworkPolicy:
-    """Read the agent that ``model.save`` wrote, of SAC, TD3, DDPG, PPO or A2C with an ``MlpPolicy``.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the archive is damaged, or is no such agent.
-    """
+    """Read what ``model.save`` wrote of SAC, TD3, DDPG, PPO or A2C with an ``MlpPolicy``; refuse anything else."""
     if not path.is_file():
         raise FileNotFoundError(f"no agent at {path}")
     saving = require("stable_baselines3.common.save_util", what="an agent of stable-baselines3")

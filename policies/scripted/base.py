@@ -108,6 +108,7 @@ class Expert(StatefulPolicy):
         """Indices of the action that move arms."""
         self._careful = set(inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
+        self._gain = 3.0 if self._careful else 2.0
 
     @abstractmethod
     def begin(self, observation: Any) -> State:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, Style, has_settled, over_first
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, has_settled, over_first
 from asm_gym.policies.scripted.geometry import (
     UP,
     Pose,
@@ -72,10 +71,6 @@ class CarryExpert(Expert):
     """An expert that carries objects one after another; the plan of its state is the present task, None at the end."""
 
     pace = 0.55
-
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
-        super().__init__(env, seed, style)
-        self._gain = 3.0 if self._careful else 2.0
 
     @abstractmethod
     def next_task(self, observation: Any) -> CarryTask | None:
