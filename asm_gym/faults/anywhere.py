@@ -6,6 +6,7 @@ A sensor is wrong by so many σ: its declared noise, or else its spread in a nom
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
@@ -94,16 +95,10 @@ class Target(NamedTuple):
     axis: int  # of the action
     half: float  # of that axis's range
     everything: tuple[str, ...]  # channels
-    onset: int
-    seed: int
 
     @property
     def sensor(self) -> dict[str, Any]:
-        return {"channel": self.channel, "element": self.element} | self.when
-
-    @property
-    def when(self) -> dict[str, Any]:
-        return {"onset": self.onset, "seed": self.seed}
+        return {"channel": self.channel, "element": self.element}
 
 
 Kind = Callable[[Target, int], tuple[Fault, ...]]
@@ -111,7 +106,7 @@ Kind = Callable[[Target, int], tuple[Fault, ...]]
 
 def _all(d: Target, kind: type[sensor.SensorFault], **how: Any) -> tuple[Fault, ...]:
     """Return the same fault of every channel."""
-    return tuple(kind(channel=name, element=None, **how, **d.when) for name in d.everything)
+    return tuple(kind(channel=name, element=None, **how) for name in d.everything)
 
 
 KINDS: dict[str, Kind] = {
@@ -124,14 +119,12 @@ KINDS: dict[str, Kind] = {
     "sense_delay": lambda d, s: (sensor.Delay(**d.sensor, steps=(1, 3, 6)[s]),),
     "late_rows": lambda d, s: _all(d, sensor.Delay, steps=(1, 3, 6)[s]),
     "lost_rows": lambda d, s: _all(d, sensor.Freeze, duration=(1, 5, 15)[s]),
-    "action_scale": lambda d, s: (action.ActionScale(factor=(0.9, 0.75, 0.5)[s], **d.when),),
-    "action_delay": lambda d, s: (action.ActionDelay(steps=(1, 3, 6)[s], **d.when),),
-    "action_drop": lambda d, s: (action.ActionDrop(probability=(0.1, 0.3, 0.7)[s], **d.when),),
-    "action_repeat": lambda d, s: (action.ActionRepeat(steps=(2, 4, 8)[s], **d.when),),
-    "action_bias": lambda d, s: (
-        action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s] * min(d.half, 5.0), **d.when),
-    ),
-    "sign_flip": lambda d, s: (action.SignFlip(axis=d.axis, duration=(3, 10, None)[s], **d.when),),
+    "action_scale": lambda d, s: (action.ActionScale(factor=(0.9, 0.75, 0.5)[s]),),
+    "action_delay": lambda d, s: (action.ActionDelay(steps=(1, 3, 6)[s]),),
+    "action_drop": lambda d, s: (action.ActionDrop(probability=(0.1, 0.3, 0.7)[s]),),
+    "action_repeat": lambda d, s: (action.ActionRepeat(steps=(2, 4, 8)[s]),),
+    "action_bias": lambda d, s: (action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s] * min(d.half, 5.0)),),
+    "sign_flip": lambda d, s: (action.SignFlip(axis=d.axis, duration=(3, 10, None)[s]),),
 }
 """Faults of each kind for an episode, at severity 0 to 2. Lost rows: every sensor keeps its last value meanwhile."""
 
@@ -161,5 +154,5 @@ def faults_anywhere(
     halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(np.float64)  # (A,)
     axis = int(rng.integers(len(halves)))
     element, spread, half = struck - place.start, float(sigma[struck]), float(halves[axis])
-    drawn = Target(name, element, spread, axis, half, tuple(spec.slices), onset, seed)
-    return KINDS[kind](drawn, SEVERITIES.index(severity))
+    drawn = Target(name, element, spread, axis, half, tuple(spec.slices))
+    return tuple(replace(fault, onset=onset, seed=seed) for fault in KINDS[kind](drawn, SEVERITIES.index(severity)))
