@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.config import reload_config
 from numba.core.registry import cpu_target
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -37,8 +38,9 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
     try:
         dispatcher: Any = numba.njit(cache=True, **how)(function)
     except RuntimeError:  # numba found no folder that it may write to
-        numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="asm-gym-numba-")
-        atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
+        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="asm-gym-numba-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        reload_config()  # type: ignore[no-untyped-call]
         dispatcher = numba.njit(cache=True, **how)(function)
     cache = _cache_of(dispatcher)
     if cache is not None:

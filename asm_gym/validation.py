@@ -210,7 +210,8 @@ def _is_sequence(value: Any) -> bool:
 
 def _within(number: float, **bounds: Unpack[Bounds]) -> bool:
     compare = {"low": operator.ge, "high": operator.le, "above": operator.gt, "below": operator.lt}
-    return all(bound is None or compare[name](number, bound) for name, bound in bounds.items())
+    given: dict[str, Any] = {**bounds}
+    return all(bound is None or compare[name](number, bound) for name, bound in given.items())
 
 
 def _described(what: str, **bounds: Unpack[Bounds]) -> str:

@@ -138,8 +138,7 @@ class RobosuiteEnv(SteppedEnv):
         self.measured_spec = self._senses.measured_spec
         """Everything that is measured, whether or not the stream carries it."""
         self.felt_channels = tuple(c for c in channels if c.name.endswith(("external_torque", "wrist_force")))
-        self.observation_layout = self._senses.sizes
-        """The observation's parts in order, and how many numbers each has."""
+        self.observation_layout = self._senses.sizes  # the observation's parts in order, and how many numbers each has
         self.observation_space = self.laid_out_space = self._senses.space()
 
     @property

@@ -42,8 +42,7 @@ class Simulation:
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
         robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self.parts]))
-        self.nominal = NominalDynamics(self.model, self.views, robots)
-        """The robots' own model of their dynamics."""
+        self.nominal = NominalDynamics(self.model, self.views, robots)  # the robots' own model of their dynamics
         n = len(self.parts)
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
         self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64))
@@ -70,8 +69,7 @@ class Simulation:
         self.moves = [slice(start + low, start + high) for start, (low, high) in zip(starts, splits, strict=False)]
         """Each arm's part of the action."""
         self._grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
-        self.compiled = all(is_compilable(robot, arm) for robot, arm in self.parts)
-        """Whether control runs compiled."""
+        self.compiled = all(is_compilable(robot, arm) for robot, arm in self.parts)  # whether control runs compiled
         self.arms = describe(self.parts, self.model)
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""

@@ -25,10 +25,8 @@ _UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("
 class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     """An environment whose control steps can be watched and changed from within."""
 
-    simulation: Simulation
-    """Physics, controllers and sensors of the loaded model."""
-    felt_channels: tuple[Channel, ...]
-    """Channels that contact limits apply to, of one arm after another."""
+    simulation: Simulation  # physics, controllers and sensors of the loaded model
+    felt_channels: tuple[Channel, ...]  # channels that contact limits apply to, of one arm after another
     _action: NDArray[np.float32]
     _actions: Actions
     _objects: ObjectSensors
@@ -37,8 +35,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def __init__(self, substeps: int) -> None:
         self.substeps = substeps  # physics substeps of a control step
-        self.corruptions: list[Corruption] = []
-        """Sensor faults: each edits the measured row in place, after the noise."""
+        self.corruptions: list[Corruption] = []  # sensor faults: each edits the measured row in place, after the noise
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         """Action faults: each replaces the commanded action."""
         self.edits = SimulatorEdits()  # changes of the simulator's numbers that will be undone

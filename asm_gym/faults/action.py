@@ -24,8 +24,7 @@ class ActionFault(HookedFault):
     anywhere = True
     hooks = "deliveries"
     groups = ("joint", "torque", "hand")
-    grippers_too: ClassVar[bool] = False
-    """Whether it acts on the numbers that command grippers as well."""
+    grippers_too: ClassVar[bool] = False  # whether it acts on the numbers that command grippers as well
 
     def check(self, env: Interface) -> None:
         axis = getattr(self, "axis", 0)

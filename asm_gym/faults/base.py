@@ -53,12 +53,9 @@ class Fault(ABC):
     duration: int | None = within(None, low=1)
     seed: int = within(0, low=0, high=2**63)
 
-    harmless: ClassVar[bool] = False
-    """A variation that should raise no alarm."""
-    anywhere: ClassVar[bool] = False
-    """Whether it needs no more than an ``Interface``."""
-    groups: ClassVar[tuple[str, ...]] = ()
-    """Groups of channels in which it shows first."""
+    harmless: ClassVar[bool] = False  # A variation that should raise no alarm
+    anywhere: ClassVar[bool] = False  # whether it needs no more than an ``Interface``
+    groups: ClassVar[tuple[str, ...]] = ()  # groups of channels in which it shows first
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -146,8 +143,7 @@ class JointFault(Fault):
     """One that acts on a ``joint``, counted from the base, 0 first; a second arm's go on after the first one's."""
 
     joint: int = 3
-    channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")
-    """Those in which it shows first."""
+    channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")  # those in which it shows first
 
     def check(self, env: RobosuiteEnv) -> None:
         count = len(env.motors)

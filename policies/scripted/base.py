@@ -26,12 +26,9 @@ class Style:
 
     noise: float = 0.05
     """Standard deviation of the action noise [action units]; correlated over about 0.2 s, as a hand's is."""
-    speed: float = 1.0
-    """Hand speed relative to the expert's usual one."""
-    speed_spread: float = 0.08
-    """Standard deviation of the speed between episodes."""
-    spread: float = 0.01
-    """Standard deviation of way-points between episodes [m]."""
+    speed: float = 1.0  # hand speed relative to the expert's usual one
+    speed_spread: float = 0.08  # standard deviation of the speed between episodes
+    spread: float = 0.01  # standard deviation of way-points between episodes [m]
 
     def __post_init__(self) -> None:
         for name in ("noise", "speed_spread", "spread"):
@@ -94,8 +91,7 @@ class Expert(StatefulPolicy):
         style: how much it varies.
     """
 
-    pace: ClassVar[float]
-    """Usual hand speed [action units]."""
+    pace: ClassVar[float]  # usual hand speed [action units]
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
         inner: Any = env.unwrapped
@@ -104,8 +100,7 @@ class Expert(StatefulPolicy):
         self.np_random = np.random.default_rng(seed)
         self.read = ObservationReader(env)
         size = int(np.prod(env.action_space.shape or ()))
-        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)
-        """Indices of the action that move arms."""
+        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)  # indices of the action that move arms
         self._careful = set(inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
         self._gain = 3.0 if self._careful else 2.0

@@ -85,10 +85,9 @@ def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vect
         closing: (3,) in the world; the hand's own direction where None.
         turns: after how much of a turn the direction is as good again [rad].
     """
-    own = hand[:2, 1]  # fingers move along the hand's y axis
-    angle = np.arctan2(own[1], own[0])
+    angle = yaw(hand[:, 1])  # fingers move along the hand's y axis
     if closing is not None:
-        heading = np.arctan2(closing[1], closing[0])
+        heading = yaw(closing)
         angle = heading + np.round((angle - heading) / turns) * turns
     y = np.array([np.cos(angle), np.sin(angle), 0.0])
     z = np.array([0.0, 0.0, -1.0])
