@@ -12,6 +12,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -82,11 +83,9 @@ def _cache_of(dispatcher: Any) -> Any:
 @lru_cache
 def _digest(folder: Path) -> str:
     """Return the digest of every source file in a folder, and of what compiles and links its code."""
-    try:
-        mujoco = version("mujoco")
-    except PackageNotFoundError:  # in a light install
-        mujoco = "none"
-    digest = hashlib.sha256(f"{numba.__version__} {mujoco}".encode())
+    digest = hashlib.sha256(numba.__version__.encode())
+    with suppress(PackageNotFoundError):  # in a light install
+        digest.update(version("mujoco").encode())
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -47,7 +47,6 @@ html_title = "asm-gym"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_copyright = False
-html_copy_source = False
 
 
 def write_commands(app: Sphinx) -> None:

@@ -123,8 +123,6 @@ def test_python_3_13_is_told_why_it_has_no_robosuite(machine: Any, monkeypatch: 
     assert "3.12" in check.remedy
 
 
-
-
 def test_the_doctor_imports_nothing_that_it_checks() -> None:
     code = (
         "import sys, asm_gym.scripts.doctor;"

@@ -176,8 +176,10 @@ class RobosuiteEnv(SteppedEnv):
             backend.reseed(env, self.np_random)
             self._seeded = True
         backend.choose_object(env, self.task)
-        draws = seed is not None and self.task.draws_shapes
-        env.hard_reset = draws and (self._is_edited() or not shapes.draw(env))
+        draws, nominal = seed is not None and self.task.draws_shapes, self.simulation.nominal
+        # What others edit would be mixed up with what is drawn.
+        edited = len(self.edits) > 0 or nominal.now() is not nominal.unedited
+        env.hard_reset = draws and (edited or not shapes.draw(env))
         env.reset()
         if draws:
             self._bind()
@@ -190,11 +192,6 @@ class RobosuiteEnv(SteppedEnv):
         self._reading = self._read()
         self._ended = False
         return self._senses.observation(self._reading.row), self._info(bool(env._check_success()))
-
-    def _is_edited(self) -> bool:
-        """Whether numbers of the model are edited, which would be mixed up with those that are drawn."""
-        nominal = self.simulation.nominal
-        return len(self.edits) > 0 or nominal.now() is not nominal.unedited
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Run one control step.

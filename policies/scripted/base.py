@@ -24,8 +24,7 @@ _STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 class Style:
     """How an expert varies; each is drawn anew for every episode."""
 
-    noise: float = 0.05
-    """Standard deviation of the action noise [action units]; correlated over about 0.2 s, as a hand's is."""
+    noise: float = 0.05  # standard deviation of the action noise [action units], correlated over about 0.2 s
     speed: float = 1.0  # hand speed relative to the expert's usual one
     speed_spread: float = 0.08  # standard deviation of the speed between episodes
     spread: float = 0.01  # standard deviation of way-points between episodes [m]
