@@ -83,9 +83,10 @@ def _cache_of(dispatcher: Any) -> Any:
 @lru_cache
 def _digest(folder: Path) -> str:
     """Return the digest of every source file in a folder, and of what compiles and links its code."""
-    digest = hashlib.sha256(numba.__version__.encode())
-    with suppress(PackageNotFoundError):  # in a light install
-        digest.update(version("mujoco").encode())
+    mujoco = "none"  # in a light install
+    with suppress(PackageNotFoundError):
+        mujoco = version("mujoco")
+    digest = hashlib.sha256(f"{numba.__version__} {mujoco}".encode())
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
