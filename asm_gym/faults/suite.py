@@ -31,8 +31,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         *("action_delay", "action_bias", "sign_flip", "adversary", "teleport", "heavy_object", "missing_object"),
     ),
 }
-"""Kinds to choose settings by, and kinds to report: half of each family, drawn once. A kind that is added is in
-neither. Settings that were chosen before 2026-11-22 had seen them all."""
+"""Kinds to choose settings by, and kinds to report: half of each family, drawn once; added kinds are in neither."""
 
 
 class Drawn(NamedTuple):
