@@ -14,11 +14,8 @@ from numpy.typing import NDArray
 class HoldsItself(Protocol):
     """An environment that can stay where it is, whatever its controller and the wrappers around it."""
 
-    holding: bool
-    """Set, the arms stay in the next control step, and the grippers keep what they were told; the step unsets it."""
-
-    keeps_holding: bool
-    """Set, no step unsets ``holding``: for wrappers in between that make several steps of one."""
+    holding: bool  # set, the arms stay in the next control step, and the grippers too; the step unsets it
+    keeps_holding: bool  # set, no step unsets ``holding``: for wrappers in between that make several steps of one
 
 
 class Hold:
@@ -41,10 +38,8 @@ class Hold:
         if not isinstance(space, spaces.Box):
             raise TypeError(f"a reflex needs a Box action space, got {space}")
         inner = env.unwrapped
-        self.env = env
-        """Where it acts; a guard refuses one that was made for another environment."""
-        self.explicit = safe_action is not None
-        """It does ``safe_action``, and knows of no environment."""
+        self.env = env  # a guard refuses one that was made for another environment
+        self.explicit = safe_action is not None  # it does that, and knows of no environment
         self._robot = inner if isinstance(inner, HoldsItself) and not self.explicit else None
         if safe_action is not None:
             self._rest = np.array(safe_action, np.float32)

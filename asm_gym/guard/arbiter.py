@@ -126,7 +126,6 @@ class Arbiter:
     """Decides who acts.
 
     Args:
-        count: n.
         rule: when control is handed back; None where no reflex ever acts.
         threshold: what surprise must exceed for an alarm.
         adaptive: how it follows the policies, from episode to episode; None where it does not.
@@ -191,8 +190,7 @@ class Arbiter:
         name = "" if transition is None else self._follow(robot, transition, row.response.name)
         name = name or ("override" if row.refused else "")
         if name:
-            why = f" ({row.response.why})" if row.response.why else ""
-            LOG.info("%s: surprise %.3g, threshold %.3g%s", name, row.surprise, self.threshold[robot], why)
+            LOG.info("%s: surprise %.3g, threshold %.3g%s", name, row.surprise, self.threshold[robot], row.response.why)
         acted_on = row.over or row.knocked or row.presses or name == "trial"
         return Decision(name, transition is not None and transition.to is State.REFLEX, acted_on)
 
@@ -203,8 +201,8 @@ class Arbiter:
             self._wait[i] *= 2 if self._on_trial[i] else 1
             counts[RETURNED, i] += 1
         else:
-            counts[ACTED, i], self._wait[i], counts[RETURNED, i] = 0, rule.try_after, 0
-        counts[HELD, i] = counts[FREE, i] = counts[CALM, i] = 0
+            self._wait[i], counts[[ACTED, RETURNED], i] = rule.try_after, 0
+        counts[[HELD, FREE, CALM], i] = 0
         self.state[i] = REFLEX
 
     def _count(self, robot: int, row: Judged) -> Situation:

@@ -24,12 +24,7 @@ class Fitted(NamedTuple):
 
     @classmethod
     def of(cls, monitor: Monitor, spec: StreamSpec) -> Self:
-        """Return a monitor that can watch such a stream.
-
-        Raises:
-            ValueError: it is for another stream (the message names what differs), or would never alarm.
-            RuntimeError: it is not calibrated.
-        """
+        """Return a monitor that can watch such a stream. Raises what ``check_monitor`` does."""
         return cls(monitor, check_monitor(monitor, spec), _parts(monitor))
 
     @property

@@ -85,11 +85,7 @@ class _Incident:
 
 
 class ContactEstimator:
-    """Tells what presses, by one completion of all that a contact shows in.
-
-    Args:
-        completion: of the memory that watches; its stream measures external torques.
-    """
+    """Tells what presses, by one completion of all that a contact shows in, in a stream with external torques."""
 
     def __init__(self, completion: Completion) -> None:
         spec = completion.spec
@@ -101,12 +97,10 @@ class ContactEstimator:
         self._joints = named(spec, "joint_position")
 
     def beyond(self, rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """Return (T - 1, J) external torques of all rows (T, D) but the first, beyond what is expected [its standard
-        deviations]."""
+        """Return (T - 1, J) external torques of rows (T, D) but the first, beyond what is expected [deviations]."""
         expected = self._completion.complete(self._filling, self._completion.lift(rows))
         beyond = (rows[:, self._filling.columns] - expected)[1:, self._own]
-        found: NDArray[np.float64] = beyond / self._filling.error[self._own]
-        return found
+        return np.asarray(beyond / self._filling.error[self._own])
 
     def presses(self, rows: NDArray[np.floating[Any]]) -> bool:
         """Return whether something presses in the last of the rows (T, D)."""

@@ -135,14 +135,10 @@ class HandAgainstJoints:
 
     def refined(self, robot: int, row: Floats, missing: Mask, error: Floats) -> Floats:
         """Return a completed row (D,), of errors (D,), with ``missing`` angles (D,) as the hand tells of them."""
-        free, unseen = missing[self._q], missing[self._x]
-        now = row[self._at]
-        if not free.any() or unseen.all() or not np.isfinite(now).all():
-            return row
-        angles = now[: len(self._q)]
-        found, _ = self._explained(robot, now, free, unseen, (angles, error[self._q]))
-        self._good[robot] = np.where(free, found, angles)
-        row[self._q] = self._good[robot]
+        free, unseen, now = missing[self._q], missing[self._x], row[self._at]
+        if free.any() and not unseen.all() and np.isfinite(now).all():
+            found, _ = self._explained(robot, now, free, unseen, (row[self._q], error[self._q]))
+            row[self._q] = self._good[robot] = np.where(free, found, row[self._q])
         return row
 
     def _named(self, robot: int, case: _Case, free: Mask, unseen: Mask) -> Contradiction | None:
@@ -184,26 +180,16 @@ def no_hand(count: int) -> tuple[Any, ...]:
 
 
 @compiled
-def compare(
-    rows: Any,
-    at: Any,
-    axes: Any,
-    anchors: Any,
-    hand: Any,
-    late: Any,
-    weights: Any,
-    gain: float,
-    cap: float,
-    limit: float,
-    mean: Any,
-    size: Any,
-    whole: Any,
-    recent: Any,
-    kept: Any,
-    good: Any,
-) -> bool:
-    """Take rows (n, D) into the running means (n, 9), and what else is known of each robot, in place; return whether
-    any contradicts itself."""
+def compare(rows: Any, at: Any, *known: Any) -> bool:
+    """Take rows (n, D) into the running means (n, 9), and what else is known of each robot, in place.
+
+    Args:
+        at, known: ``HandAgainstJoints.arguments``.
+
+    Returns:
+        Whether any robot contradicts itself.
+    """
+    axes, anchors, hand, late, weights, gain, cap, limit, mean, size, whole, recent, kept, good = known
     some = False
     J, newest = axes.shape[1], recent.shape[1] - 1
     row = np.empty(len(at))

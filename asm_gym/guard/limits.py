@@ -22,7 +22,6 @@ class EpisodeLimits:
     """The contact limits that n robots have now.
 
     Args:
-        robots: whose.
         limits: None for none.
         acts: an arm stays once a limit was passed, and its hand is slowed down; else limits are only compared with.
 

@@ -75,14 +75,11 @@ class Motions:
     def choose(
         self, actions: Floats32, acts: Mask, idle: Mask, names: Sequence[str], seen: Callable[[int], Any]
     ) -> tuple[Command, Mask]:
-        """Return what is to be done, and whose policy wanted what is no action.
+        """Return what is to be done, and whose policy wanted what is no action; see ``Engine.act``.
 
         Args:
-            actions: (n, A) that the policies want.
             acts: (n,) the reflex acts.
-            idle: (n,) nothing is done, for an episode begins.
             names: of the reflex that each is to do.
-            seen: the observation of a robot.
         """
         robots, executed = self._robots, np.empty_like(actions)
         if not _clip(actions, robots.low, robots.high, acts, idle, executed, self._last):
@@ -90,10 +87,8 @@ class Motions:
         failures, brakes = {}, np.zeros(len(actions), bool)
         overridden: Mask = (acts | ~np.isfinite(actions).all(axis=1)) & ~idle
         refused = overridden & ~acts
-        for robot in np.flatnonzero(overridden | idle).tolist():
-            if idle[robot]:
-                executed[robot] = np.clip(0.0, robots.low, robots.high)
-                continue
+        executed[idle] = np.clip(0.0, robots.low, robots.high)
+        for robot in np.flatnonzero(overridden).tolist():
             said = ""
             if refused[robot]:
                 said = f"policy: the action must be finite, got {short_repr(actions[robot].tolist())}"
@@ -130,10 +125,9 @@ class Motions:
                 action[robots.grip] = before[robots.grip]
         except Exception as error:
             # Whatever a user's policy does, an alarm must not end in no action.
-            said = f"reflex: {error!r}"
-            self._warn(robot, said, "the robot holds instead")
+            self._warn(robot, f"reflex: {error!r}", "the robot holds instead")
             stay = self._stay(before)
-            return stay.action, stay.brakes, said
+            return stay.action, stay.brakes, f"reflex: {error!r}"
         return np.clip(action, robots.low, robots.high), motion.brakes, ""
 
     def _asked(self, robot: int, name: str, seen: Callable[[int], Any]) -> Motion:

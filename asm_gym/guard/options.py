@@ -95,13 +95,7 @@ class GuardOptions:
         return chosen
 
     def rule(self, graded: bool, dt: float, rows_per_step: int) -> ReleaseRule:
-        """Return when control is handed back.
-
-        Args:
-            graded: limits of time, strikes and impulse hold where none are given.
-            dt: control period [s].
-            rows_per_step: rows of the stream in a control step.
-        """
+        """Return when control is handed back, for a control period of ``dt`` [s]; ``graded`` sets more limits."""
 
         def rows(steps: int | None, seconds: float) -> float:
             if steps is None and not graded:

@@ -32,7 +32,6 @@ class Repair:
     """Keeps the rows of one robot well, from the first row on in which a sense is not believed.
 
     Args:
-        completion: of the memory that watches the stream.
         robot: which of those that ``hands`` know.
         before: (D,) the row before; None where there is none.
         read: (D,) which columns the policy reads, of whose completion something depends.

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.events import EVENTS, KNOCK
+from asm_gym.detection.events import EVENTS
 from asm_gym.guard.arbiter import ENDED, STATES, Decision
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
 from asm_gym.guard.robots import NOTHING
-from asm_gym.guard.severity import Severity
+from asm_gym.guard.severity import KNOCKED, Severity
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
 
@@ -24,8 +24,6 @@ where its joints say, a number is not finite."""
 
 INFO = "full", "flat"
 """How much stands in ``info``."""
-
-KNOCKED = EVENTS.index(KNOCK)
 
 Mask = NDArray[np.bool_]
 
@@ -59,8 +57,7 @@ class RowReport(NamedTuple):
     @property
     def gave_up(self) -> Mask:
         """(n,) the episode is to end."""
-        found: Mask = self.state == ENDED
-        return found
+        return np.asarray(self.state == ENDED)
 
     @property
     def ends(self) -> Mask:
@@ -73,7 +70,7 @@ class RowReport(NamedTuple):
     def with_failures(self, failures: Mapping[int, str]) -> RowReport:
         """Return the same with what failed before the rows, by robot."""
         both = {i: joined(said, self.failure.get(i, "")) for i, said in failures.items()}
-        return self._replace(failure={**self.failure, **both}) if failures else self
+        return self._replace(failure={**self.failure, **both})
 
     def of(self, which: Mask) -> RowReport:
         """Return the same with nothing to say of all robots but those of ``which`` (n,)."""

@@ -44,28 +44,18 @@ a bounded time, and where a sense of force says that it presses with no more tha
 
 
 class Response(NamedTuple):
-    """What is to be done about a row of one robot.
+    """What is to be done about a row of one robot."""
 
-    Attributes:
-        name: one of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked.
-        cause: as ``info["asm"]["cause"]`` says it.
-        touched: whether the contact that was responded to is still there; None where that is not known, and where it
-            has lasted for so long that it may never end.
-        case: one of ``CAUSES``: the row of the table that was followed; empty where none was.
-    """
-
-    name: str
-    cause: dict[str, Any]
-    touched: bool | None = None
-    case: str = ""
+    name: str  # one of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked
+    cause: dict[str, Any]  # as ``info["asm"]["cause"]`` says it
+    touched: bool | None = None  # the contact is still there; None: not known, or so long that it may never end
+    case: str = ""  # one of ``CAUSES``: the row of the table that was followed; empty where none was
 
     @property
     def why(self) -> str:
-        """The cause in words."""
-        if not self.cause["family"]:
-            return ""
-        part = " ".join(filter(None, (self.case or self.cause["family"], self.cause["part"])))
-        return f"{part}, {self.cause['probability']:.2f}"
+        """The cause in words, in brackets; empty where there is none."""
+        family, part, probability = self.cause["family"], self.cause["part"], self.cause["probability"]
+        return f" ({' '.join(filter(None, (self.case or family, part)))}, {probability:.2f})" if family else ""
 
 
 NO_RESPONSE = Response("", as_info(None))
@@ -85,8 +75,6 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
         check_choice("cause", cause, CAUSES)
         check_choice("response", response, RESPONSES)
         if cause.endswith(PRESSING) and response in GOING_ON:
-            raise ValueError(
-                f"{short_repr(response)} would let an arm go on that presses: {cause} takes hold, comply, retract or "
-                "stop"
-            )
+            possible = ", ".join(name for name in RESPONSES if name not in GOING_ON)
+            raise ValueError(f"{short_repr(response)} would let an arm go on that presses: {cause} takes {possible}")
     return {**DEFAULT, **(table or {})}
