@@ -22,8 +22,7 @@ from asm_gym.guard.responses import GOING_ON, Response
 
 LOG = logging.getLogger("asm_gym.safety")
 
-MOSTLY_AFTER = 200
-"""Rows under the policy after which it is said that most of them alarm."""
+MOSTLY_AFTER = 200  # rows under the policy after which it is said that most of them alarm
 
 MOSTLY = (
     "{} of the first {} rows under this policy alarm: something is wrong all the time, or the memory does not know "
@@ -136,18 +135,13 @@ class Arbiter:
     ) -> None:
         self.running = None if adaptive is None else adaptive.start(threshold)
         self._rule, self._acts = rule or ReleaseRule(), rule is not None
-        self.threshold = np.full(count, threshold)
-        """(n,) of the episodes that run."""
-        self.state = np.zeros(count, np.int8)
-        """(n,) who acts next, a place in ``STATES``."""
+        self.threshold = np.full(count, threshold)  # (n,) of the episodes that run
+        self.state = np.zeros(count, np.int8)  # (n,) who acts next, a place in ``STATES``
         self.confirmed = np.zeros(count, bool)
         """(n,) an alarm in this episode was no false one: it went on while the reflex acted, or the user says so."""
-        self.counts = np.zeros((len(COUNTS), count), np.int64)
-        """(10, n) in the order of ``COUNTS``."""
-        self.largest = np.full(count, -np.inf)
-        """(n,) the largest surprise in this episode, while the policy acted."""
-        self.response = [""] * count
-        """To the last alarm of each."""
+        self.counts = np.zeros((len(COUNTS), count), np.int64)  # (10, n) in the order of ``COUNTS``
+        self.largest = np.full(count, -np.inf)  # (n,) the largest surprise in this episode, while the policy acted
+        self.response = [""] * count  # to the last alarm of each
         self._wait = np.full(count, self._rule.try_after)  # rows of override before a trial
         self._on_trial = np.zeros(count, bool)
 

@@ -136,10 +136,8 @@ class Diagnostician:
         self._contact = None
         if diagnosis is not None and named(spec, "external_torque").size:
             self._contact = ContactEstimator(diagnosis.completion)
-        self.incidents: dict[int, _Incident] = {}
-        """Of the robots that have not been calm for long enough."""
-        self.rows = WINDOW + 1 + round(LASTING["actuator"] / spec.dt)
-        """How many rows it looks back."""
+        self.incidents: dict[int, _Incident] = {}  # of the robots that have not been calm for long enough
+        self.rows = WINDOW + 1 + round(LASTING["actuator"] / spec.dt)  # how many rows it looks back
 
     def begin(self, robot: int) -> None:
         """A new episode of a robot."""

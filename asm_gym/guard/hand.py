@@ -29,9 +29,7 @@ WINDOW = 10  # rows by which the sensor at fault is told from others
 LEFT = 30.0  # of |z|², nine numbers: what no sensor at fault leaves more of
 SURER = 10.0  # how much more of |z|², in all of these rows, the next best sensor leaves; else a moment is waited for
 TURNS = 0.2  # the speed that is sensed of a joint is that of its angle where they differ by less [rad/s]
-
-NEEDS = "joint_position", "joint_velocity", "hand_position", "hand_orientation"
-"""Channels that it takes, of each arm."""
+NEEDS = "joint_position", "joint_velocity", "hand_position", "hand_orientation"  # channels that it takes, of each arm
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -87,8 +85,7 @@ class HandAgainstJoints:
         self._cases: dict[int, _Case] = {}
         how = self._at, *self._geometry, self._late, self._weights, self._gain, ONE * LIMIT / self._gain, LIMIT
         state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
-        self.arguments: tuple[Any, ...] = *how, *state
-        """Of ``compare``, after the rows."""
+        self.arguments: tuple[Any, ...] = *how, *state  # of ``compare``, after the rows
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""

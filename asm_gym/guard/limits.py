@@ -38,10 +38,8 @@ class EpisodeLimits:
         self._gentle = None if limits is None else limits.stricter(GENTLE, CAREFUL * limits.hand_speed)
         self._careful_steps = max(1, round(CAREFUL_S / robots.dt))
         self._careful = np.zeros(robots.count, np.int64)  # (n,) steps of the policy for which its hand goes slower
-        self.now = (limits,) * robots.count
-        """Of each robot; the same objects as long as nothing has changed."""
-        self.steady = True
-        """They stay as they are while no arm presses."""
+        self.now = (limits,) * robots.count  # of each robot; the same objects as long as nothing has changed
+        self.steady = True  # they stay as they are while no arm presses
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""

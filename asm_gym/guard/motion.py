@@ -17,8 +17,7 @@ from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.validation import as_float32, short_repr
 
-USUAL_GAIN = 0.1
-"""Weight of the newest step in the external torque that is taken to be usual."""
+USUAL_GAIN = 0.1  # weight of the newest step in the external torque that is taken to be usual
 
 Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -55,8 +54,7 @@ class Motions:
         self._take_over, self._warn, self._reacts = take_over, warn, reflexes is not None or bool(policies)
         self._last = np.zeros((robots.count, robots.rest.size), np.float32)  # executed last
         self._before = np.zeros_like(self._last)  # executed last before the override
-        self.nobody: Mask = np.zeros(robots.count, bool)
-        """(n,) never written to."""
+        self.nobody: Mask = np.zeros(robots.count, bool)  # (n,) never written to
         self._memory: dict[int, Any] = {}  # the states of policies that are in an override
         self.begin(~self.nobody)
 

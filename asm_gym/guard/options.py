@@ -14,8 +14,7 @@ from asm_gym.guard.responses import responses_from
 from asm_gym.policies.base import Policy
 from asm_gym.validation import check_flag, check_number, short_repr
 
-ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")
-"""Names that ``on_alarm`` takes."""
+ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")  # names that ``on_alarm`` takes
 
 OnAlarm = str | Policy | Callable[[Any], Policy]
 """What ``on_alarm`` takes: a name, a policy, or what makes a policy for an environment."""

@@ -17,9 +17,7 @@ from asm_gym.spec import StreamSpec
 
 Mask = NDArray[np.bool_]
 
-GRADED = "graded"
-"""Not a reflex, but the one that severity and cause ask for."""
-
+GRADED = "graded"  # not a reflex, but the one that severity and cause ask for
 PATH = 10  # how many actions a retreat undoes
 COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
 TOLERATED, TOLERATED_ALONE = (
@@ -48,8 +46,7 @@ class Reflexes:
     def __init__(self, robots: Robots, spec: StreamSpec, on_alarm: str) -> None:
         n, actions = robots.count, robots.rest.size
         wanted = ("hold", "retract", "comply") if on_alarm == GRADED else (on_alarm,)
-        self.torques = named(spec, "external_torque")
-        """(J,) columns of external torques."""
+        self.torques = named(spec, "external_torque")  # (J,) columns of external torques
         lacks = dict(robots.refused)
         if not self.torques.size:
             lacks.setdefault("comply", NO_TORQUE)
@@ -57,8 +54,7 @@ class Reflexes:
             if name in lacks:
                 raise ValueError(lacks[name])
         self.possible = frozenset(name for name in wanted if name not in lacks)
-        self.feels = bool(self.possible - {"hold", "recall"})
-        """One of them depends on what was felt and done."""
+        self.feels = bool(self.possible - {"hold", "recall"})  # one of them depends on what was felt and done
         self.robots = robots
         self.tolerated = TOLERATED if on_alarm == GRADED else TOLERATED_ALONE
         # (n, J) external torque now, and what is usual while the policy acts [N m]

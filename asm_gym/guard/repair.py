@@ -51,8 +51,7 @@ class Repair:
         self._patience, self._longest = round(TRUST_S / spec.dt), round(LONGEST_S / spec.dt)
         self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
         self._settle = 2 * completion.senses.lag + 1  # rows in which changes are taken from what was not yet repaired
-        self.missing = np.zeros(spec.size, bool)
-        """(D,) which columns are completed."""
+        self.missing = np.zeros(spec.size, bool)  # (D,) which columns are completed
         self.settling = 0
         """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
         self._returned = np.zeros(spec.size, np.int64)  # (D,) rows until its changes are those of the sense again

@@ -22,8 +22,7 @@ REASONS = CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING
 """Reasons of an alarm: a contact limit was passed, something failed, surprise is over its threshold, a hand is not
 where its joints say, a number is not finite."""
 
-INFO = "full", "flat"
-"""How much stands in ``info``."""
+INFO = "full", "flat"  # how much stands in ``info``
 
 Mask = NDArray[np.bool_]
 

@@ -13,14 +13,12 @@ LASTING = {"contact": 1.0, "actuator": 2.5}
 has been pressed for most of that time and has not turned. Where the policy goes on in spite of another cause, and the
 arm is pressed so and does not move, it is a lasting contact."""
 
-PRESSING = "pressing"
-"""The arm presses harder than healthy motion does, whatever the cause is taken for."""
+PRESSING = "pressing"  # the arm presses harder than healthy motion does, whatever the cause is taken for
 
 CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
 """What a table of responses says something about."""
 
-GOING_ON = ("go on", "complete")
-"""Responses to an alarm under which the policy acts."""
+GOING_ON = ("go on", "complete")  # responses to an alarm under which the policy acts
 
 RESPONSES = (*GOING_ON, "hold", "comply", "retract", "stop")
 """Let the policy go on; complete the sensors at fault and go on; stay and keep the grip, yielding to more than a hold's
@@ -58,8 +56,7 @@ class Response(NamedTuple):
         return f" ({' '.join(filter(None, (self.case or family, part)))}, {probability:.2f})" if family else ""
 
 
-NO_RESPONSE = Response("", as_info(None))
-"""Where nothing is to be done."""
+NO_RESPONSE = Response("", as_info(None))  # where nothing is to be done
 
 
 def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:

@@ -16,8 +16,7 @@ from asm_gym.spec import Channel, StreamSpec
 
 NO_COLUMNS = np.zeros(0, np.intp)
 
-NOTHING: Mapping[int, Any] = MappingProxyType({})
-"""Where there is nothing to say of any robot."""
+NOTHING: Mapping[int, Any] = MappingProxyType({})  # where there is nothing to say of any robot
 
 
 def named(spec: StreamSpec, channel: str) -> NDArray[np.intp]:
