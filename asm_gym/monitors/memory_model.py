@@ -21,17 +21,17 @@ from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
-from asm_gym.memory.state import MemoryState, RowHistory
+from asm_gym.memory.state import MemoryState
 from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.row_kernel import LearnedMemory, expect_rows, uninitialised
-from asm_gym.monitors.stream_model import StreamModel
+from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_shapes
 
 
-class MemoryModel(StreamModel):
+class MemoryModel(ScaledModel):
     """The temporal network, association, and what is learned on top of them: motor association and names of skills.
 
     Args:
@@ -39,7 +39,6 @@ class MemoryModel(StreamModel):
         schedule: how to learn and to infer.
 
     Attributes:
-        senses_: how it reads a row.
         network_: the weights; None before ``fit``.
         motor_: the motor association; None before ``learn_to_act``.
         completion_: completes missing senses; None where they are too many, and once some were lost.
@@ -51,11 +50,9 @@ class MemoryModel(StreamModel):
     def __init__(
         self, spec: StreamSpec, hidden_size: int, association_size: int, schedule: Schedule, dynamics: str = TRACES
     ) -> None:
-        super().__init__(spec)
+        super().__init__(spec, rows_apart(spec.dt))
         self.dynamics = dynamics
         self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
-        self.lag = rows_apart(spec.dt)
-        self.shortest = 1 + self.lag
         self.network_: TemporalNetwork | None = None
         self.compiled_: LearnedMemory | None = None
         self.motor_: Motor | None = None
@@ -116,15 +113,13 @@ class MemoryModel(StreamModel):
         association = Association(**{n: arrays[n] for n in Association._fields})
         how = self.schedule.iterations, self.schedule.prior_precision, self.schedule.sensory_precision
         super().restore(learned, skills)
-        self.senses_, self.motor_ = senses, Motor.found(learned, senses)
-        self.completion_ = Completion.found(learned, senses)
+        self.motor_, self.completion_ = Motor.found(learned, self.senses_), Completion.found(learned, self.senses_)
         self._take(dynamics.network(dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how))
         return self
 
     def start(self, batch: int) -> MemoryState:
         state, named = (np.zeros((batch, n), np.float32) for n in (self.network.hidden_size, len(self.skills_)))
-        history = RowHistory.empty(batch, self.lag, self.spec.size)
-        return MemoryState(self.network.at_rest(batch), state, history, named)
+        return MemoryState(self.network.at_rest(batch), state, super().start(batch), named)
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
         new = uninitialised(state)
