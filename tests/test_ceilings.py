@@ -10,8 +10,8 @@ import pytest
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.evidence import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.detection.evidence_detection import EvidenceDetection
-from asm_gym.monitors import ceilings, make_monitor
-from asm_gym.monitors.ceilings import learn_ceilings
+from asm_gym.monitors import calibration, make_monitor
+from asm_gym.monitors.calibration import learn_ceilings
 from tests.memories import SMALL, sine_memory
 from tests.streams import sine_episodes, sine_spec
 
@@ -34,7 +34,7 @@ def shaken(episodes, column=3, by=4.0):
 def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_were_learned(asm):
     hours = list(shaken(sine_episodes(150, seed=20)))
     before, detection = asm.detection.detector_, asm.detection
-    maxima = ceilings._worst_of(asm, detection, hours)
+    maxima = calibration._worst_of(asm, detection, hours)
     learn_ceilings(asm, hours)
     np.testing.assert_allclose((maxima <= asm.detection.detector_.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
     np.testing.assert_allclose(asm.detection.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)

@@ -2,7 +2,7 @@
 
 row → memory: errors, context → whiten → accumulate → value, attribution
 
-What else a memory can do takes it as an argument: ``skills``, ``ceilings``, ``shipped``.
+What else a memory can do takes it as an argument: ``skills``, ``calibration.learn_ceilings``, ``shipped``.
 """
 
 from __future__ import annotations

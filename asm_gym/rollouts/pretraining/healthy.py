@@ -14,7 +14,7 @@ from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.episode import Episode, spans
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.ceilings import learn_ceilings
+from asm_gym.monitors.calibration import learn_ceilings
 from asm_gym.spec import StreamSpec
 
 HELD_OUT = 3
