@@ -113,20 +113,21 @@ class Motions:
 
     def _reaction(self, robot: int, name: str, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
         """Return what is done, whether the robot brakes, and what failed; where nothing reacts the robot stays."""
-        robots, before = self._robots, self._before[robot]
+        robots, failed = self._robots, ""
+        stay = Motion(robots.rest, robots.brakes, keeps_grip=robots.rests)
         try:
-            motion = self._asked(robot, name, seen) if self._reacts else self._stay(before)
-            action = as_float32(motion.action).reshape(-1)
+            motion = self._asked(robot, name, seen) if self._reacts else stay
+            action = np.array(as_float32(motion.action)).reshape(-1)
             if action.shape != robots.rest.shape or not np.isfinite(action).all():
                 raise ValueError(f"a finite action of {robots.rest.size} numbers was needed, got {action}")
-            if motion.keeps_grip:
-                action[robots.grip] = before[robots.grip]
         except Exception as error:
             # Whatever a user's policy does, an alarm must not end in no action.
-            self._warn(robot, f"reflex: {error!r}", "the robot holds instead")
-            stay = self._stay(before)
-            return stay.action, stay.brakes, f"reflex: {error!r}"
-        return np.clip(action, robots.low, robots.high), motion.brakes, ""
+            failed = f"reflex: {error!r}"
+            self._warn(robot, failed, "the robot holds instead")
+            motion, action = stay, robots.rest.copy()
+        if motion.keeps_grip:
+            action[robots.grip] = self._before[robot, robots.grip]
+        return np.clip(action, robots.low, robots.high), motion.brakes, failed
 
     def _asked(self, robot: int, name: str, seen: Callable[[int], Any]) -> Motion:
         if self._reflexes is not None:
@@ -136,13 +137,7 @@ class Motions:
             state = policy.begin(self._before[robot].copy())
         given = {"state": state, "episode_start": np.array([fresh]), "deterministic": True}
         action, self._memory[robot] = policy.predict(seen(robot), **given)
-        return Motion(np.array(action), keeps_grip=False)
-
-    def _stay(self, before: Floats32) -> Motion:
-        action = self._robots.rest.copy()
-        if self._robots.rests:
-            action[self._robots.grip] = before[self._robots.grip]
-        return Motion(action, self._robots.brakes, keeps_grip=False)
+        return Motion(action, keeps_grip=False)
 
 
 @partial(compiled, calls=(".",))
