@@ -6,7 +6,6 @@ showed. A run lives in one folder and can be killed at any time: what was record
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -178,7 +177,3 @@ def babble(args: Args, console: Console) -> None:
 
 
 main = partial(run, "babble", Args, babble)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

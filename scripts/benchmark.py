@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -198,7 +197,3 @@ def measure(args: Args, console: Console) -> None:
 
 
 main = partial(run, "benchmark", Args, measure)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ same command continues with the rest.
 
 from __future__ import annotations
 
-import sys
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -77,7 +76,3 @@ def collect(args: Args, console: Console) -> None:
 
 
 main = partial(run, "collect", Args, collect)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

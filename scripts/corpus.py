@@ -6,7 +6,6 @@ used already.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -53,7 +52,3 @@ def make(args: Args, console: Console) -> None:
 
 
 main = partial(run, "corpus", Args, make)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,7 +8,6 @@ the memory and every number as JSON.
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -159,7 +158,3 @@ def demonstrate(args: Args, console: Console) -> None:
 
 
 main = partial(run, "demo", Args, demonstrate)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -102,7 +102,3 @@ def report(args: Args, console: Console) -> int:
 
 
 main = partial(run, "doctor", Args, report)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import platform
-import sys
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -196,7 +195,3 @@ def evaluate(args: Args, console: Console) -> None:
 
 
 main = partial(run, "evaluate", Args, evaluate)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

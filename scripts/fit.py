@@ -216,7 +216,3 @@ def fit(args: Args, console: Console) -> None:
 
 
 main = partial(run, "fit", Args, fit)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,7 +6,6 @@ them all. Exit code 1: it cannot be read as it is.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -85,7 +84,3 @@ def differences(first: Inspection, other: Inspection) -> str:
 
 
 main = partial(run, "inspect", Args, inspect)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,7 +5,6 @@ asm_gym.monitors.shipped.from_hub("OWNER/NAME") reads it there.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,7 +34,3 @@ def upload(args: Args, console: Console) -> None:
 
 
 main = partial(run, "push", Args, upload)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,7 +7,6 @@ JSON, and judged once more on seeds of its own.
 from __future__ import annotations
 
 import json
-import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -92,7 +91,3 @@ def train_agent(args: Args, console: Console) -> None:
 
 
 main = partial(run, "train", Args, train_agent)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -48,7 +47,3 @@ def warm_up(args: Args, console: Console) -> None:
 
 
 main = partial(run, "warmup", Args, warm_up)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

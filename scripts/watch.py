@@ -146,7 +146,3 @@ def watch(args: Args, console: Console) -> int:
 
 
 main = partial(run, "watch", Args, watch)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from asm_gym.episode import Episode
 from asm_gym.memory.free_energy import Before, FreeEnergy
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.scripts.reproduce.expression import Backpropagated
 from asm_gym.scripts.reproduce.handwriting import DT as PEN_DT
 from asm_gym.scripts.reproduce.handwriting import NOISE, Letter, written
@@ -126,6 +125,12 @@ class MemoryDriver:
         self.attribution = surprise.attribution
         return surprise.value
 
+    def before(self, n: int) -> Before:
+        """Return what was known before the next row of stream ``n``."""
+        at, memory = slice(n, n + 1), self.state.model
+        last = memory.history.before[at, 0]
+        return Before(memory.traces[at], last, memory.history.earlier[at, 0], last)
+
 
 class RecurrentDriver:
     """A GRU that commands the arm, and has no surprise."""
@@ -168,6 +173,7 @@ def closed_loop(
     pushes = PUSH * rng.choice([-1.0, 1.0], (B, 2))
     found = Course(np.zeros((T, B, 2)), np.zeros((T, B)), np.full((T, B), np.nan), np.full(B, T), [""] * B, threshold)
     q, stuck = np.zeros((B, 2)), np.zeros(B)
+    senses = {"encoder": ENCODERS, "hand_position": HAND}
     for t in range(T):
         if t < CUE:
             rows = cues[t].copy()
@@ -176,7 +182,7 @@ def closed_loop(
             u = driver.command()
             if way == "pushed, lowest F" and energy is not None:
                 for n in np.flatnonzero(found.alarm < t):
-                    u[n] = energy.reaction(moment(driver.state, n))
+                    u[n] = energy.reaction(driver.before(n))
             q = q + DT * u + pushes / 2 * (way.startswith("pushed") and EVENT <= t < EVENT + 2)
             rows = measured(q, u, rng)
         if way.startswith("stuck") and t >= EVENT:
@@ -188,22 +194,10 @@ def closed_loop(
                 rows[n, SPEC.slices[found.attributed[n]]] = np.nan
         if energy is not None and way in JUDGED and EVENT - 5 <= t < EVENT + WINDOW:
             for n in range(B):
-                before = moment(driver.state, n)
+                before = driver.before(n)
                 found.energy[t, n] = energy.terms(before, rows[n], energy.inferred(before, rows[n])).total
         found.path[t], found.surprise[t] = hand(q), driver.read(rows)
         for n in np.flatnonzero((found.surprise[t] > threshold) & (found.alarm == T)) if t >= EVENT else ():
-            found.alarm[n], found.attributed[n] = t, most_surprising(driver.attribution[n])
+            shares = np.nan_to_num(driver.attribution[n])
+            found.alarm[n], found.attributed[n] = t, max(senses, key=lambda name: shares[senses[name]].sum())
     return found
-
-
-def most_surprising(attribution: Floats) -> str:
-    """Return the channel of senses with the largest share."""
-    senses = {c.name: SPEC.slices[c.name] for c in SPEC.channels if SPEC.slices[c.name] != COMMAND}
-    return max(senses, key=lambda name: float(np.nan_to_num(attribution[senses[name]]).sum()))
-
-
-def moment(state: MonitorState, n: int) -> Before:
-    """Return what was known before the next row of stream ``n``."""
-    at, memory = slice(n, n + 1), state.model
-    before = memory.history.before[at, 0]
-    return Before(memory.traces[at], before, memory.history.earlier[at, 0], before)
