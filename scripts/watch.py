@@ -36,7 +36,6 @@ from asm_gym.validation import check_number
 
 AT_ONCE = 64
 """Episodes scored side by side."""
-
 SHOWN_ROWS = 20
 """Alarms printed; the file holds them all."""
 

@@ -51,10 +51,8 @@ from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 
 COMPARED = ("W_C", "W_F", "W_D")
 """The synapses that are learned."""
-
 CUE = 10
 """Rows that are read before a stream runs on alone."""
-
 TARGETS = {
     "energy": "gradient of the energy",
     "error": "gradient of the prediction error",
@@ -62,10 +60,8 @@ TARGETS = {
 }
 RATES = {"local": 3e-3, "backpropagation": 1e-2}
 """Learning rate of a change a row, and of one a batch."""
-
 PRIOR_PRECISION = 30.0
 """Π_z."""
-
 ITERATIONS = 5
 """Inference steps of learning."""
 
