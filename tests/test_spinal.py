@@ -35,9 +35,9 @@ def test_what_is_felt_is_what_the_stream_says_the_mean_of(free):
     felt, row = robot.simulation.felt, robot.measured
     assert felt.shape == (25, 10)
     at = robot.measured_spec.slices
-    means = np.concatenate([row[at[c.name]] for c in robot.simulation.felt_channels])
-    noise = np.concatenate([[c.noise] * c.size for c in robot.simulation.felt_channels])
-    assert [c.size for c in robot.simulation.felt_channels] == [7, 3]
+    means = np.concatenate([row[at[c.name]] for c in robot.felt_channels])
+    noise = np.concatenate([[c.noise] * c.size for c in robot.felt_channels])
+    assert [c.size for c in robot.felt_channels] == [7, 3]
     np.testing.assert_allclose(felt.mean(axis=0), means, atol=6 * noise.max())
 
 
