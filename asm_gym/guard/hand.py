@@ -144,8 +144,8 @@ class HandAgainstJoints:
         for n in range(len(left)):
             wrong = np.append(free, unseen)
             wrong[n] = True
-            both = np.split(wrong, [len(free)])
-            left[n] = sum(self._explained(robot, row, *both)[1] for row in rows)
+            angles, hand = wrong[: len(free)], wrong[len(free) :]
+            left[n] = sum(self._explained(robot, row, angles, hand)[1] for row in rows)
         best, next_best = np.argsort(left)[:2]
         case.waited += 1
         if left[next_best] - left[best] < SURER and case.waited * self._gain <= 1.0:

@@ -135,7 +135,7 @@ class Motions:
         policy, fresh, state = self._policies[robot], robot not in self._memory, self._memory.get(robot)
         if fresh and isinstance(policy, Hold):  # any other policy starts as in a new episode
             state = policy.begin(self._before[robot].copy())
-        given = {"state": state, "episode_start": np.array([fresh]), "deterministic": True}
+        given: dict[str, Any] = {"state": state, "episode_start": np.array([fresh]), "deterministic": True}
         action, self._memory[robot] = policy.predict(seen(robot), **given)
         return Motion(action, keeps_grip=False)
 
