@@ -14,7 +14,7 @@ from asm_gym.detection.repetition import Repetition, evidence_steps
 from asm_gym.memory.energy import activate
 from asm_gym.memory.readout import KEPT, SMALLEST, certainty
 from asm_gym.memory.recall import continued
-from asm_gym.memory.state import UNSURE, MemoryState
+from asm_gym.memory.temporal import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.memory_model import MemoryModel

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.gaps import blamed, reason
-from asm_gym.data.rows import SLOWER, Pace
+from asm_gym.data.rows import Pace
 from asm_gym.guard.checks import check_monitor
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions
@@ -37,33 +37,20 @@ Floats32 = NDArray[np.float32]
 
 _log = logging.getLogger("asm_gym.lerobot")
 
-ON_ALARM = ("hold", "stop", "slow", "monitor")
-"""Stay where the arm stood until it is quiet; stay until ``reset``; go a fifth of the way; only report. Under ``slow``
-the arm presses on, only later: it is for arms that can hurt nobody."""
+ON_ALARM = ("hold", "stop", "monitor")  # stay where the arm stood until it is quiet; stay until ``reset``; only report
 
-SLOW = 0.2
-"""Share of the way from where the arm stands to where the policy wants it."""
-
-_SENSED, _COMMANDED = (re.compile(rf"{what}(?:\[(.+)\])?") for what in (r"observation\.state", "action"))
+_MOTOR = re.compile(r"(?P<what>observation\.state|action)\[(?P<motor>.*\D.*)\]")
 _GRIPPER = re.compile(r".*(gripper|hand|jaw).*")
 
 
-class _Reaction:
-    """Stays where the arm stood when the override began, or goes a part of the policy's way.
-
-    It observes where to stay (A,), and where the policy wants the arm (A,); its state is where the arm stood (A,).
-    """
-
-    def __init__(self, slow: bool) -> None:
-        self._slow = slow
+class _Stay:
+    """Stays where the arm stood when the override began: the first observation (A,), which is also its state."""
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[Floats32, Any]:
-        present, wanted = observation
-        held = present if state is None else np.where(np.isfinite(state), state, present)
-        way = SLOW * (np.where(np.isfinite(wanted), wanted, present) - present)
-        return (present + way if self._slow else held).astype(np.float32), held
+        held = observation if state is None else np.where(np.isfinite(state), state, observation)
+        return held.astype(np.float32), held
 
 
 class LeRobotGuard:
@@ -99,7 +86,7 @@ class LeRobotGuard:
         self.monitor: Any = load_monitor(Path(monitor)) if isinstance(monitor, str | Path) else monitor
         self._spec = self.monitor.spec
         check_monitor(self.monitor, self._spec)
-        self._labels = [_motor_of(label) for label in self._spec.labels]
+        self._motors = [_motor_of(label) for label in self._spec.labels]
         self._clock = clock
         try:
             from lerobot.processor import ProcessorStep
@@ -130,16 +117,16 @@ class LeRobotGuard:
         """Return what is to be sent in place of an action; nothing where no place to stay is known."""
         self._pace.lost(self._clock())
         if self._pace.change:
-            _log.warning(self._pace.change if self._pace.kind != SLOWER else self._pace.change.partition(":")[0])
+            _log.warning(self._pace.change)
         if self._engine is None:
             self._names = tuple(action)
             self._engine = self._guard()
         engine, acts = self._engine, self.on_alarm != "monitor"
         wanted = np.array([action.get(name, np.nan) for name in self._names], np.float64)
-        seen = np.array([self._present(name, observation) for name in self._names]), wanted
+        present = np.array([self._present(name, observation) for name in self._names])
         asked = wanted.astype(np.float32)
 
-        executed: Floats32 = engine.act(asked[None], lambda _: seen).actions[0] if acts else asked
+        executed: Floats32 = engine.act(asked[None], lambda _: present).actions[0] if acts else asked
         row = self._row(observation, executed)
         overriding, in_alarm = bool(engine.overriding[0]), self.alarm
         report = engine.judge(row[None], executed[None])
@@ -149,7 +136,7 @@ class LeRobotGuard:
             if not (overriding or in_alarm):
                 _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
         if self.intervened and not overriding:
-            executed = engine.act(asked[None], lambda _: seen).actions[0]
+            executed = engine.act(asked[None], lambda _: present).actions[0]
             engine.amend(self._row(observation, executed)[None])
         if self.intervened:
             action = {n: float(value) for n, value in zip(self._names, executed, strict=True) if np.isfinite(value)}
@@ -161,7 +148,7 @@ class LeRobotGuard:
         dt = self._spec.dt
         low, high, unknown = (np.full(len(self._names), value, np.float32) for value in (-np.inf, np.inf, np.nan))
         robots = Robots(1, low, high, rest=unknown, rests=False, dt=dt)
-        policies: list[Policy] = [] if self.on_alarm == "monitor" else [_Reaction(self.on_alarm == "slow")]
+        policies: list[Policy] = [] if self.on_alarm == "monitor" else [_Stay()]
         quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
         options = GuardOptions(policies[0] if policies else "monitor", quiet_rows, 1.0, contact_limits=None)
         return Engine(robots, self.monitor, options, policies)
@@ -185,14 +172,9 @@ class LeRobotGuard:
 
     def _row(self, observation: Mapping[str, Any], action: Floats32) -> Floats32:
         """Return (D,) the row of the stream; NaN where something is missing."""
-        sensed = dict(enumerate(v for v in observation.values() if isinstance(v, float)))
-        told = dict(enumerate(action.tolist()))  # a dataset that names no motors numbers them
-        known: list[Mapping[Any, Any]] = [
-            {**sensed, **observation},
-            {**told, **dict(zip(self._names, action.tolist(), strict=True))},
-        ]
-        places = ((where, int(name) if name.isdigit() else name) for where, name in self._labels)
-        return np.array([float(known[where].get(name, np.nan)) for where, name in places], np.float32)
+        commanded = dict(zip(self._names, action.tolist(), strict=True))
+        known = ((commanded if is_command else observation).get(name, np.nan) for is_command, name in self._motors)
+        return np.array([float(value) for value in known], np.float32)
 
     def get_config(self) -> dict[str, Any]:
         """Return what LeRobot saves of this step."""
@@ -212,10 +194,10 @@ class LeRobotGuard:
 
 def _motor_of(label: str) -> tuple[bool, str]:
     """Return whether a number of the memory was commanded, and LeRobot's name of its motor."""
-    for commanded, pattern in enumerate((_SENSED, _COMMANDED)):
-        found = pattern.fullmatch(label)
-        if found:
-            return bool(commanded), found[1] or "0"
-    raise ValueError(
-        f"the memory must be of a LeRobot dataset, observation.state and action, got the channel {label!r}"
-    )
+    found = _MOTOR.fullmatch(label)
+    if found is None:
+        raise ValueError(
+            "the memory must be of a LeRobot dataset that names its motors, observation.state[MOTOR] and "
+            f"action[MOTOR], got the channel {label!r}"
+        )
+    return found["what"] == "action", found["motor"]

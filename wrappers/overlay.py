@@ -21,20 +21,14 @@ from asm_gym.episode import spans
 from asm_gym.spec import control_period
 from asm_gym.validation import check_text
 
-SURE = 0.9
-"""Least probability at which a cause is named."""
+SURE = 0.9  # least probability at which a cause is named
 
 PAPER, INK, FAINT, RULE = "#14171c", "#f2f2f2", "#a0a8b2", "#343a42"
 CURVE, ALARM, FAULT = "#56B4E9", "#FF4B3E", "#E69F00"
 
-SECONDS = 5.0
-"""Time that the chart shows [s]."""
-
-LOW, HIGH = 0.03, 30.0
-"""The vertical axis, in thresholds."""
-
-SCALE = 2
-"""Curves are drawn at this size and averaged down."""
+SECONDS = 5.0  # time that the chart shows [s]
+LOW, HIGH = 0.03, 30.0  # the vertical axis, in thresholds
+LEVELS = ((10.0, "× 10", RULE, FAINT), (1.0, "threshold", INK, INK), (0.1, "× 0.1", RULE, FAINT))  # its marks
 
 
 class Step(NamedTuple):
@@ -129,29 +123,19 @@ def strip_chart(width: int, height: int, history: list[Step], shown: int) -> NDA
         ratio = np.clip(np.where(np.isnan(ratio), HIGH, ratio), LOW, HIGH)
         return bottom - (bottom - top) * np.log(ratio / LOW) / np.log(HIGH / LOW)
 
-    ratios = np.array([step.ratio for step in history])
-    edges = width * (1.0 - (len(history) - np.arange(len(history) + 1)) / shown)  # [px] of each step
-    image = _paper(width, height, (float(y(10.0)), float(y(1.0)), float(y(0.1))))
+    image = Image.new("RGB", (width, height), PAPER)
     pen = ImageDraw.Draw(image)
-    runs = [spans(np.array([getattr(step, name) for step in history], bool)) for name in ("fault", "alarm")]
-    bars = ("fault", runs[0], 0, FAULT), ("alarm", runs[1], height - bar, ALARM)
-    for _, found, start_y, colour in bars:
-        for start, stop in found:
-            left, right = edges[start] * SCALE, edges[stop] * SCALE
-            pen.rectangle((left, start_y * SCALE, right, (start_y + bar) * SCALE - 1), fill=colour)
+    for level, _, line, _ in LEVELS:
+        pen.line([(0, y(level)), (width, y(level))], fill=line)
+    edges = width * (1.0 - (len(history) - np.arange(len(history) + 1)) / shown)  # [px] of each step
+    for name, above, colour in (("fault", 0, FAULT), ("alarm", height - bar, ALARM)):
+        for start, stop in spans(np.array([getattr(step, name) for step in history], bool)):
+            pen.rectangle((edges[start], above, edges[stop] - 1, above + bar - 1), fill=colour)
     if len(history) > 1:
-        points = np.column_stack([edges[1:], y(ratios)]) * SCALE
-        pen.line(points.ravel().tolist(), fill=CURVE, width=2 * SCALE, joint="curve")
-    image = image.reduce(SCALE)
-    size = max(10, bar - 3)
-    for level, text in ((10.0, "× 10"), (1.0, "threshold"), (0.1, "× 0.1")):
-        _paste(image, _text(text, size, INK if level == 1.0 else FAINT), 3, float(y(level)))
-    for name, found, start_y, colour in bars:
-        word = _text(name, size, "#000000", colour)
-        for start, stop in found:
-            left = max(0.0, edges[start])
-            if edges[stop] - left > word.width:
-                _paste(image, word, left, start_y + bar / 2)
+        points = np.column_stack([edges[1:], y(np.array([step.ratio for step in history]))])
+        pen.line(points.ravel().tolist(), fill=CURVE, width=2, joint="curve")
+    for level, text, _, ink in LEVELS:
+        _paste(image, _text(text, max(10, bar - 3), ink), 3, float(y(level)))
     return np.asarray(image)
 
 
@@ -168,16 +152,6 @@ def annotated(picture: NDArray[np.uint8], height: int, line: str, alarm: bool) -
         word = _text("ALARM", 2 * size, "#000000", ALARM)
         _paste(image, word, width - word.width, height - word.height / 2)
     return np.asarray(image)
-
-
-def _paper(width: int, height: int, levels: tuple[float, float, float]) -> Image.Image:
-    """Return an empty chart at the scale of the curves: lines at the decades, dashes at the threshold between them."""
-    image = Image.new("RGB", (width * SCALE, height * SCALE), PAPER)
-    pen, right = ImageDraw.Draw(image), width * SCALE
-    for y, colour, dash in zip(levels, (RULE, INK, RULE), (right, 6 * SCALE, right), strict=True):
-        for x in range(0, right, dash * 10 // 6):
-            pen.line([(x, y * SCALE), (x + dash, y * SCALE)], fill=colour, width=SCALE)
-    return image
 
 
 @lru_cache(maxsize=64)

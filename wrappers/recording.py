@@ -93,21 +93,21 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         super().close()
 
     def _finish(self) -> None:
-        if self._steps:
-            space, own = self.env.observation_space, self._source.own
-            kept = [] if own and isinstance(space, gym.spaces.Dict) else [flat(space, o) for o in self._observations]
-            actions, rewards, rows, faults = zip(*self._steps, strict=True)
-            self.episodes.append(
-                Episode(
-                    stream=np.concatenate(rows),
-                    spec=self.stream_spec,
-                    success=self._success is not False,
-                    seed=self._seed,
-                    actions=np.stack(actions),
-                    observations=np.stack(kept) if kept else np.zeros((0, 0), np.float32),
-                    rewards=np.asarray(rewards, np.float32),
-                    faults=np.concatenate(faults),
-                    info={"terminated": self._terminated},
-                )
-            )
+        if not self._steps:
+            return
+        space, own = self.env.observation_space, self._source.own
+        kept = [] if own and isinstance(space, gym.spaces.Dict) else [flat(space, o) for o in self._observations]
+        actions, rewards, rows, faults = zip(*self._steps, strict=True)
+        episode = Episode(
+            stream=np.concatenate(rows),
+            spec=self.stream_spec,
+            success=self._success is not False,
+            seed=self._seed,
+            actions=np.stack(actions),
+            observations=np.stack(kept) if kept else np.zeros((0, 0), np.float32),
+            rewards=np.asarray(rewards, np.float32),
+            faults=np.concatenate(faults),
+            info={"terminated": self._terminated},
+        )
+        self.episodes.append(episode)
         self._clear(None)

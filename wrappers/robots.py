@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -21,68 +19,35 @@ from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import check_number, short_repr
 from asm_gym.wrappers.observation_map import ObservationMap
 
-DELTAS = ("OSC_POSE", "JOINT_POSITION")
-"""Controllers whose actions are changes, of pose or of joint angles."""
+DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
 
-Values = tuple[Any, ...] | None
-
-
-def robots_of(env: gym.Env[Any, Any], spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
-    """Return what is known of the robot in an environment, wrapped or not, and where its stream stands in what it
-    observes; None where that is not known."""
-    inner: Any = env.unwrapped
-    if not isinstance(env.action_space, gym.spaces.Box):
-        none = np.zeros(0, np.float32)
-        return Robots(1, none, none, none, dt=control_period(env)), None
-
-    def ask(name: str) -> Values:
-        if name == "laid_out_space":
-            return (getattr(inner, name, inner.observation_space),)
-        if name == "stream_spec":
-            return (env.get_wrapper_attr(name),) if env.has_wrapper_attr(name) else None
-        return (getattr(inner, name),) if hasattr(inner, name) else None
-
-    def call(name: str, argument: Any) -> tuple[Any, ...]:
-        return (getattr(inner, name)(argument),)
-
-    wrapper = changed_by(env)
-    changed = "" if wrapper is None else outside(wrapper, "a reflex", "NeuralASMSafety")
-    rest, refused = nearest_to_rest(env.action_space), {}
-    if ask("holding") is None:
-        try:
-            rest = resting_action(env)
-        except ValueError as error:  # no action is known to rest
-            refused["hold"] = str(error)
-    asked = _Asked(1, ask, call, env.observation_space, env.action_space, control_period(env))
-    return _known(asked, spec, rest, changed, refused)
+AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 
-def robots_of_many(envs: VectorEnv[Any, Any, Any], spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
-    """Return what is known of the robots in a vector environment, and where their streams stand in what they observe.
+class Members:
+    """The environments of a vector environment, or a single one, which can be asked what they are."""
 
-    Raises:
-        TypeError: its members cannot be asked what they are.
-    """
-    members = askable(envs)
+    def __init__(self, env: AnyEnv) -> None:
+        self.many = isinstance(env, VectorEnv)
+        self.count = askable(env).num_envs if isinstance(env, VectorEnv) else 1
+        self._env: Any = env
 
-    def ask(name: str) -> Values:
+    def ask(self, name: str) -> tuple[Any, ...] | None:
+        """Return an attribute of each; None where one lacks it."""
         # Asked first, for a worker process in which an attribute is missing is ended by Gymnasium.
-        there = all(members.call("has_wrapper_attr", name))
-        return tuple(members.call("get_wrapper_attr", name)) if there else None
+        there = self.call("has_wrapper_attr", name)
+        return self.call("get_wrapper_attr", name) if all(there) else None
 
-    space: Any = envs.single_action_space
-    changed, wrapper = "", envs
-    while isinstance(wrapper, VectorWrapper):
-        if isinstance(wrapper, VectorActionWrapper):
-            changed = outside(wrapper, "a reflex", "VectorNeuralASMSafety")
-        wrapper = wrapper.env
-    rest, refused = nearest_to_rest(space), {}
-    if ask("holding") is None and (changed or np.any(rest)):
-        refused["hold"] = changed or no_rest(space)
-    dt = ask("dt")
-    period = control_period(envs) if dt is None else float(dt[0])  # type: ignore[arg-type]
-    asked = _Asked(envs.num_envs, ask, members.call, envs.single_observation_space, space, period)
-    return _known(asked, spec, rest, changed, refused)
+    def first(self, name: str, otherwise: Any = None) -> Any:
+        """Return an attribute of the first."""
+        return (self.ask(name) or (otherwise,))[0]
+
+    def call(self, name: str, argument: Any) -> tuple[Any, ...]:
+        """Return what a method of each returns."""
+        if self.many:
+            return tuple(self._env.unwrapped.call(name, argument))
+        owner = self._env if hasattr(self._env, name) else self._env.unwrapped
+        return (getattr(owner, name)(argument),)
 
 
 def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
@@ -95,37 +60,34 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     return inner
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """n environments that can be asked."""
+def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
+    """Return what is known of the robots in an environment, or in all members of a vector environment.
 
-    count: int
-    ask: Callable[[str], Values]
-    call: Callable[..., tuple[Any, ...]]
-    observations: gym.spaces.Space[Any]
-    actions: gym.spaces.Box
-    dt: float
+    Returns:
+        The robots, and where their streams stand in what they observe; None where that is not known.
 
-
-def _known(
-    envs: _Asked, spec: StreamSpec, rest: NDArray[np.float32], changed: str, refused: dict[str, str]
-) -> tuple[Robots, ObservationMap | None]:
-    """Return what environments say of their robots.
-
-    Args:
-        rest: (A,) the action for which they stay.
-        changed: why no reflex can know what reaches the robots; empty where it can.
-        refused: the reflexes that they cannot do, and why; more are added.
+    Raises:
+        TypeError: members of a vector environment cannot be asked what they are.
     """
-    ask, call = envs.ask, envs.call
-
-    def first(name: str, otherwise: Any = None) -> Any:
-        return (ask(name) or (otherwise,))[0]
-
+    members, many = Members(env), isinstance(env, VectorEnv)
+    actions: Any = env.single_action_space if isinstance(env, VectorEnv) else env.action_space
+    observations = env.single_observation_space if isinstance(env, VectorEnv) else env.observation_space
+    dt = float(members.first("dt") or control_period(env)) if many else control_period(env)  # type: ignore[arg-type]
+    if not isinstance(actions, gym.spaces.Box):
+        none = np.zeros(0, np.float32)
+        return Robots(1, none, none, none, dt=dt), None
+    first = members.first
+    changed, holds_itself = _changed(env), members.ask("holding") is not None
+    rest, refused = nearest_to_rest(actions), {}
+    try:
+        if not holds_itself:
+            rest = _resting_action(env, actions, changed)
+    except ValueError as error:  # no action is known to rest
+        refused["hold"] = str(error)
     grip = np.asarray(first("gripper_actions", ()), np.intp)
     if grip.size and grip.max() >= rest.size:  # a wrapper inside takes other numbers
         grip = grip[:0]
-    has_stream, controller = ask("stream_spec") is not None, first("controller")
+    has_stream, controller = members.ask("stream_spec") is not None, first("controller")
     for name in ("retract", "comply"):
         if controller not in DELTAS:
             refused[name] = (
@@ -137,29 +99,51 @@ def _known(
     if changed and has_stream:
         refused["recall"] = changed
     try:
-        places = ObservationMap(
-            envs.observations, spec, has_stream, first("observation_layout"), first("laid_out_space")
-        )
+        layout = first("observation_layout"), first("laid_out_space")
+        places = ObservationMap(observations, spec, has_stream, *layout)
     except ValueError as error:
         places, refused["complete"] = None, str(error)
-    felt, chains = first("felt_channels", ()), ask("hand_chains") or ()
+    felt, chains = first("felt_channels", ()), members.ask("hand_chains") or ()
     robots = Robots(
-        count=envs.count,
-        low=np.float32(envs.actions.low).ravel(),
-        high=np.float32(envs.actions.high).ravel(),
+        count=members.count,
+        low=np.float32(actions.low).ravel(),
+        high=np.float32(actions.high).ravel(),
         rest=rest.ravel(),
         rests="hold" not in refused,
-        brakes=ask("holding") is not None and ask("keeps_holding") is not None,
+        brakes=holds_itself and members.ask("keeps_holding") is not None,
         grip=grip,
-        dt=envs.dt,
+        dt=dt,
         chains=tuple(zip(*chains, strict=True)),
         felt_channels=felt,
-        limits_contact=bool(felt) and ask("contact_limits") is not None,
+        limits_contact=bool(felt) and members.ask("contact_limits") is not None,
         read=None if places is None else places.shown,
-        turn=(lambda i, turns: call("action_for", turns)[i]) if controller in DELTAS else None,
+        turn=(lambda i, turns: members.call("action_for", turns)[i]) if controller in DELTAS else None,
         refused=refused,
     )
     return robots, places
+
+
+def _changed(env: AnyEnv) -> str:
+    """Return why no reflex can know what reaches the robots; empty where it can."""
+    if not isinstance(env, VectorEnv):
+        wrapper = changed_by(env)
+        return "" if wrapper is None else outside(wrapper, "a reflex", "NeuralASMSafety")
+    changed, layer = "", env
+    while isinstance(layer, VectorWrapper):
+        if isinstance(layer, VectorActionWrapper):
+            changed = outside(layer, "a reflex", "VectorNeuralASMSafety")
+        layer = layer.env
+    return changed
+
+
+def _resting_action(env: AnyEnv, actions: gym.spaces.Box, changed: str) -> NDArray[np.float32]:
+    """Return the action (A,) for which robots that do not hold by themselves stay. Raises ValueError without one."""
+    if not isinstance(env, VectorEnv):
+        return resting_action(env)
+    rest = nearest_to_rest(actions)
+    if changed or np.any(rest):
+        raise ValueError(changed or no_rest(actions))
+    return rest
 
 
 def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
@@ -180,24 +164,18 @@ def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | No
     return numbers
 
 
-def body_memory(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any], watched: StreamSpec) -> NeuralASM:
+def body_memory(env: AnyEnv, watched: StreamSpec) -> NeuralASM:
     """Return the shipped memory of the robot in ``env``, or in all its members; which one it is goes to the log.
 
     Raises:
         ValueError: none fits; the message lists those that there are.
     """
-    inner: Any = env.unwrapped
-    if isinstance(env, VectorEnv):
-        known = all(inner.call("has_wrapper_attr", "controller"))
-        controller = inner.call("get_wrapper_attr", "controller")[0] if known else ""
-    else:
-        controller = getattr(inner, "controller", "")
-    memory = NeuralASM.pretrained(pretrained_for(watched, str(controller)))
-    LOG.info("watching %s with %r", inner, memory)
+    memory = NeuralASM.pretrained(pretrained_for(watched, str(Members(env).first("controller", ""))))
+    LOG.info("watching %s with %r", env.unwrapped, memory)
     return memory
 
 
-def policy_for(on_alarm: Any, env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any]) -> Policy:
+def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
     """Return the user's own policy that acts during an alarm in ``env``, or in all its members.
 
     Args:

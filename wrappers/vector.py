@@ -21,7 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
-from asm_gym.wrappers.robots import askable, body_memory, felt_by, policy_for, robots_of_many
+from asm_gym.wrappers.robots import Members, askable, body_memory, felt_by, policy_for, robots_of
 
 Mask = NDArray[np.bool_]
 
@@ -115,8 +115,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:
             first.require(other, "the first environment")
-        timed = all(self._members.call("has_wrapper_attr", "dt"))
-        if timed and round(self._members.call("get_wrapper_attr", "dt")[0] / first.dt) > 1:
+        if round(Members(env).first("dt", first.dt) / first.dt) > 1:
             raise ValueError("many environments are watched at their control rate: make them without stream_freq")
         return first, True
 
@@ -124,7 +123,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         """Take up a monitor, and all that depends on it."""
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
-        self._robots, self._places = robots_of_many(self.env, monitor.spec)
+        self._robots, self._places = robots_of(self.env, monitor.spec)
         policies = () if isinstance(chosen, str) else [policy_for(chosen, self.env)] * self.num_envs
         self._engine = Engine(self._robots, monitor, self._options, policies)
         self._monitor = self._next = monitor
@@ -239,9 +238,10 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         assert self._ended is not None
         self._ended[begun] = self._forced[begun] = False
         self._alarms[begun] = 0
-        nothing = self._engine.begin(begun) if begun.any() else self._engine.nothing()
-        if begun.any():
-            self._limits: tuple[Any, ...] = ()
+        if not begun.any():
+            return self._engine.nothing()
+        nothing = self._engine.begin(begun)
+        self._limits: tuple[Any, ...] = ()
         self._limit()
         return nothing
 
@@ -282,17 +282,14 @@ def _with(batch: Any, i: int, value: Any) -> Any:
 
 def _replaced(infos: dict[str, Any], by: dict[str, Any], mask: Mask) -> dict[str, Any]:
     """Return infos in which the environments of ``mask`` (n,) have what ``by`` says of them, and nothing else."""
-    merged = dict(infos)
+    merged: dict[str, Any] = {}
     for key in infos.keys() | by.keys():
         old, new = infos.get(key), by.get(key)
         if isinstance(old, dict) or isinstance(new, dict):
             merged[key] = _replaced(old or {}, new or {}, mask)
             continue
-        old = _blank(new) if old is None else old
-        new = _blank(old) if new is None else new
-        merged[key] = np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        like: Any = new if old is None else old
+        blank = np.full(like.shape, None, object) if like.dtype == object else np.zeros_like(like)
+        old, new = (blank if part is None else part for part in (old, new))
+        merged[key] = np.where(mask.reshape(-1, *[1] * (like.ndim - 1)), new, old)
     return merged
-
-
-def _blank(like: Any) -> NDArray[Any]:
-    return np.full(like.shape, None, object) if like.dtype == object else np.zeros_like(like)

@@ -36,8 +36,6 @@ def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
         array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # a file shorter than it declares is refused
     except Exception as error:  # its header is Python, and whatever reading that may raise, damage raises
         raise ValueError(f"{path} is damaged: {' '.join(str(error).split()) or type(error).__name__}") from error
-    if array.dtype.names:
-        return {name: array[name] for name in array.dtype.names}
     if array.dtype.kind not in "biuf" or array.ndim not in (1, 2):
         raise ValueError(f"{path} must hold rows of numbers, got {array.dtype} of shape {array.shape}")
     rows = array.reshape(len(array), -1)

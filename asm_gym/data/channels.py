@@ -23,17 +23,11 @@ from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.validation import check_number, short_repr
 
+# Words of a label that say that nothing is wrong.
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
-"""Words of a label that say that nothing is wrong."""
-
-RESAMPLED = 1.5
-"""A log with a clock is read at another rate, up to so many times its own or as much slower."""
-
-SLOWEST = 1e-6
-"""The least rate of a log [Hz]: a row in eleven days."""
-
-RATE_TOLERANCE = 0.01
-"""How far a log's rate may be off that of the memory which reads it, as a share."""
+RESAMPLED = 1.5  # A log with a clock is read at another rate, up to so many times its own or as much slower
+SLOWEST = 1e-6  # the least rate of a log [Hz]: a row in eleven days
+RATE_TOLERANCE = 0.01  # how far a log's rate may be off that of the memory which reads it, as a share
 
 
 class Column(NamedTuple):

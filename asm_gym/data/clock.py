@@ -21,29 +21,14 @@ from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
 
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
-"""From which number on, and in which unit, a clock without a unit counts from 1970: 1e8 s is March 1973."""
-
-SLOWEST_WITHOUT_UNIT = 2.0
-"""A clock without a unit that goes on by so much from row to row is not believed to count seconds."""
-
-JITTER = 0.35
-"""By what share of a step a stamp may be off, and its row still be the one that was due."""
-
-DRIFT = 0.011
-"""How far a clock may be off the rate that is read, as a share, and no row be moved for it."""
-
-NEARLY, MOSTLY = 0.15, 0.95
-"""A clock loses rows and does not jitter where so many steps are that near to whole multiples of the median."""
-
-MOST_DOUBLED = 0.02
-"""Share of rows that may have the stamp of the one before: they were written twice."""
-
-FAR = 2.5
-"""How much longer than nine in ten a step must be, so that nothing in it is known."""
-
-MOST_LOST = 4
-"""A log of T rows may have lost so many times T, or ten minutes: more is a clock that was set, or two logs in one."""
+EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least number since 1970, and its unit [s]
+SLOWEST_WITHOUT_UNIT = 2.0  # step from which on a clock without a unit is not believed to count seconds
+JITTER = 0.35  # by what share of a step a stamp may be off, and its row still be the one that was due
+DRIFT = 0.011  # how far a clock may be off the rate that is read, as a share, and no row be moved for it
+NEARLY, MOSTLY = 0.15, 0.95  # rows were lost where MOSTLY steps are NEARLY whole multiples of the median; else jitter
+MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: they were written twice
+FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in it is known
+MOST_LOST = 4  # a log may have lost so many times its rows, or ten minutes; more is a clock that was set
 
 
 class Clock(NamedTuple):

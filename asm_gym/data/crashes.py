@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from asm_gym.episode import Episode
 
-CRASH = 2.0
-"""A crash presses this many times as hard as is usual."""
+CRASH = 2.0  # A crash presses this many times as hard as is usual
 
 
 def peak_force(episode: Episode) -> float:

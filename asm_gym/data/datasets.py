@@ -7,7 +7,6 @@ https://minari.farama.org.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
@@ -24,13 +23,15 @@ from numpy.typing import NDArray
 from asm_gym.data.arrays import check_hdf5
 from asm_gym.episode import Episode, check_recorded
 from asm_gym.extras import require
-from asm_gym.files import named, written_whole
+from asm_gym.files import named
 from asm_gym.spec import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 
-METADATA, ARRAYS, CHECKSUMS = "metadata.json", "main_data.hdf5", "SHA256SUMS"
-"""Files of a dataset's folder ``data``; the first two are Minari's."""
+METADATA, ARRAYS = "metadata.json", "main_data.hdf5"  # files of a dataset's folder ``data``
+
+OWN_FILES = (ARRAYS, METADATA, "SHA256SUMS")
+"""Files that this package has written there; version 1 wrote the last one too."""
 
 
 def require_minari() -> None:
@@ -74,7 +75,6 @@ def write_dataset(
     unfinished, replaced = (folder.with_name(f".{folder.name}.{what}") for what in ("unfinished", "replaced"))
     for before in (folder, unfinished, replaced):
         _refuse_foreign(before)
-    image = _hdf5(episodes)
     for before in (unfinished, replaced):
         shutil.rmtree(before, ignore_errors=True)
     data = unfinished / "data"
@@ -82,20 +82,12 @@ def write_dataset(
     spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
     with named(data):
         storage = MinariStorage.new(data, **spaces, env_spec=env.spec)
-        with written_whole(data / ARRAYS) as file:
-            file.write(image)
-        about = {
-            "total_episodes": len(episodes),
-            "total_steps": sum(len(e.rewards) for e in episodes),
-            "dataset_size": storage.get_size(),
-            "stream_spec": spec.to_json(),
-            **details,
-            "dataset_id": dataset_id,
-            "minari_version": minari.__version__,
-        }
-        storage.update_metadata(about)
-        sums = "".join(f"{_sha256(data / name)}  {name}\n" for name in (ARRAYS, METADATA))
-        (data / CHECKSUMS).write_text(sums, encoding="ascii")
+        storage.update_episodes([_buffer(n, episode) for n, episode in enumerate(episodes)])
+        storage.update_episode_metadata(
+            {"success": bool(episode.success), "info": json.dumps(episode.info)} for episode in episodes
+        )
+        about = {"stream_spec": spec.to_json(), **details}
+        storage.update_metadata(about | {"dataset_id": dataset_id, "minari_version": minari.__version__})
     if folder.exists():
         folder.rename(replaced)
     unfinished.rename(folder)
@@ -117,36 +109,27 @@ def _folder(root: Path, dataset_id: str) -> Path:
 def _refuse_foreign(folder: Path) -> None:
     """Raise ValueError where a folder that is to be replaced holds what ``write_dataset`` does not write."""
     found = {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()} if folder.is_dir() else {folder}
-    foreign = found - {folder / "data" / name for name in (ARRAYS, METADATA, CHECKSUMS)}
+    foreign = found - {folder / "data" / name for name in OWN_FILES}
     if folder.exists() and foreign:
         raise ValueError(f"{min(foreign)} is nothing that asm-gym wrote, so {folder} is not replaced")
 
 
-def _hdf5(episodes: Sequence[Episode]) -> bytes:
-    """Minari's file, made in memory: HDF5 ends the process where a disk is full."""
-    h5py = require("h5py", what="a dataset")
-    with h5py.File("episodes", "w", driver="core", backing_store=False, track_order=True) as file:
-        for n, episode in enumerate(episodes):
-            T = len(episode.rewards)
-            last = np.arange(T) == T - 1
-            terminated = bool(episode.info.get("terminated", False))
-            arrays = {
-                "observations": episode.observations,
-                "actions": episode.actions,
-                "rewards": episode.rewards,
-                "terminations": last & terminated,
-                "truncations": last & (not terminated),
-                "infos/stream": episode.stream,
-                "infos/fault": episode.faults,
-            }
-            about = {"id": n, "seed": episode.seed, "total_steps": T, "success": bool(episode.success)}
-            group = file.create_group(f"episode_{n}")
-            group.attrs.update({k: v for k, v in about.items() if v is not None} | {"info": json.dumps(episode.info)})
-            for name, array in arrays.items():
-                group.create_dataset(name, data=array, chunks=True, maxshape=(None, *array.shape[1:]))
-        file.flush()
-        image: bytes = file.id.get_file_image()
-    return image
+def _buffer(n: int, episode: Episode) -> Any:
+    """Return an episode as Minari collects it."""
+    from minari.data_collector import EpisodeBuffer
+
+    last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
+    terminated = bool(episode.info.get("terminated", False))
+    return EpisodeBuffer(
+        id=n,
+        seed=episode.seed,
+        observations=episode.observations,
+        actions=episode.actions,
+        rewards=episode.rewards,
+        terminations=last & terminated,
+        truncations=last & (not terminated),
+        infos={"stream": episode.stream, "fault": episode.faults},
+    )
 
 
 @typed
@@ -166,7 +149,8 @@ def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
     import minari
 
     try:
-        _check_whole(folder)
+        if (folder / ARRAYS).exists():
+            check_hdf5(folder / ARRAYS)
         metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
         dataset = minari.MinariDataset(folder)
         recorded = list(dataset.iterate_episodes())
@@ -194,21 +178,6 @@ def _find_dataset(path: Path) -> Path:
     if len(below) > 1:
         raise ValueError(f"{path} holds several datasets, name one: {', '.join(map(str, below))}")
     return below[0]
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _check_whole(folder: Path) -> None:
-    """Raise ValueError unless the files are those that were written, and hold what they declare."""
-    if (folder / CHECKSUMS).is_file():  # others write none
-        for line in (folder / CHECKSUMS).read_text(encoding="ascii").splitlines():
-            written, _, name = line.partition("  ")
-            if name not in (ARRAYS, METADATA) or _sha256(folder / name) != written:
-                raise ValueError(f"{name} is not as it was written; if it was changed on purpose, remove {CHECKSUMS}")
-    if (folder / ARRAYS).exists():
-        check_hdf5(folder / ARRAYS)
 
 
 def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | None) -> StreamSpec:

@@ -19,11 +19,8 @@ from asm_gym.validation import check_number
 
 Floats = NDArray[np.floating[Any]]
 
-PAID_BACK = 0.1
-"""Of a second that is whole, how much may be missing for good: a tenth of all rows."""
-
-SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"
-"""Why there is an alarm."""
+PAID_BACK = 0.1  # of a second that is whole, how much may be missing for good: a tenth of all rows
+SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"  # why there is an alarm
 
 
 class Bridge:

@@ -13,11 +13,8 @@ from asm_gym.data.clock import FAR, evenly, timing_of
 from asm_gym.episode import spans
 from asm_gym.readings import noise_of, resolution
 
-FEW_VALUES = 8
-"""A channel of fewer different values hardly moves."""
-
-JITTERS = 0.1
-"""Share of a period that steps spread by from which on a clock jitters."""
+FEW_VALUES = 8  # A channel of fewer different values hardly moves
+JITTERS = 0.1  # share of a period that steps spread by from which on a clock jitters
 
 TREATMENT = {
     "clock": "tells the rate; no channel",

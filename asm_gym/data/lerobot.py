@@ -22,8 +22,7 @@ from asm_gym.data.text import Columns
 
 INFO = Path("meta") / "info.json"
 
-SENSED, COMMANDED = "observation.", "action"
-"""Features that are read begin so; pictures are left out."""
+SENSED, COMMANDED = "observation.", "action"  # features that are read begin so; pictures are left out
 
 
 def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:

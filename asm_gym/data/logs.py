@@ -65,8 +65,7 @@ FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
 }
 """Reader of a file's columns, by its suffix."""
 
-ASKED_FOR = (".txt",)
-"""Files that are read where they are named, and not where they lie in a folder: most are no logs."""
+ASKED_FOR = (".txt",)  # files that are read where they are named, and not where they lie in a folder: most are no logs
 
 
 class Log(NamedTuple):

@@ -38,8 +38,8 @@ SECONDS = {
 }
 """Seconds in one, by the unit behind the name of a clock."""
 
+# Names of columns that count rows.
 COUNTERS = ("", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0")
-"""Names of columns that count rows."""
 
 _OF = r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|recording)"
 _WHAT = r"(?:time[ _]?stamps?|time|stamp|date[ _]?time|date)"

@@ -21,14 +21,9 @@ from asm_gym.data.bags import MESSAGES, Numbers, stamp_of
 from asm_gym.data.live import SourceDied
 from asm_gym.extras import require
 
-CONNECT_S = 5.0
-"""How long a topic may take to be found [s]."""
-
-POLL_S = 0.05
-"""How often the end of a source is looked for while nothing comes [s]."""
-
-AT_ONCE = 2048
-"""Messages of a topic taken, and kept for the reader, at once: four seconds of 500 Hz."""
+CONNECT_S = 5.0  # how long a topic may take to be found [s]
+POLL_S = 0.05  # how often the end of a source is looked for while nothing comes [s]
+AT_ONCE = 2048  # messages of a topic taken, and kept for the reader, at once: four seconds of 500 Hz
 
 FIELDS: dict[str, dict[str, str]] = {
     "builtin_interfaces/msg/Time": {"sec": "int32", "nanosec": "uint32"},

@@ -4,8 +4,7 @@ A JSON line is a list of numbers, or an object by channel or by number; CSV begi
 
 own      median step of the newest 32 rows [s]
 right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
-faster   own < dt/1.5               rows are read dt apart, and those between passed over
-slower   own > 1.5 dt               nothing is judged: a memory of short steps cannot judge longer ones
+wrong    elsewhere                  nothing is judged: a memory cannot judge steps of another length
 """
 
 from __future__ import annotations
@@ -26,13 +25,7 @@ from asm_gym.data.names import factor, label_of, split_unit
 from asm_gym.data.text import Dialect, flat_row, header_of
 from asm_gym.spec import StreamSpec
 
-NEWEST = 32
-"""Rows that tell the rate, and after which it is told again."""
-
-EARLY = 0.5
-"""Of their own step, how much sooner than due a row may come that is read."""
-
-RIGHT, FASTER, SLOWER = "right", "faster", "slower"
+NEWEST = 32  # rows that tell the rate, and after which it is told again
 
 
 class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
@@ -43,42 +36,29 @@ class Pace:
     """Follow the clock of a source for a memory whose rows are ``dt`` [s] apart; ``change`` says a change of rate."""
 
     def __init__(self, dt: float) -> None:
-        self.dt, self.kind, self.change = dt, RIGHT, ""
+        self.dt, self.right, self.change = dt, True, ""
         self._steps: deque[float] = deque(maxlen=NEWEST)
         self._rows = 0
         self._before: float | None = None
-        self._read = 0.0  # time of the last row that was read
 
     def lost(self, stamp: float) -> int | None:
         """Return how many rows were lost before the one of this time [s]; None where it is not to be read."""
         before, self._before, self.change = self._before, stamp, ""
         self._rows += 1
         if before is None:
-            self._read = stamp
             return 0
-        if not stamp > before:
+        step = stamp - before
+        if not step > 0:
             raise ClockWentBack(f"time must increase, got {stamp:g} s after {before:g} s")
-        self._steps.append(stamp - before)
+        self._steps.append(step)
         if self._rows % NEWEST == 1:
-            self._judge(median(self._steps))
-        if self.kind == SLOWER:
-            self._read = stamp
-            return None
-        if self.kind == FASTER and stamp - self._read < self.dt - EARLY * min(self.dt, median(self._steps)):
-            return None
-        step, self._read = stamp - self._read, stamp
-        return max(0, round(step / self.dt) - 1)
-
-    def _judge(self, own: float) -> None:
-        kind = FASTER if own < self.dt / RESAMPLED else SLOWER if own > self.dt * RESAMPLED else RIGHT
-        if kind != self.kind:
-            consequence = {
-                RIGHT: " again",
-                FASTER: f", and are read at {1 / self.dt:.4g}, by their clock",
-                SLOWER: f", and the memory reads {1 / self.dt:.4g}: they are not judged, an alarm",
-            }
-            self.change = f"rows come at {1 / own:.4g} a second{consequence[kind]}"
-        self.kind = kind
+            own = median(self._steps)
+            right = self.dt / RESAMPLED <= own <= self.dt * RESAMPLED
+            if right != self.right:
+                consequence = " again" if right else f", and the memory reads {1 / self.dt:.4g}"
+                self.change = f"rows come at {1 / own:.4g} a second{consequence}"
+            self.right = right
+        return max(0, round(step / self.dt) - 1) if self.right else None
 
 
 class Row(NamedTuple):

@@ -17,11 +17,8 @@ from asm_gym.episode import Episode, spans
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR
 
-SHORTEST_S = 0.5
-"""Least length of a part between lost rows that is worth learning from [s]."""
-
-AROUND_S = 5.0
-"""How near to marked rows nothing is learned from [s]: what led to a stop is no normal motion."""
+SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
+AROUND_S = 5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is no normal motion
 
 
 class NormalEpisodes(NamedTuple):

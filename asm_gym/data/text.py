@@ -30,14 +30,9 @@ if TYPE_CHECKING:
 Columns = dict[str, NDArray[Any]]
 KeepWords = Callable[[str], bool]
 
-LONGEST_WORD = 64
-"""Characters that are kept of a word, of a label or a time."""
-
-MOST_COLUMNS = 8192
-"""Every number is weighed against every other later on: see ``whitening``."""
-
-LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS
-"""Characters of a line."""
+LONGEST_WORD = 64  # characters that are kept of a word, of a label or a time
+MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
+LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
 
 SEPARATORS = ";\t,|"
 

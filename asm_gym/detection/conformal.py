@@ -43,8 +43,8 @@ def conformal_episodes(rate: float) -> int:
 def conformal_threshold(maxima: Array, rate: float) -> float:
     """Return the q that the maximum of a fresh nominal episode exceeds with a probability of at most ``rate``.
 
-    The guarantee is over the draw of n calibration episodes, of ``maxima`` (n,), and the fresh one, which must be
-    exchangeable. Raises ValueError where there are too few.
+    The fresh episode and the n calibration episodes, of ``maxima`` (n,), must be exchangeable. Raises ValueError where
+    there are too few.
     """
     try:
         found = np.asarray(maxima)
@@ -144,10 +144,12 @@ def check_per_hour(rate: float) -> float:
 def check_hours(rate: float, hours: float) -> None:
     """Raise ValueError, naming the missing hours, where ``hours`` are too few for this rate."""
     if math.floor(rate * hours + ROUNDING) < 1:
+        unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
+        possible = math.ceil(1.0 / hours / unit) * unit  # rounded up to three digits
         raise ValueError(
             f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
             f"record {math.ceil(100 * (1.0 / rate - hours)) / 100:.4g} hours more, "
-            f"or promise {least_per_hour(hours):.4g}"
+            f"or promise {possible:.4g}"
         )
 
 
@@ -163,12 +165,6 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)
     return float(maxima[max(len(maxima) - 1 - allowed, 0)])
-
-
-def least_per_hour(hours: float) -> float:
-    """Return the least rate that so many hours can promise, rounded up to three digits."""
-    unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
-    return math.ceil(1.0 / hours / unit) * unit
 
 
 def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:

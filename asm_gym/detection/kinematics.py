@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 
-HAND = 9
-"""How many numbers say where a hand is."""
+HAND = 9  # how many numbers say where a hand is
 
 
 class Chain(NamedTuple):

@@ -22,14 +22,9 @@ from asm_gym.guard.robots import Robots
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32
 
-MOST_LOST = 1000
-"""Lost rows that a bridge is asked about one by one."""
-
-LATENCIES = 10_000
-"""Newest rows whose latency is kept."""
-
-RETRY_S = 0.2
-"""Time between two attempts to open a source again [s]."""
+MOST_LOST = 1000  # lost rows that a bridge is asked about one by one
+LATENCIES = 10_000  # newest rows whose latency is kept
+RETRY_S = 0.2  # time between two attempts to open a source again [s]
 
 Opened = Callable[[], Iterator[str]]
 
@@ -138,7 +133,7 @@ class _Watch:
         if row.change and row.read:
             self._note(row.change)
         elif row.change:
-            self.alarm(row.change)
+            self.alarm(f"{row.change}: they are not judged, an alarm")
             self._begin()
         if not row.read:
             return

@@ -45,9 +45,7 @@ EXTREME = 0.0005  # share of nominal rows below the limits of log σ², and abov
 LARGEST_RATIO = 30.0  # clips ε²/σ² (5.5 σ), so that one contact does not undo a thousand steps
 PRECISION_EPOCHS, PRECISION_RATE = 20, 1e-3
 PRECISION_BATCH, PRECISION_BATCHES = 64, 250  # rows of a batch, and most batches in an epoch; then they are larger
-
-ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS
-"""Progress reports of ``learn_association``."""
+ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS  # progress reports of ``learn_association``
 
 
 @kernel

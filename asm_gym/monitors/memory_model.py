@@ -21,8 +21,7 @@ from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
-from asm_gym.memory.state import MemoryState
-from asm_gym.memory.temporal import TemporalNetwork
+from asm_gym.memory.temporal import MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.row_kernel import LearnedMemory, expect_rows, uninitialised
 from asm_gym.monitors.stream_model import ScaledModel

@@ -28,8 +28,7 @@ from asm_gym.memory.association import Association, normalised_errors
 from asm_gym.memory.energy import activate, infer, outward
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settling_shapes
-from asm_gym.memory.state import UNSURE, MemoryState, RowHistory
-from asm_gym.memory.temporal import TemporalNetwork
+from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
 from asm_gym.memory.traces import Weights, carry, weight_shapes
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated_monitor import MonitorState

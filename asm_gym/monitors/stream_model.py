@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
-from asm_gym.memory.state import RowHistory
+from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec

@@ -25,7 +25,7 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
-from asm_gym.memory.state import RowHistory
+from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.arm_inputs import Derived, forces, motion
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
-from asm_gym.memory.state import RowHistory
+from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context
 from asm_gym.spec import StreamSpec

@@ -22,7 +22,7 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from asm_gym.detection import ModelOutput
 from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
-from asm_gym.memory.state import RowHistory
+from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.arm_inputs import WIDTHS, forces, speeds
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel, StreamModel, no_context, read_next

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.learning import shuffled
-from asm_gym.memory.state import RowHistory
+from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, adam, descend
 from asm_gym.monitors.stream_model import no_context, read_next

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from asm_gym.detection import ModelOutput
-from asm_gym.memory.state import RowHistory
+from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.baselines.torch_model import TorchModel, padded, train_on_episodes
 from asm_gym.monitors.stream_model import read_next
