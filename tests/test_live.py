@@ -177,7 +177,6 @@ def test_of_another_rate_nothing_is_judged_until_it_is_right_again(step):
     assert found[-30:] == [0] * 30
 
 
-
 def test_a_bridge_goes_over_short_gaps_and_no_longer_or_frequent_ones():
     missing = np.zeros((200, 1))
     missing[[10, 11, 100, 101, 102]] = np.nan

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, activate, kernel, outward
 from asm_gym.memory.learning import coincidence
 
-SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)
-"""Bounds of log σ²: errors of 0.25 % of a channel's spread, and of 55 times its spread."""
+SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)  # log σ² of 0.25 % of a channel's spread, and of 55 spreads
 
 
 class Association(NamedTuple):

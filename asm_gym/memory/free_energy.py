@@ -11,7 +11,7 @@
     learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
 
 ε and μ are those of ``traces`` or ``settling``, e and σ of ``association``, û of ``motor``. τ and τ_j are the spreads
-left in healthy rows, so that all sums are in nats. Learning of association bounds e/σ; within the bound they agree.
+left in healthy rows, so that all sums are in nats.
 
 Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
 time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of their outcome.
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from asm_gym.memory.association import Association
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.settling import SettlingWeights
-from asm_gym.memory.temporal import TemporalNetwork
+from asm_gym.memory.temporal import Step, TemporalNetwork
 from asm_gym.memory.traces import Weights
 from asm_gym.scaling import FARTHEST, StreamScaler
 
@@ -114,22 +114,17 @@ class FreeEnergy:
             moment = Before(c, *(rows[None, max(0, t - k)] for k in (lag, 2 * lag, 1)))
             if t >= 2 * lag:
                 found.append((moment, rows[t]))
-            c = self.after(moment, rows[t], turn=t % lag == 0)
+            if t % lag == 0:
+                c = self._followed(moment, rows[t]).traces
         return found
 
     def inferred(self, moment: Before, row: Floats) -> Floats:
         """Return the state z (H,) that the temporal network infers from a row (D,)."""
-        read = self.senses.read(row[None], moment.before, moment.earlier)
-        z: Floats = self.network.follow(moment.c, read.commands, read.senses, read.seen).z[0].astype(np.float64)
-        return z
+        return np.asarray(self._followed(moment, row).z[0], np.float64)
 
-    def after(self, moment: Before, row: Floats, turn: bool = True) -> NDArray[np.float32]:
-        """Return c (1, I) after a row (D,); unchanged unless it is an l-th row (``turn``)."""
-        if not turn:
-            return moment.c
+    def _followed(self, moment: Before, row: Floats) -> Step:
         read = self.senses.read(row[None], moment.before, moment.earlier)
-        traces: NDArray[np.float32] = self.network.follow(moment.c, read.commands, read.senses, read.seen).traces
-        return traces
+        return self.network.follow(moment.c, read.commands, read.senses, read.seen)
 
     def terms(self, moment: Before, row: Floats, z: Floats) -> Terms:
         """Return the parts of F for a row (D,) and a state (H,)."""
@@ -162,10 +157,9 @@ class FreeEnergy:
 
     def expected(self, moment: Before) -> Floats:
         """Return the command (A,) of the motor association; without one that of the last row."""
-        known = moment.last[0, self.senses.spec.motor]
-        if self.motor is not None:
-            known = self.motor.command(situation(self.senses, moment.last))[0]
-        return np.asarray(known, np.float64)
+        if self.motor is None:
+            return moment.last[0, self.senses.spec.motor]
+        return np.asarray(self.motor.command(situation(self.senses, moment.last))[0], np.float64)
 
     @cached_property
     def _weights(self) -> tuple[Any, Association]:

@@ -154,10 +154,7 @@ class Learner(ABC):
 
 
 def one_after_another(trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator) -> Iterator[Moment]:
-    """Yield rows of ``size`` endless streams of episodes, each begun at a random row.
-
-    At different phases, so that no phase of all skills displaces the others.
-    """
+    """Yield rows of ``size`` endless streams of episodes, each begun at a random row."""
     senses, commands = (np.concatenate([t[k] for t in trajectories]) for k in range(2))
     length = np.array([len(t.senses) for t in trajectories])
     start = np.cumsum(length) - length

@@ -7,8 +7,8 @@
     ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_A ∝ ε_a f(h_t)ᵀ
 
 Each change is -∂F/∂W at the inferred state. The past is in z alone, and an error teaches one step back and no further.
-W_H begins near the identity: a unit then keeps its own state, and with it what is long past. A stream that runs on
-alone hands on μ_t in place of z_t, and takes its own action.
+W_H begins near the identity, so that units keep what is long past. A stream that runs on alone hands on μ_t in place of
+z_t, and takes its own action.
 
 Sources: Millidge et al. 2024 (PLOS Comput Biol) and Tang et al. 2023 (NeurIPS); Mahajan et al. 2025 (Neural
 Computation 38(1)) for the motor prediction; Le et al. 2015 (arXiv 1504.00941) for beginning at the identity.
@@ -26,8 +26,7 @@ from asm_gym.memory.energy import Array, activate, infer, outward
 from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
-LEAST, FAINT = 0.9, 0.1
-"""Smallest initial weight of a unit on its own last state (the largest is 1), and the gain from all other units."""
+LEAST, FAINT = 0.9, 0.1  # smallest initial weight of a unit on its own last state, and the gain from all others
 
 
 class SettlingWeights(NamedTuple):

@@ -6,9 +6,8 @@
     ΔW_C ∝ Π_z ε_z c_{t-1}ᵀ    ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_D ∝ Π_x ε_x [c_{t-1}, a_t, 1]ᵀ
     ε_z = z_t - μ_t    ε_x = [x_t, a_t] - [x̂_t, â_t]
 
-λ runs from 0, the row itself, to 0.995, which halves in 140 rows; g gives all traces the same mean square. A trace has
-no learned weight, so no error travels back through time. For Π_z large against Π_x, ε_z is the error that
-backpropagation would send to the state (Whittington and Bogacz 2017).
+g gives all traces the same mean square. A trace has no learned weight, so no error travels back through time. For Π_z
+large against Π_x, ε_z is the error that backpropagation would send to the state (Whittington and Bogacz 2017).
 
 Sources: de Vries and Principe 1992 (Neural Networks 5(4)) and Shankar and Howard 2012 (Neural Computation 24(1)) for
 the traces; Millidge et al. 2024 (PLOS Comput Biol) for inference and learning.
@@ -17,6 +16,7 @@ the traces; Millidge et al. 2024 (PLOS Comput Biol) for inference and learning.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -42,17 +42,12 @@ def advance(traces: Array, rows: Array, gains: Array) -> Array:
     return out
 
 
-def at_rest(batch: int, row: int) -> NDArray[np.float32]:
-    """Return c_0 of ``batch`` streams with rows of ``row`` numbers."""
-    return np.zeros((batch, len(DECAYS) * row), np.float32)
-
-
 def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
     """Return g (K,) that give each trace of these episodes (T, R) a mean square of 1."""
     plain = np.float32(1) - DECAYS
     ordered = sorted(episodes, key=len, reverse=True)
     squares, width = np.zeros(len(DECAYS)), ordered[0].shape[1]
-    traces = at_rest(len(ordered), width)
+    traces = np.zeros((len(ordered), len(DECAYS) * width), np.float32)
     for t in range(len(ordered[0])):
         rows = np.array([episode[t] for episode in ordered if t < len(episode)], np.float32)
         traces = advance(traces[: len(rows)], rows, plain)
@@ -77,6 +72,7 @@ def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int,
     return {"W_C": (H, traces), "W_F": (N, H), "W_D": (N, traces + motor + 1), "gains": (len(DECAYS),)}
 
 
+@lru_cache(maxsize=8)
 def direct_synapses(sensory: int, motor: int) -> Array:
     """Return the mask (S + A, I + A + 1) of W_D: 0 from an action to its own prediction, else 1."""
     exists = np.ones(weight_shapes(1, sensory, motor)["W_D"], np.float32)
@@ -151,7 +147,7 @@ class Network(TemporalNetwork):
         return self.weights.W_D.shape[1] - self.weights.W_C.shape[1] - 1
 
     def at_rest(self, batch: int) -> NDArray[np.float32]:
-        return at_rest(batch, self.weights.W_F.shape[0] + 1)
+        return np.zeros((batch, self.weights.W_C.shape[1]), np.float32)
 
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         w = self.weights
@@ -184,17 +180,15 @@ class HebbianChange(NamedTuple):
 
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
     """Return random weights of about unit gain into the state and of gain 0.1 out of it, and no direct ones."""
-    weights = {n: np.zeros(shape, np.float32) for n, shape in weight_shapes(hidden, sensory, motor).items()}
-    for name, gain in (("W_C", 1.0), ("W_F", 0.1)):
-        W = weights[name]
-        W[:] = gain * rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
-    weights["gains"][:] = np.float32(1) - DECAYS
-    return Weights(**weights)
+    shapes = weight_shapes(hidden, sensory, motor)
+    W_C, W_F = (
+        (gain * rng.standard_normal(shapes[name]) / np.sqrt(shapes[name][1])).astype(np.float32)
+        for name, gain in (("W_C", 1.0), ("W_F", 0.1))
+    )
+    return Weights(W_C, W_F, np.zeros(shapes["W_D"], np.float32), np.float32(1) - DECAYS)
 
 
-def hebbian_change(
-    c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float, exists: Array | None = None
-) -> HebbianChange:
+def hebbian_change(c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float) -> HebbianChange:
     """Apply the local learning rules.
 
     Args:
@@ -202,14 +196,12 @@ def hebbian_change(
         mu, z: (B, H) the expected state, and the inferred one.
         error: (B, S + A) Π_x ε_x at ``z``.
         pi_z: Π_z.
-        exists: ``direct_synapses`` of W_D, computed where None.
     """
     motor = u.shape[1] - 1
-    exists = direct_synapses(error.shape[1] - motor, motor) if exists is None else exists
     return HebbianChange(
         W_C=coincidence(np.float32(pi_z) * (z - mu), c),
         W_F=coincidence(error, activate(z)),
-        W_D=coincidence(error, np.hstack([c, u])) * exists,
+        W_D=coincidence(error, np.hstack([c, u])) * direct_synapses(error.shape[1] - motor, motor),
     )
 
 
@@ -221,11 +213,9 @@ class TracesLearner(Learner):
 
     def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
         super().__init__(weights, HebbianChange._fields, schedule, rng)
-        motor = weights.W_D.shape[1] - weights.W_C.shape[1] - 1
-        self._direct = direct_synapses(len(weights.W_D) - motor, motor)
 
     def at_rest(self, size: int) -> Array:
-        return at_rest(size, len(self.weights.W_F) + 1)
+        return np.zeros((size, self.weights.W_C.shape[1]), np.float32)
 
     def practise(
         self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
@@ -241,7 +231,7 @@ class TracesLearner(Learner):
         precision = np.full_like(left, pi_x)
         z = infer(mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self.norm, self.schedule.iterations)
         error = np.float32(pi_x) * (left - sense(z, w.W_F))
-        change = hebbian_change(state, taken, mu, z, error, pi_z, self._direct)
+        change = hebbian_change(state, taken, mu, z, error, pi_z)
         energy = 0.5 * (pi_z * float(np.sum((z - mu) ** 2)) + float(np.sum(error**2)) / pi_x)
         senses = np.where(alone, (past + sense(mu, w.W_F))[:, :S], x)
         self.learn(change, rate)
