@@ -19,7 +19,7 @@ EXTRAS = {
     "cluster": ("distributed", "dask", "ray"),
     "video": ("moviepy",),
     "environments": ("gymnasium_robotics", "shimmy", "dm_control"),
-    "learners": ("torchrl", "wandb"),
+    "learners": ("torchrl",),
     "hub": ("huggingface_hub",),
     "notebooks": ("ipywidgets", "ipykernel", "nbclient", "nbformat"),
     "ros": ("rosbags",),
