@@ -3,8 +3,7 @@
     spent_i    + dt while number i is missing, - 0.1 dt while it is there, at least 0     [s]
     bridged    spent_i <= ``seconds`` for all that are missing in a row
 
-A memory runs on without a missing number and expects what it predicts; a row that is bridged is not judged. A number
-that is missing again and again counts in the end: a loose cable is no short gap.
+A row that is bridged is not judged. A number that is missing again and again counts in the end.
 """
 
 from __future__ import annotations

@@ -30,9 +30,9 @@ class ClockFound(NamedTuple):
     """The clock of a log."""
 
     times: NDArray[np.float64]  # (T,) [s], or row numbers without a clock
-    rate: float  # rows a second in the mean, gaps left out [Hz]; 0 where it is unknown
-    jitter: float  # standard deviation of a step that is no gap, as a share of the period
-    gaps: NDArray[np.float64]  # (G, 2) from when to when nothing came [s]
+    rate: float = 0.0  # rows a second in the mean, gaps left out [Hz]; 0 where it is unknown
+    jitter: float = 0.0  # standard deviation of a step that is no gap, as a share of the period
+    gaps: NDArray[np.float64] = np.zeros((0, 2))  # from when to when nothing came [s]
     trouble: str = ""  # why it cannot be read
 
 
@@ -82,17 +82,17 @@ def is_constant(column: Column) -> bool:
 
 
 def _clock(table: Mapping[str, NDArray[Any]], rate: float) -> ClockFound:
-    count, nothing = np.arange(max(map(len, table.values()), default=0), dtype=np.float64), np.zeros((0, 2))
+    count = np.arange(max(map(len, table.values()), default=0), dtype=np.float64)
     try:
         timing = timing_of(table)
         if timing is None:
-            return ClockFound(count / (rate or 1.0), rate, 0.0, nothing)
+            return ClockFound(count / (rate or 1.0), rate)
         if timing.dt is None:
             raise ValueError("one row")
         times, dt = timing.times, timing.dt
         lost = np.isnan(evenly(np.ones((len(times), 1)), times, dt)[:, 0])  # as fit and watch read them
     except ValueError as error:
-        return ClockFound(count, 0.0, 0.0, nothing, str(error))
+        return ClockFound(count, trouble=str(error))
     gaps = times[0] + dt * np.array([(start - 1, stop) for start, stop in spans(lost)], np.float64).reshape(-1, 2)
     steps = np.diff(times) / dt
     jitter = float(steps[steps <= FAR * max(1.0, float(np.quantile(steps, 0.9)))].std())

@@ -26,14 +26,13 @@ class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
 
 
 class LiveSource(NamedTuple):
-    """A source that is followed: how a user names it, how it is opened, and whether it may come back after it died.
+    """A source that is followed."""
 
-    ``open`` takes what follows the prefix, standard input, and after how much silence it has died [s].
-    """
-
-    example: str
-    open: Callable[[str, TextIO, float], Iterator[str]]
-    returns: bool = False
+    example: str  # of its name
+    open: Callable[
+        [str, TextIO, float], Iterator[str]
+    ]  # takes what follows the prefix, standard input, and silence [s]
+    returns: bool = False  # whether it may come back after it died
 
 
 def live_source(source: str) -> LiveSource | None:
@@ -108,7 +107,6 @@ def _follow_datagrams(place: str, stdin: TextIO, silence: float) -> Iterator[str
 
 
 def _follow_topics(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
-    """Yield rows of ROS 2 topics."""
     from asm_gym.data.ros2_dds import follow_topics
 
     return follow_topics(place, silence)

@@ -88,7 +88,7 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
     quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(AT_ONCE))
     readers = {}
     for name, kind in kinds.items():
-        topic = _dds("topic").Topic(participant, _topic(name), message(kind))
+        topic = _dds("topic").Topic(participant, f"rt/{name.strip('/')}", message(kind))
         readers[name] = _dds("sub").DataReader(participant, topic, qos=quality)
     clock, *others = names
     waiting = core.WaitSet(participant)
@@ -118,10 +118,6 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
             raise SourceDied(f"nothing came for {silence:g} s")
 
 
-def _topic(name: str) -> str:
-    return f"rt/{name.strip('/')}"
-
-
 def _kind(participant: Any, name: str) -> str:
     """The type of message that somebody publishes there."""
     builtin = _dds("builtin")
@@ -130,7 +126,7 @@ def _kind(participant: Any, name: str) -> str:
     until, others = time.monotonic() + CONNECT_S, set[str]()
     while time.monotonic() < until:
         for publication in found.take(N=AT_ONCE):
-            if getattr(publication, "topic_name", "") == _topic(name):
+            if getattr(publication, "topic_name", "") == f"rt/{name.strip('/')}":
                 if publication.type_name not in known:
                     raise ValueError(f"{name} is of {publication.type_name}; read are {', '.join(MESSAGES)}")
                 return known[publication.type_name]

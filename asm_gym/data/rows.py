@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from asm_gym.data.channels import RESAMPLED
 from asm_gym.data.clock import Clock, clock_among
 from asm_gym.data.names import factor, label_of, split_unit
-from asm_gym.data.text import Dialect, flat_row, header_of
+from asm_gym.data.text import Dialect, check_cells, flat_row, header_of
 from asm_gym.spec import StreamSpec
 
 NEWEST = 32  # rows that tell the rate, and after which it is told again
@@ -132,9 +132,7 @@ class RowReader:
         """The numbers of a row (D,), and its time [s] where it has one."""
         if self._header is not None:
             cells = self._dialect.cells(line)
-            size = len(self._header)
-            if len(cells) < size or any(cell.strip() for cell in cells[size:]):
-                raise ValueError(f"it has {len(cells)} cells, the header {size}")
+            check_cells(cells, len(self._header), "it has")
             return self._by_name(dict(zip(self._header, cells, strict=False)), self._dialect.number)
         row: Any = json.loads(line)
         if isinstance(row, list):

@@ -14,6 +14,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,9 +34,7 @@ KeepWords = Callable[[str], bool]
 LONGEST_WORD = 64  # characters that are kept of a word, of a label or a time
 MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
 LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
-
 SEPARATORS = ";\t,|"
-
 FLAGS = {"true": 1.0, "false": 0.0}
 
 
@@ -66,21 +65,17 @@ class Dialect(NamedTuple):
 
     def number(self, cell: str) -> float:
         """Return a cell's number, NaN of an empty one. Raises ValueError where it is none."""
-        text = cell.strip() or "nan"
-        try:
-            return float(text)
-        except ValueError:
-            if text.lower() in FLAGS:
-                return FLAGS[text.lower()]
-            return float(text.replace(",", ".") if self.comma and "." not in text else text)
+        text = cell.strip().lower() or "nan"
+        if text in FLAGS:
+            return FLAGS[text]
+        return float(text.replace(",", ".") if self.comma and "." not in text else text)
 
     def is_number(self, cell: str) -> bool:
         """Tell whether a cell is a number, a flag, or empty."""
-        try:
+        with suppress(ValueError):
             self.number(cell)
-        except ValueError:
-            return False
-        return True
+            return True
+        return False
 
 
 def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clock) -> Columns:
@@ -112,8 +107,7 @@ def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clo
     for n, line in rows:
         cells = dialect.cells(line)
         widest = max(widest, len(cells))
-        if len(cells) < len(names) or any(cell.strip() for cell in cells[len(names) :]):
-            raise ValueError(f"line {n} has {len(cells)} cells, its header {len(names)}")
+        check_cells(cells, len(names), f"line {n} has")
     try:
         frame = pd.read_csv(
             io.StringIO("\n".join(line for _, line in rows)),
@@ -146,6 +140,12 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
     if len(longest) > LONGEST_LINE:
         raise ValueError(f"line {n} has {len(longest)} characters: at most {MOST_COLUMNS} columns can be watched")
     return numbered, text.endswith(("\n", "\r"))
+
+
+def check_cells(cells: Sequence[str], size: int, where: str) -> None:
+    """Raise ValueError where a row has fewer cells than its header, or more that hold something."""
+    if len(cells) < size or any(cell.strip() for cell in cells[size:]):
+        raise ValueError(f"{where} {len(cells)} cells, its header {size}")
 
 
 def _cut_off(dialect: Dialect, before: str, last: str, size: int) -> bool:

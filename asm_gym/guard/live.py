@@ -89,13 +89,13 @@ class _Watch:
     def _judge(self, numbers: Any, bridged: bool) -> RowReport:
         return self.engine.judge(as_float32(numbers)[None], self.no_action, active=np.array([not bridged]))
 
-    def alarm(self, what: str, row: int | None = None) -> None:
-        """Count an alarm, and say at which row it was, by default at the newest."""
+    def alarm(self, what: str, ahead: int = 0) -> None:
+        """Count an alarm, and say at which row it was, so many ahead of the newest."""
         self.alarms += 1
-        self._note(what, row)
+        self._note(what, ahead)
 
-    def _note(self, what: str, row: int | None = None) -> None:
-        self.say(f"{(self.rows if row is None else row) * self.spec.dt:.3f} s  {what}")
+    def _note(self, what: str, ahead: int = 0) -> None:
+        self.say(f"{(self.rows + ahead) * self.spec.dt:.3f} s  {what}")
 
     def follow(self, lines: Iterable[str], returns: bool) -> bool:
         """Watch rows until the source ends or dies; return whether it died."""
@@ -162,7 +162,7 @@ class _Watch:
         for _ in over if all(over) else over[:1]:
             self._judge(np.full(self.spec.size, np.nan), bridged=True)
         if not all(over) and not self.late:  # of rows that are late again and again it is said once
-            self.alarm(f"{lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})", self.rows + 1)
+            self.alarm(f"{lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})", ahead=1)
 
     def summarise(self) -> None:
         """Say how many rows and alarms there were, and how long a row took."""
