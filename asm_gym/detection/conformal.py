@@ -7,8 +7,8 @@ By the hour
     threshold    the least maximum q of n healthy blocks with   #{i: m_i > q} + 1 <= r (T_1 + … + T_n)
 
 m_i is the largest value in block i, T_i its duration [h], and r the rate [1/h]. The loss of a block,
-[m_i > q] - r T_i, falls with q and is at most 1, so conformal risk control bounds the mean loss of the next block by 0:
-E[m > q] <= r E[T], at most r alarms an hour. Rows of a block may depend on each other; blocks must be exchangeable.
+[m_i > q] - r T_i, falls with q and is at most 1, so conformal risk control bounds the mean loss of the next block by 0.
+Rows of a block may depend on each other; blocks must be exchangeable.
 
 Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction); Angelopoulos et al. 2024 (ICLR,
 conformal risk control), Theorem 1.
@@ -107,9 +107,7 @@ class Blocks(NamedTuple):
     def restored(cls, kept: Floats) -> Blocks:
         """Read an ``array``. Raises ValueError where that is no maxima and hours."""
         if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
-            raise ValueError(
-                f"blocks should be maxima and hours in the shape (2, n) or (3, n), found {short_repr(kept)}"
-            )
+            raise ValueError(f"blocks should be maxima and hours, (2, n) or (3, n), found {short_repr(kept)}")
         return cls(*kept)
 
     @property

@@ -150,24 +150,22 @@ class Detector:
 
     @property
     def reach(self) -> float:
-        """Largest value in a context of 0: every error at ν for ever.
-
-        |w_i| <= ν Σ_j |M_ji|, so that v_i <= (ν Σ_j |M_ji|)² (2 - a) / a.
-        """
-        most = (self.bound * np.abs(self.whitening).sum(axis=0)) ** 2 * ((2.0 - self.gains) / self.gains)[:, None]
-        with np.errstate(over="ignore"):
-            ratios = (most / self.ceiling) ** self.tail  # (G, X)
-            return float(pool(ratios.reshape(1, -1))[0][0] / np.exp(self.context_quantile[-1]))
+        """Largest value in a context of 0: every error at ν for ever, so that |w_i| <= ν Σ_j |M_ji|."""
+        most = self.bound * np.abs(self.whitening).sum(axis=0, keepdims=True)
+        return float(self._most(most)[0] / np.exp(self.context_quantile[-1]))
 
     @property
     def reach_of_errors(self) -> Floats:
         """Largest value (X,) in the context of the least surprise, one error alone at ν for ever, the others at 0."""
-        most = (self.bound * self.whitening) ** 2  # (X of the error, X)
-        with np.errstate(over="ignore", divide="ignore"):
-            ratios = (most[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None] / self.ceiling) ** self.tail
-            pooled = pool(ratios.reshape(len(most), -1))[0]
-            found: Floats = pooled / np.exp(min(self.context_quantile[-1], self.context_range[0]))
+        least = np.exp(min(self.context_quantile[-1], self.context_range[0]))
+        found: Floats = self._most(self.bound * self.whitening) / least
         return found
+
+    def _most(self, evidence: Floats) -> Floats:
+        """Return the pooled ratios (N,) of whitened errors (N, X) that last for ever: v_i = w_i² (2 - a) / a."""
+        with np.errstate(over="ignore", divide="ignore"):
+            strengths = (evidence**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None]  # (N, G, X)
+            return pool(((strengths / self.ceiling) ** self.tail).reshape(len(evidence), -1))[0]
 
     def start(self, batch: int) -> Evidence:
         """Return evidence before the first row."""

@@ -5,9 +5,9 @@
     s'       s / 10 at a knock or a stop, s / 3 where a finger has just slid by 1 cm/s, else s
     after    k rows after a knock or a stop  s / (10 (1 - a)^{2k}), while that is less than s
 
-What exceeds the threshold in spite of the excuse is a fault; what exceeds it without the excuse only is counted as the
-event. A missing number excuses nothing, and neither does one that jumps to a stop, as those of swapped joints do. The
-excuse fades as slowly as the slowest evidence, (1 - a)² a row, a being the least of the usual gains.
+What exceeds the threshold in spite of the excuse is a fault. A missing number excuses nothing, and neither does one
+that jumps to a stop, as those of swapped joints do. The excuse fades as slowly as the slowest evidence, a being the
+least of the usual gains.
 """
 
 from __future__ import annotations

@@ -8,9 +8,8 @@
     pooled     s_t = (Σ_i r_i^p)^(1/p)
 
 Beyond q the maxima of episodes fall off as v^(-1/ξ), and κ = min(1, ξ_0/ξ) makes equal ratios equally rare. Where hours
-of healthy operation set q (``ceilings``), it is a quantile of 98 % and κ goes by a smaller ξ_0; ξ stays as learned. A
-large p lets the most surprising error decide, and several add up. ``accumulated`` serves to fit; in use the compiled
-step of ``detector`` does the same.
+of healthy operation set q (``ceilings``), it is a quantile of 98 % and κ goes by a smaller ξ_0; ξ stays as learned.
+``accumulated`` serves to fit; in use the compiled step of ``detector`` does the same.
 
 Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted as under a t distribution); Lowry et al.
 1992 (multivariate EWMA chart, its exact variance at start-up); Hill 1975 (index of a tail).
@@ -41,11 +40,7 @@ LEAST_SHARE = 1e-3  # the same as a share of the median q, for numbers that neve
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
-    """Return the symmetric (ZCA) matrix M (X, X) that makes ``errors`` (N, X) of nominal rows white.
-
-    Above a ``shrinkage`` λ of 0 constant channels and copies of channels are no trouble. Raises ValueError where X is
-    too large.
-    """
+    """Return the symmetric matrix M (X, X) that makes ``errors`` (N, X) white. Raises ValueError for a large X."""
     check_inputs(errors.shape[1])
     exact = np.asarray(errors, np.float64)
     covariance = gram(exact) / len(exact)  # (X, X)

@@ -5,11 +5,9 @@
           and at most n_0 + 24, so that a sense that works again is believed within about ten rows
     r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 pooled with the ratios of ``evidence``
 
-n_t is the evidence for "it repeats itself with probability ρ" against "with p" (CUSUM). A sense that often repeats
-itself, because it is coarse or slower than the stream, counts for little; none counts for more than it reached in
-nominal episodes. A sense is not watched if its noise is too small to change its reading at rest (σ < δ/2, see
-``readings``), or if it kept repeating itself in nominal episodes. If no channel declares its noise, the senses that
-never repeated themselves are watched.
+n_t is the evidence for "it repeats itself with probability ρ" against "with p" (CUSUM). A sense is not watched if its
+noise is too small to change its reading at rest (σ < δ/2, see ``readings``), or if it kept repeating itself in nominal
+episodes. If no channel declares its noise, the senses that never repeated themselves are watched.
 
 Source: Page 1954 (Biometrika 41, 100-115).
 """
@@ -44,9 +42,8 @@ class Repetition(NamedTuple):
     unlikely: Floats  # (B, X) n
 
     @classmethod
-    def start(cls, batch: int, size: int) -> Self:
-        """Return the state before the first row of ``size`` senses."""
-        shape = batch, size
+    def start(cls, *shape: int) -> Self:
+        """Return the state before the first row, for a ``shape`` (B, X)."""
         return cls(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
 
     def ratios(self, offset: Floats) -> Floats:
