@@ -25,7 +25,6 @@ from asm_gym.memory.traces import (
     Network,
     TracesLearner,
     advance,
-    at_rest,
     direct_synapses,
     initial_weights,
     learn_traces,
@@ -92,7 +91,7 @@ def test_a_trace_is_the_exponentially_weighted_sum_of_all_rows():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(30, 2, 3)).astype(np.float32)
     gains = rng.uniform(0.1, 1.0, len(DECAYS)).astype(np.float32)
-    traces = at_rest(2, 3)
+    traces = np.zeros((2, 3 * len(DECAYS)), np.float32)
     for row in rows:
         traces = advance(traces, row, gains)
     weights = DECAYS[:, None].astype(float) ** np.arange(len(rows))[::-1]  # (K, T); 0⁰ is 1

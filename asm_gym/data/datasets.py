@@ -7,7 +7,9 @@ https://minari.farama.org.
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import shutil
 from collections.abc import Sequence
@@ -32,6 +34,8 @@ METADATA, ARRAYS = "metadata.json", "main_data.hdf5"  # files of a dataset's fol
 
 OWN_FILES = (ARRAYS, METADATA, "SHA256SUMS")
 """Files that this package has written there; version 1 wrote the last one too."""
+
+SPARE_BYTES = 10_000_000  # beside the arrays of a data set, that a disk must have
 
 
 def require_minari() -> None:
@@ -79,6 +83,9 @@ def write_dataset(
         shutil.rmtree(before, ignore_errors=True)
     data = unfinished / "data"
     data.mkdir(parents=True)
+    size = sum(array.nbytes for e in episodes for array in (e.observations, e.actions, e.rewards, e.stream, e.faults))
+    if shutil.disk_usage(data).free < size + SPARE_BYTES:  # HDF5 may end the process where a disk is full
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / ARRAYS))
     spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
     with named(data):
         storage = MinariStorage.new(data, **spaces, env_spec=env.spec)

@@ -158,7 +158,7 @@ class FreeEnergy:
     def expected(self, moment: Before) -> Floats:
         """Return the command (A,) of the motor association; without one that of the last row."""
         if self.motor is None:
-            return moment.last[0, self.senses.spec.motor]
+            return np.asarray(moment.last[0, self.senses.spec.motor], np.float64)
         return np.asarray(self.motor.command(situation(self.senses, moment.last))[0], np.float64)
 
     @cached_property

@@ -32,7 +32,6 @@ from asm_gym.memory.traces import (
     TracesLearner,
     Weights,
     advance,
-    at_rest,
     direct,
     direct_synapses,
     expect,
@@ -94,7 +93,7 @@ def local(
     """Return Σ_t of the Hebbian changes along a batch of episodes of one length, with the weights held still."""
     w, curvature = weights, pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
     sensory = batch.senses.shape[2]
-    c = at_rest(batch.senses.shape[1], len(w.W_F) + 1)
+    c = np.zeros((batch.senses.shape[1], w.W_C.shape[1]), np.float32)
     total = {name: np.zeros(getattr(w, name).shape) for name in COMPARED}
     energy = error = 0.0
     for t, (x, u) in enumerate(zip(batch.senses, batch.commands, strict=True)):
