@@ -107,14 +107,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 def strip_chart(width: int, height: int, history: list[Step], shown: int) -> NDArray[np.uint8]:
-    """Return a chart of the last steps, (height, width, 3) uint8.
-
-    Args:
-        width: [px].
-        height: [px].
-        history: at most ``shown`` steps, the latest last.
-        shown: steps from edge to edge.
-    """
+    """Return a chart (height, width, 3) of the last steps, of which ``shown`` go from edge to edge; sizes in [px]."""
     bar = max(12, height // 7)  # [px] height of the fault's bar, and of the alarm's
     top, bottom = bar + 3, height - bar - 3
 

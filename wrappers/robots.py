@@ -147,12 +147,7 @@ def _resting_action(env: AnyEnv, actions: gym.spaces.Box, changed: str) -> NDArr
 
 
 def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-    """Return what environments say in ``info`` of what their arms felt within a step.
-
-    Args:
-        infos: of one environment, or of n with arrays whose first axis is n.
-        there: (n,) whose information is there; of all where None.
-    """
+    """Return what environments say in ``info`` of what their arms felt in a step, of those that are ``there`` (n,)."""
     numbers = nothing_felt(robots.count, robots.felt_size)
     if "contact_load" not in infos:
         return numbers
@@ -165,11 +160,7 @@ def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | No
 
 
 def body_memory(env: AnyEnv, watched: StreamSpec) -> NeuralASM:
-    """Return the shipped memory of the robot in ``env``, or in all its members; which one it is goes to the log.
-
-    Raises:
-        ValueError: none fits; the message lists those that there are.
-    """
+    """Return the shipped memory of the robot in ``env``, or in all its members. Raises ValueError where none fits."""
     memory = NeuralASM.pretrained(pretrained_for(watched, str(Members(env).first("controller", ""))))
     LOG.info("watching %s with %r", env.unwrapped, memory)
     return memory
@@ -178,11 +169,8 @@ def body_memory(env: AnyEnv, watched: StreamSpec) -> NeuralASM:
 def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
     """Return the user's own policy that acts during an alarm in ``env``, or in all its members.
 
-    Args:
-        on_alarm: a policy; for a single environment also what makes one: a class such as ``BackOff``, or a function.
-
-    Raises:
-        ValueError: no policy, or a reflex that was made for another environment, whose arm it would move.
+    For a single environment, a class or a function makes one. Raises ValueError where it is no policy, or a reflex that
+    was made for another environment, whose arm it would move.
     """
     made, many = on_alarm, isinstance(env, VectorEnv)
     takes = (

@@ -1,9 +1,8 @@
 """Turn the columns of a log into the channels of a stream.
 
-A column is a channel of its own. Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``,
-are the elements of one channel, and so are the columns of a two-dimensional array. Each channel is a group: it is
-predicted from the others. A column called ``action`` is a command. A unit may stand behind a name, ``joint_0 [rad]``.
-Clocks, counters of rows, labels and words are no channels (``asm_gym.data.names``).
+Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``, are the elements of one channel,
+and so are those of a two-dimensional array; others are channels of their own. Clocks, counters of rows, labels and
+words are no channels (``asm_gym.data.names``).
 """
 
 from __future__ import annotations
@@ -65,10 +64,7 @@ def read_recorded(
     action: Sequence[str] = (),
     labels: Sequence[str] = (),
 ) -> Recorded:
-    """Return the rows of a table, their channels, and which are labelled as faulty.
-
-    The arguments, and what is refused, are those of ``Episode.from_table``.
-    """
+    """Return the rows of a table, their channels, and which are labelled as faulty; as ``Episode.from_table`` does."""
     spec = channels if isinstance(channels, StreamSpec) else None
     table = table_of(frame)
     columns = columns_of(table, labels, {*spec.labels, *(c.name for c in spec.channels)} if spec else ())
@@ -121,10 +117,8 @@ def columns_of(
 ) -> list[Column]:
     """Decide for every column (T,) or (T, k) of a table what is done with it; k columns are made of the latter.
 
-    Args:
-        table: columns by name.
-        labels: patterns of the columns that say what is wrong, beside those that are called so.
-        senses: names of columns that are senses, whatever they are called.
+    ``labels`` are patterns of the columns that say what is wrong, beside those that are called so; ``senses`` are names
+    of columns that are senses, whatever they are called.
     """
     parts = {name: values.T if values.ndim == 2 else [values] for name, values in table.items() if values.ndim < 3}
     roles = {n: "sense" if n in senses else role_of(n, np.asarray(p[0]), labels) for n, p in parts.items() if len(p)}

@@ -35,13 +35,10 @@ def peak_torques(episode: Episode) -> NDArray[np.float64]:
 def crashes(
     episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = (), torques: bool = True
 ) -> dict[int, float]:
-    """Return the numbers of the episodes that crash, and how many times as hard as usual they press.
+    """Return the numbers of the episodes that crash, and how many times as hard as is usual in their tasks they press.
 
-    Args:
-        episodes: of policies that do their tasks.
-        tasks: task or policy of each.
-        reference: whether each tells what is usual in its task; by default, and where none does, all tell.
-        torques: whether joint torques count, beside contact forces.
+    ``reference`` says which episodes tell what is usual: by default, and where none does, all. ``torques`` of joints
+    count beside contact forces.
     """
     of, times = np.asarray(tasks), np.zeros(len(episodes))
     tells = np.array(reference or [True] * len(episodes), bool)

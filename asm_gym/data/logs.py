@@ -80,8 +80,7 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
     """Yield the episodes at ``path``, in the order of their names, each read when it is asked for.
 
     Args:
-        path: a file; the folder of a run, whose ``episodes`` are read; one of such files, at any depth; or one with a
-            LeRobot or a Minari dataset.
+        path: a file, a folder of files at any depth, that of a run, or one with a LeRobot or a Minari dataset.
         layout: how to read tables.
 
     Raises:

@@ -67,11 +67,9 @@ def _type_name(name: str) -> str:
 
 
 def follow_topics(topics: str, silence: float) -> Iterator[str]:
-    """Yield rows of topics as JSON lines, with the time of their stamps [s].
+    """Yield rows of topics, ``/joint_states`` or several with commas between, as JSON lines, with their times [s].
 
-    Args:
-        topics: ``/joint_states``, or several with commas between, the first being the clock.
-        silence: seconds without a row from which on the source has died.
+    The first topic is the clock; after ``silence`` [s] without a row of it the source has died.
 
     Raises:
         ValueError: no such names, or a topic is of another type, or ROS_DOMAIN_ID is no number.

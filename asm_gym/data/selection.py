@@ -31,12 +31,9 @@ class NormalEpisodes(NamedTuple):
 def normal_episodes(
     logs: Iterable[Log], between_marks: bool = False, progress: Callable[[int, int], object] | None = None
 ) -> NormalEpisodes:
-    """Return the normal episodes among logs.
+    """Return the normal episodes among logs; ``progress`` is called with the number of logs so far.
 
-    Args:
-        logs: of any kind.
-        between_marks: whether a table is learned from where no marked row is near, or left out as a whole.
-        progress: called with the number of logs so far.
+    A table with marked rows is left out, or with ``between_marks`` learned from where none of them is near.
     """
     kept = NormalEpisodes([], Counter())
     for n, (_, episode) in enumerate(logs, 1):
@@ -100,10 +97,7 @@ def pieces(episode: Episode, seconds: float) -> list[Episode]:
 def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
     """Split the pieces of long logs into heads to learn from and tails to calibrate on, a piece between left out.
 
-    Pieces of one log that follow each other are alike: shuffled, they would promise too much.
-
-    Raises:
-        ValueError: no log is long enough.
+    Shuffled, pieces that follow each other would promise too much. Raises ValueError where no log is long enough.
     """
     fitting, calibration = list[Episode](), list[Episode]()
     for parts in logs:
@@ -120,8 +114,7 @@ def split_at_random(
 ) -> tuple[list[Episode], list[Episode]]:
     """Split episodes by a seed into those to learn from, and a share (0, 1) to calibrate on.
 
-    Raises:
-        ValueError: too few of them for the false-alarm rate; the message says how many are needed.
+    Raises ValueError, which says how many are needed, where they are too few for the false-alarm rate.
     """
     n, needed = len(episodes), conformal_episodes(false_alarm_rate)
     order = np.random.default_rng(seed).permutation(n)

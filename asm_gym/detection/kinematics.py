@@ -20,23 +20,14 @@ HAND = 9  # how many numbers say where a hand is
 
 
 class Chain(NamedTuple):
-    """One arm, from its base to its hand.
+    """One arm, from its base to its hand."""
 
-    Attributes:
-        prefix: of its channels, where there are several arms.
-        axes: (J, 3) of its joints where all angles are 0, in the world.
-        anchors: (J, 3) points on them [m].
-        hand: (3, 3) the hand's place there [m], and the first two columns of its rotation.
-        late_s: the angles are sensed by so much later than the hand [s].
-        noise: how many times the noise that its channels say a reading has.
-    """
-
-    prefix: str
-    axes: NDArray[np.float64]
-    anchors: NDArray[np.float64]
-    hand: NDArray[np.float64]
-    late_s: float = 0.0
-    noise: float = 1.0
+    prefix: str  # of its channels, where there are several arms
+    axes: NDArray[np.float64]  # (J, 3) of its joints where all angles are 0, in the world
+    anchors: NDArray[np.float64]  # (J, 3) points on them [m]
+    hand: NDArray[np.float64]  # (3, 3) the hand's place there [m], and the first two columns of its rotation
+    late_s: float = 0.0  # the angles are sensed by so much later than the hand [s]
+    noise: float = 1.0  # how many times the noise that its channels say a reading has
 
     def at(self, angles: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(9,) the hand by the angles (J,) [rad]."""

@@ -7,9 +7,8 @@
     ε_t = (Δ_t - Δ̂_t) / (s σ_t)                    normalised error; s is the spread that D alone leaves
     ΔU = η ψ(ε_t) σ_t f(h_t)ᵀ / n_t                follows slow drift, as ΔD does; n_t = ‖f(h_t)‖² + ‖a_t‖²
 
-A joint that moves while the hand does not, or a commanded motion without a torque, is an error in any skill. The linear
-part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``). span_S are the
-limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
+The linear part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``).
+span_S are the limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
 2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Nagumo and Noda 1967
@@ -59,10 +58,8 @@ class Change(NamedTuple):
 def synapses(groups: NDArray[np.intp], changes: slice, inputs: int, size: int) -> Change:
     """Return masks that are 1 where there is a synapse and 0 elsewhere.
 
-    Args:
-        groups: (X,) group number of each change, from 0.
-        changes: columns of the X changes among the inputs.
-        inputs, size: I, and the hidden units of a group.
+    ``groups`` (X,) numbers the group of each change from 0, ``changes`` are the columns of the X changes among the
+    ``inputs`` I, and ``size`` is the number of hidden units of a group.
     """
     unit_group = np.repeat(np.arange(groups.max() + 1), size)  # (M,)
     V, D = np.ones((len(unit_group), inputs), np.float32), np.ones((len(groups), inputs), np.float32)
@@ -123,10 +120,7 @@ def normalised_errors(
     remainder: Array,
     spans: NDArray[np.intp],
 ) -> tuple[Array, Array]:
-    """Return ε (B, X) and f(h) (B, M) for inputs (B, I) and changes (B, X).
-
-    Errors are 0 where ``whole`` (B, 1) is 0. Columns outside of ``spans(U)`` are skipped.
-    """
+    """Return ε (B, X), 0 where ``whole`` (B, 1) is 0, and f(h) (B, M) for inputs (B, I) and changes (B, X)."""
     f = hidden_units(inputs, V)
     out = outward(inputs, D)
     if inputs.shape[0] > 1:

@@ -6,10 +6,9 @@
     c = Σ_n ψ(r_n) Δ̂_n / Σ_n Δ̂_n², in [0, 1]       share of the hidden units' predictions Δ̂ to believe
     ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ                     gradient of the Gaussian log likelihood
 
-Errors come back by weights B of their own. B changes as U does and both decay, so that B approaches U, which would be
-the gradient of a Huber loss; each change is local. c and the precision are learned on cross-fitted errors: each row is
-predicted by what was learned from the two thirds of the episodes that it is not in. From very few rows neither is
-known: then D reads the past and the command only, and U and W_S are 0.
+Errors come back by weights B of their own, which approach U. c and the precision are learned on cross-fitted errors:
+each row is predicted by what was learned from the two thirds of the episodes that it is not in. From very few rows
+D reads the past and the command only, and U and W_S are 0.
 
 Sources: Huber 1964 for ψ; Kolen and Pollack 1994 and Akrout et al. 2019 (NeurIPS) for learned feedback; Stone 1974 and
 Chernozhukov et al. 2018 (Econometrics Journal) for cross-fitting; Friston 2005 (Phil. Trans. R. Soc. B) for the
@@ -63,12 +62,8 @@ def association_change(
 ) -> tuple[Change, Array]:
     """Return the change of each synapse, as if all existed, and the errors (B, X).
 
-    Args:
-        a, delta: (B, I) inputs, and (B, X) changes.
-        spread: (X,) σ.
-        V, U, D: (M, I), (X, M), and (X, I) or (X, 0) without a linear part.
-        bound: of ψ.
-        back: (X, M) feedback weights; ``U`` where None.
+    Inputs ``a`` are (B, I), changes (B, X), σ (X,) and ``D`` (X, I), or (X, 0) without a linear part; ``bound`` is that
+    of ψ; the feedback weights ``back`` (X, M) are ``U`` where None.
     """
     f = hidden_units(a, V)
     error = delta - (complete(f, a, U, D) if D.size else outward(f, U))
@@ -94,8 +89,7 @@ def learn_association(
         a: (N, I) inputs of whole episodes, concatenated; the last input is a constant 1.
         delta: (N, X) changes, standardised.
         groups, changes, size: as in ``synapses``.
-        rng: draws initial weights and the order of the rows.
-        tick: called ``ALL_TICKS`` times.
+        rng, tick: draws initial weights and the order of the rows; is called ``ALL_TICKS`` times.
         lengths: rows of each episode; without them cross-fitting cuts the rows into three consecutive parts.
         independent: number of rows if overlapping changes are counted once; N where None.
     """
@@ -176,10 +170,7 @@ def thirds(rows: int, lengths: Sequence[int], rng: np.random.Generator) -> NDArr
 def crossfit(
     expect: Callable[[NDArray[np.bool_], NDArray[np.bool_]], Array], third: NDArray[np.intp], size: int
 ) -> Array:
-    """Return the prediction (N, X) of each row by what was learned from the other thirds.
-
-    ``expect`` learns from the rows of one mask (N,), and predicts those of another (M, X).
-    """
+    """Return the prediction (N, X) of each row; ``expect`` learns from one mask (N,), and predicts another (M, X)."""
     found = np.zeros((len(third), size), np.float32)
     for k in range(THIRDS):
         asked = third == k

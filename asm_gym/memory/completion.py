@@ -4,8 +4,8 @@
     C   = ⟨y_t y_tᵀ⟩                    learned by coincidence alone (Hebb)
     v̂_M = C_MO (C_OO + λ)⁻¹ y_O         minimises the energy ½ yᵀ (C + λ)⁻¹ y over the missing senses M: precision 0
 
-O is every entry in which no missing sense takes part, so that any set of senses can be missing at once. Products make
-curved relations, as between joint angles and the position of the hand, linear enough.
+O is every entry in which no missing sense takes part. Products make curved relations, as between joint angles and the
+position of the hand, linear enough.
 
 Sources: Kohonen 1972 (IEEE Trans. Comput. 21(4)) for correlation matrix memories; Lauritzen 1996 for the conditionals
 of a Gaussian. C is learned locally; the inverse is not local.

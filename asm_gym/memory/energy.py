@@ -60,10 +60,7 @@ def activate(z: Array) -> Array:
 
 @kernel
 def outward(a: Array, W: Array) -> Array:
-    """Return a @ W.T, (B, P) from (B, Q), along the synapses ``W`` (P, Q).
-
-    A single row is summed without BLAS, four rows of W at a time, which is faster.
-    """
+    """Return a @ W.T, (B, P) from (B, Q), along the synapses ``W`` (P, Q); of a single row without BLAS, faster."""
     out = np.empty((a.shape[0], W.shape[0]), a.dtype)
     if a.shape[0] > 1:
         np.dot(a, W.T, out)
@@ -126,11 +123,7 @@ def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
 def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> tuple[Array, Array]:
     """Return ∂F/∂z (B, H), and the most that the bend of f adds to the curvature of F (B,).
 
-    Args:
-        z, mu: (B, H) hidden state, and its expectation.
-        x: (B, X) senses and actions, less what is predicted past the state.
-        W_F: (X, H) from hidden units to these.
-        pi_z, pi_x: Π_z, and (B, X) Π_x, 0 where a number was not sensed.
+    ``x`` (B, X) are senses and actions, less what is predicted past the state; Π_x (B, X) is 0 where not sensed.
     """
     f = activate(z)  # (B, H)
     gradient = feedback(f, x, W_F, pi_x)
@@ -147,10 +140,7 @@ def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_
 
 @kernel
 def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int) -> Array:
-    """Return z_t (B, H) after steps down the energy from ``mu``; arguments as in ``energy_gradient``.
-
-    ``curvature`` is Π_z + max Π_x ‖W_F‖², ``iterations`` the largest number of steps.
-    """
+    """Return z_t (B, H) after at most so many steps down the energy from μ; ``curvature`` is Π_z + max Π_x ‖W_F‖²."""
     z = mu.copy()
     for _ in range(iterations):
         gradient, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)

@@ -4,8 +4,7 @@
 
 The step size of a synapse uses that synapse's own history only, so it is local too. Episodes are passed over in many
 parallel streams. After a random cue, and with a probability that rises during learning, a stream runs on alone for a
-row: the action is the memory's own and its state follows from its own prediction. Without this a memory learns to
-predict one row, and is lost a few rows after the senses are gone.
+row: the action is the memory's own and its state follows from its own prediction.
 
 Sources: Kingma and Ba 2015 (ICLR) for the step size; Tang et al. 2023 (NeurIPS) for offline recall; Bengio et al. 2015
 (NeurIPS) for learning from own predictions.

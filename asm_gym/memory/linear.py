@@ -3,9 +3,8 @@
     C = E[(a_t - m)(a_t - m)ᵀ]     P = (C + λ I)⁻¹        a_t: inputs of association, the changes among them
     Δ̂_g = m_g + D_g (a_t - m),     D_g = -P_gg⁻¹ P_g·      0 from g itself
 
-One inverse serves every group: D_g is the ridge regression of group g on everything else. λ is chosen for each sense by
-its error on held-out rows; D is then computed from all rows. ``specialise`` learns a policy's few episodes on top of a
-memory of the body:
+One inverse serves every group. λ is chosen for each sense by its error on held-out rows; D is then computed from all
+rows. ``specialise`` learns a policy's few episodes on top of a memory of the body:
 
     ΔD, ΔU = argmin Σ (r_t - ΔD a_t - ΔU f(h_t))² + λ (‖ΔD‖² + ‖ΔU‖²),   r_t = (Δ_t - Δ̂_t)/s
 
@@ -62,10 +61,7 @@ def moments(a: Array) -> Moments:
 
 
 def conditional(found: Moments, penalty: float, groups: NDArray[np.intp], changes: slice) -> Floats:
-    """Return D (X, I) for a penalty λ; its last column, of the constant 1, makes the means agree.
-
-    ``groups`` (X,) and ``changes`` are as in ``association.synapses``.
-    """
+    """Return D (X, I) for a penalty λ, with groups (X,) and changes as in ``association.synapses``."""
     places = np.arange(len(found.mean))[changes]  # (X,)
     P = (found.vectors / (np.maximum(found.values, 0.0) + penalty)) @ found.vectors.T
     D = np.zeros((len(places), len(P)))

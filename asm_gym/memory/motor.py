@@ -5,10 +5,9 @@
     ΔU ∝ ε f(h)ᵀ    ΔD ∝ ε mᵀ    ΔV ∝ ε_h mᵀ       ε = a_{t+1} - â_{t+1},  ε_h = f'(h) ⊙ Uᵀ ε
     W ← (1 - ηλ) W                                 weight decay
 
-The rules are those of association with three differences. Errors are not bounded: bounded errors find the median, and
-where a gripper closes, most rows around it say open. Rates and the last command are not inputs: a policy that copies
-them never moves again once it stands still. Weights decay, or each episode would be learned by heart from the places of
-its objects.
+The rules are those of association with three differences. Errors are not bounded: where a gripper closes, most rows
+around it say open. Rates and the last command are not inputs: a policy that copies them never moves again once it
+stands still. Weights decay, or each episode would be learned by heart.
 
 Sources: as ``association``; de Haan et al. 2019 (NeurIPS) for copied commands; Krogh and Hertz 1991 (NeurIPS) for
 weight decay.
@@ -94,10 +93,9 @@ class Motor(NamedTuple):
 
 
 def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return situations (N, I), and the next command in each (N, A).
+    """Return situations (N, I), and the next command in each (N, A): of ``actions``, or else of the stream.
 
-    The command is that of ``episode.actions``, the intended one where noise was added to the executed one (DART: Laskey
-    et al. 2017, CoRL); without actions, that of the stream. Raises ValueError where there are no commands.
+    Actions are what was intended where noise was added (DART: Laskey et al. 2017, CoRL). Raises ValueError without any.
     """
     motor = senses.spec.motor
     if not len(motor):

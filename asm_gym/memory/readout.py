@@ -5,7 +5,7 @@
     L_t = (1 - λ) L_{t-1} + log p_t          the named skill has the largest L
 
 h are the units of ``association``, μ is the state of the temporal network. n_k gives rare skills as much weight as
-frequent ones. The delta rule is local. L adds up evidence and forgets it, so that a change of skill is followed.
+frequent ones. L forgets, so that a change of skill is followed.
 
 Source: Wald and Wolfowitz 1948 for adding up log likelihoods.
 """

@@ -34,10 +34,7 @@ class Recalled(NamedTuple):
 
 
 def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -> Recalled:
-    """Recall online from a carried state ``c`` (B, I): predict every row, then read it.
-
-    ``senses`` (T, B, S) are NaN where missing; the last of ``commands`` (T, B, A + 1) is a constant 1.
-    """
+    """Recall online from ``c`` (B, I), with senses (T, B, S), NaN where missing, and commands and 1 (T, B, A + 1)."""
     steps = []
     for x, u in zip(senses, commands, strict=True):
         seen = np.isfinite(x)

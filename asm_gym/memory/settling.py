@@ -103,11 +103,8 @@ def settling_change(
 ) -> SettlingWeights:
     """Return the change of each array: local products, averaged over the batch.
 
-    Args:
-        before, h, z: (B, H) the state before, that of the motor prediction, and the inferred one.
-        u: (B, A + 1) the action that μ used, and a constant 1.
-        errors: Π_z ε_z (B, H), Π_x ε_x (B, S) at ``z``, and ε_a (B, A).
-        W_A: (A, H), by whose transpose ε_a comes back to h.
+    ``before``, ``h`` and ``z`` (B, H) are the state before, that of the motor prediction, and the inferred one; ``u``
+    (B, A + 1) is the action of μ and 1; ``errors`` are Π_z ε_z (B, H), Π_x ε_x (B, S) at ``z``, and ε_a (B, A).
     """
     state, senses, action = errors
     f = activate(h)

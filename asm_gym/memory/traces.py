@@ -189,14 +189,7 @@ def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Genera
 
 
 def hebbian_change(c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float) -> HebbianChange:
-    """Apply the local learning rules.
-
-    Args:
-        c, u: (B, I) the traces before; (B, A + 1) the action, and a constant 1.
-        mu, z: (B, H) the expected state, and the inferred one.
-        error: (B, S + A) Π_x ε_x at ``z``.
-        pi_z: Π_z.
-    """
+    """Apply the local learning rules to traces (B, I), action and 1 (B, A + 1), μ and z (B, H), and Π_x ε_x at z."""
     motor = u.shape[1] - 1
     return HebbianChange(
         W_C=coincidence(np.float32(pi_z) * (z - mu), c),
