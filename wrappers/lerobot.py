@@ -2,8 +2,8 @@
 
     row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before it is sent
 
-From an alarm on, until ``quiet_s`` without one, the reaction is sent and judged in place of the policy's action. A hold
-is a rest: a memory that was fitted without rests is surprised by it, and the hold does not end.
+From an alarm on, until ``quiet_s`` without one, a hold is sent and judged in place of the policy's action. A memory
+that was fitted without rests is surprised by a hold, which then does not end.
 
 Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 """

@@ -29,17 +29,15 @@ Mask = NDArray[np.bool_]
 class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
     """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
 
-    Arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` holds arrays whose first axis is n, and
+    Other arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` has arrays whose first axis is n, and
     ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` are (n,). A monitor
-    that raises puts all environments in alarm; any other failure is that of one environment. Where an episode has just
-    begun, surprise is 0 and ``executed_action`` NaN. An episode that the guard ends begins anew as any other.
+    that raises puts all environments in alarm. Where an episode has just begun, surprise is 0 and ``executed_action``
+    NaN.
 
     Args:
         env: of ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``; where ``info`` has no ``"stream"``,
             observation and action are the stream.
-        monitor: a fitted and calibrated monitor; where None, the shipped memory of the body that they move.
         on_alarm: a name as in ``NeuralASMSafety``, or one policy that all share and that keeps its memory in its state.
-        release_after, release_below, max_override, try_after, truncate, responses, contact_limits, info: as there.
         adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
             with.
 

@@ -152,21 +152,16 @@ def _period_to_read(spec: StreamSpec | None, own: float) -> float:
     """How far apart rows are to be [s]: as the memory reads them, where the clock can be followed that far."""
     if spec is None or not 1 / RESAMPLED <= own / spec.dt <= RESAMPLED:
         return own
-    if not _alike(spec.dt, own):
+    if abs(spec.dt / own - 1) > RATE_TOLERANCE:
         note(f"rows that come at {1 / own:.4g} a second are read at {1 / spec.dt:.4g}, by their clock")
     return spec.dt
-
-
-def _alike(dt: float, other: float) -> bool:
-    return abs(dt / other - 1) <= RATE_TOLERANCE
 
 
 def _described(
     columns: list[Column], channels: Sequence[str] | None, dt: float, action: Sequence[str]
 ) -> tuple[NDArray[np.float32], StreamSpec]:
     """The rows (T, D) of the columns that are chosen, and their spec."""
-    if channels is not None:
-        columns = _chosen(columns, channels)
+    columns = columns if channels is None else _chosen(columns, channels)
     commanded = {c.name for c in _chosen(columns, action)}
     parts: dict[str, list[Column]] = {}
     for column in sorted(columns, key=lambda c: c.name in commanded):  # the action stands last
@@ -199,15 +194,12 @@ def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Chann
 
 def _rows_of(spec: StreamSpec, columns: Sequence[Column], dt: float | None) -> NDArray[np.float32]:
     """The rows (T, D) as a memory of this spec reads them; other columns of the table are left out."""
-    if dt is not None and not _alike(dt, spec.dt):
+    if dt is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
         raise ValueError(f"the memory reads {1 / spec.dt:.4g} rows a second, these come at {1 / dt:.4g}")
     # joint_0 is joint[0] too, though it may be the only one here.
     found = {label_of(c.name): c for c in columns} | {c.name: c for c in columns}
     missing = [label for label in spec.labels if label not in found]
     if missing:
         raise ValueError(f"the memory reads channels that are not there: {', '.join(missing)}")
-    read = [
-        found[label].values * factor(found[label].name, found[label].unit, unit)
-        for label, unit in zip(spec.labels, spec.units, strict=True)
-    ]
-    return np.column_stack(read).astype(np.float32)
+    chosen = zip((found[label] for label in spec.labels), spec.units, strict=True)
+    return np.column_stack([c.values * factor(c.name, c.unit, unit) for c, unit in chosen]).astype(np.float32)

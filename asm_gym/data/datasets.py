@@ -31,10 +31,7 @@ from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 
 METADATA, ARRAYS = "metadata.json", "main_data.hdf5"  # files of a dataset's folder ``data``
-
-OWN_FILES = (ARRAYS, METADATA, "SHA256SUMS")
-"""Files that this package has written there; version 1 wrote the last one too."""
-
+OWN_FILES = (ARRAYS, METADATA, "SHA256SUMS")  # files that this package has written there, the last one until 1.0
 SPARE_BYTES = 10_000_000  # beside the arrays of a data set, that a disk must have
 
 
