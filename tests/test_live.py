@@ -62,7 +62,7 @@ def test_nested_json_and_units_are_read_as_from_a_file():
         (["{"], "line 1 is no row of numbers"),
         (['{"q": [1, 2]}'], "line 1 is no row of numbers: it lacks torque, cmd"),
         (['{"q": [1, 2, 3], "torque": 1, "cmd": 1}'], "q must hold 2 numbers, got 3"),
-        ([*csv_lines()[:2], "0.1,1,2"], "line 3 is no row of numbers: it has 3 cells, the header 6"),
+        ([*csv_lines()[:2], "0.1,1,2"], "line 3 is no row of numbers: it has 3 cells, its header 6"),
         ([*csv_lines()[:2], "0.1,1,2,x,fine,3"], "line 3 is no row of numbers"),
         ([*csv_lines()[:3], csv_lines()[1]], r"line 4 is no row of numbers: time must increase, got 0 s after 0\.02"),
     ],
