@@ -252,37 +252,23 @@ LOG_COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 
 
 def log_figure(found: Inspection) -> Figure:
-    """Draw a panel per channel, with its gaps shaded; the first one shows the steps of the clock."""
+    """Draw a panel per channel, with its gaps shaded."""
     drawn = [c for c in found.columns if c.role in LOG_COLOURS and c.values.dtype.kind in "biuf"]
     more = f"; {len(drawn) - MOST_PANELS} more channels are in the table" if len(drawn) > MOST_PANELS else ""
     drawn = drawn[:MOST_PANELS]
-    down = math.ceil((len(drawn) + 1) / ACROSS)
+    down = math.ceil(max(len(drawn), 1) / ACROSS)
     with figure(height=0.7 + 1.25 * down, width=11.0) as fig:
         panels = fig.subplots(down, ACROSS, squeeze=False).ravel()
-        _clock_panel(panels[0], found)
-        for ax, column in zip(panels[1:], drawn, strict=False):
+        for ax, column in zip(panels, drawn, strict=False):
             _column_panel(ax, found, column)
         for ax in panels:
             ax.title.set_fontsize(7)
             ax.tick_params(labelsize=6)
-        for ax in panels[len(drawn) + 1 :]:
+        for ax in panels[len(drawn) :]:
             ax.set_visible(False)
         fig.suptitle(f"{found.caption()}{more}", fontsize=10)
         fig.supxlabel("time [s]" if found.clock.rate else "row", fontsize=9)
     return fig
-
-
-def _clock_panel(ax: Axes, found: Inspection) -> None:
-    ax.set_title("steps of the clock [ms]")
-    if len(found.clock.times) < 2 or not found.clock.rate:
-        ax.text(0.5, 0.5, found.clock.trouble or "no clock", ha="center", va="center", fontsize=7, wrap=True)
-        ax.set_axis_off()
-        return
-    usual = 1e3 / found.clock.rate
-    ax.hist(np.clip(1e3 * np.diff(found.clock.times), 0, 4 * usual), bins=60, color=BLUE, log=True)
-    ax.axvline(usual, color=VERMILLION, linewidth=1)
-    low, high = ax.get_xlim()
-    ax.set_xlim(min(low, 0.95 * usual), max(high, 1.05 * usual))  # rounding is no jitter
 
 
 def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:

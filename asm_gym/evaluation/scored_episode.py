@@ -46,13 +46,6 @@ class TraceDetail:
     fault: NDArray[np.bool_]
     stream: Floats | None = None
 
-    def __post_init__(self) -> None:
-        steps = len(self.attribution)
-        if self.attribution.shape != (steps, len(self.channels)):
-            raise ValueError(f"attribution must be (T, {len(self.channels)}), got {self.attribution.shape}")
-        if self.fault.shape != (steps,) or self.fault.dtype != np.bool_:
-            raise ValueError(f"fault must be bool of shape {(steps,)}, got {self.fault.dtype} {self.fault.shape}")
-
 
 @dataclass(frozen=True, eq=False)
 class ScoredEpisode:
@@ -61,21 +54,17 @@ class ScoredEpisode:
     Row t was sensed from ``t * dt`` to ``(t + 1) * dt``. A fault first active in row t began at ``t * dt``; an alarm in
     row t was raised at ``(t + 1) * dt``.
 
-    Args:
-        kind: ``"nominal"``, or the name of the fault or the harmless variation.
+    Attributes:
+        kind: ``"nominal"``, or the name of the fault or the harmless variation; ``severity`` of the fault.
         seed: of ``reset``; twins share it.
         dt: period of the rows [s].
         threshold: surprise above it is an alarm.
         surprise: (T,) ``inf`` where the stream was not finite, never NaN.
         onset: the first row with a fault; None without one.
-        severity: of the fault, such as ``"mild"``.
-        task, monitor: names.
         acting: ``"policy alone"`` where the monitor only watched, else the response, such as ``"hold"``.
         affected_channels: those in which the fault shows first.
         top_channel: the channel with the greatest share of surprise at ``first_alarm``; empty without an alarm.
-        outcome: how the episode ended.
         excused: by event (knock, stop), (T,) the surprise that it excused; 0 in other rows.
-        detail: what only figures need.
     """
 
     kind: str
