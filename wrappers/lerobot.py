@@ -63,8 +63,7 @@ class LeRobotGuard:
         clock: a clock in seconds, for the rate.
 
     Attributes:
-        alarm: whether there was an alarm at the newest row.
-        intervened: whether something else was sent than the policy asked for.
+        alarm, intervened: whether there was an alarm at the newest row, and whether a hold was sent.
         last_alarm: surprise in thresholds, reason and channel of the newest alarm; empty before the first.
 
     Example:

@@ -12,17 +12,11 @@ from asm_gym.spec import StreamSpec
 
 
 class ObservationMap:
-    """Where the numbers of a stream stand in the observation.
+    """Where the numbers of a stream stand in an observation of this space.
 
-    Args:
-        space: of the observation.
-        spec: of the stream.
-        has_stream: the environment has a stream of its own; else observation and action are it.
-        layout: parts of the observation in order, by the names of channels, and how many numbers each has.
-        own: the space that the layout is of; it must be that of the observation.
-
-    Raises:
-        ValueError: the environment does not say where they stand, or a wrapper inside has changed the observation.
+    ``layout`` are the parts of the observation in order, by the names of channels, and their sizes; ``own`` is the
+    space of that layout. Without a stream of its own, observation and action are the stream. Raises ValueError where
+    the environment does not say where they stand, or a wrapper inside has changed the observation.
     """
 
     def __init__(

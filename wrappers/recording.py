@@ -19,9 +19,8 @@ from asm_gym.validation import as_float32
 class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Keeps every finished episode in ``episodes``, and gives environments without a stream one.
 
-    ``info["stream"]`` and ``stream_spec`` exist on the wrapped environment whatever it is. Where the stream runs faster
-    than control, an episode has several rows of it for each action. An episode of an environment whose ``info`` says
-    nothing of ``"success"`` or ``"is_success"`` counts as one.
+    Where the stream runs faster than control, an episode has several rows of it for each action. An episode counts as a
+    success where ``info`` says nothing of ``"success"`` or ``"is_success"``.
 
     Args:
         env: an environment with a stream, or with spaces that can be read as numbers.
@@ -78,11 +77,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
     def finish(self) -> Episode:
-        """Ends the episode that is being recorded, and hands out the one recorded last; it is not kept.
-
-        Raises:
-            ValueError: nothing was recorded.
-        """
+        """End the episode that is recorded, and return the last one, which is not kept. Raises ValueError without."""
         self._finish()
         if not self.episodes:
             raise ValueError("no step was recorded yet")

@@ -61,13 +61,9 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
 
 
 def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
-    """Return what is known of the robots in an environment, or in all members of a vector environment.
+    """Return the robots of an environment or a vector environment, and where their streams stand in observations.
 
-    Returns:
-        The robots, and where their streams stand in what they observe; None where that is not known.
-
-    Raises:
-        TypeError: members of a vector environment cannot be asked what they are.
+    Raises TypeError where members of a vector environment cannot be asked what they are.
     """
     members, many = Members(env), isinstance(env, VectorEnv)
     actions: Any = env.single_action_space if isinstance(env, VectorEnv) else env.action_space
@@ -199,11 +195,7 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
 
 
 def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> Any:
-    """Return the environment underneath, once its stream can run at ``rate`` [Hz]; nothing is changed.
-
-    Raises:
-        ValueError: it cannot, or a wrapper inside changes actions, which a reflex within a step would pass by.
-    """
+    """Return the environment underneath. Raises ValueError where its stream cannot run at ``rate`` [Hz]."""
     check_number("monitor_freq", rate, low=1, whole=True)
     inner: Any = env.unwrapped
     if not hasattr(inner, "stream_spec_at"):

@@ -43,8 +43,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
 
     Raises:
         TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
-        ValueError: an unknown ``on_alarm``, another mode of autoreset, a monitor fitted for another stream (the message
-            names the channels), or a wrapper inside that changes actions or normalises by running statistics.
+        ValueError: as ``NeuralASMSafety``, or another mode of autoreset.
         RuntimeError: the monitor is not calibrated.
 
     Example:

@@ -25,11 +25,7 @@ def read_parquet(path: Path) -> Columns:
 
 
 def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
-    """Return the array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the one column ``value``.
-
-    Raises:
-        ValueError: it is damaged, or has not as many columns as are named.
-    """
+    """Return the array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the column ``value``."""
     if not regular_file(path):
         raise ValueError(f"{path} is empty")
     try:

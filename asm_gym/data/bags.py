@@ -48,11 +48,7 @@ MESSAGES: dict[str, Callable[[Any], Numbers]] = {
 
 
 def read_bag(path: Path) -> Columns:
-    """Return the columns of a bag (``.mcap``, ``.db3``, ``.bag``), ``time`` among them [s].
-
-    Raises:
-        ValueError: it is damaged, or has no JointState; the message lists its topics.
-    """
+    """Return the columns of a bag, ``time`` [s] among them. Raises ValueError if it is damaged or has no JointState."""
     regular_file(path)
     highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)

@@ -114,11 +114,7 @@ def timing_of(table: Mapping[str, NDArray[Any]]) -> Timing | None:
 
 
 def period(times: Floats) -> float | None:
-    """Return the seconds from row to row in the mean, lost rows counted; None of fewer than two rows.
-
-    Where nearly all steps are whole multiples of the median, rows were lost between those that are more than one;
-    elsewhere the clock jitters, and only steps that are far longer are gaps.
-    """
+    """Return the seconds from row to row in the mean, lost rows counted; None of fewer than two rows."""
     if len(times) < 2:
         return None
     if not np.isfinite(times).all():

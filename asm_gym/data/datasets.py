@@ -48,15 +48,12 @@ def write_dataset(
     """Write episodes of one spec as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
 
     Args:
-        root: the folder of all datasets.
-        dataset_id: such as ``asm_gym/lift-v0``.
-        episodes: with an action, a reward and a flat observation of every step.
-        env: that they were recorded in.
+        root, dataset_id: the folder of all datasets, and a name such as ``asm_gym/lift-v0``.
+        episodes, env: with an action, a reward and a flat observation of every step, recorded in ``env``.
         details: JSON-serialisable; kept in the metadata.
 
     Raises:
-        ValueError: episodes are missing, incomplete or of several specs; the name leads out of ``root``, or to a folder
-            that holds what this package did not write.
+        ValueError: episodes are missing, incomplete or of several specs; the name leads elsewhere, or to foreign files.
         OSError: the disk has no room for it.
     """
     require_minari()

@@ -41,13 +41,10 @@ def live_source(source: str) -> LiveSource | None:
 
 
 def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
-    """Return the lines of a live source, as they come.
+    """Return the lines of a live source, as they come; SourceDied after ``silence`` [s] without one.
 
-    Args:
-        source: ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams sent to this
-            machine from itself, of which an empty one is the end, ``dds:/joint_states`` for topics of ROS 2.
-        stdin: standard input.
-        silence: seconds without a line, after the first one, from which on SourceDied is raised.
+    Sources are ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams of this
+    machine, of which an empty one is the end, and ``dds:/joint_states`` for topics of ROS 2.
     """
     found = live_source(source)
     if found is None:
@@ -56,7 +53,6 @@ def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
 
 
 def _follow_pipe(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
-    """Yield the lines of standard input."""
     try:
         number = stdin.fileno()
     except (UnsupportedOperation, AttributeError):  # no pipe, but text in memory
@@ -71,7 +67,6 @@ def _follow_pipe(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
 
 
 def _follow_file(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
-    """Yield the lines of a file that grows."""
     path = Path(place)
     regular_file(path)
     with path.open("rb") as file:

@@ -4,8 +4,7 @@
     a row              a message of the first topic, at the time in its header, with the newest of the others
     numbers            named as those of a bag are, joint_states.position[panda_joint1] (``asm_gym.data.bags``)
 
-A reader asks for no more than best effort, which every writer offers. Sources: ROS 2 design, "Topic and Service name
-mapping to DDS"; ROS_DOMAIN_ID as ROS 2 reads it.
+Source: ROS 2 design, "Topic and Service name mapping to DDS".
 """
 
 from __future__ import annotations

@@ -81,13 +81,8 @@ class Dialect(NamedTuple):
 def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clock) -> Columns:
     """Return the columns of numbers of a table of text; an empty cell is NaN, true and false are 1 and 0.
 
-    Args:
-        path: of the file.
-        columns: names of the columns of a table without a header.
-        keeps: whose words are kept, by name; other columns of words are left out.
-
-    Raises:
-        ValueError: it is no table: no header or no row, a name twice, rows of several lengths, words among numbers.
+    ``columns`` name those of a table without a header; words are kept of columns that ``keeps`` chooses by name. Raises
+    ValueError where it is no table: no header or no row, a name twice, rows of several lengths, words among numbers.
     """
     import pandas as pd
 

@@ -40,12 +40,10 @@ def follow(
     """Say every alarm as it is raised, and why; return how many there were.
 
     Args:
-        lines: rows, as ``asm_gym.data.live.lines_from`` yields them.
-        monitor: calibrated.
+        lines, monitor: rows, as ``asm_gym.data.live.lines_from`` yields them; a calibrated monitor.
         say: takes a line for the user.
         seconds: that something may be missing without an alarm.
-        again: opens the source anew after it has died, or its clock went back.
-        wait: for how long that is tried [s].
+        again, wait: opens the source anew after it has died, or its clock went back; for how long that is tried [s].
 
     Raises:
         ValueError: no row came, or a line is no row.
