@@ -1,7 +1,6 @@
 """Draw a strip chart of surprise under every rendered picture.
 
-The chart scrolls to the left, the latest step at its right edge. Its vertical axis is logarithmic and fixed in units of
-the threshold, so that a film does not rescale.
+The latest step stands at the right edge. The vertical axis is logarithmic and in units of the threshold.
 """
 
 from __future__ import annotations

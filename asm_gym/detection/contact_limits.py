@@ -82,12 +82,7 @@ class ContactLimits:
 
 
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:
-    """Return (N,) the most that healthy motion reached, of each number that an arm feels [N m], [N].
-
-    Args:
-        streams: (T, D) of healthy episodes; peaks within rows count where they are sensed.
-        spec: of the streams; where it senses no such forces, nothing is returned.
-    """
+    """Return the most that healthy streams (T, D) reached, of each number that an arm feels [N m], [N]; () without."""
     felt = [c for c in spec.channels if c.name.endswith(FELT)]
     if not streams or not felt:
         return ()

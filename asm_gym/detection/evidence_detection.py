@@ -34,11 +34,9 @@ class EvidenceDetection:
     Args:
         spec: the stream.
         gains: a in (0, 1], weights of the newest row in the accumulated evidence, for sudden and slow faults.
-        bound: ν > 0, standard deviations to which an error is bounded, so that a short knock counts less than a
-            lasting error.
+        bound: ν > 0, standard deviations to which an error is bounded.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
-        habituates: whether surprise is relative to what is usual in a context. A context identifies the policy, so a
-            memory for any policy does without.
+        habituates: whether surprise is relative to what is usual in a context; a memory for any policy does without.
         tail_index: ξ_0 in (0, 1]: a ratio falls off as probability to this power. The smaller, the more senses add up.
 
     Attributes:

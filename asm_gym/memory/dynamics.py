@@ -61,11 +61,8 @@ def train(
 ) -> Trained:
     """Learn the synapses through time, then those of association, from whole episodes.
 
-    Args:
-        trajectories, hidden, schedule: the episodes; H and how to learn of the temporal network, one of ``DYNAMICS``.
-        groups, changes, units: as in ``association.synapses``.
-        rng: draws everything random.
-        progress: called with steps done and their total.
+    ``hidden`` and ``schedule`` are of the temporal network, one of ``DYNAMICS``; ``groups``, ``changes`` and ``units``
+    are as in ``association.synapses``; ``progress`` is called with steps done and their total.
     """
     done, total = 0, passes(trajectories, schedule) + ALL_TICKS
 

@@ -75,19 +75,13 @@ Through = tuple[float, Floats, Floats, Floats]  # the sum through time, and its 
 
 @dataclass(frozen=True, eq=False)
 class FreeEnergy:
-    """F of a memory.
+    """F of a memory."""
 
-    Args:
-        network, senses: its synapses, and how it reads a row.
-        motor: its motor association; without one the third sum is 0.
-        tau, tau_motor: τ of the temporal network, and τ_j (A,) in spreads of a command.
-    """
-
-    network: TemporalNetwork
-    senses: StreamScaler
-    motor: Motor | None
-    tau: float
-    tau_motor: Floats
+    network: TemporalNetwork  # its synapses
+    senses: StreamScaler  # how it reads a row
+    motor: Motor | None  # without a motor association the third sum is 0
+    tau: float  # τ of the temporal network
+    tau_motor: Floats  # τ_j (A,) in spreads of a command
 
     @classmethod
     def of(

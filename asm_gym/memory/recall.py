@@ -3,8 +3,6 @@
     online    every row is predicted, then read; a missing sense is inferred from the rest of the row
     offline   the predictions stand in for the senses and the actions
 
-A prediction that is fed back has no error, so z_t = μ_t is the fixed point of inference offline.
-
 Sources: Tang, Barron and Bogacz 2023 (NeurIPS) for online and offline recall by temporal predictive coding; Mahajan et
 al. 2025 (Neural Computation 38(1)) for skills.
 """

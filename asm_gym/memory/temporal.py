@@ -78,14 +78,7 @@ class Step(NamedTuple):
 
 
 class TemporalNetwork(ABC):
-    """A network whose weights no longer change.
-
-    Args:
-        weights: a NamedTuple of the synapses through time, among them ``W_F`` (N, H).
-        association: the synapses between senses.
-        iterations: inference steps a row.
-        prior_precision, sensory_precision: Π_z and Π_x.
-    """
+    """A network whose weights, among them ``W_F`` (N, H), no longer change; precisions are Π_z and Π_x."""
 
     weights: Any
 
@@ -133,12 +126,9 @@ class TemporalNetwork(ABC):
 
     @abstractmethod
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
-        """Expect a row, read it, and infer its state.
+        """Expect a row from the carried state ``c`` (B, I), read it, and infer its state.
 
-        Args:
-            c: (B, I) the carried state.
-            u: (B, A + 1) the action as commanded, standardised, and a constant 1.
-            x, seen: (B, S) what was sensed, standardised; 1 where it is a measurement, 0 where it is to be ignored.
+        ``u`` (B, A + 1) is the action and a constant 1, ``x`` (B, S) what was sensed, ``seen`` 0 where it is ignored.
         """
 
     @abstractmethod
