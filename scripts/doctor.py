@@ -102,3 +102,6 @@ def report(args: Args, console: Console) -> int:
 
 
 main = partial(run, "doctor", Args, report)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -195,3 +195,6 @@ def evaluate(args: Args, console: Console) -> None:
 
 
 main = partial(run, "evaluate", Args, evaluate)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -91,3 +91,6 @@ def train_agent(args: Args, console: Console) -> None:
 
 
 main = partial(run, "train", Args, train_agent)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -47,3 +47,6 @@ def warm_up(args: Args, console: Console) -> None:
 
 
 main = partial(run, "warmup", Args, warm_up)
+
+if __name__ == "__main__":
+    raise SystemExit(main())

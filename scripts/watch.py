@@ -145,3 +145,6 @@ def watch(args: Args, console: Console) -> int:
 
 
 main = partial(run, "watch", Args, watch)
+
+if __name__ == "__main__":
+    raise SystemExit(main())
