@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +34,7 @@ def recorded(tmp_path, monkeypatch):
         episode = sine_episodes(1, trial.seed % 1000)[0]
         return save_episode(folder / trial.label.path, replace(episode, label=trial.label, success=True))
 
-    monkeypatch.setattr("asm_gym.rollouts.collect.record", record)
+    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record", record)
     for number in range(2):
         record_round(tmp_path, number)
     return tmp_path, made
@@ -116,7 +117,7 @@ def pushed(tmp_path, monkeypatch):
         made = replace(episode, stream=stream, faults=np.arange(60) >= onset, label=trial.label, success=True)
         return save_episode(folder / trial.label.path, made)
 
-    monkeypatch.setattr("asm_gym.rollouts.collect.record", record)
+    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record", record)
     monkeypatch.setattr(module, "trials", lambda *_: wanted)
     record_round(tmp_path / "corpus", 0, 1, SOURCES[:1])
     return tmp_path / "corpus"
