@@ -43,7 +43,6 @@ class Detectability(NamedTuple):
     """What the ideal observer could detect of one faulty episode.
 
     Attributes:
-        task, kind, severity, seed: identify the episode.
         separation: S at the end of the window.
         delay: time from the onset until the observer is sure [s]; None if never.
     """

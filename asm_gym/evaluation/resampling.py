@@ -130,16 +130,7 @@ def resample(
     seed: int = 0,
     draws: int = DRAWS,
 ) -> Draws:
-    """Resample the results of one monitor.
-
-    Args:
-        faulty: episodes with an onset; twins of nominal ones share their seed.
-        nominal: episodes without one; each is a scene of its task.
-        calibration: sets the thresholds anew.
-        window_s: an alarm within this time of the onset is a detection [s].
-        seed: the same for all monitors that are compared.
-        draws: number of resamples.
-    """
+    """Resample the results of one monitor; twins share task and seed, and monitors of the same ``seed`` are paired."""
     rng = np.random.default_rng(seed)
     names = sorted({(t.task, t.seed) for t in (*nominal, *faulty)})
     place = {name: i for i, name in enumerate(names)}

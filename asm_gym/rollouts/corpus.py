@@ -82,13 +82,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Corpus:
-    """A recorded corpus.
-
-    Example:
-        >>> from asm_gym.rollouts.corpus import Corpus
-        >>> corpus = Corpus.open("runs/corpus")  # doctest: +SKIP
-        >>> nominal = corpus.episodes("nominal", tasks=("Lift",))  # doctest: +SKIP
-    """
+    """A recorded corpus."""
 
     folder: Path
     entries: tuple[Entry, ...]

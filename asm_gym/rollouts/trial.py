@@ -35,14 +35,7 @@ AFTER_S = 2.0
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """How the episodes of a run are made.
-
-    Args:
-        policy: that acts.
-        robot: the arm; the task's own by default.
-        stream_freq: rows of the stream per second [Hz]; one per control step by default.
-        env_kwargs: further arguments of ``gym.make``.
-    """
+    """How the episodes of a run are made: the arm is the task's own, and a stream row a control step, by default."""
 
     policy: PolicySource = "scripted"
     robot: str | None = None
@@ -60,14 +53,11 @@ class RolloutConfig:
 class Trial:
     """One episode to run.
 
-    Args:
-        env_id: such as ``asm_gym/Lift-v0``.
+    Attributes:
         seed: of the environment and of the policy: trials that share it are twins.
-        kind: ``"nominal"``, ``"passing_push"``, a kind of fault or harmless variation of the suite, or, with
-            ``faults``, their name.
-        severity: of a fault of the suite.
+        kind: ``"nominal"``, ``"passing_push"``, a fault or harmless variation of the suite (of this ``severity``), or,
+            with ``faults``, their name.
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
-        faults: what goes wrong, in place of ``kind``.
         acting: ``"policy alone"``, or a value of ``on_alarm``.
         after_s: the episode ends so long after the onset [s]; by default it runs to its end.
         role: what it is recorded for: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"``, ``"harmless"`` or

@@ -2,12 +2,11 @@
 
     a_t = clip(e_t + s x_t),   x_t = ρ x_{t-1} + √(1 - ρ²) ξ_t      e the guide's action, 0 without one; ξ white
 
-Each lesson is one episode. One in three is the expert's own and not learned from: the threshold is set on those. Of the
-others two in five are the expert's own too, at many speeds; in two of five noise disturbs the expert; in one noise
-alone moves the arm, or the hand reaches for one place after another. Under noise the arm also drifts now and then, as
-agents do once they have done their task. With reaching, one lesson more for each three has the expert press what it
-holds against its surroundings. In half of all lessons the arm stops now and then, and in half an object's mass differs.
-The noise is weak enough that most of a lesson is free of impacts: those would teach the memory to expect them.
+Each lesson is one episode. One in three is the expert's own, and sets the threshold. The others are led by the expert
+at many speeds, by the expert under noise, or by noise alone (or a hand that reaches for one place after another); under
+noise the arm also drifts now and then, as agents do once they have done their task. With reaching, some lessons more
+have the expert press what it holds. The noise is weak enough that most of a lesson is free of impacts: those would
+teach the memory to expect them.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling;
 Rolf et al. 2010 (IEEE TAMD 2(3)) for goals in place of random commands.
@@ -67,17 +66,12 @@ ARRIVED, GIVEN_UP = 0.02, 60
 
 
 class Lesson(NamedTuple):
-    """How the arm moves in one episode of babbling.
+    """How the arm moves in one episode: the ``number``-th of its task.
 
     Attributes:
-        task: its name.
-        number: among the lessons of its task.
-        seed: of the environment, of the guide and of the noise.
         guide: ``"scripted"`` or ``"reaching"``; empty for noise alone.
-        noise: s, standard deviation of the noise [action units].
-        smoothness: ρ.
-        speed: of the guide, relative to its usual one.
-        weight: factor of the mass of the task's object.
+        noise, smoothness: s [action units] and ρ of the noise.
+        speed, weight: of the guide, and of the task's object, relative to what is usual.
         pause, drift, press: probabilities per step that the arm stops, drifts, or presses what it holds for a while.
     """
 

@@ -71,9 +71,6 @@ class Lessons(NamedTuple):
 def healthy(recordings: Sequence[Episode]) -> Lessons:
     """Select the parts of recordings that press no harder than is usual, measured by the undisturbed expert.
 
-    Noise drives arms into tables and joints into their stops. That is no fault of the body, but a memory that took it
-    for usual would be blind to every collision.
-
     Raises:
         ValueError: a task has no undisturbed solved lesson to measure by, or too little is left.
     """
@@ -154,9 +151,8 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
     """Set the threshold for so many false alarms per hour of healthy episodes, crashes included.
 
-    By the hours of each task, where all have the hours that it takes. Where there are enough episodes, one in
-    ``FOR_CEILINGS`` sets the ceilings of senses, and the others the threshold. The forces of healthy motion are those
-    without crashes: a limit raised by a hit would be none.
+    By the hours of each task, where all have the hours that it takes; one in ``FOR_CEILINGS`` sets the ceilings of
+    senses, where there are enough. The forces of healthy motion are those without crashes.
     """
     whole, for_ceilings = for_threshold([*lessons.whole, *hours])
     if for_ceilings:
