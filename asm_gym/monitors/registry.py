@@ -126,6 +126,12 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
 
     Raises:
         ValueError: the name is taken or is not that of the model's ``kind``, or there is no such detection.
+
+    Example:
+        >>> from asm_gym import NeuralASM, register_monitor
+        >>> class Watchman(NeuralASM):
+        ...     kind = "watchman"
+        >>> register_monitor("watchman", Watchman)
     """
     check_choice("detection", detection, DETECTIONS)
     if not isinstance(model, str) and getattr(model, "kind", None) != name:
