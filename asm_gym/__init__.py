@@ -12,9 +12,10 @@ import gymnasium
 
 from asm_gym.extras import needed_for
 from asm_gym.tasks import TASKS
+from asm_gym.version import __version__  # noqa: F401
 
 if TYPE_CHECKING:
-    from asm_gym.episode import Episode
+    from asm_gym.data.episode import Episode
     from asm_gym.faults.suite import register_fault
     from asm_gym.monitors import NeuralASM, make_monitor, register_monitor
     from asm_gym.policies import make_policy
@@ -44,14 +45,12 @@ __all__ = [
     "register_task",
 ]
 
-__version__ = "0.1.0"
-
 _HOME = {
     **dict.fromkeys(("NeuralASM", "make_monitor", "register_monitor"), "monitors"),
     **dict.fromkeys(("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"),
     **dict.fromkeys(("collect", "harmless"), "rollouts"),
     **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
-    "Episode": "episode",
+    "Episode": "data.episode",
     "make_policy": "policies",
     "register_fault": "faults.suite",
     "register_policy": "policies.registry",

@@ -1,7 +1,6 @@
 """Everything that acts, behind stable-baselines3's ``predict``."""
 
 from asm_gym.policies.base import Policy, PolicyState, Seeded, rollout
-from asm_gym.policies.memory_policy import NeuralASMPolicy
 from asm_gym.policies.registry import POLICIES, make_policy
 
-__all__ = ["POLICIES", "NeuralASMPolicy", "Policy", "PolicyState", "Seeded", "make_policy", "rollout"]
+__all__ = ["POLICIES", "Policy", "PolicyState", "Seeded", "make_policy", "rollout"]

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 
 from asm_gym.policies.base import Policy
-from asm_gym.policies.memory_policy import NeuralASMPolicy
 from asm_gym.policies.network import NetworkPolicy, read_archive
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
@@ -110,7 +109,8 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name.endswith(".zip"):
         return read_archive(Path(name)).fit_to(env, name)
     if name.endswith(".asm"):
-        return NeuralASMPolicy.load(name, env)
+        memory_policy: Any = target("asm_gym.monitors.memory_policy:NeuralASMPolicy")
+        return cast(Policy, memory_policy.load(name, env))
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
     known = ", ".join((*POLICIES, *REGISTERED, *agents()))

@@ -23,9 +23,8 @@ from rich.console import Console
 from rich.progress import track
 from threadpoolctl import threadpool_limits
 
-import asm_gym  # noqa: F401  (registers the environments)
+from asm_gym.data.episode import Episode
 from asm_gym.envs.backend import import_robosuite
-from asm_gym.episode import Episode
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.monitors import NeuralASM, make_monitor

@@ -6,10 +6,10 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from asm_gym import __version__
 from asm_gym.extras import needed_for
 from asm_gym.scripts.command import DONE, exit_code
 from asm_gym.validation import check_choice
+from asm_gym.version import __version__
 
 COMMANDS = {
     "demo": "watch a robot notice that something is wrong",

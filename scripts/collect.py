@@ -15,7 +15,7 @@ import gymnasium as gym
 from rich.console import Console
 
 from asm_gym.data.datasets import require_minari, write_dataset
-from asm_gym.episode import load_episode
+from asm_gym.data.episode import load_episode
 from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from asm_gym.data.episode import Episode
 from asm_gym.data.gaps import filled
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import LogLayout, read_logs
@@ -31,7 +32,6 @@ from asm_gym.data.selection import (
 )
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
-from asm_gym.episode import Episode
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.monitors.arm_inputs import Derived
@@ -135,8 +135,8 @@ def divide(args: Args, logs: list[list[Episode]], in_time: bool) -> tuple[list[E
                 f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
             )
     else:
-        rate = args.false_alarm_rate if by_episode else ANY_EPISODE
-        fitting, calibration = split_at_random([p for log in logs for p in log], rate, CALIBRATION_SHARE, args.seed)
+        needed = conformal_episodes(args.false_alarm_rate if by_episode else ANY_EPISODE)
+        fitting, calibration = split_at_random([p for log in logs for p in log], needed, CALIBRATION_SHARE, args.seed)
     args.promise.check_hours(hours_of(calibration))
     return fitting[: QUICK_EPISODES if args.quick else None], calibration
 

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.compilation import kept_in
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.row_kernel import observe_rows
 from asm_gym.scripts.command import run

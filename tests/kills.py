@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.episode import load_episode
+from asm_gym.data.episode import load_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.scripts import cli
 

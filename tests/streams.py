@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.spec import Channel, StreamSpec
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.memory import association_learning
 from asm_gym.memory.association import (
     complete,

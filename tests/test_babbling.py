@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.data.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.comparison import detectability_of
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.monitors import make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.monitors import MONITORS, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs

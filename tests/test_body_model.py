@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
-from asm_gym.episode import Episode
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.body_model import BodyModel, read_urdf
 from asm_gym.monitors.value_association import ValueAssociation

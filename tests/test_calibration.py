@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import betabinom
 
 from asm_gym.data.crashes import crashes
+from asm_gym.data.episode import Episode, EpisodeLabel
 from asm_gym.detection import conformal_threshold
-from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.monitors import CalibratedMonitor, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 

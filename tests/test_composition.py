@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_threshold
 from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
-from asm_gym.episode import Episode
 from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,

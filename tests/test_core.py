@@ -18,7 +18,7 @@ CORE = ("filelock", "gymnasium", "numpy", "numba", "packaging", "pandas", "rich"
 WATCH = """
 import gymnasium, numpy as np
 import asm_gym, asm_gym.monitors, asm_gym.wrappers
-from asm_gym.episode import Episode, load_episode, save_episode
+from asm_gym.data.episode import Episode, load_episode, save_episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.spec import Channel, StreamSpec
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episode import save_episode
+from asm_gym.data.episode import save_episode
 from asm_gym.rollouts import corpus as module
 from asm_gym.rollouts.corpus import MANIFEST, ROUNDS, VERSION, Corpus, Source, record_corpus, trials
 from asm_gym.rollouts.trial import faulty_trial

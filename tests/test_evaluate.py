@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.episode import EpisodeLabel, load_episode
+from asm_gym.data.episode import EpisodeLabel, load_episode
 from asm_gym.scripts import command
 from asm_gym.scripts.evaluate import Args, main, trials_of
 

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
+from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection import conformal_threshold
-from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import (
     BenchmarkResult,

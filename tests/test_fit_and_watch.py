@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from asm_gym.data.episode import Episode, EpisodeLabel
 from asm_gym.data.inspection import inspected
 from asm_gym.data.logs import Log
 from asm_gym.data.selection import normal_episodes, pieces, split_at_random, split_in_time, with_shared_noise
 from asm_gym.data.text import read_text
-from asm_gym.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.alarms import traces_of
 from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
@@ -47,11 +47,11 @@ def test_normal_episodes_are_cut_into_pieces_and_split_by_the_seed():
     cut = pieces(normal, 0.5)
     np.testing.assert_array_equal(np.vstack([p.stream for p in cut]), normal.stream[:75])
     episodes = [Episode.from_table(log(n)) for n in range(40)]
-    fitting, calibration = split_at_random(episodes, 0.05, 0.5, seed=1)
+    fitting, calibration = split_at_random(episodes, 19, 0.5, seed=1)
     assert len(calibration) == 20
     assert sorted(map(id, fitting + calibration)) == sorted(map(id, episodes))
-    assert split_at_random(episodes, 0.05, 0.5, seed=1)[1] == calibration
-    assert split_at_random(episodes, 0.05, 0.5, seed=2)[1] != calibration
+    assert split_at_random(episodes, 19, 0.5, seed=1)[1] == calibration
+    assert split_at_random(episodes, 19, 0.5, seed=2)[1] != calibration
 
 
 def test_the_head_of_a_log_is_learned_from_and_its_tail_calibrated_on():

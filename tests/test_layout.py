@@ -21,7 +21,7 @@ LAYERS = (
 """Rooms in their order: each may import itself and what stands before it, so that nothing enters a room twice."""
 FACADE = "asm_gym.__init__"
 """Hands out names of every layer, each when it is asked for: see ``test_importing_the_package_is_cheap``."""
-TABLES = ("asm_gym.episode", "asm_gym.data.channels.")
+TABLES = ("asm_gym.data.episode", "asm_gym.data.channels.")
 """The one way back: ``Episode.from_table``, a name of the contract, reads columns as the room of data does."""
 AUTOGRAD = ("torch", "jax", "autograd", "tensorflow", "theano")
 

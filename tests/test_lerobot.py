@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.monitors import make_monitor
 from asm_gym.wrappers.lerobot import LeRobotGuard
 from tests.needs import needs

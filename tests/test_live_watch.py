@@ -10,11 +10,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from asm_gym.data.live import SourceDied
+from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
-from asm_gym.data.rows import ClockWentBack
+from asm_gym.data.rows import ClockWentBack, SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK
-from asm_gym.episode import Episode
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.guard.live import follow

@@ -13,12 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.data.clock import clock_among, evenly, period
+from asm_gym.data.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.data.logs import FILES, LogLayout, read_logs
 from asm_gym.data.names import is_command
 from asm_gym.data.reader_notes import LogWarning
 from asm_gym.data.selection import normal_episodes
 from asm_gym.data.text import read_text
-from asm_gym.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.readings import noise_of, resolution
 from asm_gym.spec import MOTOR
 from tests.needs import needs

@@ -11,13 +11,13 @@ import pytest
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.memory import motor
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.memory_policy import ENOUGH, FORGETS, CommandReadout, NeuralASMPolicy
 from asm_gym.monitors.skills import learn_to_act
-from asm_gym.policies import NeuralASMPolicy, make_policy, rollout
-from asm_gym.policies.memory_policy import ENOUGH, FORGETS, CommandReadout
+from asm_gym.policies import make_policy, rollout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.spec import Channel, StreamSpec
 from tests.memories import SMALL, learned_bytes, sine_memory

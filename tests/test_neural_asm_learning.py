@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.skills import name_skills
 from tests.memories import SMALL, learned_bytes, sine_memory

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import real_arms
 from asm_gym.scripts.reproduce.real_arms import ARMS, FAULTS, NEWTONS, SLIP, Job, Piece, examined, jacobian, with_fault

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from asm_gym.episode import save_episode
+from asm_gym.data.episode import save_episode
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 from stable_baselines3 import SAC
 
-from asm_gym.episode import Episode, EpisodeLabel
+from asm_gym.data.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.scoring import NOMINAL_ROLES, Recordings
 from asm_gym.rollouts import collect, progress
 from asm_gym.rollouts.collect import environment

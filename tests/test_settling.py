@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.checkpoint import read_checkpoint
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.memory.energy import infer
 from asm_gym.memory.learning import Schedule
 from asm_gym.memory.settling import (

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asm_gym.episode import Episode, EpisodeLabel, load_episode, save_episode
+from asm_gym.data.episode import Episode, EpisodeLabel, load_episode, save_episode
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec(

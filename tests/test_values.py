@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
 from asm_gym.detection.scores import Largest
-from asm_gym.episode import Episode
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.arm_inputs import forces, motion
 from asm_gym.monitors.base import Surprise

@@ -16,7 +16,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from asm_gym.episode import spans
+from asm_gym.data.episode import spans
 from asm_gym.spec import control_period
 from asm_gym.validation import check_text
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.spec import StreamSpec, flat
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32

@@ -23,7 +23,7 @@ from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
 from asm_gym.data.arrays import check_hdf5
-from asm_gym.episode import Episode, check_recorded
+from asm_gym.data.episode import Episode, check_recorded
 from asm_gym.extras import require
 from asm_gym.files import named
 from asm_gym.spec import StreamSpec, control_period, flat_rows

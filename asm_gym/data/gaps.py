@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import spans
+from asm_gym.data.episode import spans
 from asm_gym.validation import check_number
 
 Floats = NDArray[np.floating[Any]]

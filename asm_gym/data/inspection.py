@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.channels import Column, columns_of, table_of
 from asm_gym.data.clock import FAR, evenly, timing_of
-from asm_gym.episode import spans
+from asm_gym.data.episode import spans
 from asm_gym.readings import noise_of, resolution
 
 FEW_VALUES = 8  # A channel of fewer different values hardly moves

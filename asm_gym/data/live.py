@@ -14,15 +14,12 @@ from io import UnsupportedOperation
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
+from asm_gym.data.rows import SourceDied
 from asm_gym.files import regular_file
 from asm_gym.validation import check_number
 
 POLL_S = 0.002  # how often a source is looked at for more [s]
 LARGEST = 65_535  # bytes of a datagram, and more than a row of any robot
-
-
-class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
-    """Nothing came for longer than a source may be silent."""
 
 
 class LiveSource(NamedTuple):

@@ -19,10 +19,10 @@ from asm_gym.checkpoint import read_arrays
 from asm_gym.data.arrays import read_array, read_parquet
 from asm_gym.data.bags import read_bag
 from asm_gym.data.datasets import METADATA, read_dataset
+from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot import INFO, read_lerobot
 from asm_gym.data.names import is_clock, is_command, is_label
 from asm_gym.data.text import Columns, read_json_lines, read_text
-from asm_gym.episode import Episode, load_episode
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import typed
 

@@ -25,6 +25,11 @@ from asm_gym.data.names import factor, label_of, split_unit
 from asm_gym.data.text import Dialect, check_cells, flat_row, header_of
 from asm_gym.spec import StreamSpec
 
+
+class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
+    """Nothing came for longer than a source may be silent."""
+
+
 NEWEST = 32  # rows that tell the rate, and after which it is told again
 
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import Episode, spans
 from asm_gym.data.logs import Log
-from asm_gym.detection import conformal_episodes
-from asm_gym.episode import Episode, spans
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR
 
@@ -110,19 +109,19 @@ def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[
 
 
 def split_at_random(
-    episodes: list[Episode], false_alarm_rate: float, calibration_share: float, seed: int
+    episodes: list[Episode], needed: int, calibration_share: float, seed: int
 ) -> tuple[list[Episode], list[Episode]]:
     """Split episodes by a seed into those to learn from, and a share (0, 1) to calibrate on.
 
-    Raises ValueError, which says how many are needed, where they are too few for the false-alarm rate.
+    Raises ValueError where fewer than ``needed`` would be left to calibrate on.
     """
-    n, needed = len(episodes), conformal_episodes(false_alarm_rate)
+    n = len(episodes)
     order = np.random.default_rng(seed).permutation(n)
     calibration = math.floor(n * calibration_share + 1e-9)
     if calibration < needed or calibration == n:
         least = max(2, math.ceil(needed / calibration_share - 1e-9))
         raise ValueError(
-            f"a false-alarm rate of {false_alarm_rate:g} needs {least} normal episodes, {needed} of them to "
+            f"this false-alarm rate needs {least} normal episodes, {needed} of them to "
             f"calibrate on, got {n}: record more, take a higher --false-alarm-rate, or --split long logs"
         )
     return [episodes[i] for i in order[calibration:]], [episodes[i] for i in order[:calibration]]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 
 Array = NDArray[np.floating[Any]]
 Floats = NDArray[np.float64]

@@ -21,7 +21,6 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 if TYPE_CHECKING:
     from asm_gym.envs.backend import ObjectSensors
-    from asm_gym.envs.simulation import Simulation
 
 Corruption = Callable[[NDArray[np.float64]], None]  # a sensor fault: edits a measured row in place
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)
@@ -200,7 +199,7 @@ class Senses:
 
     def read(
         self,
-        simulation: Simulation,
+        sense: Callable[[NDArray[np.float64], NDArray[np.float64], np.random.Generator], NDArray[np.float64]],
         objects: ObjectSensors,
         action: NDArray[np.float32],
         faults: Sequence[Corruption],
@@ -213,7 +212,7 @@ class Senses:
         """
         if faults or self._needs_objects or not within_step:
             self._object_poses = np.concatenate([*objects.read(), np.zeros(0)])
-        row = simulation.sense(np.concatenate([self._object_poses, action]), self._noise, rng)
+        row = sense(np.concatenate([self._object_poses, action]), self._noise, rng)
         for corrupt in faults:
             corrupt(row)
         stream = np.empty(len(self._carried), np.float32)

@@ -111,7 +111,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _read(self, within_step: bool = False) -> Reading:
         rest = self._action, self.corruptions, self.np_random
-        return self._senses.read(self.simulation, self._objects, *rest, within_step=within_step)
+        return self._senses.read(self.simulation.sense, self._objects, *rest, within_step=within_step)
 
     @property
     def motors(self) -> NDArray[np.intp]:

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import spans
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
-from asm_gym.episode import spans
 from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 from asm_gym.extras import require
 from asm_gym.memory.completion import Completion

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.evaluation.defaults import RATES, REPORTED_RATE
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind
 from asm_gym.evaluation.resampling import by_episode

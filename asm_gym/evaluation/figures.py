@@ -22,8 +22,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from asm_gym.data.channels import Column
+from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection, is_constant
-from asm_gym.episode import spans
 from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 from asm_gym.evaluation.statistics import wilson_interval

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode, spans
+from asm_gym.data.episode import Episode, spans
 
 Floats = NDArray[np.floating[Any]]
 

@@ -12,16 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import asm_gym
 from asm_gym.data.crashes import crashes
+from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection import conformal_episodes
-from asm_gym.episode import Episode, load_episode
 from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
+from asm_gym.version import __version__
 
 NOMINAL_ROLES = ("fit", "calibration", "nominal")
 """Roles of episodes without a fault."""
@@ -128,7 +128,7 @@ def judged(
 @cache
 def code_digest() -> str:
     """Return a digest of the code that decides what a monitor learns."""
-    package, made = Path(asm_gym.__file__).parent, hashlib.sha256()
+    package, made = Path(__file__).parents[1], hashlib.sha256()
     for place in (package / name for name in CODE):
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
@@ -139,7 +139,7 @@ def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) ->
     """Return the monitor fitted on these episodes; kept in the folder by episodes, settings and code."""
     model = name.removesuffix(EVIDENCE)
     made = make_monitor(name, recordings[0].spec, seed=seed)
-    learned = model, asm_gym.__version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
+    learned = model, __version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
     path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"
     with suppress(FileNotFoundError, ValueError):  # a damaged one is fitted anew

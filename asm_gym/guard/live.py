@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
-from asm_gym.data.live import SourceDied
-from asm_gym.data.rows import ClockWentBack, Row, RowReader
+from asm_gym.data.rows import ClockWentBack, Row, RowReader, SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions

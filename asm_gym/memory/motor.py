@@ -15,14 +15,13 @@ weight decay.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode
 from asm_gym.memory.association import complete, hidden_units
 from asm_gym.memory.association_learning import association_change
 from asm_gym.memory.energy import Array
@@ -90,22 +89,6 @@ class Motor(NamedTuple):
         shapes |= {"mean": (motor,), "spread": (motor,)}
         check_shapes(learned, {f"motor_{name}": shape for name, shape in shapes.items()})
         return cls(**{name: learned[f"motor_{name}"] for name in shapes})
-
-
-def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return situations (N, I), and the next command in each (N, A): of ``actions``, or else of the stream.
-
-    Actions are what was intended where noise was added (DART: Laskey et al. 2017, CoRL). Raises ValueError without any.
-    """
-    motor = senses.spec.motor
-    if not len(motor):
-        raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}")
-    m, commands = [], []
-    for e in episodes:
-        intended = e.actions if len(e.actions) == len(e) else e.stream[:, motor]
-        m.append(situation(senses, e.stream[:-1]))
-        commands.append(intended[1:].astype(np.float32))
-    return np.concatenate(m), np.concatenate(commands)
 
 
 def learn_motor(m: Array, commands: Array, units: int, rng: np.random.Generator) -> Motor:

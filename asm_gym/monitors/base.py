@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection.events import EVENTS, KNOCK, STOP
-from asm_gym.episode import Episode
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 

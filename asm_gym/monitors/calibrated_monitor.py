@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
+from asm_gym.data.episode import Episode
 from asm_gym.detection import Detection, Nominal
 from asm_gym.detection.base import Arrays
-from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import Calibrated
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import (
     Blocks,
     Detection,
@@ -27,7 +28,6 @@ from asm_gym.detection.conformal import EPISODE, HOUR, check_hours
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES
-from asm_gym.episode import Episode
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.stream_model import StreamModel, model_outputs
 from asm_gym.monitors.training_data import Hashes, check_fresh, check_nominal, hashes_of

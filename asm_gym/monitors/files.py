@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,6 @@ from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.monitors.packing import packed, unpacked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
-
-if TYPE_CHECKING:
-    from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 
 MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks", "learned_from", "ceilings_from"
 """Names of the arrays that ``calibrate``, ``fit`` and ``learn_ceilings`` keep in a checkpoint."""
@@ -63,8 +60,8 @@ def threshold_below(threshold: object, reach: float) -> float | None:
     return number
 
 
-def write_monitor(path: str | Path, monitor: CalibratedMonitor) -> None:
-    """Write a checkpoint of a fitted monitor."""
+def write_monitor(path: str | Path, monitor: Any) -> None:
+    """Write a checkpoint of a fitted ``CalibratedMonitor``."""
     learned = {n: a if a.dtype.kind == "f" else np.asarray(a, np.float64) for n, a in monitor.learned_.items()}
     kept = {
         MAXIMA: monitor.maxima_,

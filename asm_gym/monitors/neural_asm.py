@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import Checkpoint, read_checkpoint
+from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.events import Excuses
-from asm_gym.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.arm_inputs import Derived

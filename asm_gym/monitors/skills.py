@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.memory.association import hidden_units
-from asm_gym.memory.motor import learn_motor, lessons
+from asm_gym.memory.motor import learn_motor, situation
 from asm_gym.memory.readout import learn_readout
 from asm_gym.memory.recall import continued
 from asm_gym.monitors.neural_asm import NeuralASM
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.training_data import check_nominal
+from asm_gym.scaling import StreamScaler
 
 
 def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
@@ -88,6 +89,22 @@ def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 51
         motor = learn_motor(*lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed))
     model.restore({**model.learned_, **motor.named()}, model.skills_)
     return memory
+
+
+def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return situations (N, I), and the next command in each (N, A): of ``actions``, or else of the stream.
+
+    Actions are what was intended where noise was added (DART: Laskey et al. 2017, CoRL). Raises ValueError without any.
+    """
+    motor = senses.spec.motor
+    if not len(motor):
+        raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}")
+    m, commands = [], []
+    for e in episodes:
+        intended = e.actions if len(e.actions) == len(e) else e.stream[:, motor]
+        m.append(situation(senses, e.stream[:-1]))
+        commands.append(intended[1:].astype(np.float32))
+    return np.concatenate(m), np.concatenate(commands)
 
 
 def recall(memory: NeuralASM, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:

@@ -12,9 +12,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episode import Episode
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.spec import StreamSpec
 
 WILD = 1e6

@@ -21,9 +21,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.arm_inputs import Derived, forces, motion

@@ -16,9 +16,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.base import Arrays
-from asm_gym.episode import Episode
 from asm_gym.monitors.base import State, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next

@@ -16,9 +16,8 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-import asm_gym  # noqa: F401  (registers the environments in every worker)
+from asm_gym.data.episode import Episode, save_episode
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.episode import Episode, save_episode
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas

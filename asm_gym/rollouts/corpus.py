@@ -18,7 +18,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from asm_gym.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.data.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
 from asm_gym.files import written_whole
 from asm_gym.rollouts.collect import environment, record_missing

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 
-import asm_gym
 from asm_gym.files import written_whole
 from asm_gym.rollouts.parallel import Progress, parallel_map
+from asm_gym.version import __version__
 
 Item = TypeVar("Item")
 
@@ -29,7 +29,7 @@ def versions(*more: str) -> dict[str, str]:
     for package in ("robosuite", "mujoco", "gymnasium", "numpy", *more):
         with suppress(metadata.PackageNotFoundError):  # a light install may be without robosuite
             others[package] = metadata.version(package)
-    return {"asm_gym": asm_gym.__version__, **others}
+    return {"asm_gym": __version__, **others}
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from asm_gym.episode import spans
+from asm_gym.data.episode import spans
 
 
 class SafetyCallback(BaseCallback):

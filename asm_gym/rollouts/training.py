@@ -23,7 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.policies import rollout
 from asm_gym.policies.network import NetworkPolicy, describe, network
 from asm_gym.rollouts.parallel import Progress

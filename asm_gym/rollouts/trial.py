@@ -10,8 +10,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from asm_gym.data.episode import EpisodeLabel
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.episode import EpisodeLabel
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.faults import Fault, anywhere
 from asm_gym.faults.anywhere import FaultyInterface

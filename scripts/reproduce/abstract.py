@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table

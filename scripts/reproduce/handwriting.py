@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]

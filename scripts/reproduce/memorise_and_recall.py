@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.evaluation.figures import figure
 from asm_gym.memory.dynamics import SETTLING
 from asm_gym.scripts.command import option

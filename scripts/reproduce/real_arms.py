@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.bags import read_bag
+from asm_gym.data.episode import Episode, spans
 from asm_gym.data.selection import complete_parts, pieces
 from asm_gym.detection.scores import Largest
-from asm_gym.episode import Episode, spans
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.linear import FrictionRule

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from asm_gym.episode import Episode
+from asm_gym.data.episode import Episode
 from asm_gym.memory.free_energy import Before, FreeEnergy
 from asm_gym.monitors import NeuralASM
 from asm_gym.scripts.reproduce.expression import Backpropagated

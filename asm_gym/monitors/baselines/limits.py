@@ -16,8 +16,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
-from asm_gym.episode import Episode
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context

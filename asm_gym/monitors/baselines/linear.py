@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solve_discrete_are
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
-from asm_gym.episode import Episode
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.arm_inputs import WIDTHS, forces, speeds

@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from asm_gym.data.episode import Episode
 from asm_gym.detection.base import Arrays
-from asm_gym.episode import Episode
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import ScaledRows, StreamScaler

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from asm_gym.episode import save_episode
+from asm_gym.data.episode import save_episode
 from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style

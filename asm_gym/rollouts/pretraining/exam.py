@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.data.crashes import CRASH, peak_force
+from asm_gym.data.episode import Episode
 from asm_gym.detection.events import KNOCK, STOP
-from asm_gym.episode import Episode
 from asm_gym.evaluation.comparison import detectability_of, visible_kinds
 from asm_gym.evaluation.detection_tables import milliseconds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from asm_gym.data.crashes import CRASH, peak_force, peak_torques
+from asm_gym.data.episode import Episode, spans
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.evidence import FEWEST_EPISODES
-from asm_gym.episode import Episode, spans
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.calibration import learn_ceilings
