@@ -26,8 +26,7 @@ FORMAT = "asm-gym"
 VERSION = 1
 HEADER = "header.json"
 
-LONGEST_HEADER = 16 * 2**20
-"""[bytes]"""
+LONGEST_HEADER = 16 * 2**20  # [bytes]
 
 MOST_EXPANDED = 30
 """Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1."""

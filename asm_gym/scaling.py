@@ -29,17 +29,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Rows = NDArray[np.floating[Any]]
 
-SLOW = 0.3
-"""A channel is slow where a step's change is under this share of its spread."""
-
-LAPSE = 0.05
-"""Time over which a change is taken, where rows come faster [s]."""
-
-FEW_VALUES = 5
-"""A channel of fewer different values is a flag or a mode."""
-
-MOST_SHOWN = 10_000
-"""Rows from which the resolution of channels is estimated."""
+SLOW = 0.3  # a channel is slow where a step's change is under this share of its spread
+LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
+FEW_VALUES = 5  # a channel of fewer different values is a flag or a mode
+MOST_SHOWN = 10_000  # rows from which the resolution of channels is estimated
 
 FARTHEST = 1e3
 """Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted from such a number."""

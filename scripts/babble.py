@@ -41,8 +41,7 @@ from asm_gym.validation import check_choice
 
 SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
-HOURS_SEED = 11
-"""Seed of the healthy hours."""
+HOURS_SEED = 11  # seed of the healthy hours
 _PANDAS = {"Door", "NutAssemblySquare", "NutAssemblyRound"}
 """Tasks whose experts often fail with other arms than the Panda."""
 _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe")

@@ -37,8 +37,7 @@ from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.robots import body_memory
 
 NAMES = "monitor", "safety", "env"
-PARTS = 10
-"""Parts of a measurement; a ratio's spread is that of the ratios of their medians."""
+PARTS = 10  # parts of a measurement; a ratio's spread is that of the ratios of their medians
 Rivals = dict[str, Callable[[], Any]]
 
 

@@ -38,8 +38,7 @@ from asm_gym.rollouts.watched import watch_pair
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import TASKS, env_id
 
-PUSHED = "robot0_link5"
-"""Link that is pushed."""
+PUSHED = "robot0_link5"  # link that is pushed
 
 
 @dataclass(frozen=True)

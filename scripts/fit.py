@@ -43,16 +43,11 @@ from asm_gym.scripts.command import Checked, option, run
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
-SILENCE_S = 2.0
-"""A live source without a row for this long has ended [s]."""
-PIECE_S, SPARE = 5.0, 4
-"""Longest pieces of a live recording [s], and how many more there are than the promise needs."""
-ANY_EPISODE = 0.5
-"""A rate that one episode can promise: a promise by the hour needs hours."""
-CALIBRATION_SHARE = 0.5
-"""Share of the episodes that set the threshold, and are not learned from."""
-QUICK_EPISODES, QUICK_EPOCHS = 20, 5
-"""Most episodes and passes with ``--quick``."""
+SILENCE_S = 2.0  # a live source without a row for this long has ended [s]
+PIECE_S, SPARE = 5.0, 4  # longest pieces of a live recording [s], and how many more there are than the promise needs
+ANY_EPISODE = 0.5  # a rate that one episode can promise: a promise by the hour needs hours
+CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are not learned from
+QUICK_EPISODES, QUICK_EPOCHS = 20, 5  # most episodes and passes with ``--quick``
 
 
 @dataclass(frozen=True)

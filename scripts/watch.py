@@ -34,10 +34,8 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, Checked, option, run
 from asm_gym.validation import check_number
 
-AT_ONCE = 64
-"""Episodes scored side by side."""
-SHOWN_ROWS = 20
-"""Alarms printed; the file holds them all."""
+AT_ONCE = 64  # episodes scored side by side
+SHOWN_ROWS = 20  # alarms printed; the file holds them all
 
 
 @dataclass(frozen=True)

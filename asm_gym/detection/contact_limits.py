@@ -20,7 +20,6 @@ from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
 
 FELT = "external_torque", "wrist_force"  # ends of the names of the channels that limits are about
-
 LEFT_OUT = 0.05  # share of healthy episodes, those that pressed hardest, left out of what healthy motion needs
 MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 100 N m
 

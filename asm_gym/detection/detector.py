@@ -46,7 +46,6 @@ UNBOUNDED_LOG = np.array([-700.0, 700.0])  # a range of logarithms that bounds n
 FAINTEST = 1e-9  # smallest s whose logarithm is taken
 LEAST = math.log(TINY)
 NEGLIGIBLE = -50.0  # logarithm of a share that vanishes beside 1 in double precision
-
 USUAL = 0.95  # τ
 MOST_ROWS = 60_000  # largest number of rows, evenly spaced, that teach what is usual in a context
 UPDATES, PASSES, FEWEST = 1000, 12, 40  # largest number of batches and of passes, and smallest number of batches

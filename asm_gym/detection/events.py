@@ -26,7 +26,6 @@ from asm_gym.spec import Channel, StreamSpec
 
 NO_EVENT, KNOCK, STOP, FAULT = "", "knock", "stop", "fault"
 EVENTS = NO_EVENT, KNOCK, STOP, FAULT  # kinds of rows; the last is the worst
-
 KNOCKING, KNOCKED_S = 50.0, 1.0  # force at the wrist, on an axis [N], and duration of its excuse [s]
 NEAR_STOP, PAST_STOP = 0.03, 0.1  # a joint is at its stop from so far before it to so far past it [rad]
 FASTEST = 5.0  # largest joint speed [rad/s]: a joint farther from its stop in the row before is not at it now

@@ -97,7 +97,6 @@ def jacobian(views: Views, dofs: Ints, n: int, point: Floats, com: Floats, J: Fl
 
 HOLD_STIFFNESS = 400.0  # Kp of an arm that is held [1/s²]; Kd is 2 √Kp
 YIELDS_AT = 60.0  # Y: the force at the hand from which an arm that is held and at rest gives way [N]
-
 BRAKING, YIELDING = 1, 2  # of ``Goals.held``: on its way to rest, and since then
 RESTING = 0.1  # an arm none of whose joints is faster than this has come to rest [rad/s]
 YIELD_LEVER = 0.15  # r₀: what a joint has at least for a lever [m]

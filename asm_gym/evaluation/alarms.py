@@ -70,8 +70,7 @@ def excused_in(trace: ScoredEpisode) -> dict[str, int]:
     return {e: len(spans((raw > trace.threshold) & ~trace.alarm)) for e, raw in trace.excused.items()}
 
 
-BAND = 2.0
-"""Half width of the band about an expected sense, in standard deviations."""
+BAND = 2.0  # half width of the band about an expected sense, in standard deviations
 
 
 def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode], model: object = None) -> None:

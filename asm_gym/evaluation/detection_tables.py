@@ -22,8 +22,7 @@ from asm_gym.monitors.calibration import AlarmRate
 Compared = DetectionMetrics | Bound
 """A monitor, or the ideal observer, whose row has fewer cells."""
 
-UNLIKELY = 0.025
-"""A calibration counts as broken where so many false alarms are less likely than this."""
+UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely than this
 
 
 def milliseconds(delays: Delays | None, which: str = "median_ms", otherwise: str = "missed") -> str:

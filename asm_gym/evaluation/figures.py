@@ -44,8 +44,7 @@ _STYLE: dict[Any, Any] = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
 }
-MOST_BANDS = 4
-"""More curves than these have no bands of uncertainty: they could not be told apart."""
+MOST_BANDS = 4  # more curves than these have no bands of uncertainty: they could not be told apart
 
 
 @contextmanager
@@ -244,8 +243,7 @@ def _detail(trace: ScoredEpisode) -> TraceDetail:
     return trace.detail
 
 
-ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000
-"""Panels side by side; channels drawn; points of a curve."""
+ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000  # panels side by side; channels drawn; points of a curve
 
 LOG_COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 """By the role of a channel; one that never moves is grey."""

@@ -21,8 +21,7 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
 from asm_gym.monitors.calibration import AlarmRate
 
-DRAWS = 400
-"""Bootstrap resamples."""
+DRAWS = 400  # bootstrap resamples
 
 
 def by_episode(rate: float) -> AlarmRate:

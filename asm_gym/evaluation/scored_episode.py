@@ -15,11 +15,8 @@ from asm_gym.data.episode import Episode, spans
 
 Floats = NDArray[np.floating[Any]]
 
-NOMINAL = "nominal"
-"""Kind of an episode without a fault."""
-
-POLICY_ALONE = "policy alone"
-"""``acting`` of an episode in which the monitor only watches."""
+NOMINAL = "nominal"  # kind of an episode without a fault
+POLICY_ALONE = "policy alone"  # ``acting`` of an episode in which the monitor only watches
 
 
 class InterventionOutcome(NamedTuple):

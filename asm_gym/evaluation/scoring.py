@@ -23,14 +23,12 @@ from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, Scor
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
 from asm_gym.version import __version__
 
-NOMINAL_ROLES = ("fit", "calibration", "nominal")
-"""Roles of episodes without a fault."""
+NOMINAL_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
 """Rooms and files of the package whose code decides what a monitor learns."""
 
-AT_ONCE = 256
-"""Episodes scored together: the attribution of more would fill the memory."""
+AT_ONCE = 256  # episodes scored together: the attribution of more would fill the memory
 
 Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 """``[task(item) for item in items]``, by whichever workers."""

@@ -18,27 +18,17 @@ from asm_gym.guard.arbiter import CALM, FREE, MOSTLY_AFTER, POLICY, ROWS, SINCE,
 from asm_gym.monitors import Surprise
 from asm_gym.spec import Channel, StreamSpec
 
-FREE_FORCE = 40.0
-"""Force that healthy motion of many tasks comes to; impulse is counted beyond it [N]."""
-
-AGAIN = 4.0
-"""Each time that the policy has pressed too hard before shortens that by as many times."""
-
-LEVER = 0.5
-"""How far from a joint's axis an arm is touched, about [m]."""
-
-BLOW = 2900.0
-"""First blow on a table for each m/s of the hand [N s/m]; measured 2,500 to 3,100, on a bin 4,100."""
+FREE_FORCE = 40.0  # force that healthy motion of many tasks comes to; impulse is counted beyond it [N]
+AGAIN = 4.0  # each time that the policy has pressed too hard before shortens that by as many times
+LEVER = 0.5  # how far from a joint's axis an arm is touched, about [m]
+BLOW = 2900.0  # first blow on a table for each m/s of the hand [N s/m]; measured 2,500 to 3,100, on a bin 4,100
 
 LEANS_S = 0.4
 """More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
 did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
-FAST = 0.35
-"""No healthy hand is faster [m/s]."""
-
-UNKNOWN = np.array([np.nan, 0.0, np.nan])
-"""Force, impulse and speed of a robot of which nothing is known."""
+FAST = 0.35  # no healthy hand is faster [m/s]
+UNKNOWN = np.array([np.nan, 0.0, np.nan])  # force, impulse and speed of a robot of which nothing is known
 
 KNOCKED = EVENTS.index(KNOCK)
 

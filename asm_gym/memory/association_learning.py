@@ -29,7 +29,6 @@ from asm_gym.memory.linear import learn_from_past, learn_linear
 
 FEEDBACK_GAIN = 1e-3  # initial gain of B
 DECAY = 0.3  # share of its step size by which a synapse of U or B decays
-
 UPDATES, PASSES, BATCH = 6000, 40, 256  # largest number of batches, and of passes over the rows; rows of a batch
 RATE, WARM_UP = 5e-3, 0.1  # step size, and share of the updates in which it rises; after that it falls along a cosine
 TICKS = 20  # progress reports of one learning of the hidden units
@@ -39,7 +38,6 @@ TRACKING = np.float32(0.01)  # weight of the newest batch in the running spread 
 THIRDS = 3
 LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped in ``trust``
 SMALLEST_SPREAD = np.float32(1e-4)  # below this single precision is noise
-
 EXTREME = 0.0005  # share of nominal rows below the limits of log σ², and above
 LARGEST_RATIO = 30.0  # clips ε²/σ² (5.5 σ), so that one contact does not undo a thousand steps
 PRECISION_EPOCHS, PRECISION_RATE = 20, 1e-3

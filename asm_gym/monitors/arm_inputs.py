@@ -25,14 +25,9 @@ Floats = NDArray[np.float64]
 _FORCE = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
 _COMMANDED = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
 
-WIDTHS = (0.01, 0.1, 1.0)
-"""w, shares of a speed's spread."""
-
-MOST_ANGLES = 12
-"""Of more angles no sines are taken: their products would be too many."""
-
-CHAIN = 3
-"""Angles from the second on that are summed: shoulder, elbow and wrist often turn about parallel axes."""
+WIDTHS = (0.01, 0.1, 1.0)  # w, shares of a speed's spread
+MOST_ANGLES = 12  # of more angles no sines are taken: their products would be too many
+CHAIN = 3  # angles from the second on that are summed: shoulder, elbow and wrist often turn about parallel axes
 
 
 class Derived(NamedTuple):

@@ -23,8 +23,7 @@ from asm_gym.extras import require
 
 Floats = NDArray[np.float64]
 
-LARGEST = 10_000_000
-"""Characters of a file: no arm has more."""
+LARGEST = 10_000_000  # characters of a file: no arm has more
 
 MOVING = ("revolute", "continuous", "prismatic")
 

@@ -36,12 +36,9 @@ from asm_gym.validation import typed
 
 LOG = logging.getLogger("asm_gym.monitors")
 
-AT_ONCE = 400
-"""Episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory."""
-MOST_BLIND = 0.6
-"""Largest share of the channels that a monitor may be blind to."""
-MOST_NAMED = 6
-"""Channels that a message names."""
+AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
+MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
+MOST_NAMED = 6  # channels that a message names
 
 
 class AlarmRate(NamedTuple):

@@ -40,8 +40,7 @@ CLASSES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """Classes of causes: the family of each, and the kinds of hypotheses that name its part."""
 
-WINDOW = 3
-"""Last rows that a diagnosis rests on."""
+WINDOW = 3  # last rows that a diagnosis rests on
 
 KINDS = (
     *("sensor", "force sensor", "commanded torque", "measured torque", "external torque", "joint", "contact"),
@@ -49,18 +48,14 @@ KINDS = (
 )
 """Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
 
-GROUPS = ("joint", "torque", "hand", "wrench", "gripper")
-"""Of channels, whose share of the surprise is evidence."""
+GROUPS = ("joint", "torque", "hand", "wrench", "gripper")  # of channels, whose share of the surprise is evidence
 
 EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
 """In order: how much the best hypothesis of each kind explains; the energy; the largest share of the surprise in one
 sensor, and the share in each group of channels."""
 
-SETTLED, SETTLED_AFTER = 0.9, 3
-"""A belief of so much, after so many diagnoses, is final."""
-
-REPEATS = 3
-"""Equal readings of a noisy sensor after which it is stuck."""
+SETTLED, SETTLED_AFTER = 0.9, 3  # a belief of so much, after so many diagnoses, is final
+REPEATS = 3  # equal readings of a noisy sensor after which it is stuck
 
 
 class Cause(NamedTuple):

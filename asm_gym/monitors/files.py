@@ -84,8 +84,7 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
     write_checkpoint(path, monitor.model.kind, header, packed(arrays))
 
 
-RETIRED = "feedback"
-"""A hyperparameter of older files that made no difference once a memory was fitted."""
+RETIRED = "feedback"  # a hyperparameter of older files that made no difference once a memory was fitted
 
 
 def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> Any:

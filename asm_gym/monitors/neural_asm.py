@@ -38,8 +38,7 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, typed
 
-ADAPTED_BELOW = 0.5
-"""Share of the threshold below which ``adapt`` learns from a row."""
+ADAPTED_BELOW = 0.5  # share of the threshold below which ``adapt`` learns from a row
 
 
 class NeuralASM(CalibratedMonitor):

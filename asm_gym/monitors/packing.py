@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 BITS, SCALE, ROOT = ".bits", ".scale", ".root"
 """Ends of the names of packed arrays; shipped memories also hold covariances C = s² K Kᵀ, by a root K of 16 bits."""
-WEIGHTS = "V", "U", "W_S", "W_C", "W_D", "W_F"
-"""Of association and of the traces' network."""
+WEIGHTS = "V", "U", "W_S", "W_C", "W_D", "W_F"  # of association and of the traces' network
 LARGEST = 127
 SCALE_BITS = 10
 

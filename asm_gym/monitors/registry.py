@@ -16,8 +16,7 @@ from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
-EVIDENCE = "+evidence"
-"""End of the name of a monitor whose errors are judged by the detection of the Neural ASM."""
+EVIDENCE = "+evidence"  # end of the name of a monitor whose errors are judged by the detection of the Neural ASM
 
 DETECTIONS: dict[str, Any] = {
     "evidence": EvidenceDetection,

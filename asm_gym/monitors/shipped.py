@@ -24,10 +24,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 
 :meta hide-value:
 """
-USUAL = 20
-"""Rows of a stream a second where each control step has one [Hz]."""
-FILE, CARD = "memory.asm", "README.md"
-"""Files in a repository of a memory on the hub."""
+USUAL = 20  # rows of a stream a second where each control step has one [Hz]
+FILE, CARD = "memory.asm", "README.md"  # files in a repository of a memory on the hub
 
 
 def pretrained() -> dict[str, Path]:

@@ -20,8 +20,7 @@ from asm_gym.monitors.base import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
-AT_ONCE = 64
-"""Episodes run side by side; with more the arrays no longer fit the cache."""
+AT_ONCE = 64  # episodes run side by side; with more the arrays no longer fit the cache
 
 
 class StreamModel:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.spec import StreamSpec
 
-WILD = 1e6
-"""Largest distance of a number from its channel's median, in ranges of the channel."""
+WILD = 1e6  # largest distance of a number from its channel's median, in ranges of the channel
 
 Hashes = NDArray[np.float64]
 """One of each episode, of 52 bits, which a double holds exactly."""

@@ -36,20 +36,11 @@ from asm_gym.validation import typed
 Floats = NDArray[np.float64]
 
 FOLDS = 5
-PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)
-"""Of standardised inputs."""
-
-PREDICTED = 0.5
-"""R² from which on a value is judged."""
-
-FAINTEST = 1e-4
-"""Least spread of what is left of a standardised number."""
-
-STIFFNESS = 1e-2
-"""λ."""
-
-MOST_INPUTS = 1024
-"""With more inputs no leverage is computed: the matrices would be too large."""
+PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2, 1e-1)  # of standardised inputs
+PREDICTED = 0.5  # R² from which on a value is judged
+FAINTEST = 1e-4  # least spread of what is left of a standardised number
+STIFFNESS = 1e-2  # λ
+MOST_INPUTS = 1024  # with more inputs no leverage is computed: the matrices would be too large
 
 
 class _Fitted(NamedTuple):

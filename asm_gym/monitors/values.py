@@ -26,11 +26,8 @@ from asm_gym.monitors.value_association import MOST_INPUTS, STIFFNESS, ValueAsso
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
-PREFIX = "values."
-"""Prefix of the names of its arrays in a checkpoint."""
-
-ALIKE_S = 0.1
-"""τ [s]."""
+PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
+ALIKE_S = 0.1  # τ [s]
 
 
 class Values(NamedTuple):

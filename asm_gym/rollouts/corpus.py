@@ -28,10 +28,8 @@ from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
-VERSION = 2
-"""Version of the recordings."""
-SEED = 2026
-"""Seed of the corpus; no shipped memory has learned from its episodes."""
+VERSION = 2  # version of the recordings
+SEED = 2026  # seed of the corpus; no shipped memory has learned from its episodes
 SKILLS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblyRound", "PickPlaceMilk")
 """Tasks with episodes to learn from, to calibrate on and to test on."""
 MANIFEST = "manifest.json"

@@ -29,8 +29,7 @@ Submit = Callable[[bytes, Any], "Future[Any]"]
 """Runs a pickled task on an item, as ``concurrent.futures.Executor.submit`` does."""
 
 MOST_WORKERS = 1000
-IDLE_S = 300.0
-"""A process without work ends after this time [s]."""
+IDLE_S = 300.0  # a process without work ends after this time [s]
 _LIBRARIES = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "NUMBA_NUM", "NUMEXPR_NUM", "VECLIB_MAXIMUM")
 ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 """Environment of each worker: more threads would compete for the same cores."""

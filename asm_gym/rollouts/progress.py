@@ -12,8 +12,7 @@ from rich.progress import Progress as Bars
 
 from asm_gym.rollouts.parallel import Progress
 
-EVERY_S = 10.0
-"""Least time between two lines [s]."""
+EVERY_S = 10.0  # least time between two lines [s]
 
 
 @contextmanager

@@ -28,14 +28,11 @@ from asm_gym.policies import rollout
 from asm_gym.policies.network import NetworkPolicy, describe, network
 from asm_gym.rollouts.parallel import Progress
 
-ACTOR_SHARE = 0.05
-"""The actor's learning rate, as a share of the critic's."""
-ENTROPY = -3.0
-"""Target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off."""
+ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
+ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
 BATCH, LOG_STD, CLONING_RATE = 256, -3.5, 1e-3
 """Of cloning: batch size; the actor's log standard deviation before tanh; learning rate."""
-BEST = "best.npz"
-"""File of the best agent of the evaluations."""
+BEST = "best.npz"  # file of the best agent of the evaluations
 
 Floats = NDArray[np.float32]
 

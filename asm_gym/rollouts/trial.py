@@ -25,12 +25,9 @@ Settings = tuple[tuple[str, Any], ...]
 PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
 """What ``make_policy`` takes, any object with ``predict``, or a factory for an environment."""
 
-PASSING = "passing_push"
-"""20 N for 0.3 s: a kind beside those of the suite."""
-EXECUTIONS = {"slower": 0.85, "faster": 1.15}
-"""Harmless variations of the expert itself: its speed."""
-AFTER_S = 2.0
-"""How long a faulty episode is recorded after its onset [s]."""
+PASSING = "passing_push"  # 20 N for 0.3 s: a kind beside those of the suite
+EXECUTIONS = {"slower": 0.85, "faster": 1.15}  # harmless variations of the expert itself: its speed
+AFTER_S = 2.0  # how long a faulty episode is recorded after its onset [s]
 
 
 @dataclass(frozen=True)

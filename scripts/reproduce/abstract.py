@@ -63,8 +63,7 @@ TITLES = {"traces": "traces", "settling": "settling", "gru": "GRU, BPTT"}
 UNITS = {"traces": 144, "settling": 112}
 GRU: dict[str, Any] = {"hidden": 64, "rate": 3e-2}
 """All have about as many weights through time, chosen on seeds 100 to 104."""
-RATE = 0.05
-"""False alarms asked for."""
+RATE = 0.05  # false alarms asked for
 EVENTS = ("pushed", "stuck")
 AROUND = slice(EVENT, EVENT + WINDOW)
 

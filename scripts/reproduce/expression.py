@@ -24,10 +24,8 @@ from asm_gym.scripts.reproduce.recurrent import Batch
 
 Rows = NDArray[np.float64]
 
-PEN = slice(0, 2)
-"""Columns of the pen's position."""
-FREE = 0.6
-"""``free_running_probability`` of ``NeuralASM`` for recall."""
+PEN = slice(0, 2)  # columns of the pen's position
+FREE = 0.6  # ``free_running_probability`` of ``NeuralASM`` for recall
 
 
 class Expresser(Protocol):

@@ -25,16 +25,11 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 """Names of the letters, which look like none of the alphabet."""
 STEPS = 60
-DT = 1.0 / STEPS
-"""Control period [s]: a letter takes 1 s at normal speed."""
-NOISE = 0.02
-"""Standard deviation of the pen's sensed position [cm]; letters are about 5 cm large."""
-MU = -1.75
-"""Mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset."""
-WOBBLE = 0.04
-"""Variation of a stroke between writings, as a share of its length and in radians of its direction."""
-FINE = 8
-"""Samples of the velocity in a step, whose mean is commanded."""
+DT = 1.0 / STEPS  # control period [s]: a letter takes 1 s at normal speed
+NOISE = 0.02  # standard deviation of the pen's sensed position [cm]; letters are about 5 cm large
+MU = -1.75  # mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset
+WOBBLE = 0.04  # variation of a stroke between writings, as a share of its length and in radians of its direction
+FINE = 8  # samples of the velocity in a step, whose mean is commanded
 PEN = StreamSpec(
     (
         Channel("hand_position", 2, "cm", NOISE, "pen", ("x", "y")),

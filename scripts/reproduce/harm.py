@@ -41,8 +41,7 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
-TASKS = ("Lift", "Stack", "Door", "PickPlaceCan")
-"""Tasks of hostile and untrained policies."""
+TASKS = ("Lift", "Stack", "Door", "PickPlaceCan")  # tasks of hostile and untrained policies
 EXPERTS = (*TASKS, "NutAssemblySquare", "Wipe")
 HEALTHY = (
     *(("Lift", "scripted"), ("Stack", "scripted"), ("Door", "scripted"), ("PickPlaceCan", "scripted")),
@@ -53,19 +52,13 @@ HEALTHY = (
 LEARNERS = ("SAC", "PPO", "TD3")
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", PASSING)
 """Faults under which healthy policies act too."""
-ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100))
-"""Other arms, and another rate of the memory [Hz]."""
+ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100))  # other arms, and another rate of the memory [Hz]
 AGAINST = ("hostile", "untrained", "elsewhere", "faulty")
-HARMFUL = ("hostile", "untrained")
-"""Kinds of policies that a guard is against."""
-EXCESS = 40.0
-"""Contact force beyond which contact counts as harm [N]."""
-TRANSIENT = 280.0
-"""Transient limit of a blow on a hand or finger [N] (ISO/TS 15066:2016, Table A.2)."""
-CASE = ("kind", "task", "policy", "fault", "robot", "rate")
-"""Values that distinguish one case from another."""
-FIRST_S = 0.1
-"""Duration of the first blow, from its first substep on [s]."""
+HARMFUL = ("hostile", "untrained")  # kinds of policies that a guard is against
+EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
+TRANSIENT = 280.0  # transient limit of a blow on a hand or finger [N] (ISO/TS 15066:2016, Table A.2)
+CASE = ("kind", "task", "policy", "fault", "robot", "rate")  # values that distinguish one case from another
+FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
 
 
 @dataclass(frozen=True)

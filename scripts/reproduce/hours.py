@@ -20,8 +20,7 @@ from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings
 
-PROMISES = (10.0, 5.0, 3.0, 1.0)
-"""False alarms per hour that a threshold promises."""
+PROMISES = (10.0, 5.0, 3.0, 1.0)  # false alarms per hour that a threshold promises
 EXPERT = "scripted"
 
 

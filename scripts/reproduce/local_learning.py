@@ -48,21 +48,16 @@ from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, reper
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 
-COMPARED = ("W_C", "W_F", "W_D")
-"""The synapses that are learned."""
-CUE = 10
-"""Rows that are read before a stream runs on alone."""
+COMPARED = ("W_C", "W_F", "W_D")  # the synapses that are learned
+CUE = 10  # rows that are read before a stream runs on alone
 TARGETS = {
     "energy": "gradient of the energy",
     "error": "gradient of the prediction error",
     "alone": f"gradient of the error alone, after a cue of {CUE}",
 }
-RATES = {"local": 3e-3, "backpropagation": 1e-2}
-"""Learning rate of a change a row, and of one a batch."""
-PRIOR_PRECISION = 30.0
-"""Π_z."""
-ITERATIONS = 5
-"""Inference steps of learning."""
+RATES = {"local": 3e-3, "backpropagation": 1e-2}  # learning rate of a change a row, and of one a batch
+PRIOR_PRECISION = 30.0  # Π_z
+ITERATIONS = 5  # inference steps of learning
 
 
 @dataclass(frozen=True)

@@ -45,8 +45,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 """The first as ``asm-gym fit`` fits a log, the other without whitening, as the first has it."""
 WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "association_values+evidence"}
 """Monitors with a body model in place of sines of angles."""
-PIECE_S, FOLDS = 1.0, 4
-"""Length of a piece [s], and folds of which one is tested at a time."""
+PIECE_S, FOLDS = 1.0, 4  # length of a piece [s], and folds of which one is tested at a time
 
 
 class RealArm(NamedTuple):
@@ -90,11 +89,9 @@ class Piece(NamedTuple):
         return self.episode.stream[:, self.episode.spec.slices[name]].astype(np.float64)
 
 
-NEWTONS, GRAVITY = 20.0, 9.81
-"""Push at the hand, and weight of a payload of 1 kg [N]."""
+NEWTONS, GRAVITY = 20.0, 9.81  # push at the hand, and weight of a payload of 1 kg [N]
 STEP_SHARE, SLIP, LATE_S, RISE_S = 0.2, 0.05, 0.1, 0.1
-MOVES = 0.02
-"""Angle that an encoder must move by after the onset, or nothing shows that it is frozen [rad]."""
+MOVES = 0.02  # angle that an encoder must move by after the onset, or nothing shows that it is frozen [rad]
 FAULTS = dict.fromkeys(("push", "payload", "step"), "effort")
 FAULTS |= {"frozen": "position", "slipped": "position", "late": "effort"}
 """Column that each fault changes: a push of 20 N sideways or a payload of 1 kg at a Panda's hand, through its Jacobian;

@@ -22,8 +22,7 @@ from asm_gym.memory.learning import Trajectory
 from asm_gym.monitors.baselines.torch_model import adam, descend
 
 Array = NDArray[np.float32]
-BATCH = 16
-"""Episodes of a batch."""
+BATCH = 16  # episodes of a batch
 
 
 class Batch(NamedTuple):

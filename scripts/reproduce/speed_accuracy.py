@@ -35,10 +35,8 @@ from asm_gym.validation import check_number
 
 CUE = 20
 
-SHORTER = (20, 1)
-"""How many times shorter than this package's the steps of inference are."""
-TESTS = 8
-"""Writings of each letter to recall."""
+SHORTER = (20, 1)  # how many times shorter than this package's the steps of inference are
+TESTS = 8  # writings of each letter to recall
 MEASURES = {"recalled_cm": "recalled [cm]", "next_cm": "next row [cm]"}
 
 _COUNT = partial(check_number, "iterations", low=1, whole=True)

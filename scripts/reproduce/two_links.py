@@ -26,13 +26,10 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 Floats = NDArray[np.float64]
 
-LINKS = np.array([20.0, 20.0])
-"""Lengths [cm]."""
-START = np.array([16.0, 16.0])
-"""Where the hand begins [cm]."""
+LINKS = np.array([20.0, 20.0])  # lengths [cm]
+START = np.array([16.0, 16.0])  # where the hand begins [cm]
 DT = 0.05
-ENCODER_NOISE = 1e-3
-"""Standard deviation [rad]."""
+ENCODER_NOISE = 1e-3  # standard deviation [rad]
 SPEC = StreamSpec(
     (
         Channel("encoder", 2, "rad", ENCODER_NOISE, "joints"),
@@ -44,14 +41,11 @@ SPEC = StreamSpec(
 )
 ENCODERS, HAND, COMMAND = slice(0, 2), slice(2, 4), slice(4, 6)
 
-CUE, EVENT, WINDOW = 15, 30, 20
-"""Rows that are read first; the row of the event; rows within which it is to be noticed."""
-PUSH = 0.06
-"""Displacement of both joints [rad], over two rows; about 2 cm at the hand."""
+CUE, EVENT, WINDOW = 15, 30, 20  # rows that are read first; the row of the event; rows within which it is to be noticed
+PUSH = 0.06  # displacement of both joints [rad], over two rows; about 2 cm at the hand
 WAYS = ("left alone", "pushed", "pushed, lowest F", "stuck", "stuck, left out")
 """What happens, and how the memory reacts."""
-JUDGED = (WAYS[0], WAYS[1], WAYS[3])
-"""Ways in which F is computed, in the rows around the event."""
+JUDGED = (WAYS[0], WAYS[1], WAYS[3])  # ways in which F is computed, in the rows around the event
 
 
 def hand(q: Floats) -> Floats:

@@ -30,11 +30,8 @@ from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
-FAINTEST = 1e-4
-"""Smallest spread of what is left of a standardised number, and smallest variance of w and v."""
-
-LEAST_SPREAD = 1e-6
-"""Smallest spread of a channel [its unit]."""
+FAINTEST = 1e-4  # smallest spread of what is left of a standardised number, and smallest variance of w and v
+LEAST_SPREAD = 1e-6  # smallest spread of a channel [its unit]
 
 Floats = NDArray[np.float64]
 
@@ -121,8 +118,7 @@ class LinearAssociation(ScaledModel):
         return state, ModelOutput(error, no_context(rows))
 
 
-OVER = 0.1
-"""Seconds that a residual is averaged over."""
+OVER = 0.1  # seconds that a residual is averaged over
 
 
 class _Averaged(NamedTuple):

@@ -32,10 +32,8 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
 BATCH = 256
-STAGES = 10
-"""Steps of the flow."""
-FARTHEST = 30.0
-"""Where standardised numbers are cut off: networks of this kind diverge far from what they have seen."""
+STAGES = 10  # steps of the flow
+FARTHEST = 30.0  # where standardised numbers are cut off: networks of this kind diverge far from what they have seen
 
 
 class LogpZO(TorchModel):

@@ -19,11 +19,8 @@ from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import ScaledRows, StreamScaler
 
-EPOCHS, BATCH = 200, 16
-"""Passes at most over whole episodes, and episodes side by side."""
-
-FRESH = 5
-"""One in so many episodes is not trained on, but says when to stop."""
+EPOCHS, BATCH = 200, 16  # passes at most over whole episodes, and episodes side by side
+FRESH = 5  # one in so many episodes is not trained on, but says when to stop
 
 PATIENCE, SLOWER, SLOWEST = 5, 0.3, 3e-5
 """Epochs without a gain after which the step size is cut to a share; below the smallest, training has converged."""

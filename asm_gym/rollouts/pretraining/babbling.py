@@ -38,16 +38,12 @@ from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_number
 
 ALONE, LED, DRIVEN, REACHING = "noise", "expert", "disturbed", "reaching"
-LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)
-"""What leads, lesson by lesson of a task."""
+LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)  # what leads, lesson by lesson of a task
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
-NOISE = 0.02, 0.2
-"""Range of s, up to about the exploration of a half-trained agent [action units]."""
-SPEED, WEIGHT = (0.5, 1.5), (0.7, 1.4)
-"""Speed of the expert, relative to its usual one; factor of an object's mass."""
-PAUSE, PAUSED = 0.01, (5, 60)
-"""Probability per step that the arm stops, and for how many steps."""
+NOISE = 0.02, 0.2  # range of s, up to about the exploration of a half-trained agent [action units]
+SPEED, WEIGHT = (0.5, 1.5), (0.7, 1.4)  # speed of the expert, relative to its usual one; factor of an object's mass
+PAUSE, PAUSED = 0.01, (5, 60)  # probability per step that the arm stops, and for how many steps
 DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
 """Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
 PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
@@ -55,14 +51,10 @@ PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
-AROUND = (-0.25, -0.4, -0.12), (0.25, 0.4, 0.25)
-"""Range of places, relative to where the hand begins [m]."""
-TURNED = 0.2, 0.2, 0.8
-"""Greatest turn of the hand about the axes of the world [rad]."""
-PACE = 0.45
-"""Speed of the hand [action units]."""
-ARRIVED, GIVEN_UP = 0.02, 60
-"""The hand goes on to the next place this near to one [m], or after so many steps."""
+AROUND = (-0.25, -0.4, -0.12), (0.25, 0.4, 0.25)  # range of places, relative to where the hand begins [m]
+TURNED = 0.2, 0.2, 0.8  # greatest turn of the hand about the axes of the world [rad]
+PACE = 0.45  # speed of the hand [action units]
+ARRIVED, GIVEN_UP = 0.02, 60  # the hand goes on to the next place this near to one [m], or after so many steps
 
 
 class Lesson(NamedTuple):

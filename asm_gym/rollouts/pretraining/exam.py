@@ -22,10 +22,8 @@ from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
-SEVERITIES = "medium", "strong"
-"""Of the faults in an examination; mild ones are hardly detectable."""
-SCENES = 12
-"""Faults happen in the first so many scenes."""
+SEVERITIES = "medium", "strong"  # of the faults in an examination; mild ones are hardly detectable
+SCENES = 12  # faults happen in the first so many scenes
 
 
 class Exam(NamedTuple):

@@ -17,17 +17,13 @@ from asm_gym.monitors.base import Progress
 from asm_gym.monitors.calibration import learn_ceilings
 from asm_gym.spec import StreamSpec
 
-HELD_OUT = 3
-"""One in so many lessons of a task sets the threshold, and is not learned from."""
+HELD_OUT = 3  # one in so many lessons of a task sets the threshold, and is not learned from
 LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
 """Learned: up to so many times what an undisturbed expert usually feels at most, in an undisturbed and a disturbed
 lesson. In the latter contact is an accident: a memory that knows it detects no push."""
-FOR_CEILINGS = 10
-"""One in so many healthy episodes of a task sets the ceilings of senses, where that makes enough."""
-AROUND_S = 0.2
-"""Left out before and after a hit [s]."""
-SHORTEST = 20
-"""Least steps of a stretch that is learned from."""
+FOR_CEILINGS = 10  # one in so many healthy episodes of a task sets the ceilings of senses, where that makes enough
+AROUND_S = 0.2  # left out before and after a hit [s]
+SHORTEST = 20  # least steps of a stretch that is learned from
 PASSES, HIDDEN = 4, 32
 """Passes of the temporal network over the lessons, and its units: few, as its context would mislead under an unknown
 policy."""
@@ -45,8 +41,7 @@ class Gentle(NamedTuple):
     torque: float
 
 
-KNOWN = Gentle(30.0, 15.0)
-"""Learned in any case: an arm whose experts touch little meets contact all the same."""
+KNOWN = Gentle(30.0, 15.0)  # learned in any case: an arm whose experts touch little meets contact all the same
 
 
 def held_out(number: int) -> bool:
