@@ -56,7 +56,7 @@ class SurpriseOverlay(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 f'SurpriseOverlay draws on pictures and needs render_mode="rgb_array", got {env.render_mode!r}: '
                 'make the environment with gym.make(..., render_mode="rgb_array")'
             )
-        self.caption = caption and check_text("caption", caption)
+        self.caption = caption if isinstance(caption, str) and not caption else check_text("caption", caption)
         self._dt = control_period(env)
         self._shown = max(2, round(SECONDS / self._dt))  # steps
         self._clear()

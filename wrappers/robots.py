@@ -95,7 +95,8 @@ def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | N
     if changed and has_stream:
         refused["recall"] = changed
     try:
-        layout = first("observation_layout"), first("laid_out_space")
+        own = first("laid_out_space", None if many else env.unwrapped.observation_space)  # type: ignore[union-attr]
+        layout = first("observation_layout"), own
         places = ObservationMap(observations, spec, has_stream, *layout)
     except ValueError as error:
         places, refused["complete"] = None, str(error)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_monitor, diagnosis_of
+from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.motion import Command
 from asm_gym.guard.observer import joined
@@ -146,6 +146,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
+        check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         policies = () if isinstance(chosen, str) else (policy_for(chosen, self.env),)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_monitor, diagnosis_of
+from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
@@ -118,6 +118,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
+        check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         self._robots, self._places = robots_of(self.env, monitor.spec)

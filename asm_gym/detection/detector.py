@@ -151,7 +151,8 @@ class Detector:
     def reach(self) -> float:
         """Largest value in a context of 0: every error at ν for ever, so that |w_i| <= ν Σ_j |M_ji|."""
         most = self.bound * np.abs(self.whitening).sum(axis=0, keepdims=True)
-        return float(self._most(most)[0] / np.exp(self.context_quantile[-1]))
+        with np.errstate(over="ignore"):  # a context that hides everything reaches 0
+            return float(self._most(most)[0] / np.exp(self.context_quantile[-1]))
 
     @property
     def reach_of_errors(self) -> Floats:

@@ -74,7 +74,11 @@ class RobosuiteEnv(SteppedEnv):
         sensor_noise: float = 1.0,
         camera: str = "frontview",
         render_size: tuple[int, int] = (480, 480),
+        **unknown: Any,
     ) -> None:
+        if unknown:
+            hint = "; the arm is named by robot=" if "robots" in unknown else ""
+            raise TypeError(f"asm_gym/{task}-v0 takes no {', '.join(unknown)}{hint}")
         self.task = task_spec(task)
         self.robots = robots_for(self.task, robot)
         check_choice("render_mode", render_mode, (None, "rgb_array"))

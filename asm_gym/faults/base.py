@@ -173,7 +173,7 @@ def _check(parameter: Field[Any], value: Any) -> None:
         check_numbers(name, value, 3, low=low, high=high)
         if name == "direction" and not np.linalg.norm(value) > 0:
             raise ValueError(f"direction must not be all zero, got {value}")
-    elif kind == "str" and value != "":
+    elif kind == "str" and not (isinstance(value, str) and not value):
         check_text(name, value)
 
 

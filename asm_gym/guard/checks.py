@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
-from asm_gym.monitors import ExplainsItself, Monitor, NeuralASM
+import numpy as np
+
+from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, short_repr
@@ -56,6 +59,21 @@ def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
         raise TypeError(f"monitor must have initial_state() and observe(), got {short_repr(monitor)}")
     monitor.spec.require(watched, "the monitor")
     return check_number("the monitor's threshold", monitor.threshold)
+
+
+def check_answer(monitor: Monitor) -> None:
+    """Raise TypeError where a user's monitor answers a row with anything but a state and a surprise."""
+    if isinstance(monitor, CalibratedMonitor):
+        return
+    try:
+        tried = deepcopy(monitor)  # one that counts its rows must not count this one
+        answer: Any = tried.observe(tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))
+    except Exception as error:  # an alarm at the first row, unless it is mended by then
+        LOG.warning("the monitor failed at a row of zeros: %r", error)
+        return
+    if not (isinstance(answer, tuple) and len(answer) == 2 and hasattr(answer[1], "attribution")):
+        parts = [type(part).__name__ for part in answer] if isinstance(answer, tuple) else [type(answer).__name__]
+        raise TypeError(f"observe(state, stream) must return (state, Surprise), got ({', '.join(parts)})")
 
 
 def diagnosis_of(monitor: Monitor) -> Diagnosis | None:

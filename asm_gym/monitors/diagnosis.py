@@ -209,11 +209,15 @@ class Diagnosis:
             probabilities[family] += float(q)
         family = max(probabilities, key=lambda name: probabilities[name])
         which = max((q, name) for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True) if own == family)[1]
-        able = [kind for kind in CLASSES[which][1] if kind in best]
-        most = max(able, key=lambda kind: evidence[EVIDENCE.index(kind)], default="")
-        named = self.hypotheses[best[most]] if most else None
+        named = self._named(which, evidence, best)
         columns = named.columns if named is not None and family == "sensor" else np.zeros(0, np.intp)
         return Cause(family, named.part if named else "", probabilities[family], probabilities, columns)
+
+    def _named(self, which: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
+        """Return the hypothesis that explains most, of those of a class."""
+        able = [kind for kind in CLASSES[which][1] if kind in best]
+        most = max(able, key=lambda kind: evidence[EVIDENCE.index(kind)], default="")
+        return self.hypotheses[best[most]] if most else None
 
     def _stuck(
         self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
