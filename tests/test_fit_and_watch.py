@@ -175,7 +175,7 @@ def memory(logs):
 def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, capsys):
     out = tmp_path / "x.asm"
     assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01"]) == 2
-    assert "a false-alarm rate of 0.01 needs 198 normal episodes, 99 of them to calibrate on, got 40" in (
+    assert "this false-alarm rate needs 198 normal episodes, 99 of them to calibrate on, got 40" in (
         capsys.readouterr().err
     )
     assert not out.exists()

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
 from asm_gym.memory import motor
-from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, lessons, situation
+from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, situation
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.memory_policy import ENOUGH, FORGETS, CommandReadout, NeuralASMPolicy
-from asm_gym.monitors.skills import learn_to_act
+from asm_gym.monitors.skills import learn_to_act, lessons
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec
