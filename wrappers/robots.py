@@ -95,7 +95,7 @@ def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | N
     if changed and has_stream:
         refused["recall"] = changed
     try:
-        own = first("laid_out_space", None if many else env.unwrapped.observation_space)  # type: ignore[union-attr]
+        own = first("laid_out_space", None if many else env.unwrapped.observation_space)
         layout = first("observation_layout"), own
         places = ObservationMap(observations, spec, has_stream, *layout)
     except ValueError as error:
