@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.envs.compiled_substeps import touching
 from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.extras import require
 from asm_gym.spec import Channel
@@ -118,17 +119,14 @@ def speed_up_contacts(env: Any) -> None:
         mask[[ids[name] for name in names if name in ids]] = True
         return mask
 
+    everything = np.ones(count, bool)
+
     def mask(geoms: Any) -> NDArray[np.bool_]:
         return members(tuple(geoms) if isinstance(geoms, list) else geoms)
 
     def check_contact(geoms_1: Any, geoms_2: Any = None) -> bool:
         """Whether any geom of one group touches any of the other; of anything where there is no other."""
-        first, second = data.contact.geom.T  # (ncon,)
-        one = mask(geoms_1)
-        if geoms_2 is None:
-            return bool((one[first] | one[second]).any())
-        other = mask(geoms_2)
-        return bool((one[first] & other[second] | one[second] & other[first]).any())
+        return touching(data.contact.geom, mask(geoms_1), everything if geoms_2 is None else mask(geoms_2))
 
     @lru_cache
     def pads(gripper: Any) -> tuple[tuple[str, ...], ...]:

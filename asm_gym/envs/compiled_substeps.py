@@ -257,6 +257,16 @@ def average(samples: Floats, count: int, arms: Ints, columns: Ints, mean: Floats
 
 
 @compiled
+def touching(pairs: Ints, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> bool:
+    """Whether, among pairs (N, 2) of geoms in contact, one of the first group (G,) touches one of the other (G,)."""
+    for n in range(len(pairs)):
+        a, b = pairs[n]
+        if (one[a] and other[b]) or (one[b] and other[a]):
+            return True
+    return False
+
+
+@compiled
 def edited(live: Floats, frozen: Floats, rows: Ints) -> bool:
     """Whether two arrays (N, M) differ in any of ``rows``."""
     for r in rows:
