@@ -110,3 +110,8 @@ def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path
     rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy.npy"]}))
     with pytest.raises(ValueError, match="damaged"):
         NeuralASM.load(tmp_path / "shape.asm")
+
+
+def test_a_file_of_an_older_version_is_refused_with_what_makes_it_anew(asm, tmp_path):
+    with pytest.raises(ValueError, match=r"older version: make it anew with asm-gym fit"):
+        NeuralASM.load(tampered(asm, tmp_path / "m.asm", {"W_C.planesf4": np.zeros((4, 8), np.uint8)}))

@@ -31,6 +31,8 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
     """
     header, saved = saved.header, saved._replace(arrays=unpacked(saved.arrays))
     undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
+    if any(".planes" in name for name in undeclared):  # as arrays were packed before
+        raise ValueError("the file was written by an older version: make it anew with asm-gym fit or asm-gym babble")
     if undeclared:
         raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
     arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
