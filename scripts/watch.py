@@ -1,9 +1,11 @@
 """Says when a recording is surprising, where, and how much; or watches rows as they come.
 
 A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
-udp:PORT for datagrams from this machine, or dds:/joint_states for ROS 2: JSON lines (a list of numbers, or an object by
-channel, one a row), or CSV with a header; every alarm is printed as it is raised, in constant memory. Exit code 1:
-there was an alarm.
+udp:PORT for datagrams from this machine (udp:PORT@ADDRESS:PORT for those of one sender), or dds:/joint_states for
+ROS 2: JSON lines (a list of numbers, or an object by channel, one a row), or CSV with a header; every alarm is printed
+as it is raised, in constant memory. A line that cannot be read is an alarm too, and watching goes on.
+
+Exit codes: 0 no alarm, 1 alarms, 2 an error.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ class Args(Checked):
     bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
     """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
     wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
-    """For how long a controller or a topic that has died may take to come back; then it is watched anew."""
+    """For how long a live source may take to send its first row, or to come back after it has died."""
+    until_alarm: bool = False
+    """The first alarm of a live source ends the watch, with exit code 1: asm-gym watch ... --until-alarm || stop."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
@@ -136,9 +140,10 @@ def watch(args: Args, console: Console) -> int:
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if live is not None:
         opened = partial(lines_from, args.source, sys.stdin, args.silence)
-        again = opened if live.returns else None
         say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-        return BAD_NEWS if follow(opened(), monitor, say, args.bridge, again, args.wait) else DONE
+        lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
+        alarms = follow(lines, monitor, lambda event: say(str(event)), args.bridge, again, args.wait, args.until_alarm)
+        return BAD_NEWS if alarms else DONE
     return review(args, monitor, console)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
-from asm_gym.data.rows import ClockWentBack, SourceDied
+from asm_gym.data.rows import SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -45,8 +45,8 @@ def lines(rows, stamps=None, dies=False):
 
 def watched(source, monitor, *how):
     """The number of alarms, and what was said."""
-    said = list[str]()
-    return follow(source, monitor, said.append, *how), "\n".join(said)
+    events = []
+    return follow(source, monitor, events.append, *how), "\n".join(map(str, events))
 
 
 def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
@@ -61,6 +61,36 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
     assert "0.260 s  2 rows lost: an alarm (late)" in said
     assert said.splitlines()[-1].startswith("30 rows, ")
     assert watched(lines(rows[kept], DT * kept), monitor, 0.05)[0] == 0
+
+
+@pytest.mark.parametrize("bad", ["an empty datagram", "[1, 2", "[1]", "[" * 100_000, "\x00\ufffd"])
+def test_a_line_that_cannot_be_read_is_an_alarm_and_the_fault_after_it_is_found(bad, monitor):
+    rows = list(lines(episode(500).stream[:60]))
+    frozen = json.loads(rows[40])["q"]
+    after = [json.dumps({**json.loads(row), "q": frozen}) for row in rows[40:]]
+    events = []
+    assert follow([*rows[:20], bad, *rows[20:40], *after], monitor, events.append) > 1
+    alarms = [(event.reason, event.channel) for event in events if event.kind == "alarm"]
+    assert alarms[0][0] == "unreadable"
+    assert "surprise" in [why for why, _ in alarms[1:]]
+
+
+def test_a_source_whose_lines_are_no_rows_at_all_is_an_error_unless_others_may_send_to_it(monitor):
+    rows = list(lines(episode(500).stream[:10]))
+    with pytest.raises(ValueError, match="line 1 is no row of numbers, and no header"):
+        watched(["garbage", *rows], monitor)
+    count, said = watched(["garbage", *rows], monitor, 0.0, lambda first: iter(()), 0.1)
+    assert count == 1
+    assert "10 rows" in said
+    with pytest.raises(ValueError, match="no row came"):
+        watched([], monitor)
+
+
+def test_the_first_alarm_ends_a_watch_that_is_told_so(monitor):
+    rows = list(lines(episode(500).stream))
+    source = iter([*rows[:5], "no row", *rows])
+    assert watched(source, monitor, 0.0, None, 0.0, True)[0] == 1
+    assert next(source) == rows[0]
 
 
 def test_missing_numbers_are_bridged_or_an_alarm_that_says_why(monitor):
@@ -127,7 +157,7 @@ def test_another_rate_is_said_once_and_is_an_alarm(rate, monitor):
 def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(monitor):
     rows, opened = episode(501).stream[:20], []
 
-    def again():
+    def again(first):
         opened.append(1)
         if len(opened) == 1:
             raise ConnectionRefusedError
@@ -135,13 +165,14 @@ def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(
 
     count, said = watched(lines(rows, dies=True), monitor, 0.0, again, 5.0)
     assert count
-    assert said.count("the source is back") == 2
+    assert said.count("the source is back") == 1
     assert "time must increase, got 1 s after 5.02 s: an alarm, and a new beginning" in said
-    assert "42 rows" in said
-    with pytest.raises(ClockWentBack):
-        watched(lines(rows, [5.0, 5.02, 1.0]), monitor)
+    assert "23 rows" in said
+    count, said = watched(lines(rows, [5.0, 5.02, 1.0]), monitor)
+    assert count
+    assert "time must increase, got 1 s after 5.02 s: an alarm, and a new beginning" in said
 
-    def never():
+    def never(first):
         raise OSError("no")
 
     said = watched(lines(rows, dies=True), monitor, 0.0, never, 0.3)[1]

@@ -5,12 +5,14 @@ A source that falls silent has died. A new source is one row of ``LIVE``.
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from io import UnsupportedOperation
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -19,16 +21,17 @@ from asm_gym.files import regular_file
 from asm_gym.validation import check_number
 
 POLL_S = 0.002  # how often a source is looked at for more [s]
-LARGEST = 65_535  # bytes of a datagram, and more than a row of any robot
+LARGEST = 65_535  # bytes of a datagram
+LONGEST = 100 * LARGEST  # bytes of a line: more than a row of any robot
+EMPTY = b"an empty datagram"  # the line that stands for one
 
 
 class LiveSource(NamedTuple):
     """A source that is followed."""
 
     example: str  # of its name
-    open: Callable[
-        [str, TextIO, float], Iterator[str]
-    ]  # takes what follows the prefix, standard input, and silence [s]
+    open: Callable[[str, TextIO, float, float], Iterator[str]]
+    """Takes what follows the prefix, standard input, silence [s], and how long the first line may take [s]."""
     returns: bool = False  # whether it may come back after it died
 
 
@@ -37,19 +40,24 @@ def live_source(source: str) -> LiveSource | None:
     return LIVE.get(source if source == "-" else f"{source.partition(':')[0]}:")
 
 
-def lines_from(source: str, stdin: TextIO, silence: float) -> Iterator[str]:
-    """Return the lines of a live source, as they come; SourceDied after ``silence`` [s] without one.
+def lines_from(source: str, stdin: TextIO, silence: float, first: float = math.inf) -> Iterator[str]:
+    """Return the lines of a live source, as they come.
 
     Sources are ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams of this
-    machine, of which an empty one is the end, and ``dds:/joint_states`` for topics of ROS 2.
+    machine, ``udp:PORT@ADDRESS`` or ``udp:PORT@ADDRESS:PORT`` for those of one sender, and ``dds:/joint_states`` for
+    topics of ROS 2.
+
+    Args:
+        silence: without a line for so long the source has died, which raises SourceDied [s].
+        first: as ``silence``, before the first line.
     """
     found = live_source(source)
     if found is None:
         raise ValueError(f"unknown source {source!r}; known: {', '.join(s.example for s in LIVE.values())}")
-    return found.open(source.partition(":")[2], stdin, silence)
+    return found.open(source.partition(":")[2], stdin, silence, first)
 
 
-def _follow_pipe(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
+def _follow_pipe(place: str, stdin: TextIO, silence: float, first: float) -> Iterator[str]:
     try:
         number = stdin.fileno()
     except (UnsupportedOperation, AttributeError):  # no pipe, but text in memory
@@ -60,10 +68,10 @@ def _follow_pipe(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
         ready, _, _ = select.select([number], [], [], POLL_S)
         return os.read(number, LARGEST) if ready else None
 
-    yield from _lines(more, silence)
+    yield from _lines(more, silence, first)
 
 
-def _follow_file(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
+def _follow_file(place: str, stdin: TextIO, silence: float, first: float) -> Iterator[str]:
     path = Path(place)
     regular_file(path)
     with path.open("rb") as file:
@@ -76,29 +84,37 @@ def _follow_file(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
                 time.sleep(POLL_S)
             return found or None
 
-        yield from _lines(more, silence)
+        yield from _lines(more, silence, first)
 
 
-def _follow_datagrams(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
-    """Yield the lines of datagrams that this machine sends to a port of itself."""
-    if not place.isdigit():
-        raise ValueError(f"udp takes a port of this machine, as in udp:9870, got {place!r}")
-    port = int(check_number("port", int(place), low=1, high=65_535, whole=True))
+def _follow_datagrams(place: str, stdin: TextIO, silence: float, first: float) -> Iterator[str]:
+    """Yield the lines of datagrams to a port of this machine, from itself or from one sender elsewhere.
+
+    Nothing that a datagram holds ends them: an empty one is a line that is no row.
+    """
+    number, at, sender = place.partition("@")
+    host, colon, own = sender.partition(":")
+    if not number.isdigit() or (at and not host) or (colon and not own.isdigit()):
+        raise ValueError(f"udp takes a port of this machine, as in udp:9870, or udp:9870@127.0.0.1:5005, got {place!r}")
+    port = int(check_number("port", int(number), low=1, high=65_535, whole=True))
+    believed = IPv4Address(host or "127.0.0.1")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", port))  # nobody else's rows are believed
+        receiver.bind(("127.0.0.1" if believed.is_loopback else "0.0.0.0", port))
         receiver.settimeout(POLL_S)
 
         def more() -> bytes | None:
             try:
-                found = receiver.recv(LARGEST)
+                found, (address, source) = receiver.recvfrom(LARGEST)
             except TimeoutError:
                 return None
-            return found.rstrip(b"\n") + b"\n" if found else b""
+            if (host and IPv4Address(address) != believed) or (own and source != int(own)):
+                return None
+            return (found.rstrip(b"\n") or EMPTY) + b"\n"
 
-        yield from _lines(more, silence)
+        yield from _lines(more, silence, first)
 
 
-def _follow_topics(place: str, stdin: TextIO, silence: float) -> Iterator[str]:
+def _follow_topics(place: str, stdin: TextIO, silence: float, first: float) -> Iterator[str]:
     from asm_gym.data.ros2_dds import follow_topics
 
     return follow_topics(place, silence)
@@ -113,21 +129,25 @@ LIVE = {
 """Live sources by prefix."""
 
 
-def _lines(more: Callable[[], bytes | None], silence: float) -> Iterator[str]:
+def _lines(more: Callable[[], bytes | None], silence: float, first: float) -> Iterator[str]:
     """Lines of what ``more`` returns: bytes, none at the end, or None where there are none yet."""
-    rest, last = b"", None
+    rest, last, most = b"", time.monotonic(), first
     while (found := more()) != b"":
         if found is None:
-            if last is not None and time.monotonic() - last > silence:
-                raise SourceDied(f"nothing came for {silence:g} s")
+            if time.monotonic() - last > most:
+                raise SourceDied(f"nothing came for {most:g} s")
             continue
-        last = time.monotonic()
+        last, most = time.monotonic(), silence
         *whole, rest = (rest + found).split(b"\n")
-        if len(rest) > 100 * LARGEST:
-            raise ValueError(f"a line of {len(rest)} bytes is no row")
-        yield from (line.decode() for line in whole)
+        rest = rest[: LONGEST + 1]  # what is longer is no row, and costs no memory
+        yield from map(_text, whole)
     if rest.strip():
-        yield rest.decode()
+        yield _text(rest)
+
+
+def _text(line: bytes) -> str:
+    """Return a line as text; what is none, or too long, as something that cannot be read as a row."""
+    return f"a line of more than {LONGEST} bytes" if len(line) > LONGEST else line.decode(errors="replace")
 
 
 def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:

@@ -10,6 +10,7 @@ wrong    elsewhere                  nothing is judged: a memory cannot judge ste
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -33,8 +34,11 @@ class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
 NEWEST = 32  # rows that tell the rate, and after which it is told again
 
 
+LEAP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
+
+
 class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
-    """A row is older than the one before it."""
+    """A row is older than the one before it, or much newer."""
 
 
 class Pace:
@@ -47,14 +51,22 @@ class Pace:
         self._before: float | None = None
 
     def lost(self, stamp: float) -> int | None:
-        """Return how many rows were lost before the one of this time [s]; None where it is not to be read."""
+        """Return how many rows were lost before the one of this time [s]; None where it is not to be read.
+
+        Raises:
+            ValueError: the time is not finite.
+            ClockWentBack: it is no later than the one before, or later than ``LEAP_S``.
+        """
+        if not math.isfinite(stamp):
+            raise ValueError(f"its time is {stamp}")
         before, self._before, self.change = self._before, stamp, ""
         self._rows += 1
         if before is None:
             return 0
         step = stamp - before
-        if not step > 0:
-            raise ClockWentBack(f"time must increase, got {stamp:g} s after {before:g} s")
+        if not 0 < step <= LEAP_S:
+            what = "leapt" if step > 0 else "must increase"
+            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
         self._steps.append(step)
         if self._rows % NEWEST == 1:
             own = median(self._steps)
@@ -73,6 +85,7 @@ class Row(NamedTuple):
     lost: int = 0  # rows that should have come before it
     read: bool = True  # it stands where the memory reads one
     change: str = ""  # how the rate changed
+    problem: str = ""  # why the line is no row, or no successor of the one before
 
 
 class RowReader:
@@ -92,32 +105,53 @@ class RowReader:
         self._columns: list[tuple[str, float]] | None = None  # of each number of the stream, and its factor
         self._clock: Clock | None = None
         self._pace = Pace(spec.dt)
+        self._known = False  # a row was read
+
+    def begin(self) -> None:
+        """Begin anew with the clock; columns stay."""
+        self._pace = Pace(self.spec.dt)
 
     def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
-        """Yield each row, and when its line came, by ``time.perf_counter``; ValueError names a line that is none."""
+        """Yield each row, and when its line came, by ``time.perf_counter``; a line that is none has a ``problem``."""
         for line in filter(str.strip, lines):
             arrived = time.perf_counter()
             self.line += 1
-            if self.line == 1 and line.lstrip()[0] not in "[{":
-                self._read_header(line)
-                continue
             try:
-                numbers, stamp = self._numbers(line)
-                lost = 0 if stamp is None else self._pace.lost(stamp)
-            except (ValueError, TypeError) as error:
-                kind = ClockWentBack if isinstance(error, ClockWentBack) else ValueError
-                raise kind(f"line {self.line} is no row of numbers: {error}") from error
-            if numbers.shape != (self.spec.size,):
-                raise ValueError(f"line {self.line} must hold {self.spec.size} numbers, got the shape {numbers.shape}")
-            yield Row(numbers, lost or 0, lost is not None, "" if stamp is None else self._pace.change), arrived
+                if self._begins_with(line):
+                    continue
+                row = self._row(line)
+            except Exception as error:  # anybody may have sent it: deep, huge or broken, it must not end a watch
+                kind = "no row of numbers" + (", and no header" if self._header is None and not self._known else "")
+                row = Row(np.full(self.spec.size, np.nan), read=False, problem=f"line {self.line} is {kind}: {error}")
+            yield row, arrived
 
-    def _read_header(self, line: str) -> None:
+    def _begins_with(self, line: str) -> bool:
+        """Tell whether a line is the header of CSV, for the first time or once more, and take it up."""
+        if self._header is not None:
+            return self._dialect.cells(line) == self._header
+        if self._known or line.lstrip()[0] in "[{":
+            return False
         self._dialect = Dialect.of(line)
+        header = header_of(self._dialect.cells(line), "the header")
+        self._match(header)
+        self._header = header
+        return True
+
+    def _row(self, line: str) -> Row:
+        """Return the row of a line; ValueError where it is none."""
+        numbers, stamp = self._numbers(line)
+        if numbers.shape != (self.spec.size,):
+            raise ValueError(f"it must hold {self.spec.size} numbers, got the shape {numbers.shape}")
+        self._known = True
+        if stamp is None:
+            return Row(numbers)
         try:
-            self._header = header_of(self._dialect.cells(line), "the header")
-            self._match(self._header)
-        except ValueError as error:
-            raise ValueError(f"line 1 is no row of numbers, and no header: {error}") from error
+            lost = self._pace.lost(stamp)
+        except ClockWentBack as error:
+            self.begin()
+            self._pace.lost(stamp)
+            return Row(numbers, problem=str(error))
+        return Row(numbers, lost or 0, lost is not None, self._pace.change)
 
     def _match(self, names: Iterable[str]) -> None:
         """Find the column of each label, and the clock. Raises ValueError where a column is missing."""

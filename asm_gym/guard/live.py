@@ -1,4 +1,7 @@
-"""Watch rows as they come, in constant memory, over lost rows, other rates and sources that die and come back."""
+"""Watch rows as they come, in constant memory, over lost rows, other rates and sources that die and come back.
+
+Nothing that a line holds ends a watch: a line that cannot be read is an alarm.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,12 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
-from asm_gym.data.rows import ClockWentBack, Row, RowReader, SourceDied
+from asm_gym.data.rows import Row, RowReader, SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions
@@ -24,28 +27,50 @@ from asm_gym.validation import as_float32
 MOST_LOST = 1000  # lost rows that a bridge is asked about one by one
 LATENCIES = 10_000  # newest rows whose latency is kept
 RETRY_S = 0.2  # time between two attempts to open a source again [s]
+TOGETHER_S = 1.0  # lines that cannot be read, and come within this time of another, are one alarm [s]
 
-Opened = Callable[[], Iterator[str]]
+ALARM, NOTE, SUMMARY = "alarm", "note", "summary"  # kinds of events
+DIED, UNREADABLE, CLOCK, RATE = "source died", "unreadable", "clock", "rate"  # why there is an alarm, beside surprise
+
+Opened = Callable[[float], Iterator[str]]
+
+
+class LiveEvent(NamedTuple):
+    """What a watch has to say; as text it is a line for the user."""
+
+    kind: str  # ``ALARM``, ``NOTE`` or ``SUMMARY``
+    time: float  # of the rows up to now [s]
+    text: str
+    reason: str = ""  # of an alarm
+    channel: str = ""  # that an alarm points to
+    thresholds: float | None = None  # surprise over its threshold; infinite where something is missing
+    latency_ms: float | None = None  # from the arrival of the row to the alarm
+
+    def __str__(self) -> str:
+        return self.text if self.kind == SUMMARY else f"{self.time:.3f} s  {self.text}"
 
 
 def follow(
     lines: Iterable[str],
     monitor: Any,
-    say: Callable[[str], None],
+    say: Callable[[LiveEvent], None],
     seconds: float = 0.0,
     again: Opened | None = None,
     wait: float = 0.0,
+    until_alarm: bool = False,
 ) -> int:
     """Say every alarm as it is raised, and why; return how many there were.
 
     Args:
         lines, monitor: rows, as ``asm_gym.data.live.lines_from`` yields them; a calibrated monitor.
-        say: takes a line for the user.
+        say: takes what there is to say.
         seconds: that something may be missing without an alarm.
-        again, wait: opens the source anew after it has died, or its clock went back; for how long that is tried [s].
+        again, wait: opens the source anew after it has died; for how long that is tried [s]. It is given how long the
+            first line may take.
+        until_alarm: the first alarm ends the watch.
 
     Raises:
-        ValueError: no row came, or a line is no row.
+        ValueError: no row came, or the first line of a source that cannot be opened anew is no row.
     """
     watch = _Watch(monitor, say, seconds)
     source: Iterable[str] | None = lines
@@ -53,7 +78,7 @@ def follow(
         warnings.filterwarnings("ignore", ".*rows under this policy alarm")  # every alarm is said here
         try:
             while source is not None:
-                died = watch.follow(source, again is not None)
+                died = watch.follow(source, again is not None, until_alarm)
                 source = watch.reopened(again, wait) if died and again is not None and watch.rows else None
         except KeyboardInterrupt:
             if watch.rows:
@@ -66,13 +91,15 @@ def follow(
 class _Watch:
     """The state of a source while it is watched; the arguments are those of ``follow``."""
 
-    def __init__(self, monitor: Any, say: Callable[[str], None], seconds: float) -> None:
+    def __init__(self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float) -> None:
         self.say, self.seconds, self.spec = say, seconds, monitor.spec
         spec: StreamSpec = monitor.spec
         self.engine = Engine(Robots.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
+        self.reader = RowReader(spec)
         self.no_action = np.zeros((1, spec.motor.size), np.float32)
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
-        self.rows = self.alarms = 0
+        self.rows = self.alarms = self.unreadable = 0
+        self.unreadable_at = -np.inf  # when a line that cannot be read came last, by ``time.perf_counter``
         self._judge(np.zeros(spec.size), bridged=False)  # compiles
         self._begin()
 
@@ -86,51 +113,59 @@ class _Watch:
     def _judge(self, numbers: Any, bridged: bool) -> RowReport:
         return self.engine.judge(as_float32(numbers)[None], self.no_action, active=np.array([not bridged]))
 
-    def alarm(self, what: str, ahead: int = 0) -> None:
+    def alarm(self, text: str, reason: str, ahead: int = 0, **about: Any) -> None:
         """Count an alarm, and say at which row it was, so many ahead of the newest."""
         self.alarms += 1
-        self._note(what, ahead)
+        self._note(text, ahead, kind=ALARM, reason=reason, **about)
 
-    def _note(self, what: str, ahead: int = 0) -> None:
-        self.say(f"{(self.rows + ahead) * self.spec.dt:.3f} s  {what}")
+    def _note(self, text: str, ahead: int = 0, kind: str = NOTE, **about: Any) -> None:
+        self.say(LiveEvent(kind, (self.rows + ahead) * self.spec.dt, text, **about))
 
-    def follow(self, lines: Iterable[str], returns: bool) -> bool:
-        """Watch rows until the source ends or dies; return whether it died."""
+    def follow(self, lines: Iterable[str], returns: bool, until_alarm: bool) -> bool:
+        """Watch rows until the source ends or dies, or until an alarm; return whether it died."""
         try:
-            for row, arrived in RowReader(self.spec).rows(lines):
+            for row, arrived in self.reader.rows(lines):
+                if row.problem and not (returns or self.rows):
+                    raise ValueError(row.problem)
                 self._row(row, arrived)
+                if until_alarm and self.alarms:
+                    return False
         except SourceDied as error:
-            self.alarm(f"the source has died, {error}: an alarm")
-            return True
-        except ClockWentBack as error:
-            if not returns:
-                raise
-            self.alarm(f"{error}: an alarm, and a new beginning")
-            return True
+            self.alarm(f"the source has died, {error}: an alarm", DIED)
+            return not until_alarm
         return False
 
     def reopened(self, again: Opened, wait: float) -> Iterable[str] | None:
         """Return the lines of the source once it is there again; None where it did not come back."""
         start = time.monotonic()
-        while time.monotonic() - start < wait:
+        while (left := start + wait - time.monotonic()) > 0:
             try:
-                lines = again()
+                lines = again(left)
                 first = next(lines, None)
             except (OSError, SourceDied):
                 first = None
             if first is not None:
+                self.reader.begin()
                 self._begin()
                 self._note(f"the source is back after {time.monotonic() - start:.1f} s")
                 return chain([first], lines)
-            time.sleep(RETRY_S)
-        self.say(f"the source did not come back within {wait:g} s")
+            time.sleep(min(RETRY_S, left))
+        self._note(f"the source did not come back within {wait:g} s")
         return None
 
     def _row(self, row: Row, arrived: float) -> None:
-        if row.change and row.read:
+        if row.problem and not row.read:
+            self.unreadable += 1
+            if arrived - self.unreadable_at > TOGETHER_S:
+                self.alarm(f"{row.problem[:200]}: an alarm", UNREADABLE)
+            self.unreadable_at = arrived
+        elif row.problem:
+            self.alarm(f"{row.problem}: an alarm, and a new beginning", CLOCK)
+            self._begin()
+        elif row.change and row.read:
             self._note(row.change)
         elif row.change:
-            self.alarm(f"{row.change}: they are not judged, an alarm")
+            self.alarm(f"{row.change}: they are not judged, an alarm", RATE)
             self._begin()
         if not row.read:
             return
@@ -144,9 +179,12 @@ class _Watch:
         excess = float(report.surprise.value[0] / report.threshold[0])
         if excess > 1.0 and not self.above:
             at, why = blamed(numbers, report.surprise.attribution[0]), reason(numbers)
-            channel = "" if at is None else self.spec.labels[at] + "  "
+            channel = "" if at is None else self.spec.labels[at]
             because = "" if why == SURPRISING else f"  ({why})"
-            self.alarm(f"{channel}{excess:.2f} thresholds  {self.latencies[-1]:.2f} ms after the row came{because}")
+            took = self.latencies[-1]
+            text = f"{excess:.2f} thresholds  {took:.2f} ms after the row came{because}"
+            text = f"{channel}  {text}" if channel else text
+            self.alarm(text, why, channel=channel, thresholds=excess, latency_ms=took)
         event = EVENTS[report.event[0]]
         if event in (KNOCK, STOP) and event != self.event:
             self._note(f"{event}: no alarm")
@@ -159,12 +197,16 @@ class _Watch:
         for _ in over if all(over) else over[:1]:
             self._judge(np.full(self.spec.size, np.nan), bridged=True)
         if not all(over) and not self.late:  # of rows that are late again and again it is said once
-            self.alarm(f"{lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})", ahead=1)
+            self.alarm(f"{lost} row{'s' * (lost != 1)} lost: an alarm ({LATE})", LATE, ahead=1)
 
     def summarise(self) -> None:
         """Say how many rows and alarms there were, and how long a row took."""
-        if not self.rows:
+        if not (self.rows or self.unreadable):
             raise ValueError("no row came")
-        median, late = np.percentile(self.latencies, [50, 99])
-        counted = f"{self.rows} rows, {self.alarms} alarm{'s' * (self.alarms != 1)}"
-        self.say(f"{counted}; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms")
+        text = f"{self.rows} rows, {self.alarms} alarm{'s' * (self.alarms != 1)}"
+        if self.unreadable:
+            text += f", {self.unreadable} line{'s' * (self.unreadable != 1)} that could not be read"
+        if self.latencies:
+            median, late = np.percentile(self.latencies, [50, 99])
+            text += f"; a row took {median:.2f} ms, 99 % of the newest under {late:.2f} ms"
+        self._note(text, kind=SUMMARY)
