@@ -81,8 +81,25 @@ def test_a_line_that_is_no_row_is_named_and_the_next_one_is_read(lines, message)
 
 def test_whatever_a_line_holds_reading_goes_on():
     good, depth = json.dumps(ROWS[0].tolist()), 100_000
-    bad = ["garbage", "[1, 2, 3", "[1]", "[]", "5", "null", '"x"', "{}", "[" * depth, '{"q":' * depth, "[1e999, {}, 3, 4]"]
-    bad += ["[" + "9" * 400 + ", 2, 3, 4]", "[" + "9" * 9000 + ", 2, 3, 4]", "\ufffd\x00", "a line of more than 5 bytes"]
+    bad = [
+        "garbage",
+        "[1, 2, 3",
+        "[1]",
+        "[]",
+        "5",
+        "null",
+        '"x"',
+        "{}",
+        "[" * depth,
+        '{"q":' * depth,
+        "[1e999, {}, 3, 4]",
+    ]
+    bad += [
+        "[" + "9" * 400 + ", 2, 3, 4]",
+        "[" + "9" * 9000 + ", 2, 3, 4]",
+        "\ufffd\x00",
+        "a line of more than 5 bytes",
+    ]
     rows = [row for row, _ in RowReader(SPEC).rows([bad[0], good, *(line for b in bad for line in (b, good))])]
     assert [bool(row.problem) for row in rows] == [True, False] + len(bad) * [True, False]
     assert all(row.numbers.tolist() == ROWS[0].tolist() for row in rows if not row.problem)
