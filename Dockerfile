@@ -1,13 +1,13 @@
 # docker build -t asm-gym . && docker run --rm asm-gym          the demonstration
 # docker run --rm asm-gym make test                             the tests
-FROM python:3.11-slim-bookworm
+FROM python:3.13-slim-bookworm
 
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
-# evdev, which robosuite needs, is compiled; opencv links to GL and GLib; EGL and Mesa draw without a screen.
+# EGL and Mesa draw without a screen.
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends \
-       gcc git libc6-dev libegl1 libgl1 libgl1-mesa-dri libglib2.0-0 linux-libc-dev make \
+       git libegl1 libgl1 libgl1-mesa-dri make \
     && rm -rf /var/lib/apt/lists/*
 
 ENV PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu

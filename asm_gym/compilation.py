@@ -23,6 +23,7 @@ from numba.core.config import reload_config
 from numba.core.registry import cpu_target
 
 F = TypeVar("F", bound=Callable[..., Any])
+KEEP_NOWHERE = "asm-gym-numba-"  # begins the name of a folder that goes when the process ends
 
 
 def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), nogil: bool = False) -> F:
@@ -39,7 +40,7 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
     try:
         dispatcher: Any = numba.njit(cache=True, **how)(function)
     except RuntimeError:  # numba found no folder that it may write to
-        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="asm-gym-numba-")
+        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix=KEEP_NOWHERE)
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         reload_config()  # type: ignore[no-untyped-call]
         dispatcher = numba.njit(cache=True, **how)(function)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from packaging.version import Version
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 EXTRAS = {
-    "robosuite": ("mujoco", "robosuite"),
+    "robosuite": ("mujoco", "robosuite", "termcolor"),
     "agents": ("torch", "stable_baselines3", "tensorboard"),
     "data": ("minari", "h5py"),
     "report": ("matplotlib", "imageio", "imageio_ffmpeg", "PIL", "pyarrow", "sklearn", "loky"),
@@ -30,22 +30,30 @@ EXTRAS = {
 BROUGHT_BY = {package: extra for extra, packages in EXTRAS.items() for package in packages}
 """Extra that installs a package."""
 
-NOT_ON_3_13 = {
-    "robosuite": "its mink asks for NumPy below 2, of which there is no build",
-    "dm_control": "its labmaze has no build",
-}
-"""Reasons why no extra installs a package on Python 3.13 and later."""
+ROBOSUITE = "robosuite==1.5.2"
+INSTALL_ROBOSUITE = f"pip install 'asm-gym[robosuite]' && pip install --no-deps {ROBOSUITE}"
+"""Its declared mink==0.0.5 wants NumPy below 2; only the GR1 humanoid's inverse kinematics uses it."""
 
-MUJOCO_BELOW = "3.10"
-"""First version of MuJoCo with which robosuite's environments are not tested; with 4.0 they cannot be made."""
+TESTED = {"mujoco": SpecifierSet(">=3.3,<3.10"), "robosuite": Requirement(ROBOSUITE).specifier}
+"""Versions with which the environments are tested."""
 
 
-def check_mujoco() -> None:
-    """Raise ImportError where the installed MuJoCo does not work with robosuite."""
-    with suppress(PackageNotFoundError):  # its importer says so
-        if Version(found := version("mujoco")) >= Version(MUJOCO_BELOW):
-            remedy = f"pip install 'mujoco<{MUJOCO_BELOW}'"
-            raise ImportError(f"robosuite needs MuJoCo below {MUJOCO_BELOW}, got {found}: {remedy}")
+def check_simulator() -> None:
+    """Raise ImportError where the installed MuJoCo or robosuite does not fit the environments."""
+    for name, tested in TESTED.items():
+        with suppress(PackageNotFoundError):  # its importer says so
+            if not tested.contains(found := version(name), prereleases=True):
+                raise ImportError(f"the environments need {name}{tested}, got {found}: {fitting(name)}")
+
+
+def fitting(name: str) -> str:
+    """Return the line that replaces MuJoCo or robosuite by a version that fits."""
+    return f"pip install {'--no-deps ' if name == 'robosuite' else ''}'{name}{TESTED[name]}'"
+
+
+def remedy(package: str) -> str:
+    """Return the line that installs a package of an extra."""
+    return INSTALL_ROBOSUITE if package == "robosuite" else f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
 
 
 def require(module: str, *, what: str) -> Any:
@@ -63,7 +71,4 @@ def needed_for(what: str) -> Iterator[None]:
         package = (error.name or "").split(".")[0]
         if package not in BROUGHT_BY:
             raise
-        remedy = f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
-        if package in NOT_ON_3_13 and sys.version_info >= (3, 13):
-            remedy = f"take Python 3.12, for 3.13 there is none: {NOT_ON_3_13[package]}"
-        raise ImportError(f"{what} needs {package}: {remedy}", name=package) from error
+        raise ImportError(f"{what} needs {package}: {remedy(package)}", name=package) from error

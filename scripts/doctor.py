@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import platform
-import sys
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -17,16 +16,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from asm_gym.extras import BROUGHT_BY, NOT_ON_3_13
-from asm_gym.graphics import GET_RENDERING, loads, rendering_backend, rendering_problem
+from asm_gym.extras import BROUGHT_BY, TESTED, fitting, remedy
+from asm_gym.graphics import GET_RENDERING, rendering_backend, rendering_problem
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
+NAME_CACHE = "export NUMBA_CACHE_DIR=FOLDER, one that you can write to, then asm-gym warmup"
 REINSTALL = "install asm-gym anew (in a clone: make clean, then make doctor)"
-OLDER_PYTHON = "python3.12 -m venv, and install there (in a clone: make doctor PYTHON=python3.12)"
-COMPILER = "apt-get install gcc libc6-dev linux-libc-dev python3-dev"
-LIBRARIES = {"libGL.so.1": "libgl1", "libglib-2.0.so.0": "libglib2.0-0", "libgthread-2.0.so.0": "libglib2.0-0"}
-"""Libraries that opencv-python links to, and their Debian packages; robosuite's viewer imports it."""
+OTHER_PYTHON = "python3.13 -m venv, and install there (in a clone: make doctor PYTHON=python3.13)"
 
 
 @dataclass(frozen=True)
@@ -49,14 +46,9 @@ def run_checks() -> list[Check]:
     return [
         python(),
         *map(package, PACKAGES),
-        *(library(name) for name in LIBRARIES if sys.platform == "linux"),
+        cache(),
         Check("rendering", no_picture or f"MUJOCO_GL={rendering_backend()} draws", GET_RENDERING if no_picture else ""),
     ]
-
-
-def library(name: str) -> Check:
-    """Check whether a library can be loaded."""
-    return Check(name, "found") if loads(name) else Check(name, "missing", f"apt-get install {LIBRARIES[name]}")
 
 
 def python() -> Check:
@@ -64,25 +56,36 @@ def python() -> Check:
     version, wanted = platform.python_version(), SpecifierSet(metadata.metadata("asm-gym")["Requires-Python"] or "")
     if wanted.contains(version, prereleases=True):
         return Check("Python", version)
-    return Check("Python", f"{version}, but asm-gym needs {wanted}", OLDER_PYTHON, needed=True)
+    return Check("Python", f"{version}, but asm-gym needs {wanted}", OTHER_PYTHON, needed=True)
 
 
 def package(name: str) -> Check:
     """Check the installed version of a package against the range that asm-gym asks for."""
-    extra = BROUGHT_BY.get(name.replace("-", "_"), "")
+    extra = BROUGHT_BY.get(module := name.replace("-", "_"), "")
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        if name in NOT_ON_3_13 and sys.version_info >= (3, 13):
-            return Check(name, f"not installed: {NOT_ON_3_13[name]} for Python 3.13", OLDER_PYTHON)
-        compiler = f"{COMPILER}, then " if name == "robosuite" else ""  # it brings evdev, which is compiled
-        remedy = f"{compiler}python -m pip install 'asm-gym[{extra}]'" if extra else REINSTALL
-        return Check(name, "not installed", remedy, needed=not extra)
+        return Check(name, "not installed", remedy(module) if extra else REINSTALL, needed=not extra)
     asked = [r for r in map(Requirement, metadata.requires("asm-gym") or []) if r.name == name]
     wanted = next((r.specifier for r in asked if not r.marker or r.marker.evaluate({"extra": extra})), SpecifierSet())
+    if name in TESTED and not TESTED[name].contains(version, prereleases=True):
+        return Check(name, f"{version}, but needs {TESTED[name]}", fitting(name), needed=True)
     if wanted.contains(version, prereleases=True):
         return Check(name, version)
-    return Check(name, f"{version}, but needs {wanted}", f"python -m pip install '{name}{wanted}'", needed=True)
+    return Check(name, f"{version}, but needs {wanted}", f"pip install '{name}{wanted}'", needed=True)
+
+
+def cache() -> Check:
+    """Check whether compiled code is kept for the next process."""
+    try:
+        from asm_gym.compilation import KEEP_NOWHERE, kept_in
+        from asm_gym.monitors.row_kernel import observe_rows
+    except ImportError as error:  # of what another check names
+        return Check("compiled code", escape(str(error)), REINSTALL, needed=True)
+    folder = kept_in(observe_rows)
+    if folder is None or KEEP_NOWHERE in str(folder):
+        return Check("compiled code", "lost when a process ends: neither the install nor HOME is writable", NAME_CACHE)
+    return Check("compiled code", str(folder))
 
 
 def report(args: Args, console: Console) -> int:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from asm_gym.extras import check_mujoco, require
+from asm_gym.extras import check_simulator, require
 from asm_gym.tasks import TASKS
 
 if TYPE_CHECKING:
     from asm_gym.envs.robosuite_env import RobosuiteEnv
 
 # Checked here, so that the error of a missing or unfit package says what to install.
-check_mujoco()
+check_simulator()
 require("mujoco", what="a robosuite environment or a fault in one")
 
 
