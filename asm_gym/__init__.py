@@ -60,7 +60,12 @@ _HOME = {
 
 for _task in TASKS.values():
     # Without max_episode_steps: the environment truncates itself, so that `horizon` is an argument like any other.
-    gymnasium.register(_task.id, f"asm_gym.envs:{_task.name}", kwargs={"task": _task.name})
+    gymnasium.register(
+        _task.id,
+        f"asm_gym.envs:{_task.name}",
+        vector_entry_point="asm_gym.envs.vector:make",
+        kwargs={"task": _task.name},
+    )
 
 gymnasium.register(id="asm_gym/SyntheticArm-v0", entry_point="asm_gym.synthetic_arm:SyntheticArm")
 

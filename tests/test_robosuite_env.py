@@ -186,7 +186,7 @@ def test_success_ends_the_episode_where_asked():
     env.close()
 
 
-@pytest.mark.parametrize("mode", ["sync", "async"])
+@pytest.mark.parametrize("mode", ["sync", "async", None])
 def test_vectors_of_environments_agree_with_single_ones(lift, mode):
     vector = gym.make_vec("asm_gym/Lift-v0", num_envs=2, vectorization_mode=mode)
     observations, info = vector.reset(seed=[3, 4])

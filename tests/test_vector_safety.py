@@ -1,4 +1,4 @@
-"""Many environments under one monitor equal as many guarded ones, and members on threads equal Gymnasium's own."""
+"""Many environments under one monitor equal as many guarded ones."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,6 +6,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from asm_gym import collect
+from asm_gym.envs.vector import ThreadedVectorEnv
 from asm_gym.guard.observer import choose
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold
@@ -117,8 +118,9 @@ def test_environments_without_a_stream_are_watched_through_their_spaces():
     assert_equal_step_by_step(*both({"on_alarm": "hold", "release_after": 2}, own_stream=False), steps=30)
 
 
-def test_members_in_processes_are_watched_alike():
-    ours, theirs = both({"on_alarm": "hold", "max_override": 2}, many=AsyncVectorEnv)
+@pytest.mark.parametrize("many", [AsyncVectorEnv, ThreadedVectorEnv])
+def test_members_in_processes_and_on_threads_are_watched_alike(many):
+    ours, theirs = both({"on_alarm": "hold", "max_override": 2}, many=many)
     assert_equal_step_by_step(ours, theirs, steps=25)
     ours.close()
 
@@ -187,7 +189,7 @@ def test_robots_side_by_side_are_watched_as_each_alone():
     episodes = collect("asm_gym/Lift-v0", episodes=4, seed=3, workers=1, **settings)
     asm = NeuralASM(episodes[0].spec, hidden_size=16, association_size=40, epochs=2).fit(episodes[:3])
     asm = asm.with_threshold(0.5 * asm.score(episodes[3]).value.max())
-    many = gym.make_vec("asm_gym/Lift-v0", num_envs=2, vectorization_mode="sync", **settings)
+    many = gym.make_vec("asm_gym/Lift-v0", num_envs=2, threads=2, **settings)
     many = VectorNeuralASMSafety(many, asm, on_alarm=on_alarm, release_after=2)
     alone = [NeuralASMSafety(gym.make("asm_gym/Lift-v0", **settings), asm, on_alarm, release_after=2) for _ in range(2)]
     rng = np.random.default_rng(0)

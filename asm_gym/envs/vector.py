@@ -1,0 +1,208 @@
+"""Many environments side by side in one process, stepped on several threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import chain
+from typing import Any, NamedTuple, TypeVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from numpy.typing import NDArray
+
+from asm_gym.tasks import TASKS
+from asm_gym.validation import check_number
+
+Result = TypeVar("Result")
+Mask = NDArray[np.bool_]
+
+
+class Outcome(NamedTuple):
+    """What one member returned in a step of the vector."""
+
+    observation: Any
+    reward: Any
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+    final: dict[str, Any]  # last observation and info of an episode that ended, under ``AutoresetMode.SAME_STEP``
+
+
+class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
+    """Gymnasium's ``SyncVectorEnv`` on several threads, with the same digits whatever their number.
+
+    Physics, control and sensors of a member run without Python's lock, so that the members of this package's tasks keep
+    one core a thread busy. Any other environment may be a member too; pure Python gains nothing.
+
+    A member, its wrappers included, is stepped, reset, called, rendered and closed on one thread for as long as the
+    vector lives, as OpenGL needs it: the first members on the caller's, the rest on threads that ``close`` ends.
+
+    Args:
+        env_fns: functions that each make a member.
+        threads: how many, the caller's included; by default the cores that this process may run on.
+        autoreset_mode: when the episode after one that ended begins.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> from asm_gym import FaultInjection
+        >>> from asm_gym.envs.vector import ThreadedVectorEnv
+        >>> from asm_gym.faults import Push
+        >>> push = Push(body="robot0_link5", newtons=20.0, onset=0)
+        >>> envs = ThreadedVectorEnv([lambda: FaultInjection(gym.make("asm_gym/Lift-v0"), [push])] * 2)
+        >>> observations, infos = envs.reset(seed=0)
+        >>> *_, infos = envs.step(envs.action_space.sample())
+        >>> infos["fault"].tolist()
+        [('Push',), ('Push',)]
+        >>> envs.close()
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
+        threads: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        wanted = _cores() if threads is None else check_number("threads", threads, low=1, whole=True)
+        super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
+        self.threads = min(wanted, self.num_envs)
+        parts = np.array_split(np.arange(self.num_envs), self.threads)
+        self._here, *others = (part.tolist() for part in parts)  # numbers of the members of each thread
+        self._elsewhere = [(ThreadPoolExecutor(1, "asm-gym-vector"), members) for members in others]
+
+    def _of_each(self, what: Callable[[int], Result], which: Mask | None = None) -> list[Result]:
+        """Return ``what`` of each member's number, or of those of ``which`` (n,), each on its member's thread.
+
+        An exception is raised once every thread has come to its end.
+        """
+
+        def work(members: list[int]) -> list[Result]:
+            return [what(i) for i in members if which is None or which[i]]
+
+        others: list[Future[list[Result]]] = [pool.submit(work, members) for pool, members in self._elsewhere]
+        try:
+            found = work(self._here)
+        finally:
+            errors = [future.exception() for future in others]
+        for error in filter(None, errors):
+            raise error
+        return list(chain(found, *(future.result() for future in others)))
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        n, options = self.num_envs, dict(options or {})
+        seeds = [seed if seed is None else seed + i for i in range(n)] if seed is None or np.ndim(seed) == 0 else seed
+        if len(seeds) != n:
+            raise ValueError(f"seed must be a number or one of each of {n} environments, got {len(seeds)}")
+        which = options.pop("reset_mask", None)
+        if which is not None:
+            if not (isinstance(which, np.ndarray) and which.dtype == bool and which.shape == (n,) and which.any()):
+                raise ValueError(f'options["reset_mask"] must be {n} booleans, one of them true, got {which}')
+            if not all(seen is not None or begun for seen, begun in zip(self._env_obs, which, strict=True)):
+                raise gym.error.ResetNeeded("the first reset() must be of all environments")
+        begun = np.ones(n, bool) if which is None else which.copy()
+
+        def start(i: int) -> tuple[int, Any, dict[str, Any]]:
+            return (i, *self.envs[i].reset(seed=seeds[i], options=options or None))
+
+        infos: dict[str, Any] = {}
+        for i, observation, info in self._of_each(start, begun):
+            self._env_obs[i] = observation
+            infos = self._add_info(infos, info, i)
+        self._autoreset_envs = self._autoreset_envs & ~begun
+        return self._stacked(), infos
+
+    def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
+        given = list(iterate(self.action_space, actions))
+        if len(given) != self.num_envs:
+            raise ValueError(f"actions must be one of each of {self.num_envs} environments, got {len(given)}")
+        outcomes = self._of_each(lambda i: self._outcome(i, given[i]))
+        self._env_obs, rewards, terminated, truncated, infos, finals = (list(x) for x in zip(*outcomes, strict=True))
+        ended = np.array(terminated, bool), np.array(truncated, bool)
+        self._autoreset_envs = ended[0] | ended[1]
+        merged: dict[str, Any] = {}
+        for i, final in enumerate(finals):
+            merged = self._add_info(merged, final, i) if final else merged
+        return self._stacked(), np.array(rewards, np.float64), *ended, self._merged(infos, merged)
+
+    def _outcome(self, i: int, action: Any) -> Outcome:
+        """Step member ``i``, or begin its next episode."""
+        env, mode = self.envs[i], self.autoreset_mode
+        if self._autoreset_envs[i]:
+            if mode == AutoresetMode.DISABLED:
+                raise gym.error.ResetNeeded(f"the episode of environment {i} has ended: reset it by its reset_mask")
+            if mode == AutoresetMode.NEXT_STEP:
+                observation, info = env.reset()
+                return Outcome(observation, 0.0, False, False, info, {})
+        observation, reward, terminated, truncated, info = env.step(action)
+        final: dict[str, Any] = {}
+        if mode == AutoresetMode.SAME_STEP and (terminated or truncated):
+            final = {"final_obs": observation, "final_info": info}
+            observation, info = env.reset()
+        return Outcome(observation, reward, terminated, truncated, info, final)
+
+    def _stacked(self) -> Any:
+        """Return the members' observations in a batch of its own."""
+        space = self.single_observation_space
+        batch: Any = create_empty_array(space, self.num_envs, np.empty)
+        return concatenate(space, self._env_obs, batch)
+
+    def _merged(self, infos: list[dict[str, Any]], merged: dict[str, Any]) -> dict[str, Any]:
+        """Add the infos of all members to ``merged``, as ``_add_info`` does one by one."""
+        first, everyone = infos[0], np.ones(self.num_envs, bool)
+        alike = {key for key, value in first.items() if _is_number(value) or isinstance(value, np.ndarray)}
+        alike = {key for key in alike if all(_alike(first[key], info.get(key)) for info in infos)} - {"final_obs"}
+        for key in first:
+            if key in alike:
+                merged[key], merged[f"_{key}"] = np.array([info[key] for info in infos]), everyone
+        for i, info in enumerate(infos):
+            rest = {key: value for key, value in info.items() if key not in alike}
+            merged = self._add_info(merged, rest, i) if rest else merged
+        return merged
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        def called(i: int) -> Any:
+            found = self.envs[i].get_wrapper_attr(name)
+            return found(*args, **kwargs) if callable(found) else found
+
+        return tuple(self._of_each(called))
+
+    def render(self) -> tuple[Any, ...]:
+        return self.call("render")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        if hasattr(self, "_elsewhere"):  # it was made
+            try:
+                self._of_each(lambda i: self.envs[i].close())
+            finally:
+                for pool, _ in self._elsewhere:
+                    pool.shutdown()
+
+
+def _cores() -> int:
+    """Return how many cores this process may run on."""
+    affinity = getattr(os, "sched_getaffinity", None)  # of Linux
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float, bool) or isinstance(value, np.number)
+
+
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two values, the first of them a number or an array, make one array."""
+    same = type(one) is type(other)
+    return same and (not isinstance(one, np.ndarray) or (one.shape == other.shape and one.dtype == other.dtype))
+
+
+def make(num_envs: int = 1, task: str = "Lift", **settings: Any) -> ThreadedVectorEnv:
+    """Return what ``gym.make_vec("asm_gym/<task>-v0", num_envs)`` makes.
+
+    Args:
+        settings: ``threads`` and ``autoreset_mode`` of ``ThreadedVectorEnv``; the rest is of each environment.
+    """
+    ours = {key: settings.pop(key) for key in ("threads", "autoreset_mode") if key in settings}
+    return ThreadedVectorEnv([partial(gym.make, TASKS[task].id, **settings)] * num_envs, **ours)
