@@ -14,7 +14,7 @@ from rich.console import Console
 from asm_gym.compilation import kept_in
 from asm_gym.data.episode import Episode
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.row_kernel import observe_rows
+from asm_gym.monitors.row_kernel import expect_rows
 from asm_gym.scripts.command import run
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -42,7 +42,7 @@ def warm_up(args: Args, console: Console) -> None:
                 guarded.reset(seed=0)
                 for _ in range(3):
                     guarded.step(np.zeros(guarded.action_space.shape or (), np.float32))
-    where = kept_in(observe_rows) or "memory only"
+    where = kept_in(expect_rows) or "memory only"
     console.print(f"Compiled after {time.perf_counter() - start:.0f} s; kept in {where}", soft_wrap=True, markup=False)
 
 

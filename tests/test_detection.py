@@ -249,7 +249,7 @@ def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
 def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
     state, states = Repetition.start(1, rows.shape[1]), []
     for row in rows:
-        state = Repetition(*repeated(*state, row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most)))
+        state = state.followed_by(row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most))
         states.append(state)
     return states
 

@@ -68,14 +68,24 @@ def _step(
     context_range: Any,
     gains: Any,
     bound: float,
-) -> Any:
-    """Return the fields of the new ``Evidence``, the value (B,) and the shares of the errors (B, X)."""
+    new: Any,
+    recent: Any,
+    counted: Any,
+    value: Any,
+    shares: Any,
+) -> None:
+    """Write the fields of the new ``Evidence``, the value (B,) and the shares of the errors (B, X)."""
     B, X = errors.shape
     G, C = len(gains), context.shape[1]
-    new, recent, value = np.empty((B, G, X)), np.empty((B, C)), np.empty(B)
-    ratios, shares = np.empty((G, X)), np.zeros((B, X))  # logarithms of ratios
-    whitened = np.dot(errors / np.sqrt(1.0 + (errors / bound) ** 2), whitening)
+    ratios, limited = np.empty((G, X)), np.empty((B, X))  # logarithms of ratios, and bounded errors
     for n in range(B):
+        for i in range(X):
+            share = errors[n, i] / bound
+            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
+            shares[n, i] = 0.0
+    whitened = np.dot(limited, whitening)
+    for n in range(B):
+        counted[n] = steps[n] + 1
         greatest = LEAST
         for g in range(G):
             a = gains[g]
@@ -101,7 +111,6 @@ def _step(
         value[n] = np.exp(greatest) * total ** (1.0 / POWER) / np.exp(usual)
         for i in range(X):
             shares[n, i] *= value[n] / max(total, TINY)
-    return (new, recent, steps + 1), value, shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +185,10 @@ class Detector:
         """Return the new evidence, the value (B,), and each error's share of it (B, X); ``context`` is (B, C)."""
         learned = self.whitening, self.ceiling, self.tail, self.context_quantile, self.context_range
         row = np.asarray(errors, np.float64), np.asarray(context, np.float64)
-        new, value, shares = _step(*evidence, *row, *learned, self.gains, self.bound)
-        return Evidence(*new), value, shares
+        new = Evidence._make(map(np.empty_like, evidence))
+        value, shares = np.empty(len(errors)), np.empty(errors.shape)
+        _step(*evidence, *row, *learned, self.gains, self.bound, *new, value, shares)
+        return new, value, shares
 
     def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:
         """Return v (T, G, X), and the running mean of the contexts (T, C), of a whole episode."""

@@ -60,8 +60,9 @@ class Excuses:
 
     def step(self, left: NDArray[np.int64], rows: Floats) -> tuple[NDArray[Any], ...]:
         """Return the new state, the place of each event of rows (B, D) in ``EVENTS``, and its divisor of surprise."""
+        found = np.empty_like(left), np.empty(len(rows), np.int8), np.empty(len(rows))
         senses = self._wrist, self._joints, self._ends, self._fingers
-        found: tuple[NDArray[Any], ...] = _step(left, rows, *senses, self._rows, self.on_its_way)
+        _step(left, rows, *senses, self._rows, self.on_its_way, *found)
         return found
 
     def divisors(self, stream: NDArray[np.floating[Any]]) -> Floats:
@@ -79,12 +80,23 @@ def _columns(spec: StreamSpec, which: Callable[[Channel], bool]) -> NDArray[np.i
 
 @compiled
 def _step(
-    left: Any, rows: Any, wrist: Any, joints: Any, ends: Any, fingers: Any, lasting: Any, on_its_way: float
-) -> Any:
-    """Return the new state (B, 3 + J), and the events (B,) and divisors (B,)."""
-    B = len(rows)
-    after, kind, divisor = np.maximum(left - 1, 0), np.zeros(B, np.int8), np.ones(B)
-    for n in range(B):
+    left: Any,
+    rows: Any,
+    wrist: Any,
+    joints: Any,
+    ends: Any,
+    fingers: Any,
+    lasting: Any,
+    on_its_way: float,
+    after: Any,
+    kind: Any,
+    divisor: Any,
+) -> None:
+    """Write the new state (B, 3 + J), and the events (B,) and divisors (B,)."""
+    for n in range(len(rows)):
+        kind[n], divisor[n] = 0, 1.0
+        for k in range(3):
+            after[n, k] = max(left[n, k] - 1, 0)
         for i in wrist:
             if abs(rows[n, i]) > KNOCKING and np.isfinite(rows[n, i]):
                 after[n, 0] = lasting[0] + lasting[2]
@@ -107,4 +119,3 @@ def _step(
             if after[n, k] > 0:
                 kind[n] = k + 1
                 divisor[n] = max(divisor[n], EXCUSED * FADE ** max(lasting[2] - after[n, k] + 1, 0))
-    return after, kind, divisor

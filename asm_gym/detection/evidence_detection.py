@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
 from asm_gym.detection.evidence import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, TINY, Evidence, ceilings, pool
-from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps, repeated
+from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
 
@@ -128,7 +128,7 @@ class EvidenceDetection:
         """Return the new state, and each number's share (B, D) of the surprise at the next rows (B, D)."""
         evidence, _, parts = self.fitted_detector.step(state.evidence, *output)
         senses, (steps, most, offset) = self.spec.sensory, self.repeating
-        repetition = Repetition(*repeated(*state.repetition, rows[:, senses], steps, most))
+        repetition = state.repetition.followed_by(rows[:, senses], steps, most)
         found = place(parts)
         if repetition.unlikely.any():
             ratios = np.zeros_like(found)

@@ -46,6 +46,13 @@ class Repetition(NamedTuple):
         """Return the state before the first row, for a ``shape`` (B, X)."""
         return cls(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
 
+    def followed_by(self, rows: Floats, steps: Floats, most: Floats) -> Repetition:
+        """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
+        new = Repetition._make(map(np.empty_like, self))
+        arguments: list[Any] = [*self, rows, np.arange(rows.shape[1]), steps, most, *new]
+        repeated(*arguments)
+        return new
+
     def ratios(self, offset: Floats) -> Floats:
         """Return r (B, X), with n_0 ``offset`` (X,)."""
         return np.where(self.unlikely > 0, np.exp(TAIL_INDEX * (self.unlikely - offset)), 0.0)
@@ -88,8 +95,7 @@ def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArr
     state, unbounded = Repetition.start(len(ordered), len(noisy)), np.full(len(noisy), np.inf)
     for t in range(len(ordered[0])):
         rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
-        row, again, unlikely = (part[: len(rows)] for part in state)
-        state = Repetition(*repeated(row, again, unlikely, rows, steps, unbounded))
+        state = Repetition._make(part[: len(rows)] for part in state).followed_by(rows, steps, unbounded)
         offset = np.maximum(offset, state.unlikely.max(axis=0))
     return np.concatenate([counted, offset[None]])
 
@@ -104,13 +110,16 @@ def evidence_steps(surprise: Floats) -> Floats:
 
 
 @compiled
-def repeated(row: Any, again: Any, unlikely: Any, rows: Any, steps: Any, most: Any) -> Any:
-    """Return the fields of ``Repetition`` after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
-    B, X = rows.shape
-    now, evidence = np.zeros((B, X), np.bool_), np.zeros((B, X))
-    for n in range(B):
-        for i in range(X):
-            now[n, i] = rows[n, i] == row[n, i]
+def repeated(
+    row: Any, again: Any, unlikely: Any, rows: Any, columns: Any, steps: Any, most: Any, new: Any, now: Any, sum_: Any
+) -> None:
+    """Write the fields of ``Repetition``, ``new``, ``now`` and ``sum_``, after the ``columns`` (X,) of rows (B, D).
+
+    ``steps`` are ``evidence_steps``, ``most`` (X,) is the upper bound of n.
+    """
+    for n in range(len(rows)):
+        for i in range(len(columns)):
+            new[n, i] = rows[n, columns[i]]
+            now[n, i] = new[n, i] == row[n, i]
             step = steps[1 if again[n, i] else 0, 1 if now[n, i] else 0, i]
-            evidence[n, i] = min(max(unlikely[n, i] + step, 0.0), most[i])
-    return rows, now, evidence
+            sum_[n, i] = min(max(unlikely[n, i] + step, 0.0), most[i])

@@ -83,6 +83,18 @@ def outward(a: Array, W: Array) -> Array:
 
 
 @kernel
+def beside(a: Array, b: Array) -> Array:
+    """Return the columns of ``a`` (B, P), then those of ``b`` (B, Q); numba takes far longer to compile ``hstack``."""
+    out = np.empty((a.shape[0], a.shape[1] + b.shape[1]), a.dtype)
+    for n in range(a.shape[0]):
+        for i in range(a.shape[1]):
+            out[n, i] = a[n, i]
+        for i in range(b.shape[1]):
+            out[n, a.shape[1] + i] = b[n, i]
+    return out
+
+
+@kernel
 def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
     """Return W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H); for a single row each weight is read once."""
     X, H = W_F.shape

@@ -37,12 +37,20 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
 def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Array:
     """Return L_t (B, K) from L_{t-1}, f(h) (B, M) and f(μ) (B, H), which is not used where W_K has M columns only."""
     rates, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]
-    rates[:, :M] = units
-    rates[:, M:] = state[:, : W_K.shape[1] - M]
-    drive, added = outward(rates, W_K) + b_K, np.empty_like(L)
     for n in range(L.shape[0]):
-        strength = np.exp(drive[n] - drive[n].max())
-        added[n] = KEPT * L[n] + np.log(strength / strength.sum() + SMALLEST)
+        for i in range(W_K.shape[1]):
+            rates[n, i] = units[n, i] if i < M else state[n, i - M]
+    drive, added = outward(rates, W_K), np.empty_like(L)
+    for n in range(L.shape[0]):
+        most, total = np.float32(-np.inf), np.float32(0)
+        for k in range(len(b_K)):
+            drive[n, k] += b_K[k]
+            most = max(most, drive[n, k])
+        for k in range(len(b_K)):
+            drive[n, k] = np.exp(drive[n, k] - most)
+            total += drive[n, k]
+        for k in range(len(b_K)):
+            added[n, k] = KEPT * L[n, k] + np.log(drive[n, k] / total + SMALLEST)
     return added
 
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, activate, infer, outward
+from asm_gym.memory.energy import Array, Scalar, activate, infer, kernel, outward
 from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
@@ -43,6 +43,32 @@ def settling_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[in
     """Return the shape of each array of ``SettlingWeights`` by name."""
     H, S, A = hidden, sensory, motor
     return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (S, H), "b_F": (S,), "W_A": (A, H)}
+
+
+@kernel
+def settle(
+    z: Array,
+    u: Array,
+    x: Array,
+    seen: Array,
+    W_H: Array,
+    W_U: Array,
+    W_F: Array,
+    b_F: Array,
+    pi_z: Scalar,
+    pi_x: Scalar,
+    curvature: Scalar,
+    iterations: int,
+) -> tuple[Array, Array]:
+    """Return f(μ_t) (B, H) and z_t (B, H) from the state before, the action and 1 (B, A + 1), and the senses (B, S)."""
+    mu, driven = outward(activate(z), W_H), outward(u, W_U)
+    left, precision = np.empty_like(x), np.empty_like(x)
+    for n in range(x.shape[0]):
+        for i in range(mu.shape[1]):
+            mu[n, i] += driven[n, i]
+        for i in range(x.shape[1]):
+            left[n, i], precision[n, i] = x[n, i] - b_F[i], pi_x * seen[n, i]
+    return activate(mu), infer(mu, left, W_F, pi_z, precision, curvature, iterations)
 
 
 class SettlingNetwork(TemporalNetwork):

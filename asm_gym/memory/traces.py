@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, Scalar, activate, infer, kernel, outward
+from asm_gym.memory.energy import Array, Scalar, activate, beside, infer, kernel, outward
 from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
@@ -116,15 +116,20 @@ def carry(
 ) -> tuple[Array, Array]:
     """Return f(μ_t) (B, H), 0 unless ``context`` or a sense is missing, and c_t (B, I)."""
     B, S = x.shape
-    rows = np.hstack((x, u))
-    whole = seen.all()
-    if whole and not context:
-        return np.zeros((B, W_C.shape[0]), c.dtype), advance(c, rows, gains)
-    mu = expect(c, W_C)
+    rows, whole = beside(x, u), True
+    for n in range(B):
+        for i in range(S):
+            whole = whole and seen[n, i] != 0
+    mu = np.zeros((B, W_C.shape[0]), c.dtype)
+    if context or not whole:
+        mu = outward(c, W_C)
     if not whole:
-        past = outward(np.hstack((c, u)), W_D)  # (B, S + A)
-        left, precision = rows[:, :-1] - past, np.full((B, past.shape[1]), pi_x, c.dtype)
-        precision[:, :S] *= seen
+        past = outward(beside(c, u), W_D)  # (B, S + A)
+        left, precision = np.empty_like(past), np.empty_like(past)
+        for n in range(B):
+            for i in range(past.shape[1]):
+                left[n, i] = rows[n, i] - past[n, i]
+                precision[n, i] = pi_x * seen[n, i] if i < S else pi_x
         found = sense(infer(mu, left, W_F, pi_z, precision, curvature, iterations), W_F)
         for n in range(B):
             for i in range(S):

@@ -6,7 +6,7 @@ row → standardise → memory: expect, infer, associate → ε_t/σ_t, and the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.row_kernel import LearnedMemory, expect_rows, uninitialised
+from asm_gym.monitors.layout import Layout
+from asm_gym.monitors.row_kernel import expect_rows, layout_of, uninitialised
 from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
@@ -53,7 +54,7 @@ class MemoryModel(ScaledModel):
         self.dynamics = dynamics
         self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
         self.network_: TemporalNetwork | None = None
-        self.compiled_: LearnedMemory | None = None
+        self.compiled_: Layout | None = None
         self.motor_: Motor | None = None
         self.completion_: Completion | None = None
 
@@ -64,8 +65,9 @@ class MemoryModel(ScaledModel):
         return self.network_
 
     def _take(self, network: TemporalNetwork) -> None:
-        names = [self.learned_[n] for n in ("W_K", "b_K")] if self.skills_ else [np.zeros((0, 0)), np.zeros(0)]
-        self.network_, self.compiled_ = network, LearnedMemory.of(network, self.senses_, (names[0], names[1]))
+        nameless = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
+        names = {name: self.learned_[name] for name in nameless} if self.skills_ else nameless
+        self.network_, self.compiled_ = network, layout_of(network, self.senses_, names)
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams, lag = [e.stream for e in episodes], self.lag
@@ -121,8 +123,11 @@ class MemoryModel(ScaledModel):
         return MemoryState(self.network.at_rest(batch), state, super().start(batch), named)
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
+        assert self.compiled_ is not None
         new = uninitialised(state)
-        error, _ = expect_rows(np.ascontiguousarray(rows, np.float64), state, new, self.compiled_)  # type: ignore[arg-type]
+        states = [part for s in (state, new) for part in (s.traces, s.expected, *s.history, s.skill)]
+        arguments: list[Any] = [np.ascontiguousarray(rows, np.float64), *states, *self.compiled_, True]
+        error, _ = expect_rows(*arguments)
         return new, ModelOutput(error, new.expected)
 
     def expected_action(self, state: MemoryState) -> NDArray[np.float32]:
