@@ -38,7 +38,6 @@ from asm_gym.detection.repetition import (
     Repetition,
     count_repetitions,
     evidence_steps,
-    repeated,
 )
 from asm_gym.monitors import NeuralASM
 from tests.streams import frozen, sine_episodes, sine_spec
