@@ -54,6 +54,14 @@ def named(path: Path) -> Iterator[None]:
         raise
 
 
+def writable(path: str | Path) -> None:
+    """Raise an error where a file could not be written there, before the work is done that it is to hold."""
+    folder = _checked(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    with named(folder), tempfile.NamedTemporaryFile(dir=folder, prefix=f".{Path(path).name}.", suffix=UNFINISHED):
+        pass
+
+
 def regular_file(path: str | Path) -> int:
     """Its size [bytes].
 

@@ -52,3 +52,9 @@ def _median(values: NDArray[np.float64]) -> float:
     """Return the median of finite numbers; ``np.median`` takes ten times as long for so few."""
     ordered, half = np.sort(values), len(values) // 2
     return float(ordered[half] if len(values) % 2 else (ordered[half - 1] + ordered[half]) / 2.0)
+
+
+def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
+    edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
+    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))

@@ -86,6 +86,7 @@ class StreamSpec:
         channels: in their order in a row.
         dt: control period [s].
         source: name of the robot, for example ``Panda``; not compared between specs.
+        missing: numbers that stand for missing data in logs, such as -99999; not compared between specs.
 
     Example:
         >>> from asm_gym import Channel, StreamSpec
@@ -97,6 +98,7 @@ class StreamSpec:
     channels: tuple[Channel, ...]
     dt: float
     source: str = ""
+    missing: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.channels, tuple) or not all(isinstance(c, Channel) for c in self.channels):
@@ -195,7 +197,7 @@ class StreamSpec:
                 Channel(**{**c, "elements": tuple(c["elements"]), "stops": tuple(map(tuple, c.get("stops", ())))})
                 for c in raw["channels"]
             )
-            return cls(channels, raw["dt"], raw["source"])
+            return cls(channels, raw["dt"], raw["source"], tuple(raw.get("missing", ())))
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"the text of a stream's spec is damaged ({error}): {short_repr(text)}") from error
 

@@ -17,9 +17,9 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.data.episode import Episode
-from asm_gym.data.gaps import filled
+from asm_gym.data.gaps import bridge_of, filled
 from asm_gym.data.live import lines_from, live_source, record
-from asm_gym.data.logs import LogLayout, read_logs
+from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import (
     SHORTEST_S,
@@ -33,13 +33,15 @@ from asm_gym.data.selection import (
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
+from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, make_monitor, monitor_class
 from asm_gym.monitors.arm_inputs import Derived
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import Checked, option, run
+from asm_gym.scripts.command import option, run
+from asm_gym.scripts.log_options import LogOptions
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
@@ -50,8 +52,8 @@ CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are
 QUICK_EPISODES, QUICK_EPOCHS = 20, 5  # most episodes and passes with ``--quick``
 
 
-@dataclass(frozen=True)
-class Args(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Args(LogOptions):
     """A memory from recordings."""
 
     data: Path = option(positional=True, metavar="DATA")
@@ -68,16 +70,8 @@ class Args(Checked):
     """Alarms per hour of normal episodes, in place of a share of them."""
     action: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
-    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
-    """Rows of logs per second; by default their time column tells."""
-    channels: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns of logs that are read: names, or patterns; by default all numeric ones."""
-    label: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns that mark what is wrong, beside those called so; marked rows are not learned from."""
-    columns: tuple[str, ...] = option((), metavar="NAME")
-    """Names of the columns of files without a header."""
-    bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
-    """Gaps up to this long are interpolated, such as 0.05; a log is cut at others."""
+    bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    """Gaps up to this long are interpolated, by default two rows; a log is cut at others."""
     urdf: Path | None = option(None, metavar="FILE")
     """Body model of the arm: torques are compared with the weight of its links, and weaker pushes are found."""
     split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
@@ -136,6 +130,43 @@ def divide(args: Args, logs: list[list[Episode]], in_time: bool) -> tuple[list[E
     return fitting[: QUICK_EPISODES if args.quick else None], calibration
 
 
+def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[str]]:
+    """Return the parts between lost rows, short gaps filled, and what was done, a line each.
+
+    Where parts are too few for the promise, logs are cut at short gaps too, as they would be without a bridge.
+    Raises ValueError where no part is left, and says which numbers are missing.
+    """
+    dt = episodes[0].spec.dt
+    seconds = bridge_of(args.bridge, dt)
+    bridged = [replace(e, stream=filled(e.stream, dt, seconds)) for e in episodes]
+    cut = [complete_parts(e) for e in bridged]
+    if args.split is None and sum(map(len, cut)) < args.needed / CALIBRATION_SHARE:
+        shorter = [complete_parts(e) for e in episodes]
+        if sum(map(len, shorter)) > sum(map(len, cut)):
+            bridged, cut = episodes, shorter
+    parts = [part for of_one in cut for part in of_one]
+    if not parts:
+        missing = np.mean([np.isnan(e.stream).mean(axis=0) for e in episodes], axis=0)  # (D,)
+        worst = [f"{episodes[0].spec.labels[k]} in {missing[k]:.0%}" for k in np.argsort(-missing)[:4] if missing[k]]
+        raise ValueError(
+            f"no stretch of {SHORTEST_S:g} s is complete: rows that lack a number are {', '.join(worst)} of all; "
+            "--ignore leaves such columns out, --bridge SECONDS fills longer gaps"
+        )
+    rows = sum(
+        int((np.isnan(a.stream) & ~np.isnan(b.stream)).any(axis=1).sum())
+        for a, b in zip(episodes, bridged, strict=True)
+    )
+    said = [f"Filled {rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."] if rows else []
+    known = [bool(np.isfinite(e.stream).all()) for e in bridged]
+    made = sum(len(of_one) for of_one, whole in zip(cut, known, strict=True) if not whole)
+    if not all(known):
+        hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
+        said.append(
+            f"Rows were lost: {known.count(False)} of {len(known)} episodes were cut there, into {made} parts.{hint}"
+        )
+    return parts, said
+
+
 def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
     """Return the hyperparameters that suit the recordings."""
     suitable: dict[str, Any] = {"seed": args.seed}
@@ -174,15 +205,15 @@ def fit(args: Args, console: Console) -> None:
     live = live_source(str(args.data)) is not None
     args = record_live(args, say) if live else args
     start = time.perf_counter()
-    layout = LogLayout(None, args.rate, args.action, args.channels, args.label, args.columns, by_name=True)
+    writable(args.out)
+    layout = args.layout(action=args.action, by_name=True)
     with stage("reading", console, {}) as progress, noted() as notes:
         found = normal_episodes(read_logs(args.data, layout), args.split is not None, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in found.left_out.items())
     if not found.episodes:
         hint = "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    bridged = [replace(e, stream=filled(e.stream, e.spec.dt, args.bridge)) for e in with_shared_noise(found.episodes)]
-    parts = [part for episode in bridged for part in complete_parts(episode)]
+    parts, cuts = parts_between_gaps(args, with_shared_noise(found.episodes))
     fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live)
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:
@@ -195,9 +226,8 @@ def fit(args: Args, console: Console) -> None:
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     if left_out:
         say(f"Left out: {left_out}.")
-    if len(parts) != len(found.episodes):
-        hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
-        say(f"Rows were lost: {len(found.episodes)} episodes were cut there, into {len(parts)} parts.{hint}")
+    for line in cuts:
+        say(line)
     hours = hours_of(calibration)
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     if args.promise.per == EPISODE:

@@ -6,58 +6,73 @@ them all. Exit code 1: it cannot be read as it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from asm_gym.data.inspection import Inspection, inspected
-from asm_gym.data.logs import LogLayout, read_tables
+from asm_gym.data.logs import Source, first_tables, read_tables
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.tables import Columns
 from asm_gym.evaluation import figures
-from asm_gym.scripts.command import BAD_NEWS, DONE, Checked, option, run
-from asm_gym.validation import check_number
+from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
+from asm_gym.scripts.log_options import LogOptions
 
 FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{:.2g}", "repeats": "{:.0%}"}
 """How the facts are printed; others as they are."""
 
 
-@dataclass(frozen=True)
-class Args(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Args(LogOptions):
     """What a log is."""
 
     log: Path = option(positional=True, metavar="LOG")
     """A file or a folder, as asm-gym fit reads it."""
     out: Path = option(Path("runs/inspect"), metavar="FOLDER")
     """Folder of the pictures."""
-    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
-    """Rows a second, where the log has no clock."""
-    columns: tuple[str, ...] = option((), metavar="NAME")
-    """Names of the columns of files without a header."""
     logs: int = option(3, least=1)
-    """How many logs of a folder are shown."""
+    """How many logs of a folder are drawn; of all others there is a line each."""
 
 
 def inspect(args: Args, console: Console) -> int:
-    """Read, print a table a log, and draw a picture of each."""
+    """Read, print the table of the first log and a line of every other, and draw pictures."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    known, trouble, first = set[str](), False, None
     with noted() as notes:
-        tables = read_tables(args.log, LogLayout(None, args.rate, columns=args.columns))
-        found = [inspected(name, columns, args.rate) for name, columns in islice(tables, args.logs)]
-        more = next(tables, None) is not None
-    for log in found:
-        picture = figures.save(figures.log_figure(log), args.out / f"{Path(log.name).stem or 'log'}.png")
-        for line in [log.caption(), *table(log.facts), *(f"- {line}" for line in log.remarks()), f"Wrote {picture}"]:
-            say(line)
-    for line in [*(f"Note: {note}." for note in notes), *(differences(found[0], other) for other in found[1:])]:
-        if line:
-            say(line)
-    if more:
-        say(f"There are more logs; these are the first {args.logs}.")
-    return BAD_NEWS if any(log.clock.trouble for log in found) else DONE
+        layout = args.layout()
+        sources, tables = first_tables(read_tables(args.log, layout))
+        for n, source in enumerate(sources):
+            columns, nominal = table_of_source(source), replace(layout, nominal=source.rate)
+            log = inspected(source.name, columns, nominal, [t for t in tables if t is not source.columns])
+            trouble = trouble or bool(log.clock.trouble)
+            say(log.caption())
+            lines = [*(table(log.facts) if first is None else []), *(f"- {line}" for line in log.remarks())]
+            for line in lines:
+                if line not in known:  # of many logs what is alike is said once
+                    say(line)
+            known.update(line for line in lines if line.startswith("- "))
+            if n < args.logs:
+                picture = figures.save(figures.log_figure(log), args.out / f"{Path(source.name).stem or 'log'}.png")
+                say(f"Wrote {picture}")
+            if first is not None and (line := differences(first, log)):
+                say(line)
+            first = first or log
+    for note in notes:
+        say(f"Note: {note}.")
+    return BAD_NEWS if trouble else DONE
+
+
+def table_of_source(source: Source) -> Columns:
+    """Return the columns of a recording; of an episode, its stream."""
+    if source.episode is None:
+        return source.columns
+    stream, spec = source.episode.stream, source.episode.spec
+    rows = {label: stream[:, k] for k, label in enumerate(spec.labels)}
+    return {"time": np.arange(len(stream)) * spec.dt} | rows
 
 
 def table(facts: list[dict[str, Any]]) -> list[str]:

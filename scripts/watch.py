@@ -23,25 +23,28 @@ from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.gaps import SURPRISING, bridge_of, bridged
 from asm_gym.data.live import lines_from, live_source
-from asm_gym.data.logs import LogLayout, read_logs
+from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of, write_rerun
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
+from asm_gym.files import writable
 from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import BAD_NEWS, DONE, Checked, option, run
+from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
+from asm_gym.scripts.log_options import LogOptions
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
 SHOWN_ROWS = 20  # alarms printed; the file holds them all
 
 
-@dataclass(frozen=True)
-class Args(Checked):
+@dataclass(frozen=True, kw_only=True)
+class Args(LogOptions):
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
@@ -50,12 +53,8 @@ class Args(Checked):
     """A calibrated monitor, such as asm-gym fit writes."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
     """Folder of the table, the figures and the report of a recording."""
-    rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
-    """Rows of logs a second; by default their column called time says it, or else the memory."""
-    columns: tuple[str, ...] = option((), metavar="NAME")
-    """Names of the columns of files without a header."""
-    bridge: float = option(0.0, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
-    """For how long a number may be missing without an alarm, such as 0.05; such rows are not judged."""
+    bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    """For how long a number may be missing without an alarm, by default two rows; such rows are not judged."""
     wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
     """For how long a live source may take to send its first row, or to come back after it has died."""
     until_alarm: bool = False
@@ -72,11 +71,14 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     """Score a recording, write its alarms and a report, and print the alarms."""
     alarms: list[Alarm] = []
     worst: list[ScoredEpisode] = []
-    episodes, excused = 0, Counter[str]()
+    episodes, excused, over = 0, Counter[str](), 0
+    bridge = bridge_of(args.bridge, monitor.spec.dt)
+    writable(args.out / "alarms.csv")
     with stage("watching", console, {}) as progress, noted() as notes:
-        logs = iter(read_logs(args.source, LogLayout(monitor.spec, args.rate, columns=args.columns)))
+        logs = iter(read_logs(args.source, args.layout(spec=monitor.spec)))
         while group := list(islice(logs, AT_ONCE)):  # a folder of recordings may be larger than memory
-            traces = traces_of(group, monitor, args.bridge)
+            traces = traces_of(group, monitor, bridge)
+            over += sum(int(bridged(log.episode.stream, monitor.spec.dt, bridge).sum()) for log in group)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
             excused.update(event for trace in traces for event in Counter(excused_in(trace)).elements())
             worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
@@ -93,13 +95,20 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")
-    shown = sorted(alarms, key=lambda alarm: -alarm.excess)[:SHOWN_ROWS]
+    if over:
+        say(f"Bridged {over} rows that lack a number, for at most {bridge:.3g} s at once: they are not judged.")
+    shown = ranked(alarms)[:SHOWN_ROWS]
     say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
     for log, start, end, channel, why, excess in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(written)
     return BAD_NEWS if alarms else DONE
+
+
+def ranked(alarms: Sequence[Alarm]) -> list[Alarm]:
+    """Return alarms by their excess; missing data, which are infinite, behind what was sensed."""
+    return sorted(alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
 
 
 def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:
@@ -141,8 +150,9 @@ def watch(args: Args, console: Console) -> int:
     if live is not None:
         opened = partial(lines_from, args.source, sys.stdin, args.silence)
         say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+        bridge = bridge_of(args.bridge, monitor.spec.dt)
         lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
-        alarms = follow(lines, monitor, lambda event: say(str(event)), args.bridge, again, args.wait, args.until_alarm)
+        alarms = follow(lines, monitor, lambda event: say(str(event)), bridge, again, args.wait, args.until_alarm)
         return BAD_NEWS if alarms else DONE
     return review(args, monitor, console)
 

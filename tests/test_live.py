@@ -61,11 +61,14 @@ def test_nested_json_and_units_are_read_as_from_a_file():
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (["time,q_0,q_1,torque", "1,2,3,4"], "line 1 is no row of numbers, and no header: it lacks cmd"),
-        (["q_0,q_0", "1,2"], "columns of the same name"),
+        (
+            ["time,q_0,q_1,torque", "1,2,3,4"],
+            "line 1 is no row of numbers, and no header: the memory reads channels that are not there: cmd",
+        ),
+        (["q_0,q_0,q_1,torque,cmd", "1,2,3,4,5"], "columns of the same name"),
         (["[1, 2]"], r"line 1 is no row of numbers.*: it must hold 4 numbers, got the shape \(2,\)"),
         (["{"], "line 1 is no row of numbers"),
-        (['{"q": [1, 2]}'], "line 1 is no row of numbers.*: it lacks torque, cmd"),
+        (['{"q": [1, 2]}'], "line 1 is no row of numbers.*: the memory reads channels that are not there: torque, cmd"),
         (['{"q": [1, 2, 3], "torque": 1, "cmd": 1}'], "q must hold 2 numbers, got 3"),
         ([*csv_lines()[:2], "0.1,1,2"], "line 3 is no row of numbers: it has 3 cells, its header 6"),
         ([*csv_lines()[:2], "0.1,1,2,x,fine,3"], "line 3 is no row of numbers"),

@@ -12,19 +12,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.data.clock import clock_among, evenly, period
+from asm_gym.data.clock import clocks_among
+from asm_gym.data.columns import LogLayout
 from asm_gym.data.episode import Episode, EpisodeLabel, save_episode
-from asm_gym.data.logs import FILES, LogLayout, read_logs
+from asm_gym.data.logs import FILES, read_logs
 from asm_gym.data.names import is_command
-from asm_gym.data.reader_notes import LogWarning
+from asm_gym.data.reader_notes import LogWarning, noted
 from asm_gym.data.selection import normal_episodes
 from asm_gym.data.text import read_text
+from asm_gym.data.timing import evenly, period
 from asm_gym.readings import noise_of, resolution
 from asm_gym.spec import MOTOR
 from tests.needs import needs
 from tests.streams import arm_table as log
 
 RATE, ROWS = 50.0, 80
+pytestmark = pytest.mark.filterwarnings("default::asm_gym.data.reader_notes.LogWarning")
 
 
 def read(path: Path, **layout: Any) -> Episode:
@@ -92,7 +95,7 @@ def test_a_memory_says_what_a_log_lacks():
     lacking = {name: values for name, values in log(0).items() if name != "q_1"}
     with pytest.raises(ValueError, match=r"channels that are not there: q\[1\]"):
         Episode.from_table(lacking, channels=spec)
-    with pytest.raises(ValueError, match="reads 50 rows a second, these come at 100"):
+    with pytest.raises(ValueError, match="reads 50 rows a second, these come at 100"), pytest.warns(LogWarning):
         Episode.from_table(log(0), channels=spec, rate=100)
 
 
@@ -107,9 +110,9 @@ def test_units_stand_behind_names_and_must_be_those_of_the_memory():
     with pytest.raises(ValueError, match="q_0 is in V, and the memory reads rad"):
         Episode.from_table(in_volts, channels=episode.spec)
     with pytest.raises(ValueError, match="'q' is of several units: deg, rad"):
-        Episode.from_table({**columns, "q_2 [deg]": q[0]})
+        Episode.from_table({**columns, "q_2 [deg]": 2 * q[0]})
     with pytest.raises(ValueError, match="'q_0' twice"):
-        Episode.from_table({**columns, "q_0": q[0]})
+        Episode.from_table({**columns, "q_0": 2 * q[0]})
 
 
 def test_the_noise_and_the_step_of_a_sense_are_found():
@@ -137,10 +140,9 @@ def test_the_noise_and_the_step_of_a_sense_are_found():
     ],
 )
 def test_a_clock_is_known_by_its_name_whatever_the_case(name, unit):
-    assert clock_among(["T", "temperature", "torque_t", "target", "timestep_error", "wrist.t", "timeout"]) is None
-    found = clock_among(["q", name])
-    assert found is not None
-    assert (found.column, found.unit) == (name, unit)
+    assert not clocks_among(["T", "temperature", "torque_t", "target", "timestep_error", "wrist.t", "timeout"])
+    (found,) = clocks_among(["q", name])
+    assert found == ((name,), (unit,))
 
 
 @pytest.mark.parametrize(
@@ -160,9 +162,14 @@ def test_clocks_of_every_unit_tell_the_rate_and_are_no_sense(name, times):
     assert len(episode) == 40
 
 
-def test_a_clock_that_may_count_anything_is_asked_for_its_unit():
-    with pytest.raises(ValueError, match=r"'t' goes on by 50 from row to row, and says no unit: call it 't \[ms\]'"):
-        Episode.from_table({"t": np.arange(0, 2000, 50), "q": np.zeros(40)})
+def test_a_clock_without_a_unit_is_read_by_plausible_rates_and_by_velocities_and_that_is_said():
+    t = np.arange(0, 2000, 50)
+    with pytest.warns(LogWarning, match="'t' goes on by 50 from row to row and says no unit: read in ms"):
+        assert Episode.from_table({"t": t, "q": np.sin(t)}).spec.dt == pytest.approx(0.05)
+    slow = {"t": np.arange(400), "q_0": np.sin(0.02 * np.arange(400)), "v_0": 20 * np.cos(0.02 * np.arange(400))}
+    with pytest.warns(LogWarning, match="as the motion says"):
+        assert Episode.from_table(slow).spec.dt == pytest.approx(1e-3)
+    assert Episode.from_table({"t": t, "q": np.sin(t)}, clock="t [s]").spec.dt == 50
 
 
 def test_the_period_is_the_mean_step_and_gaps_and_lost_rows_are_none_of_it():
@@ -239,12 +246,13 @@ COBOT = """Num;Timestamp;Current_J0;Temperature_T0;cycle ;Robot_ProtectiveStop;g
 
 def test_semicolons_decimal_commas_iso_times_and_labels(tmp_path):
     episode = read(written(tmp_path / "x.csv", COBOT))
-    assert episode.spec.labels == ("Current_J0", "Temperature_T0", "cycle")
+    assert episode.spec.labels == ("Current_J0", "Temperature_T0")  # cycle never moves
     assert episode.spec.dt == 1.0
     np.testing.assert_allclose(episode.stream[:, 0], [0.109627604, 0, -2.5, 1], atol=1e-8)
     assert np.isnan(episode.stream[2, 1])
     np.testing.assert_array_equal(episode.faults, [False, True, False, False])
-    kept = normal_episodes(read_logs(tmp_path / "x.csv"))
+    with noted():
+        kept = normal_episodes(read_logs(tmp_path / "x.csv"))
     assert kept.left_out == {"with a fault": 1}
 
 
@@ -288,8 +296,8 @@ def test_text_is_read_in_the_encodings_of_loggers(encoding, tmp_path):
     [
         ("", [], "a header and at least one row, got 0 lines"),
         ("a,b\n", [], "a header and at least one row, got 1 lines"),
-        ("a,a\n1,2\n", [], "columns of the same name: 'a'"),
-        ("a,b\n1,2\n3,oops\n4,5\n", [], "b, line 3 must be a number, got 'oops'"),
+        ("a,a\n1,2\n", [], "a #2 differs from another column of the name 'a'; --ignore 'a #2' leaves it out"),
+        ("a,b\n1,2\n3,oops\n4,5\n", [], "b must hold numbers, got 'oops' in row 2; --ignore 'b' leaves it out"),
         ("a,b\n1,2\n3,4,5\n", [], "line 3 has 3 cells, its header 2"),
         ("a,b\n1,2\n3\n", [], "line 3 has 1 cells, its header 2"),
         ("0,1\n1,2\n", [], "its first line is of 2 numbers and no header: name its columns with --columns"),
@@ -355,7 +363,7 @@ def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
         (
             lambda p: p.mkdir(),
             FileNotFoundError,
-            "no episodes: no .npz, .npy, .parquet, .csv.*no LeRobot or Minari",
+            "no episodes: no .npz, .npy, .parquet.*no LeRobot or Minari",
         ),
         (lambda p: p.write_bytes(b"PK"), ValueError, "files that can be read end in .npz, .npy, .parquet"),
     ],

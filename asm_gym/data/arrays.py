@@ -1,14 +1,15 @@
-"""Read Parquet files and NumPy arrays, and check HDF5 before it is read."""
+"""Read Parquet files, NumPy's arrays, MATLAB's, and HDF5, which is checked before it is read."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from asm_gym.data.text import Columns
+from asm_gym.data.tables import Columns
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
@@ -32,12 +33,85 @@ def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
         array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # a file shorter than it declares is refused
     except Exception as error:  # its header is Python, and whatever reading that may raise, damage raises
         raise ValueError(f"{path} is damaged: {' '.join(str(error).split()) or type(error).__name__}") from error
+    if array.dtype.names and array.ndim == 1:
+        return {name: array[name] for name in array.dtype.names if array[name].ndim <= 2}
     if array.dtype.kind not in "biuf" or array.ndim not in (1, 2):
         raise ValueError(f"{path} must hold rows of numbers, got {array.dtype} of shape {array.shape}")
     rows = array.reshape(len(array), -1)
     if columns and rows.shape[1] != len(columns):
         raise ValueError(f"{len(columns)} columns are named, and {path} has {rows.shape[1]}")
     return {name: rows[:, k] for k, name in enumerate(columns)} or {"value": array}
+
+
+def read_mat(path: Path) -> Columns:
+    """Return the variables of a MATLAB file up to version 7, (T,) or (T, k), fields of structures as ``data.q``."""
+    from scipy.io import loadmat
+
+    regular_file(path)
+    try:
+        found = loadmat(path, squeeze_me=True, struct_as_record=True)
+    except NotImplementedError:
+        return read_hdf5(path)[""][0]  # version 7.3 is HDF5
+    except Exception as error:  # scipy raises whatever the damage leads to
+        raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+    return _along_time(_fields("", {n: v for n, v in found.items() if not n.startswith("__")}))
+
+
+def _fields(of: str, values: dict[str, Any]) -> Columns:
+    """The arrays of numbers among variables and the fields of structures."""
+    made: Columns = {}
+    for name, value in values.items():
+        array = np.asarray(value)
+        if array.dtype.names and array.ndim == 0:
+            made |= _fields(f"{of}{name}.", {field: array[field].item() for field in array.dtype.names})
+        elif array.dtype.kind in "biuf" and array.ndim in (1, 2):
+            made[f"{of}{name}"] = array
+    return made
+
+
+def _along_time(arrays: Columns) -> Columns:
+    """Arrays with their rows along time: those of the length that most have, turned where that stands second."""
+    lengths = [size for array in arrays.values() for size in array.shape if size > 1]
+    rows = max(set(lengths), key=lambda size: (lengths.count(size), size), default=0)
+    turned = {n: a.T if a.ndim == 2 and a.shape[0] != rows == a.shape[1] else a for n, a in arrays.items()}
+    return {name: array for name, array in turned.items() if len(array) == rows}
+
+
+def read_hdf5(path: Path) -> dict[str, tuple[Columns, float | None, bool]]:
+    """Return columns, rate [Hz] and success of each demonstration of robomimic; of other HDF5, all under an empty name.
+
+    Observations are columns of their names, and actions are called so. Source: robomimic, "Dataset Contents".
+    """
+    h5py = require("h5py", what="an HDF5 file")
+    try:
+        check_hdf5(path)
+        with h5py.File(path, "r") as file:
+            if "data" not in file or not isinstance(file["data"], h5py.Group):
+                return {"": (_along_time(_datasets(h5py, file)), None, True)}
+            about = json.loads(file["data"].attrs.get("env_args", "{}"))
+            rate = about.get("env_kwargs", {}).get("control_freq")
+            names = sorted(file["data"], key=lambda name: (len(name), name))
+            return {name: (_demonstration(h5py, file["data"][name]), rate, True) for name in names}
+    except (OSError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+
+
+def _demonstration(h5py: Any, group: Any) -> Columns:
+    found = _datasets(h5py, group.get("obs", group))
+    found = {name: values for name, values in found.items() if values.ndim <= 2}
+    return found | ({"actions": np.asarray(group["actions"])} if "actions" in group else {})
+
+
+def _datasets(h5py: Any, group: Any) -> Columns:
+    """The arrays of numbers in a group and in those within it."""
+    made: Columns = {}
+    for name, node in group.items():
+        if isinstance(node, h5py.Group):
+            made |= {f"{name}.{inner}": values for inner, values in _datasets(h5py, node).items()}
+        elif node.dtype.kind in "biuf" and node.ndim in (1, 2):
+            values = np.asarray(node)
+            made[name] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+    return made
 
 
 def check_hdf5(path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.data.text import Columns
+from asm_gym.data.tables import Columns
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 

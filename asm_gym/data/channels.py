@@ -1,52 +1,37 @@
 """Turn the columns of a log into the channels of a stream.
 
 Columns that differ in a number only, ``joint[0], joint[1]`` or ``joint_0, joint_1``, are the elements of one channel,
-and so are those of a two-dimensional array; others are channels of their own. Clocks, counters of rows, labels and
-words are no channels (``asm_gym.data.names``).
+and so are those of a two-dimensional array; others are channels of their own. An angle that turns over is a channel of
+two numbers, its sine and its cosine. What is no channel says ``asm_gym.data.columns``.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from fnmatch import fnmatchcase
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.clock import evenly, timing_of
-from asm_gym.data.names import ELEMENT, factor, label_of, role_of, split_unit
+from asm_gym.data.behaviour import code_of
+from asm_gym.data.clock import Clock, find_clock, seconds_a_row
+from asm_gym.data.columns import Column, LogLayout, decide
+from asm_gym.data.names import TAU, TURN, TURNED, factor, is_command, is_label, label_of, split_unit
 from asm_gym.data.reader_notes import note
+from asm_gym.data.tables import Columns, laid_out, table_of
+from asm_gym.data.timing import Timing, evenly, timing_of
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.validation import check_number, short_repr
+from asm_gym.validation import check_number
 
 # Words of a label that say that nothing is wrong.
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
 RESAMPLED = 1.5  # A log with a clock is read at another rate, up to so many times its own or as much slower
 SLOWEST = 1e-6  # the least rate of a log [Hz]: a row in eleven days
 RATE_TOLERANCE = 0.01  # how far a log's rate may be off that of the memory which reads it, as a share
-
-
-class Column(NamedTuple):
-    """A column of a log, and what is done with it."""
-
-    name: str  # without the unit
-    unit: str  # empty where the log does not say
-    role: str  # sense, command, clock, counter, label or words
-    channel: str  # which it belongs to
-    element: str  # of the channel; empty where it is the only one
-    values: NDArray[Any]  # (T,)
-
-    @property
-    def read(self) -> bool:
-        """Whether it is part of the stream."""
-        return self.role in ("sense", "command")
-
-    def matches(self, pattern: str) -> bool:
-        """Tell whether it or its channel is called so."""
-        return any(name == pattern or fnmatchcase(name, pattern) for name in (self.name, self.channel))
 
 
 class Recorded(NamedTuple):
@@ -57,88 +42,158 @@ class Recorded(NamedTuple):
     faults: NDArray[np.bool_]  # (T,) where a label says that something is wrong; (0,) where the table has no label
 
 
-def read_recorded(
-    frame: Any,
-    channels: StreamSpec | Sequence[str] | None = None,
-    rate: float | None = None,
-    action: Sequence[str] = (),
-    labels: Sequence[str] = (),
-) -> Recorded:
-    """Return the rows of a table, their channels, and which are labelled as faulty; as ``Episode.from_table`` does."""
-    spec = channels if isinstance(channels, StreamSpec) else None
-    table = table_of(frame)
-    columns = columns_of(table, labels, {*spec.labels, *(c.name for c in spec.channels)} if spec else ())
-    used = [c for c in columns if c.read]
-    dt = None if rate is None else 1.0 / check_number("rate", rate, low=SLOWEST)
-    timing = timing_of(table)
-    lengths = {c.name: len(c.values) for c in columns if c.read or c.role == "label"}
-    if not used or not max(lengths.values()):
+class ColumnPlan:
+    """Which columns of a source make a row of a memory's stream, and how: the same for files and for live rows.
+
+    Args:
+        names: of the columns, with their units.
+        spec: of the memory. A channel of sine and cosine is made of the angle of that name.
+
+    Raises:
+        ValueError: a column is missing, or of another unit.
+
+    Example:
+        >>> from asm_gym import Channel, StreamSpec
+        >>> plan = ColumnPlan(["yaw [deg]", "seq"], StreamSpec((Channel("yaw", 1, "rad"),), dt=0.01))
+        >>> plan.row({"yaw [deg]": 180.0, "seq": 7}).round(2)
+        array([3.14])
+    """
+
+    def __init__(self, names: Iterable[str], spec: StreamSpec) -> None:
+        bare = {name: split_unit(name)[0] for name in names}
+        # joint_0 is joint[0] too, though it may be the only one here.
+        places = {label_of(short): name for name, short in bare.items()} | {short: name for name, short in bare.items()}
+        self.codes = np.array(spec.missing)
+        self.columns, self._scale, self._turned = list[str](), list[float](), list[int]()
+        missing = []
+        for channel in spec.channels:
+            by_label = any(label in places for label in channel.labels)
+            turned = channel.elements == TURNED and not by_label
+            for k, label in enumerate(channel.labels):
+                wanted = channel.name if turned else label
+                name = places.get(wanted)
+                if name is None and not by_label:
+                    name = places.get(f"{channel.name}[{k}]")  # a list by its channel's name
+                if name is None:
+                    missing.append(wanted)
+                    continue
+                scale = factor(*split_unit(name), channel.unit)
+                self.columns.append(name)
+                self._scale.append(scale * TAU / TURN[channel.unit] if turned else scale)
+                self._turned.append(1 + k if turned else 0)
+        if missing:
+            names = ", ".join(dict.fromkeys(missing))
+            raise ValueError(f"the memory reads channels that are not there: {names}")
+
+    def row(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Return the numbers (D,) of a row by the names of its columns; NaN of those that it lacks."""
+        found = (values.get(name) for name in self.columns)
+        return self._made(np.array([math.nan if value is None else value for value in found], np.float64))
+
+    def rows(self, table: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+        """Return the rows (T, D) of a table."""
+        return self._made(np.column_stack([table[name] for name in self.columns]).astype(np.float64))
+
+    def _made(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The numbers (..., D) of a stream of those of the columns."""
+        if self.codes.size:
+            numbers = np.where(np.isin(numbers, self.codes), np.nan, numbers)
+        numbers = numbers * self._scale
+        for k, turned in enumerate(self._turned):
+            if turned:
+                numbers[..., k] = (np.sin, np.cos)[turned - 1](numbers[..., k])
+        return numbers
+
+
+def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ()) -> Recorded:
+    """Return the rows of a table, their channels, and which are labelled as faulty; as ``Episode.from_table`` does.
+
+    ``others`` are tables of the same log or folder: what a column is, all of them tell.
+    """
+    table = laid_out(table_of(frame))
+    lengths = {name: len(values) for name, values in table.items()}
+    if not lengths or not max(lengths.values()):
         raise ValueError(f"a frame must hold columns of numbers, got {', '.join(table)[:200] or 'nothing'}")
-    if timing is not None:
-        lengths[timing.clock.column] = len(table[timing.clock.column])
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
-    marks = [_marked(c.values) for c in columns if c.role == "label"]
-    faults = np.logical_or.reduce(marks) if marks else np.zeros(0, np.bool_)
-    if timing is not None and timing.dt is not None:
-        dt = dt or _period_to_read(spec, timing.dt)
-        rows = np.column_stack([c.values for c in used] + [faults] * bool(marks)).astype(np.float64)  # (T, D)
+    clock = clock_of(table, layout)
+    columns = [] if layout.spec else decide([table, *others], layout, clock)
+    spec = layout.spec or described(columns, layout)
+    plan = ColumnPlan(table, spec)
+    rows = plan.rows(table)
+    if layout.spec is not None:
+        rows = _decoded(rows, table, plan)
+    labels = [v for n, v in table.items() if n not in plan.columns and is_label(split_unit(n)[0], layout.labels)]
+    faults = np.logical_or.reduce([_marked(values) for values in labels]) if labels else np.zeros(0, np.bool_)
+    timing = _timing(table, clock, layout)
+    dt, by_clock = _period(timing, table, layout)
+    if by_clock and timing is not None:
+        rows = np.column_stack([rows, faults] if labels else [rows])
         rows = evenly(rows[timing.kept], timing.times, dt)
-        used = [c._replace(values=values) for c, values in zip(used, rows.T, strict=False)]
-        if marks:
-            faults = np.nan_to_num(rows[:, -1]) > 0
-    if isinstance(channels, StreamSpec):
-        return Recorded(_rows_of(channels, used, dt), channels, faults)
-    if dt is None:
-        raise ValueError("how many rows come a second? Say the rate [Hz] of this layout, or add a column time [s]")
-    return Recorded(*_described(used, channels, dt, action), faults)
+        if labels:
+            rows, faults = rows[:, :-1], np.nan_to_num(rows[:, -1]) > 0
+    if layout.spec is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
+        raise ValueError(f"the memory reads {1 / spec.dt:.4g} rows a second, these come at {1 / dt:.4g}")
+    if layout.spec is None:
+        spec = replace(spec, dt=dt, channels=tuple(_with_noise(spec, rows)))
+        _note_columns(columns)
+    return Recorded(rows.astype(np.float32), spec, faults)
 
 
-def table_of(frame: Any) -> dict[str, NDArray[Any]]:
-    """Return the columns, (T,) or (T, k), of a dictionary, a frame of pandas or Polars, or an Arrow table by name."""
-    names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
-    if names is None or callable(names):
-        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}")
-    if len({str(name) for name in names}) < len(list(names)):
-        raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
-    return {str(name): as_array(frame[name]) for name in names}
+def clock_of(table: Columns, layout: LogLayout) -> Clock | None:
+    """Return the clock of a table; None where there is none, or none can be read and ``rate`` is said."""
+    try:
+        return find_clock(table, layout.clock, layout.spec.dt if layout.spec else None)
+    except ValueError:
+        if layout.rate is None or layout.clock:
+            raise
+        return None
 
 
-def as_array(column: Any) -> NDArray[Any]:
-    """Return an array (T,) or, of lists of one length, (T, k)."""
-    array = np.asarray(column)
-    if array.dtype == object and len(array) and all(isinstance(row, list | tuple | np.ndarray) for row in array):
-        return np.array(array.tolist()) if len({len(row) for row in array}) == 1 else array
-    return array
+def _timing(table: Columns, clock: Clock | None, layout: LogLayout) -> Timing | None:
+    try:
+        return None if clock is None else timing_of(table, clock)
+    except ValueError:
+        if layout.rate is None:
+            raise
+        return None
 
 
-def columns_of(
-    table: Mapping[str, NDArray[Any]], labels: Sequence[str] = (), senses: Collection[str] = ()
-) -> list[Column]:
-    """Decide for every column (T,) or (T, k) of a table what is done with it; k columns are made of the latter.
+def _period(timing: Timing | None, table: Columns, layout: LogLayout) -> tuple[float, bool]:
+    """How far apart rows are to be [s], and whether their clock tells where each belongs."""
+    own = timing.dt if timing is not None else None
+    if layout.rate is not None:
+        dt = 1.0 / check_number("rate", layout.rate, low=SLOWEST)
+        if own is not None and timing is not None and not 1 / RESAMPLED <= own / dt <= RESAMPLED:
+            clock = timing.clock.name
+            note(f"the clock {clock!r} says {1 / own:.4g} rows a second: by --rate {layout.rate:g} it is not read")
+            return dt, False
+        return dt, own is not None
+    if own is None:
+        if layout.nominal is None:
+            moved = seconds_a_row(table)
+            hint = "" if moved is None else f"; positions and velocities say about {1 / moved:.4g}"
+            what = "Say the rate [Hz] of this layout (--rate), or name or add a column of times (--clock)"
+            raise ValueError(f"how many rows come a second? {what}{hint}")
+        return 1.0 / layout.nominal, False
+    if layout.nominal is not None and abs(own * layout.nominal - 1) <= RATE_TOLERANCE:
+        return 1.0 / layout.nominal, True
+    spec = layout.spec
+    if spec is None or not 1 / RESAMPLED <= own / spec.dt <= RESAMPLED:
+        return own, True
+    if abs(spec.dt / own - 1) > RATE_TOLERANCE:
+        note(f"rows that come at {1 / own:.4g} a second are read at {1 / spec.dt:.4g}, by their clock")
+    return spec.dt, True
 
-    ``labels`` are patterns of the columns that say what is wrong, beside those that are called so; ``senses`` are names
-    of columns that are senses, whatever they are called.
-    """
-    parts = {name: values.T if values.ndim == 2 else [values] for name, values in table.items() if values.ndim < 3}
-    roles = {n: "sense" if n in senses else role_of(n, np.asarray(p[0]), labels) for n, p in parts.items() if len(p)}
-    bare = {name: split_unit(name)[0] for name, role in roles.items() if role in ("sense", "command")}
-    for name, count in Counter(bare.values()).items():
-        if count > 1:
-            raise ValueError(f"columns must have different names, got {name!r} twice")
-    elements = {name: ELEMENT.fullmatch(short) for name, short in bare.items() if table[name].ndim == 1}
-    stems = Counter(found["stem"] for found in elements.values() if found)
-    made = []
-    for header, role in roles.items():
-        (name, unit), found = split_unit(header), elements.get(header)
-        if table[header].ndim == 2:
-            made += [Column(f"{name}[{k}]", unit, role, name, str(k), v) for k, v in enumerate(parts[header])]
-        elif found and (found["named"] or stems[found["stem"]] > 1) and found["stem"] not in bare.values():
-            element = found["named"] or found["number"]
-            made.append(Column(name, unit, role, found["stem"], element, table[header]))
-        else:
-            made.append(Column(name, unit, role, name, "", table[header]))
-    return made
+
+def _decoded(rows: NDArray[np.float64], table: Columns, plan: ColumnPlan) -> NDArray[np.float64]:
+    """The rows (T, D) without the numbers that stand for missing data, such as this log alone has."""
+    codes = {name: code_of(table[name]) for name in dict.fromkeys(plan.columns)}
+    for name, code in codes.items():
+        if not math.isnan(code) and code not in plan.codes:
+            note(f"{name}: {code:g} is taken for missing data, in {int(np.sum(table[name] == code))} rows")
+            rows[np.ix_(table[name] == code, [c == name for c in plan.columns])] = np.nan
+    return rows
 
 
 def _marked(values: NDArray[Any]) -> NDArray[np.bool_]:
@@ -148,35 +203,41 @@ def _marked(values: NDArray[Any]) -> NDArray[np.bool_]:
     return np.array([str(cell).strip().lower() not in NORMAL for cell in values])
 
 
-def _period_to_read(spec: StreamSpec | None, own: float) -> float:
-    """How far apart rows are to be [s]: as the memory reads them, where the clock can be followed that far."""
-    if spec is None or not 1 / RESAMPLED <= own / spec.dt <= RESAMPLED:
-        return own
-    if abs(spec.dt / own - 1) > RATE_TOLERANCE:
-        note(f"rows that come at {1 / own:.4g} a second are read at {1 / spec.dt:.4g}, by their clock")
-    return spec.dt
-
-
-def _described(
-    columns: list[Column], channels: Sequence[str] | None, dt: float, action: Sequence[str]
-) -> tuple[NDArray[np.float32], StreamSpec]:
-    """The rows (T, D) of the columns that are chosen, and their spec."""
-    columns = columns if channels is None else _chosen(columns, channels)
-    commanded = {c.name for c in _chosen(columns, action)}
+def described(columns: Sequence[Column], layout: LogLayout) -> StreamSpec:
+    """Return the spec of the columns that are read; its period is 1 s, and its noise 0."""
+    for column in columns:
+        if column.role in ("mixed", "double"):
+            raise ValueError(f"{column.name} {column.why}")
+    for pattern in layout.channels:
+        _chosen(columns, pattern)
+    used = [c for c in columns if c.read]
+    if not used:
+        why = "; ".join(f"{c.name} {c.why}" for c in columns)[:300]
+        raise ValueError(f"a frame must hold columns of numbers, got {why or 'nothing'}")
+    for name, count in Counter(c.name for c in used).items():
+        if count > 1:
+            raise ValueError(f"columns must have different names, got {name!r} twice")
+    commanded = {c.name for pattern in layout.action for c in _chosen(used, pattern)}
+    if layout.by_name and not layout.action:
+        named = {c.name for c in used if is_command(c.name)}
+        whole = {c.channel for c in used if c.name in named} - {c.channel for c in used if c.name not in named}
+        commanded = {c.name for c in used if c.channel in whole}
+        commanded = set() if len(commanded) == len(used) else commanded
     parts: dict[str, list[Column]] = {}
-    for column in sorted(columns, key=lambda c: c.name in commanded):  # the action stands last
-        parts.setdefault(column.channel, []).append(column)
-    spec = StreamSpec(tuple(_channel(name, part, commanded) for name, part in parts.items()), dt, "table")
-    return np.column_stack([c.values for part in parts.values() for c in part]).astype(np.float32), spec
+    for column in sorted(used, key=lambda c: c.name in commanded):  # the action stands last
+        parts.setdefault(column.name if column.turn else column.channel, []).append(column)
+    channels = tuple(_channel(name, part, commanded) for name, part in parts.items())
+    codes = sorted({c.code for c in used if not math.isnan(c.code)})
+    return StreamSpec(channels, 1.0, "table", tuple(codes))
 
 
-def _chosen(columns: Sequence[Column], patterns: Sequence[str]) -> list[Column]:
-    """Those that match one of the patterns, in the order of the table. Raises ValueError where one finds nothing."""
-    for pattern in patterns:
-        if not any(c.matches(pattern) for c in columns):
-            names = ", ".join(c.name for c in columns) or "none"
-            raise ValueError(f"no column of these channels is called {pattern!r}; there are: {names}")
-    return [c for c in columns if any(c.matches(pattern) for pattern in patterns)]
+def _chosen(columns: Sequence[Column], pattern: str) -> list[Column]:
+    """Those that match a pattern. Raises ValueError where none does."""
+    found = [c for c in columns if c.matches(pattern)]
+    if not found:
+        names = ", ".join(c.name for c in columns) or "none"
+        raise ValueError(f"no column of these channels is called {pattern!r}; there are: {names}")
+    return found
 
 
 def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Channel:
@@ -186,20 +247,26 @@ def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Chann
     units = {c.unit for c in columns if c.unit}
     if len(units) > 1:
         raise ValueError(f"channel {name!r} is of several units: {', '.join(sorted(units))}")
-    group = MOTOR if own & commanded else name
-    noise = 0.0 if group == MOTOR else float(np.median([noise_of(c.values) for c in columns]))
+    group = MOTOR if own & commanded else columns[0].channel
+    if columns[0].turn:
+        return Channel(name, 2, "rad" if columns[0].turn < 7 else "deg", 0.0, group, TURNED)
     elements = tuple(c.element for c in columns)
-    return Channel(name, len(columns), next(iter(units), "1"), noise, group, elements if any(elements) else ())
+    return Channel(name, len(columns), next(iter(units), "1"), 0.0, group, elements if any(elements) else ())
 
 
-def _rows_of(spec: StreamSpec, columns: Sequence[Column], dt: float | None) -> NDArray[np.float32]:
-    """The rows (T, D) as a memory of this spec reads them; other columns of the table are left out."""
-    if dt is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
-        raise ValueError(f"the memory reads {1 / spec.dt:.4g} rows a second, these come at {1 / dt:.4g}")
-    # joint_0 is joint[0] too, though it may be the only one here.
-    found = {label_of(c.name): c for c in columns} | {c.name: c for c in columns}
-    missing = [label for label in spec.labels if label not in found]
-    if missing:
-        raise ValueError(f"the memory reads channels that are not there: {', '.join(missing)}")
-    chosen = zip((found[label] for label in spec.labels), spec.units, strict=True)
-    return np.column_stack([c.values * factor(c.name, c.unit, unit) for c, unit in chosen]).astype(np.float32)
+def _with_noise(spec: StreamSpec, rows: NDArray[np.float64]) -> Iterable[Channel]:
+    """The channels with the white noise that their rows (T, D) show."""
+    for channel, place in zip(spec.channels, spec.slices.values(), strict=True):
+        noise = 0.0 if channel.group == MOTOR else float(np.median([noise_of(x) for x in rows[:, place].T]))
+        yield replace(channel, noise=noise)
+
+
+def _note_columns(columns: Sequence[Column]) -> None:
+    """Say what is left out, and why."""
+    for role in dict.fromkeys(c.role for c in columns if not c.read and c.role not in ("clock", "label", "ignored")):
+        same = [c for c in columns if c.role == role]
+        names = ", ".join(c.name for c in same[:6]) + (f" and {len(same) - 6} others" if len(same) > 6 else "")
+        note(f"left out: {names}: {same[0].why}")
+    for column in columns:
+        if column.read and column.why:
+            note(f"{column.name}: {column.why}")

@@ -1,161 +1,279 @@
-"""Find the clock of a log, and put its rows where they belong in time.
+"""Find the clock of a log, and the unit in which it counts.
 
-unit       behind the name; without one, large numbers count s, ms, µs or ns since 1970, and others seconds
-text       ISO 8601, 2022-10-26T08:17:21.847Z
-step       n_i = (t_i - t_{i-1})/dt, dt being the mean step, gaps left out
-near whole numbers   a row keeps its values and stands n_i places after the one before; places between are NaN
-elsewhere            values between two stamps are interpolated; where these are far apart, NaN
+unit       behind the name; or else by what a number since 1970 would be, by velocities against differences of
+           positions, and by the unit that gives 1 to 1000 rows a second
+pair       columns of seconds and of nanoseconds are one clock
+choice     the steadiest of those called so; a clock in whole seconds gives way to a counter that agrees with it
+text       ISO 8601, 24/11/2026 10:00:00.5, 10:00:00.5
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import CLOCK, SECONDS, is_clock
+from asm_gym.data.names import CLOCK, SECONDS, is_clock, ratio, split_unit
 from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
 
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least number since 1970, and its unit [s]
 SLOWEST_WITHOUT_UNIT = 2.0  # step from which on a clock without a unit is not believed to count seconds
-JITTER = 0.35  # by what share of a step a stamp may be off, and its row still be the one that was due
-DRIFT = 0.011  # how far a clock may be off the rate that is read, as a share, and no row be moved for it
-NEARLY, MOSTLY = 0.15, 0.95  # rows were lost where MOSTLY steps are NEARLY whole multiples of the median; else jitter
+UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: they were written twice
-FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in it is known
-MOST_LOST = 4  # a log may have lost so many times its rows, or ten minutes; more is a clock that was set
+ALIKE = 0.2  # how far two clocks, or a clock and the velocities, may be off, as a share, and tell each other's unit
+
+_PAIR = re.compile(r"(?P<of>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nsecs?|ns|usecs?|us|micros)\]?", re.I)
+_SECONDS = ("secs", "sec", "seconds", "s", "")
+_SPEEDS = {
+    **{"velocity": "position", "velocities": "positions", "vel": "pos", "qvel": "qpos", "qd": "q", "dq": "q"},
+    **{"v": "q", "speed": "position"},
+}
+"""What a position is called, by what its velocity is called."""
 
 
 class Clock(NamedTuple):
-    """A column of times."""
+    """Columns of times that add up to one, and the seconds in a number of each; None where its name does not say."""
 
-    column: str
-    unit: float | None = None  # seconds in one of its numbers; None where its name does not say
+    columns: tuple[str, ...]
+    units: tuple[float | None, ...] = (None,)
 
-    def seconds(self, values: NDArray[Any]) -> Floats:
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return " + ".join(self.columns)
+
+    def seconds(self, table: Mapping[str, NDArray[Any]]) -> Floats:
         """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits."""
-        if values.dtype.kind == "M":
-            return np.asarray((values - values[:1]) / np.timedelta64(1, "ns"), np.float64) * 1e-9
-        if values.dtype.kind not in "biuf":
-            start = self.moment(str(values[0]))
-            return np.array([self.moment(str(cell)) - start for cell in values])
-        if values.ndim != 1 or not len(values):
-            raise ValueError(f"the clock {self.column!r} must hold a number a row, got the shape {values.shape}")
-        known = values[np.isfinite(values)]
-        unit = self.unit_of(float(known[0])) if len(known) else 1.0
-        step = float(np.median(np.diff(known))) if len(known) > 2 else 0.0
-        if self.unit is None and unit == 1.0 and step >= SLOWEST_WITHOUT_UNIT:
-            raise ValueError(
-                f"{self.column!r} goes on by {step:g} from row to row, and says no unit: "
-                f"call it '{self.column} [ms]' or '{self.column} [s]'"
-            )
-        if not len(known) or float(known[0]) < EPOCHS[-1][0]:
-            return values.astype(np.float64) * unit
-        since = values.astype(np.int64) - int(known[0]) if values.dtype.kind in "biu" else values - known[0]
-        return np.asarray(since, np.float64) * unit
+        parts = [_seconds(c, u, table[c], len(self.columns) > 1) for c, u in zip(self.columns, self.units, strict=True)]
+        return np.sum(parts, axis=0, dtype=np.float64)
 
-    def unit_of(self, number: float) -> float:
-        """Return the seconds in one of its numbers, of which this is one."""
-        if self.unit is not None:
-            return self.unit
-        return next((unit for least, unit in EPOCHS if number >= least), 1.0)
+    def moment(self, row: Mapping[str, Any]) -> float | None:
+        """Return the time of a row [s]; None where it has none. Raises ValueError where it cannot be read."""
+        cells = [row.get(column) for column in self.columns]
+        if any(cell is None for cell in cells):
+            return None
+        pairs = zip(self.columns, self.units, cells, strict=True)
+        return sum(_moment(column, unit, str(cell)) for column, unit, cell in pairs)
 
-    def moment(self, cell: str) -> float:
-        """Return the time of a cell of text [s]. Raises ValueError where it is none."""
+
+def _seconds(column: str, unit: float | None, values: NDArray[Any], paired: bool) -> Floats:
+    if values.dtype.kind == "M":
+        return np.asarray((values - values[:1]) / np.timedelta64(1, "ns"), np.float64) * 1e-9
+    values = values if values.dtype.kind in "biuf" else _seconds_of_text(column, values)
+    if values.ndim != 1 or not len(values):
+        raise ValueError(f"the clock {column!r} must hold a number a row, got the shape {values.shape}")
+    known = values[np.isfinite(values)]
+    first = float(known[0]) if len(known) else 0.0
+    unit = _epoch(first) if unit is None else unit
+    if first < EPOCHS[-1][0] or (paired and unit < 1.0):
+        return values.astype(np.float64) * unit
+    since = values.astype(np.int64) - int(first) if values.dtype.kind in "biu" else values - first
+    return np.asarray(since, np.float64) * unit
+
+
+def _epoch(number: float) -> float:
+    """The unit in which a number since 1970 counts; of others, seconds."""
+    return next((unit for least, unit in EPOCHS if number >= least), 1.0)
+
+
+_TIME_OF_DAY = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
+
+
+def _seconds_of_text(column: str, values: NDArray[Any]) -> Floats:
+    """(T,) numbers of a column of text; times and dates in seconds from its first row."""
+    import pandas as pd
+
+    text = pd.Series(values).astype("string").str.strip().replace("", pd.NA)
+    numbers = pd.to_numeric(text, errors="coerce")
+    if (numbers.notna() | text.isna()).all():
+        return numbers.to_numpy(np.float64, na_value=np.nan)
+    if text.str.fullmatch(_TIME_OF_DAY.pattern).fillna(True).all():
+        day = (pd.to_timedelta(text) / pd.Timedelta(seconds=1)).to_numpy(np.float64)
+        return np.asarray(day + 86400.0 * np.concatenate([[0], np.cumsum(np.diff(day) < -43200)]))
+    for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": True}):
+        with suppress(ValueError, TypeError):
+            moments = pd.to_datetime(text, utc=True, **how)  # type: ignore[call-overload]
+            return ((moments - moments.min()) / pd.Timedelta(seconds=1)).to_numpy(np.float64, na_value=np.nan)
+    odd = next(str(cell) for cell in text[numbers.isna() & text.notna()])
+    raise ValueError(f"the clock {column!r} must hold a time, got {odd[:40]!r}: --rate HZ reads the rows without it")
+
+
+def _moment(column: str, unit: float | None, cell: str) -> float:
+    """The time of one cell [s]."""
+    try:
+        number = float(cell or "nan")
+    except ValueError:
         try:
-            number = float(cell or "nan")
+            moment = datetime.fromisoformat(cell.strip())
         except ValueError:
-            try:
-                moment = datetime.fromisoformat(cell.strip())
-            except ValueError:
-                raise ValueError(f"the clock {self.column!r} must hold a time, got {cell[:40]!r}") from None
-            moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)  # all rows are of the same zone
-            return (moment - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
-        return number * self.unit_of(number)
+            return float(_text_moment(column, cell))
+        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)  # all rows are of the same zone
+        return (moment - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
+    return number * (_epoch(number) if unit is None else unit)
 
 
-class Timing(NamedTuple):
-    """When the rows of a log were sensed."""
-
-    clock: Clock
-    times: Floats  # (N,) of the rows that are kept [s]
-    kept: NDArray[np.intp]  # (N,) which rows of the log these are: one of several with the same time
-    dt: float | None  # from row to row in the mean [s]; None of a single row
+def _text_moment(column: str, cell: str) -> float:
+    start = "00:00:00" if _TIME_OF_DAY.fullmatch(cell.strip()) else "01/01/1970 00:00:00"
+    return float(_seconds_of_text(column, np.array([start, cell.strip()], object))[1])
 
 
-def clock_among(names: Iterable[str]) -> Clock | None:
-    """Return the first of these columns that is a clock; None where none is."""
+def clocks_among(names: Iterable[str]) -> list[Clock]:
+    """Return the clocks among columns by their names; seconds and nanoseconds of one time are one clock."""
+    names = list(names)
+    lower = {name.lower(): name for name in reversed(names)}
+    pairs = {}
     for name in names:
-        if is_clock(name):
-            found = CLOCK.fullmatch(name.strip())
-            assert found is not None
-            return Clock(name, SECONDS[found["unit"].lower()] if found["unit"] else None)
+        found = _PAIR.fullmatch(name)
+        for end in _SECONDS if found else ():
+            coarse = lower.get(name[: found.start("unit")].lower() + end + name[found.end("unit") :].lower())  # type: ignore[union-attr]
+            if coarse is not None and coarse != name and (end or is_clock(coarse)):
+                pairs[coarse] = Clock((coarse, name), (1.0, SECONDS[_spelled(found["unit"])]))  # type: ignore[index]
+                break
+    fine = {pair.columns[1] for pair in pairs.values()}
+    return [
+        pairs.get(n, Clock((n,), (_named_unit(n),))) for n in names if n in pairs or (is_clock(n) and n not in fine)
+    ]
+
+
+def _spelled(unit: str) -> str:
+    unit = unit.lower()
+    return "ns" if unit.startswith("n") else "us"
+
+
+def _named_unit(name: str) -> float | None:
+    if name.lower() == "ipoc":
+        return 1e-3  # KUKA's counter of milliseconds
+    found = CLOCK.fullmatch(name.strip())
+    if found is not None and found["unit"]:
+        return SECONDS[found["unit"].lower()]
+    return SECONDS.get(split_unit(name)[1].lower()) or SECONDS.get(name.lower().rpartition("_")[2])
+
+
+def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | None = None) -> Clock | None:
+    """Return the steadiest clock of a table, or the one that is ``wanted``; None where there is none.
+
+    ``dt`` [s] is how far apart a memory reads rows: it tells the unit of a clock that says none. Raises ValueError
+    where none can be read, and says why.
+    """
+    if wanted:
+        return _wanted(table, wanted, dt)
+    trouble, usable = "", list[tuple[tuple[float, float], Clock]]()
+    for clock in clocks_among(table):
+        try:
+            clock = _with_unit(clock, table, dt)
+            usable.append((_unsteadiness(clock.seconds(table)), clock))
+        except ValueError as error:
+            trouble = trouble or str(error)
+    best = min(usable, key=lambda each: each[0], default=None)
+    if best is not None and best[0][0] <= MOST_DOUBLED:
+        others = [c for how, c in usable if c is not best[1] and how[0] <= MOST_DOUBLED]
+        _note_choice(table, best[1], others)
+        return best[1]
+    rising = _rising(table, [clock for _, clock in usable])
+    if rising is not None:
+        if best is not None:
+            note(
+                f"the stamps of {best[1].name!r} repeat themselves: the clock is {rising.name!r}, which rises with them"
+            )
+        return rising
+    if trouble:
+        raise ValueError(trouble)
+    return best[1] if best is not None else None
+
+
+def _wanted(table: Mapping[str, NDArray[Any]], wanted: str, dt: float | None) -> Clock:
+    """The clock of this name, with the unit behind it."""
+    bare, unit = split_unit(wanted)
+    names = {split_unit(name)[0]: name for name in table} | {name: name for name in table}
+    name = names.get(wanted) or names.get(bare)
+    if name is None:
+        raise ValueError(f"no column is called {wanted!r}; there are: {', '.join(table)[:300]}")
+    pair = next((clock for clock in clocks_among(table) if clock.columns[0] == name and clock.columns[1:]), None)
+    if pair is not None and not unit:
+        return pair
+    return _with_unit(Clock((name,), (SECONDS.get(unit.lower()) or _named_unit(name),)), table, dt)
+
+
+def _unsteadiness(times: Floats) -> tuple[float, float]:
+    """The share of rows with the stamp of the one before, and how much steps differ, as a share."""
+    steps = np.diff(times)
+    if not np.isfinite(times).all():
+        return 1.0, 1.0
+    median = float(np.median(steps)) if len(steps) else 1.0
+    doubled = float(np.mean(steps == 0.0)) if len(steps) else 0.0
+    jitter = float(np.median(np.abs(steps / median - 1))) if median > 0 else 1.0
+    return (0.0 if doubled <= MOST_DOUBLED else doubled) + float(median < 0), round(jitter, 2)
+
+
+def _note_choice(table: Mapping[str, NDArray[Any]], best: Clock, others: Sequence[Clock]) -> None:
+    own = float(np.median(np.diff(best.seconds(table)))) if len(table[best.columns[0]]) > 2 else 0.0
+    for other in others:
+        step = float(np.median(np.diff(other.seconds(table))))
+        if own > 0 and step > 0 and abs(step / own - 1) > ALIKE:
+            rates = f"{1 / own:.4g} and {1 / step:.4g} rows a second"
+            note(f"{best.name!r} and {other.name!r} disagree, {rates}: the former is read; --clock NAME chooses")
+
+
+def _with_unit(clock: Clock, table: Mapping[str, NDArray[Any]], dt: float | None) -> Clock:
+    """The clock with its unit, told by its numbers where its name does not say."""
+    column, values = clock.columns[0], table[clock.columns[0]]
+    if clock.units[0] is not None or values.dtype.kind not in "biuf" or values.ndim != 1:
+        return clock
+    known = values[np.isfinite(values)].astype(np.float64)
+    step = float(np.median(np.diff(known))) if len(known) > 2 else 0.0
+    if not step > 0 or known[0] >= EPOCHS[-1][0]:
+        return clock
+    moved = seconds_a_row(table) or dt
+    alike = [u for u in UNITS if moved is not None and abs(step * u / moved - 1) < ALIKE]
+    guessed = next((u for u in UNITS if 1.0 <= 1 / (step * u) <= 1000.0), 1.0)
+    unit = alike[0] if alike else guessed if step >= SLOWEST_WITHOUT_UNIT else 1.0
+    if unit != 1.0:
+        why = "as the motion says" if alike else "the unit that gives 1 to 1000 rows a second"
+        note(
+            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {UNITS[unit]}, {why}; "
+            f"--clock '{column} [s]' or --rate HZ says otherwise"
+        )
+    return Clock((column,), (unit,))
+
+
+def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock | None:
+    """A clock that is not called so: its numbers rise, and its name, their size, or a coarse clock tells the unit."""
+    for name, values in table.items():
+        if values.dtype.kind not in "biuf" or values.ndim != 1 or len(values) < 3 or not np.isfinite(values).all():
+            continue
+        if any(name in clock.columns for clock in coarse) or not np.mean(np.diff(values) > 0) > 1 - MOST_DOUBLED:
+            continue
+        unit = _named_unit(name) or (_epoch(float(values[0])) if values[0] >= EPOCHS[1][0] else None)
+        span = float(values[-1]) - float(values[0])
+        for clock in coarse if unit is None else ():
+            whole = float(np.ptp(clock.seconds(table)))
+            unit = next((u for u in UNITS if whole > 0 and abs(span * u / whole - 1) < ALIKE), None)
+        if unit is not None:
+            return Clock((name,), (unit,))
     return None
 
 
-def timing_of(table: Mapping[str, NDArray[Any]]) -> Timing | None:
-    """Return when the rows of a table were sensed; None without a clock. Raises ValueError where it cannot be read."""
-    clock = clock_among(table)
-    if clock is None:
-        return None
-    times = clock.seconds(table[clock.column])
-    again = np.concatenate([[False], np.diff(times) == 0.0])
-    if again.any() and again.mean() <= MOST_DOUBLED:
-        note(f"{int(again.sum())} rows have the same time as the one before, and are left out")
-        kept = np.flatnonzero(~again)
-    else:
-        kept = np.arange(len(times))
-    return Timing(clock, times[kept], kept, period(times[kept]))
-
-
-def period(times: Floats) -> float | None:
-    """Return the seconds from row to row in the mean, lost rows counted; None of fewer than two rows."""
-    if len(times) < 2:
-        return None
-    if not np.isfinite(times).all():
-        row = int(np.argmin(np.isfinite(times)))
-        raise ValueError(f"time must be a number in every row, got {times[row]} in row {row}")
-    steps = np.diff(times)
-    if not np.all(steps > 0):
-        row = int(np.argmin(steps > 0)) + 1
-        raise ValueError(
-            f"time must increase from row to row, got {times[row - 1]:g} s before {times[row]:g} s: cut the log there"
-        )
-    median = float(np.median(steps))
-    counts = np.rint(steps / median)
-    near = counts >= 1
-    if np.mean(near & (np.abs(steps / median - counts) <= NEARLY)) >= MOSTLY:
-        mean = float(steps[near].sum() / counts[near].sum())
-    else:
-        mean = float(steps[steps <= FAR * median].mean())
-    return float(f"{mean:.6g}")  # stamps jitter, and rates that differ by rounding would be two rates
-
-
-def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
-    """Return rows (T, D) as rows that are ``dt`` [s] apart, NaN where one was lost; unchanged where they are."""
-    steps = np.diff(times) / dt
-    whole = np.rint(steps)
-    size = int(np.sum(steps)) + 1
-    if size > MOST_LOST * len(times) + 600 / dt:
-        gap = int(np.argmax(steps))
-        raise ValueError(f"time jumps by {steps[gap] * dt:g} s after {times[gap]:g} s: cut the log there")
-    steady = abs(float(steps.sum() / max(whole.sum(), 1)) - 1) <= DRIFT
-    if steady and np.all(whole >= 1) and np.all(np.abs(steps - whole) <= JITTER):
-        places = np.concatenate([[0], np.cumsum(whole)]).astype(np.intp)
-        if len(places) == places[-1] + 1:
-            return rows
-        placed = np.full((places[-1] + 1, rows.shape[1]), np.nan)
-        placed[places] = rows
-        return placed
-    due = times[0] + dt * np.arange(size)
-    far = FAR * max(dt, float(np.quantile(steps, 0.9)) * dt)
-    after = np.clip(np.searchsorted(times, due), 1, len(times) - 1)
-    unknown = (times[after] - times[after - 1] > far) & (times[after] != due) & (times[after - 1] != due)
-    interpolated = np.column_stack([np.interp(due, times, column) for column in rows.T])
-    interpolated[unknown] = np.nan
-    return interpolated
+def seconds_a_row(table: Mapping[str, NDArray[Any]]) -> float | None:
+    """Return the seconds from row to row by which velocities explain the differences of positions; None without any."""
+    found = []
+    names = {split_unit(name)[0]: name for name in table}
+    for bare, name in names.items():
+        for speed, position in _SPEEDS.items():
+            other = names.get(re.sub(rf"(?<![A-Za-z]){speed}(?![A-Za-z])", position, bare, count=1, flags=re.I), name)
+            pair = table[other], table[name]
+            if other == name or any(x.dtype.kind not in "biuf" or x.ndim != 1 or len(x) < 8 for x in pair):
+                continue
+            moved, speeds = np.gradient(pair[0].astype(np.float64)), pair[1].astype(np.float64)
+            use = np.isfinite(moved) & np.isfinite(speeds)
+            power = float(speeds[use] @ speeds[use])
+            if power > 0 and np.corrcoef(moved[use], speeds[use])[0, 1] > 0.9:
+                scale = (ratio(split_unit(other)[1], "rad") or 1.0) / (ratio(split_unit(name)[1], "rad/s") or 1.0)
+                found.append(scale * float(moved[use] @ speeds[use]) / power)
+    return float(np.median(found)) if found and np.median(found) > 0 else None

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
 from asm_gym.data.channels import read_recorded
+from asm_gym.data.columns import LogLayout
 from asm_gym.files import regular_file
+from asm_gym.readings import spans as spans
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
@@ -125,22 +127,29 @@ class Episode:
         rate: float | None = None,
         action: Sequence[str] = (),
         labels: Sequence[str] = (),
+        ignore: Sequence[str] = (),
+        clock: str = "",
         **fields: Any,
     ) -> Episode:
         """Make an episode from a log.
 
         Args:
             frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
-            channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all columns of numbers.
+            channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all that sense.
             rate: rows a second [Hz]; by default that of its clock.
             action: patterns of the commanded columns.
             labels: patterns of further columns that label faults.
+            ignore: patterns of columns that are left out.
+            clock: the column of times, perhaps with a unit, ``"tick [ms]"``; by default the steadiest.
             fields: other arguments of ``Episode``.
 
         Raises:
             ValueError: bad columns; the rate is unknown or differs from the spec's; time runs backwards.
         """
-        found = read_recorded(frame, channels, rate, action, labels)
+        spec = channels if isinstance(channels, StreamSpec) else None
+        chosen = () if spec is not None else tuple(channels or ())
+        layout = LogLayout(spec, rate, action, chosen, labels, ignore=ignore, clock=clock)
+        found = read_recorded(frame, layout)
         return cls(found.stream, found.spec, **{"faults": found.faults} | fields)
 
 
@@ -201,9 +210,3 @@ def load_episode(path: str | Path) -> Episode:
         raise
     except (*DAMAGE, TypeError) as error:
         raise ValueError(f"{path} is damaged or no episode that can be read: {error}") from error
-
-
-def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
-    edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
-    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))

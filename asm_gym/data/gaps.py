@@ -13,13 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import spans
+from asm_gym.readings import spans
 from asm_gym.validation import check_number
 
 Floats = NDArray[np.floating[Any]]
 
+BRIDGED_ROWS = 2  # rows that are bridged where nobody says for how long
 PAID_BACK = 0.1  # of a second that is whole, how much may be missing for good: a tenth of all rows
 SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"  # why there is an alarm
+
+
+def bridge_of(seconds: float | None, dt: float) -> float:
+    """Return for how long something may be missing [s]: two rows of ``dt`` [s], where nobody says it."""
+    return BRIDGED_ROWS * dt if seconds is None else seconds
 
 
 class Bridge:

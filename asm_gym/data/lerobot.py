@@ -17,8 +17,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from asm_gym.data.arrays import read_parquet
-from asm_gym.data.channels import as_array
-from asm_gym.data.text import Columns
+from asm_gym.data.tables import Columns, as_array
 
 INFO = Path("meta") / "info.json"
 
@@ -54,15 +53,22 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
             rows = index == episode
             success = bool(columns["next.success"][rows].any()) if "next.success" in columns else True
             found = {name: as_array(columns[name][rows]) for name in read}
-            yield {k: v for name in read for k, v in _split(name, found[name], read[name])}, rate, success
+            made = {k: v for name in read for k, v in _split(name, found[name], read[name])}
+            stamps = {"timestamp": columns["timestamp"][rows]} if "timestamp" in columns else {}
+            yield stamps | made, rate, success  # frames that were lost are known by the stamps alone
 
 
 def _names(feature: dict[str, Any]) -> list[str]:
     """Names of the numbers of a feature, in a list or in lists by what they name; empty where they have none."""
     names = feature.get("names") or []
-    lists = names.values() if isinstance(names, dict) else [names]
-    found = [str(name) for part in lists if isinstance(part, list) for name in part]
+    found = list(_words(list(names.values()) if isinstance(names, dict) else names))
     return found if len(set(found)) == len(found) else []
+
+
+def _words(names: Any) -> Iterator[str]:
+    """The names in lists at any depth."""
+    for name in names if isinstance(names, list) else []:
+        yield from _words(name) if isinstance(name, list) else [str(name)]
 
 
 def _split(name: str, values: NDArray[Any], names: Sequence[str]) -> Iterator[tuple[str, NDArray[Any]]]:

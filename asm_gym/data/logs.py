@@ -1,71 +1,50 @@
 """Read recordings of any kind as episodes, one after another: run folders, datasets, and logs from elsewhere.
 
-A new format is one row of ``FILES``: a function from a file to its columns, by the suffix.
+A new format is one row of ``FILES``: a function from a file to its columns, by the suffix. What the columns of a folder
+are is decided once, by its first tables, and all others are read so.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from glob import escape
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from asm_gym.checkpoint import read_arrays
-from asm_gym.data.arrays import read_array, read_parquet
+from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
+from asm_gym.data.channels import clock_of, read_recorded
+from asm_gym.data.columns import LogLayout
 from asm_gym.data.datasets import METADATA, read_dataset
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot import INFO, read_lerobot
-from asm_gym.data.names import is_clock, is_command, is_label
-from asm_gym.data.text import Columns, read_json_lines, read_text
-from asm_gym.spec import MOTOR, StreamSpec
+from asm_gym.data.reader_notes import note
+from asm_gym.data.tables import Columns, laid_out, table_of
+from asm_gym.data.text import read_json_lines, read_text
+from asm_gym.data.timing import recordings
 from asm_gym.validation import typed
-
-
-@dataclass(frozen=True)
-class LogLayout:
-    """How to read logs; most are arguments of ``Episode.from_table``."""
-
-    spec: StreamSpec | None = None  # of the memory that is to read them
-    rate: float | None = None  # rows a second [Hz]
-    action: Sequence[str] = ()  # patterns of the columns that were commanded
-    channels: Sequence[str] = ()  # patterns of the columns that are read; all where empty
-    labels: Sequence[str] = ()  # patterns of the columns that say what is wrong, beside those that are called so
-    columns: Sequence[str] = ()  # names of the columns of files without a header
-    by_name: bool = False  # without an ``action``, columns that are called so were commanded
-
-    def episode(self, columns: Any) -> Episode:
-        """Return the episode of a table; it is a success, for somebody handed it over as one."""
-        chosen = self.spec or (list(self.channels) if self.channels else None)
-        read = partial(Episode.from_table, columns, chosen, self.rate, labels=self.labels, success=True)
-        found = read(action=() if self.spec else self.action)
-        if self.spec or self.action or not self.by_name:
-            return found
-        channels = found.spec.channels
-        named = [escape(c.name) for c in channels if c.group != MOTOR and is_command(c.name)]
-        return read(action=named) if 0 < len(named) < len(channels) else found
-
-    def keeps(self, name: str) -> bool:
-        """Tell whether the words of a column say a time or a label."""
-        return is_clock(name) or is_label(name, self.labels)
-
 
 FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
     ".npz": lambda path, layout: read_arrays(path),
     ".npy": lambda path, layout: read_array(path, layout.columns),
     ".parquet": lambda path, layout: read_parquet(path),
-    **dict.fromkeys((".csv", ".tsv", ".txt"), lambda path, layout: read_text(path, layout.columns, layout.keeps)),
-    **dict.fromkeys((".jsonl", ".ndjson"), lambda path, layout: read_json_lines(path, layout.columns, layout.keeps)),
+    ".mat": lambda path, layout: read_mat(path),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".log"), lambda path, layout: read_text(path, layout.columns)),
+    **dict.fromkeys((".jsonl", ".ndjson"), lambda path, layout: read_json_lines(path, layout.columns)),
     **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, layout: read_bag(path)),
 }
 """Reader of a file's columns, by its suffix."""
 
-ASKED_FOR = (".txt",)  # files that are read where they are named, and not where they lie in a folder: most are no logs
+HDF5 = (".hdf5", ".h5")  # files of several demonstrations, as robomimic writes them
+ASKED_FOR = (".txt", ".dat", ".log")  # read where they are named, and not in a folder: most are no logs
+POINTER = b"version https://git-lfs.github.com"
+FIRST_TABLES, FIRST_NUMBERS = (
+    20,
+    20_000_000,
+)  # by how many of a folder's tables, or numbers, it is decided what columns are
 
 
 class Log(NamedTuple):
@@ -73,6 +52,17 @@ class Log(NamedTuple):
 
     name: str
     episode: Episode
+
+
+class Source(NamedTuple):
+    """A recording as it was found: a table, or an episode of our own."""
+
+    name: str
+    columns: Columns
+    episode: Episode | None = None
+    rate: float | None = None  # that somebody meant it to have [Hz]
+    success: bool = True  # for somebody handed it over as one
+    file: str = ""  # it was read from
 
 
 @typed
@@ -87,24 +77,87 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
         FileNotFoundError: there is nothing of the kind.
         ValueError: a file cannot be read; the message names it.
     """
-    path, layout = Path(path), layout or LogLayout()
+    layout = layout or LogLayout()
+    if (Path(path) / INFO).is_file():
+        layout = replace(layout, action=layout.action or ("action*",))
+    sources, first = first_tables(read_tables(path, layout))
+    for source in sources:
+        episode = source.episode
+        if episode is None:
+            try:
+                others = [] if layout.spec else [other for other in first if other is not source.columns]
+                found = read_recorded(source.columns, replace(layout, nominal=source.rate), others)
+            except ValueError as error:
+                raise ValueError(f"{source.file or source.name}: {error}") from error
+            fields = {"faults": found.faults, "success": source.success}
+            episode = Episode(found.stream, found.spec, **fields)  # type: ignore[arg-type]
+        layout = replace(layout, spec=layout.spec or episode.spec)  # the others are read as the first one was
+        yield Log(source.name, episode)
+
+
+def first_tables(sources: Iterator[Source]) -> tuple[Iterator[Source], list[Columns]]:
+    """Return the sources, and the tables of the first of them, by which it is decided what columns are."""
+    first, numbers = list[Source](), 0
+    for source in islice(sources, FIRST_TABLES):
+        first.append(source)
+        numbers += sum(values.size for values in source.columns.values())
+        if numbers > FIRST_NUMBERS or source.episode is not None:
+            break
+    return chain(first, sources), [source.columns for source in first if source.episode is None]
+
+
+def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
+    """Yield the recordings at ``path`` as they are in their files: a column a sense, a row a moment."""
+    path = Path(path)
     files = _files_at(path)
     if (path / INFO).is_file():
-        yield from _lerobot(path, layout)
+        for n, (columns, rate, success) in enumerate(read_lerobot(path)):
+            yield from _parts(Source(f"episode {n}", columns, None, rate, success), layout)
     elif files:
         root = path / "episodes" if (path / "episodes").is_dir() else path
         for file in files:
+            name = str(file.relative_to(root)) if file != path else file.name
             try:
-                ours = file.suffix == ".npz" and _is_episode(file)
-                episode = load_episode(file) if ours else layout.episode(FILES[file.suffix](file, layout))
+                with file.open("rb") as opened:
+                    if opened.read(len(POINTER)) == POINTER:
+                        raise ValueError("it is a pointer of Git LFS and not the file itself: run git lfs pull")
+                if file.suffix == ".npz" and _is_episode(file):
+                    yield Source(name, {}, load_episode(file))
+                elif file.suffix in HDF5:
+                    for part, (columns, rate, success) in read_hdf5(file).items():
+                        source = Source(f"{name} {part}".strip(), columns, None, rate, success, str(file))
+                        yield from _parts(source, layout)
+                else:
+                    yield from _parts(Source(name, FILES[file.suffix](file, layout), file=str(file)), layout)
             except (ValueError, zipfile.BadZipFile) as error:
                 raise ValueError(f"{file}: {error}") from error
-            layout = replace(layout, spec=layout.spec or episode.spec)  # the others are read as the first one was
-            yield Log(str(file.relative_to(root)) if file != path else file.name, episode)
     else:
         if next(path.rglob(METADATA), None) is None:
-            raise FileNotFoundError(f"{path} holds no episodes: no {', '.join(FILES)}, no LeRobot or Minari dataset")
-        yield from (Log(f"episode {n}", episode) for n, episode in enumerate(read_dataset(path)))
+            known = ", ".join((*FILES, *HDF5))
+            raise FileNotFoundError(f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset")
+        yield from (Source(f"episode {n}", {}, episode) for n, episode in enumerate(read_dataset(path)))
+
+
+def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
+    """The recordings in a table: it is cut where its clock begins anew, or leaps."""
+    table = laid_out(table_of(source.columns))
+    if not table or not max(map(len, table.values())):
+        raise ValueError(f"it holds no row of numbers, got {', '.join(table)[:200] or 'no column'}")
+    if len({len(values) for values in table.values()}) > 1:
+        yield source._replace(columns=table)  # refused, with the lengths
+        return
+    try:
+        clock = clock_of(table, layout)
+        parts = recordings(clock.seconds(table)) if clock is not None else []
+    except ValueError:
+        parts = []
+    if len(parts) < 2:
+        yield source._replace(columns=table)
+        return
+    note(f"{source.name}: time begins anew or leaps {len(parts) - 1} times, and the log is cut there")
+    for n, (start, stop) in enumerate(parts, 1):
+        part = {name: values[start:stop] for name, values in table.items()}
+        yield source._replace(name=f"{source.name} part {n}", columns=part)
 
 
 def _files_at(path: Path) -> list[Path]:
@@ -112,38 +165,14 @@ def _files_at(path: Path) -> list[Path]:
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
     if path.is_file():
-        if path.suffix not in FILES:
-            raise ValueError(f"{path}: files that can be read end in {', '.join(FILES)}")
+        if path.suffix not in (*FILES, *HDF5):
+            raise ValueError(f"{path}: files that can be read end in {', '.join((*FILES, *HDF5))}")
         return [path]
     root = path / "episodes" if (path / "episodes").is_dir() else path
-    found = (f for f in root.rglob("*") if f.suffix in FILES and f.suffix not in ASKED_FOR)
+    found = (f for f in root.rglob("*") if f.suffix in (*FILES, *HDF5) and f.suffix not in ASKED_FOR)
     return sorted(f for f in found if not any(part.startswith(".") for part in f.relative_to(root).parts))
 
 
 def _is_episode(path: Path) -> bool:
     with zipfile.ZipFile(path) as file:
         return "header.json" in file.namelist()
-
-
-def read_tables(path: str | Path, layout: LogLayout) -> Iterator[tuple[str, Columns]]:
-    """Yield the columns of the logs at ``path`` as they are in their files, by name; of datasets, their streams."""
-    path = Path(path)
-    files = _files_at(path)
-    if not files or (path / INFO).is_file() or any(f.suffix == ".npz" for f in files):
-        for name, episode in read_logs(path, layout):
-            rows = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}
-            yield name, {"time": np.arange(len(episode)) * episode.spec.dt} | rows
-        return
-    for file in files:
-        try:
-            yield file.name, FILES[file.suffix](file, layout)
-        except ValueError as error:
-            raise ValueError(f"{file}: {error}") from error
-
-
-def _lerobot(folder: Path, layout: LogLayout) -> Iterator[Log]:
-    for n, (columns, rate, success) in enumerate(read_lerobot(folder)):
-        known = replace(layout, rate=layout.rate or rate, action=layout.action or ("action*",))
-        episode = replace(known.episode(columns), success=success)
-        layout = replace(layout, spec=layout.spec or episode.spec)
-        yield Log(f"episode {n}", episode)

@@ -1,4 +1,4 @@
-"""Read the name of a column: its unit, and its role as a clock, a label, a counter, a command or a sense."""
+"""Read the name of a column: its unit, its channel, and whether it is a clock, a label or a command by name."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ import re
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import cache
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+TAU = 2 * math.pi
 UNITS = {
     name: (base, size)
     for base, sizes in {
@@ -41,7 +39,14 @@ SECONDS = {
 # Names of columns that count rows.
 COUNTERS = ("", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0")
 
-_OF = r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|recording)"
+TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fromkeys(("rad", "radian", "radians"), TAU)
+"""A whole turn, by the unit of an angle."""
+TURNED = ("sin", "cos")  # elements of a channel that stands for an angle which turns over
+
+_OF = (
+    r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|recording|record|recv|"
+    r"receive|received|publish|device|sim|wall)"
+)
 _WHAT = r"(?:time[ _]?stamps?|time|stamp|date[ _]?time|date)"
 _UNIT = "|".join(sorted(map(re.escape, SECONDS), key=len, reverse=True))
 CLOCK = re.compile(
@@ -55,21 +60,54 @@ def _word(words: str) -> re.Pattern[str]:
     return re.compile(rf"(.*[^a-z])?({words})([^a-z].*)?", re.I)
 
 
-LABEL = _word("labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|grip_?lost")
-COMMAND = _word("target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|action")
-SPEED = _word("vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel")
-POSITION = _word("pos|position|positions|angles?|q|qpos|joint_pos")
+LABEL = _word(
+    "labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|grip_?lost|y_true|ground_?truth|outliers?"
+)
+COMMAND = _word("target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?")
+_SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
+_PLACES = "pos|position|positions|angles?|q|qpos|joint_pos"
+SPEED, POSITION = _word(_SPEEDS), _word(_PLACES)
 
-ELEMENT = re.compile(r"(?P<stem>.*[^\W\d_])(?:\[(?P<named>\w+)\]|[_.]?(?P<number>\d+))")
-"""One of several numbers of a channel: ``joint[0]``, ``joint_0``, ``position[elbow]``."""
+SENSE = _word(f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|temperatures?|voltages?|pressures?")
+
+_ELEMENT = re.compile(r"(?P<of>.+)\[(?P<named>[\w./ -]+)\]|(?P<stem>.*[^\W\d_])[_.]?(?P<number>\d+)")
 
 _WITH_UNIT = re.compile(r"(?P<name>.*\S)\s+[\[(](?P<unit>[^\[\]()]+)[\])]")
+_UNIT_AT_ONCE = re.compile(r"(?P<name>.*\S)[\[(](?P<unit>[^\[\]()]+)[\])]")  # q1(deg)
+_UNIT_BEHIND = re.compile(r"(?P<name>.+)_(?P<unit>deg|rad|mm|Nm|mA|rpm)")  # q1_deg
 
 
+class Element(NamedTuple):
+    """One of several numbers of a channel: ``joint[0]``, ``joint_0``, ``position[elbow]``."""
+
+    channel: str
+    name: str
+    named: bool  # in brackets: a number behind a name may be no element
+
+
+@cache
+def element_of(name: str) -> Element | None:
+    """Return the channel and the element that a name says; None where it says none."""
+    found = _ELEMENT.fullmatch(name)
+    if found is None:
+        return None
+    named = found["named"] is not None
+    return Element(found["of"] if named else found["stem"], found["named"] if named else found["number"], named)
+
+
+@cache
 def split_unit(column: str) -> tuple[str, str]:
-    """Return a column's name and unit: ``joint_0`` and ``rad`` of ``joint_0 [rad]``; the unit may be empty."""
-    found = _WITH_UNIT.fullmatch(column)
-    return (found["name"], found["unit"]) if found else (column, "")
+    """Return a column's name and unit: ``joint_0`` and ``rad`` of ``joint_0 [rad]``; the unit may be empty.
+
+    ``q1(deg)`` and ``q1_deg`` say it too; ``yaw_deg``, which is no element of a channel, keeps its name.
+    """
+    if found := _WITH_UNIT.fullmatch(column):
+        return found["name"], found["unit"]
+    if (found := _UNIT_AT_ONCE.fullmatch(column)) and (found["unit"] in UNITS or found["unit"] in SECONDS):
+        return found["name"], found["unit"]
+    if found := _UNIT_BEHIND.fullmatch(column):
+        return found["name"] if element_of(found["name"]) else column, found["unit"]
+    return column, ""
 
 
 def ratio(unit: str, other: str) -> float | None:
@@ -89,11 +127,10 @@ def factor(name: str, own: str, unit: str) -> float:
     return found
 
 
-@cache
 def label_of(name: str) -> str:
     """Return what a stream calls the number of a column: ``joint[0]`` of ``joint_0``."""
-    found = ELEMENT.fullmatch(name)
-    return f"{found['stem']}[{found['named'] or found['number']}]" if found else name
+    found = element_of(name)
+    return f"{found.channel}[{found.name}]" if found else name
 
 
 def is_clock(name: str) -> bool:
@@ -109,25 +146,3 @@ def is_label(name: str, patterns: Sequence[str] = ()) -> bool:
 def is_command(name: str) -> bool:
     """Tell whether a column was commanded and not sensed."""
     return COMMAND.fullmatch(name) is not None
-
-
-def is_counter(name: str, values: NDArray[Any]) -> bool:
-    """Tell whether a column (T,) counts rows: each is one more than the one before, but for rows that were lost."""
-    if name.lower() not in COUNTERS or len(values) < 2 or values.dtype.kind not in "biuf":
-        return False
-    steps = np.diff(values.astype(np.float64))
-    return bool((steps >= 1).all() and (steps == np.rint(steps)).all() and np.median(steps) == 1)
-
-
-def role_of(column: str, values: NDArray[Any], labels: Sequence[str] = ()) -> str:
-    """Return the role of a column (T,): clock, label, words, counter, command or sense; ``labels`` are patterns."""
-    name, _ = split_unit(column)
-    if is_clock(column):
-        return "clock"
-    if is_label(name, labels):
-        return "label"
-    if values.dtype.kind not in "biuf":
-        return "words"
-    if is_counter(name, values):
-        return "counter"
-    return "command" if is_command(name) else "sense"

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import RESAMPLED
-from asm_gym.data.clock import Clock, clock_among
-from asm_gym.data.names import factor, label_of, split_unit
+from asm_gym.data.channels import RESAMPLED, ColumnPlan
+from asm_gym.data.clock import EPOCHS, SLOWEST_WITHOUT_UNIT, UNITS, Clock, clocks_among
+from asm_gym.data.tables import Named, named_columns, named_row
 from asm_gym.data.text import Dialect, check_cells, flat_row, header_of
 from asm_gym.spec import StreamSpec
 
@@ -102,8 +102,10 @@ class RowReader:
         self.spec, self.line = spec, 0
         self._dialect = Dialect(",", comma=False)
         self._header: list[str] | None = None  # of CSV
-        self._columns: list[tuple[str, float]] | None = None  # of each number of the stream, and its factor
+        self._plan: ColumnPlan | None = None  # of rows by name
+        self._named: Named = {}  # columns that name others
         self._clock: Clock | None = None
+        self._first: float | None = None  # number of a clock whose unit is not known yet
         self._pace = Pace(spec.dt)
         self._known = False  # a row was read
 
@@ -133,7 +135,9 @@ class RowReader:
             return False
         self._dialect = Dialect.of(line)
         header = header_of(self._dialect.cells(line), "the header")
-        self._match(header)
+        self._named = named_columns(header)
+        if not self._named:
+            self._match(header)
         self._header = header
         return True
 
@@ -155,17 +159,14 @@ class RowReader:
 
     def _match(self, names: Iterable[str]) -> None:
         """Find the column of each label, and the clock. Raises ValueError where a column is missing."""
-        bare = {name: split_unit(name)[0] for name in names}
-        places = {label_of(b): name for name, b in bare.items()} | {b: name for name, b in bare.items()}
-        labels = {label: label for label in self.spec.labels}
-        for channel in self.spec.channels:  # a list by its channel's name
-            labels |= {label: f"{channel.name}[{k}]" for k, label in enumerate(channel.labels) if label not in places}
-        missing = [label for label, name in labels.items() if name not in places]
-        if missing:
-            raise ValueError(f"it lacks {', '.join(missing)}")
-        headers = [places[name] for name in labels.values()]
-        self._columns = [(h, factor(*split_unit(h), unit)) for h, unit in zip(headers, self.spec.units, strict=True)]
-        self._clock = clock_among(bare)
+        names = list(names)
+        plan = ColumnPlan(names, self.spec)
+        doubled = [name for name in plan.columns if names.count(name) > 1]
+        if doubled:
+            raise ValueError(f"it has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
+        self._plan = plan
+        read = set(self._plan.columns)
+        self._clock = next((clock for clock in clocks_among(names) if not read & set(clock.columns)), None)
 
     def _numbers(self, line: str) -> tuple[NDArray[np.float64], float | None]:
         """The numbers of a row (D,), and its time [s] where it has one."""
@@ -180,15 +181,30 @@ class RowReader:
         for channel in self.spec.channels:
             if isinstance(part := row.get(channel.name), list) and len(part) != channel.size:
                 raise ValueError(f"{channel.name} must hold {channel.size} numbers, got {len(part)}")
-        if self._columns is None:
-            self._match(flat)
         return self._by_name(flat, lambda value: float("nan" if value is None else value))
 
     def _by_name(
         self, row: Mapping[str, Any], number: Callable[[Any], float]
     ) -> tuple[NDArray[np.float64], float | None]:
         """The numbers and the time of a row by name; a number that the row lacks is NaN."""
-        assert self._columns is not None
-        numbers = [number(row.get(name)) * scale if name in row else np.nan for name, scale in self._columns]
-        stamp = row.get(self._clock.column) if self._clock else None
-        return np.array(numbers), None if stamp is None or self._clock is None else self._clock.moment(str(stamp))
+        row = named_row(row, self._named) if self._named else row
+        if self._plan is None:
+            self._match(row)
+        assert self._plan is not None
+        numbers = self._plan.row({name: number(row[name]) for name in self._plan.columns if name in row})
+        return numbers, self._moment(row)
+
+    def _moment(self, row: Mapping[str, Any]) -> float | None:
+        """The time of a row [s]; the unit of a clock that says none is the one that fits the memory's rate best."""
+        if self._clock is None or (stamp := self._clock.moment(row)) is None:
+            return None
+        first, self._first = self._first, stamp if self._first is None else self._first
+        if first is not None and self._clock.units == (None,) and stamp < EPOCHS[-1][0]:
+            step = stamp - first
+            fits = min(UNITS, key=lambda unit: abs(np.log(step * unit / self.spec.dt))) if step > 0 else 1.0
+            unit = fits if step >= SLOWEST_WITHOUT_UNIT else 1.0
+            self._clock, stamp = Clock(self._clock.columns, (unit,)), stamp * unit
+            if unit != 1.0:
+                self._pace = Pace(self.spec.dt)
+                self._pace.lost(first * unit)
+        return stamp

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode, spans
+from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
-from asm_gym.readings import noise_of
+from asm_gym.readings import noise_of, spans
 from asm_gym.spec import MOTOR
 
 SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]

@@ -1,8 +1,10 @@
 """Read the columns of text through pandas: CSV of any country, tables without a header, and JSON lines.
 
-separator   the one of ; tab , | that the first line holds most of, or else blanks
+separator   the one of ; tab , | that the header holds most of, or else blanks
 decimals    a point; where the separator is no comma, a comma too: 0,1096
-header      names, perhaps behind a # or with blanks; without one, columns are named by the caller
+header      names, perhaps behind a # or with blanks, below a preamble; without one, columns are named by the caller
+units       may stand in a line of their own below the header
+twice       a header that comes again is left out; columns of one name are one where they are equal
 last line   cut off in the middle: left out, with a note
 """
 
@@ -12,8 +14,7 @@ import csv
 import io
 import json
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,21 +22,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import is_clock, split_unit
+from asm_gym.data.names import split_unit
 from asm_gym.data.reader_notes import note
+from asm_gym.data.tables import Columns
 from asm_gym.files import regular_file
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Columns = dict[str, NDArray[Any]]
-KeepWords = Callable[[str], bool]
 
 LONGEST_WORD = 64  # characters that are kept of a word, of a label or a time
 MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
 LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
 SEPARATORS = ";\t,|"
 FLAGS = {"true": 1.0, "false": 0.0}
+DOUBLED = " #"  # stands, with a number, behind the name of a column that another has
+MOST_PREAMBLE, AGREE = 50, 5  # lines above a header; lines below it that must have as many cells
+LONGEST_UNIT = 12  # characters of a unit
+_HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
 
 
 class Dialect(NamedTuple):
@@ -78,21 +82,31 @@ class Dialect(NamedTuple):
         return False
 
 
-def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clock) -> Columns:
-    """Return the columns of numbers of a table of text; an empty cell is NaN, true and false are 1 and 0.
+def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
+    """Return the columns of a table of text; an empty cell is NaN, true and false are 1 and 0, words stay words.
 
-    ``columns`` name those of a table without a header; words are kept of columns that ``keeps`` chooses by name. Raises
-    ValueError where it is no table: no header or no row, a name twice, rows of several lengths, words among numbers.
+    ``columns`` name those of a table without a header. Raises ValueError where it is no table: no header or no row, or
+    rows of several lengths.
     """
     import pandas as pd
 
     numbered, complete = _lines(path)
     if not numbered:
         raise ValueError("it needs a header and at least one row, got 0 lines")
-    first, rows = numbered[0][1], numbered[1:]
+    at = 0 if columns else _header_at([line for _, line in numbered[: MOST_PREAMBLE + AGREE]])
+    if at:
+        note(f"{path}: its first {at} lines are no part of the table, and are left out")
+    first, rows = numbered[at][1], numbered[at + 1 :]
     dialect = Dialect.of(first)
     names, has_header = _header(dialect, first, columns)
     rows = rows if has_header else numbered
+    if len(rows) > 1 and has_header and _are_units(dialect, rows[0][1], rows[1][1]):
+        units = [cell.strip() for cell in dialect.cells(rows.pop(0)[1])]
+        names = [f"{n} [{u.strip('[]()')}]" if u and n else n for n, u in zip(names, units, strict=False)]
+    again = sum(line.strip() == first.strip() for _, line in rows) if has_header else 0
+    if again:
+        note(f"{path}: its header stands there {again + 1} times, and is left out")
+        rows = [(n, line) for n, line in rows if line.strip() != first.strip()]
     if not complete and len(rows) > 1 and _cut_off(dialect, rows[-2][1], rows[-1][1], len(names)):
         note(f"{path}: its last line was cut off, and is left out")
         rows = rows[:-1]
@@ -114,7 +128,50 @@ def read_text(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clo
         )
     except ValueError as error:
         raise ValueError(f"it is no table of text: {' '.join(str(error).split())}") from error
-    return _numbers({name: frame[k] for k, name in enumerate(names)}, keeps, dialect.comma, rows[0][0])
+    cells = [_column(frame[k], dialect.comma) for k in range(len(names))]
+    return _merged([(n, c) for n, c in zip(names, cells, strict=True) if n or c.dtype.kind == "O" or _any(c)])
+
+
+def _any(values: NDArray[Any]) -> bool:
+    return bool(np.isfinite(values).any())
+
+
+def _header_at(lines: Sequence[str]) -> int:
+    """The number of the line that is the header: those below it have as many cells, and numbers among them."""
+    for at, line in enumerate(lines[:MOST_PREAMBLE]):
+        dialect = Dialect.of(line)
+        with suppress(ValueError):
+            size = len(_cells_of_header(dialect, line))
+            below = [dialect.cells(other) for other in lines[at + 1 : at + 1 + AGREE]]
+            agree = [len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below]
+            numbers = [sum(dialect.is_number(c) for c in cells[:size] if c.strip()) for cells in below]
+            if below and all(agree) and max(numbers) > 0 and numbers[-1] > 0:
+                return at
+    return 0
+
+
+def _are_units(dialect: Dialect, line: str, below: str) -> bool:
+    """Whether the line below a header holds units: short words where the next line has numbers."""
+    cells = [cell.strip() for cell in dialect.cells(line)]
+    given = [cell for cell in cells if cell]
+    words = given and all(len(c) <= LONGEST_UNIT and not dialect.is_number(c) for c in given)
+    return bool(words) and any(dialect.is_number(c) for c in dialect.cells(below) if c.strip())
+
+
+def _merged(columns: Sequence[tuple[str, NDArray[Any]]]) -> Columns:
+    """The columns by name; of one name, equal ones are one, and others get a number."""
+    made: Columns = {}
+    for name, values in columns:
+        same = [kept for kept in made if kept.partition(DOUBLED)[0] == name]
+        if any(_equal(made[kept], values) for kept in same):
+            note(f"columns of the same name are equal, and read as one: {name}")
+        else:
+            made[f"{name}{DOUBLED}{len(same) + 1}" if same else name] = values
+    return made
+
+
+def _equal(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
 def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
@@ -127,14 +184,23 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
     try:
         text = raw.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
-        text = raw.decode("cp1252", errors="replace")
-        note(f"{path} is not in UTF-8, and is read as Windows-1252")
+        if wide:
+            raise ValueError("it is no text") from None
+        text = "".join(map(_decoded, raw.removeprefix(b"\xef\xbb\xbf").splitlines(keepends=True)))
+        note(f"{path} is not in UTF-8 throughout: other lines are read as Windows-1252")
     lines = re.split(r"\r\n?|\n", text)
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip(" ")]
     n, longest = max(numbered, key=lambda each: len(each[1]), default=(0, ""))
     if len(longest) > LONGEST_LINE:
         raise ValueError(f"line {n} has {len(longest)} characters: at most {MOST_COLUMNS} columns can be watched")
     return numbered, text.endswith(("\n", "\r"))
+
+
+def _decoded(line: bytes) -> str:
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("cp1252", errors="replace")
 
 
 def check_cells(cells: Sequence[str], size: int, where: str) -> None:
@@ -149,32 +215,35 @@ def _cut_off(dialect: Dialect, before: str, last: str, size: int) -> bool:
     return len(cells) < size or any(dialect.is_number(was) and not dialect.is_number(now) for was, now in cells)
 
 
-def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
-    """Names of the columns, and whether the first line holds them."""
+def _cells_of_header(dialect: Dialect, line: str) -> list[str]:
     cells = dialect.cells(line)
     if len(cells) > 1 and cells[0] in ("#", "%"):  # in front of a header whose names are separated by blanks
-        cells = cells[1:]
+        return cells[1:]
+    return cells
+
+
+def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
+    """Names of the columns, and whether the first line holds them."""
+    cells = _cells_of_header(dialect, line)
     numbers = [dialect.is_number(cell) for cell in cells if cell.strip()]
     if columns:
         if len(columns) != len(cells):
             raise ValueError(f"{len(columns)} columns are named, and its first line has {len(cells)} cells")
-        return header_of(columns, "it"), not all(numbers)
-    if numbers and all(numbers):
-        raise ValueError(f"its first line is of {len(numbers)} numbers and no header: name its columns with --columns")
+        return header_of(columns, "it"), not any(numbers)
+    if numbers and sum(numbers) > len(numbers) / 2:
+        said = f"is of {len(numbers)} numbers" if all(numbers) else f"holds {sum(numbers)} numbers"
+        raise ValueError(f"its first line {said} and no header: name its columns with --columns")
     return header_of(cells, "it"), True
 
 
 def header_of(cells: Sequence[str], where: str) -> list[str]:
-    """Return the names of columns. Raises ValueError where there are none or too many, or one stands twice."""
+    """Return the names of columns. Raises ValueError where there are none or too many."""
     names = [cell.strip().lstrip("#%-").strip() if cell.strip() not in ("%", "#") else "" for cell in cells]
     while names and not names[-1]:  # ;;; at the end of every line
         names.pop()
     if not names:
         raise ValueError(f"{where} needs a header and at least one row, got 0 lines")
     _check_width(len(names))
-    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
-    if doubled:
-        raise ValueError(f"{where} has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
     return names
 
 
@@ -183,32 +252,31 @@ def _check_width(size: int) -> None:
         raise ValueError(f"it has {size} columns, and at most {MOST_COLUMNS} can be watched")
 
 
-def _numbers(series: Mapping[str, pd.Series[Any]], keeps: KeepWords, comma: bool, first: int) -> Columns:
-    """Columns of numbers, and the words of those that are kept. Raises ValueError where a column mixes the two."""
+def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
+    """Return the numbers (T,) of cells of text: decimals, true and false, 0x1f; NaN of empty cells and of words."""
     import pandas as pd
 
-    made: Columns = {}
-    for name, cells in series.items():
-        if cells.dtype.kind in "biuf":
-            if name or cells.notna().any():
-                made[name] = cells.to_numpy()
-            continue
-        text = cells.astype("string").str.strip()
-        plain = text.str.replace(",", ".", regex=False) if comma else text
-        values = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
-        empty = text.isna() | (text == "")
-        words = values.isna() & ~empty
-        if words.any() and keeps(name):
-            made[name] = text.fillna("").str[:LONGEST_WORD].to_numpy(dtype=object)
-        elif words.any() and not (words | empty).all():
-            row = int(np.argmax(words))
-            raise ValueError(f"{name}, line {row + first} must be a number, got {str(text.iloc[row])[:40]!r}")
-        elif not words.any():
-            made[name] = values.to_numpy(np.float64, na_value=np.nan)
-    return made
+    text = pd.Series(cells).astype("string").str.strip()
+    plain = text.str.replace(",", ".", regex=False) if comma else text
+    values = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
+    hexadecimal = text.str.fullmatch(_HEX).fillna(False)
+    if hexadecimal.any():
+        values[hexadecimal] = [float(int(cell, 16)) for cell in text[hexadecimal]]
+    return values.to_numpy(np.float64, na_value=np.nan)
 
 
-def read_json_lines(path: Path, columns: Sequence[str] = (), keeps: KeepWords = is_clock) -> Columns:
+def _column(cells: pd.Series[Any], comma: bool) -> NDArray[Any]:
+    """A column of numbers, or of words where it holds one."""
+    if cells.dtype.kind in "biuf":
+        return cells.to_numpy()
+    text = cells.astype("string").str.strip()
+    values = numbers_in(text, comma)
+    if np.isfinite(values[(text.notna() & (text != "")).to_numpy(bool)]).all():
+        return values
+    return text.fillna("").str[:LONGEST_WORD].to_numpy(dtype=object)
+
+
+def read_json_lines(path: Path, columns: Sequence[str] = ()) -> Columns:
     """Return the columns of a file with an object, or a list of numbers, on each line; a missing number is NaN."""
     import pandas as pd
 
@@ -226,7 +294,7 @@ def read_json_lines(path: Path, columns: Sequence[str] = (), keeps: KeepWords = 
     if not rows:
         raise ValueError("it needs at least one row, got none")
     frame = pd.DataFrame(rows)
-    return _numbers({name: frame[name] for name in frame.columns}, keeps, comma=False, first=numbered[0][0])
+    return {name: _column(frame[name], comma=False) for name in frame.columns}
 
 
 def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
@@ -237,14 +305,22 @@ def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
         row = dict(zip(columns, row, strict=True))
     if not isinstance(row, dict):
         raise ValueError(f"it must be an object or a list, got {str(row)[:40]}")
+    named = next((key for key in ("name", "names", "joint_names") if _is_words(row.get(key))), None)
+    words = row[named] if named else []
     found: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, dict):
             found |= {f"{name}.{part}": v for part, v in flat_row(value).items()}
         elif isinstance(value, list):
             bare, unit = split_unit(name)
-            names = (f"{bare}[{k}] [{unit}]" if unit else f"{bare}[{k}]" for k in range(len(value)))
+            elements = words if len(words) == len(value) else range(len(value))
+            names = (f"{bare}[{k}] [{unit}]" if unit else f"{bare}[{k}]" for k in elements)
             found |= {n: v for n, v in zip(names, value, strict=True) if isinstance(v, int | float) or v is None}
         else:
             found[name] = value
     return found
+
+
+def _is_words(value: Any) -> bool:
+    """Whether a value is a list of names, as messages of ROS have one of their joints."""
+    return isinstance(value, list) and bool(value) and all(isinstance(word, str) for word in value)

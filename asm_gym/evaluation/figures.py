@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from asm_gym.data.channels import Column
+from asm_gym.data.columns import Column
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection, is_constant
 from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements

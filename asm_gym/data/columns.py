@@ -1,0 +1,203 @@
+"""Decide for every column of a log what it is, once, by its name and by how it behaves in the first recordings.
+
+    label       by its name, or --label                command   by its name
+    clock       the chosen one, and others             counter   rises by a constant
+    constant    never moves, and stands alone          copy      equals another column
+    words       text; with some numbers it is refused  empty     holds no number
+    ignored     --ignore, or not among --channels      sense     all others
+
+``--channels`` brings back what was set aside by its behaviour.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.behaviour import FEWEST, code_of, counts, follows, is_constant, turn_of
+from asm_gym.data.clock import Clock, clocks_among
+from asm_gym.data.names import COUNTERS, SENSE, UNITS, element_of, is_command, is_label, split_unit
+from asm_gym.data.tables import is_numeric
+from asm_gym.data.text import DOUBLED, numbers_in
+from asm_gym.spec import StreamSpec
+
+READ = ("sense", "command")
+BY_BEHAVIOUR = ("constant", "counter", "pace", "copy")
+MIXED = 0.5  # share of numbers from which on a column with words is one of numbers
+
+
+@dataclass(frozen=True)
+class LogLayout:
+    """How to read logs; most are arguments of ``Episode.from_table``, and options of the commands."""
+
+    spec: StreamSpec | None = None  # of the memory that is to read them
+    rate: float | None = None  # rows a second [Hz], whatever the clock says
+    action: Sequence[str] = ()  # patterns of the columns that were commanded
+    channels: Sequence[str] = ()  # patterns of the columns that are read; all where empty
+    labels: Sequence[str] = ()  # patterns of the columns that say what is wrong, beside those that are called so
+    columns: Sequence[str] = ()  # names of the columns of files without a header
+    by_name: bool = False  # without an ``action``, columns that are called so were commanded
+    ignore: Sequence[str] = ()  # patterns of the columns that are left out
+    clock: str = ""  # the column of times, perhaps with a unit behind it; by default the steadiest
+    nominal: float | None = None  # rows a second that somebody meant them to have, where no clock says it [Hz]
+
+
+class Column(NamedTuple):
+    """A column of a log, and what is done with it."""
+
+    name: str  # without the unit
+    unit: str  # empty where the log does not say
+    role: str
+    channel: str  # which it belongs to
+    element: str  # of the channel; empty where it is the only one
+    values: NDArray[Any]  # (T,)
+    why: str = ""  # it has this role, and the option that changes that
+    turn: float = 0.0  # a whole turn of an angle that turns over; 0 of others
+    code: float = math.nan  # the number that stands for missing data
+
+    @property
+    def read(self) -> bool:
+        """Whether it is part of the stream."""
+        return self.role in READ
+
+    def matches(self, pattern: str) -> bool:
+        """Tell whether it or its channel is called so."""
+        return any(name == pattern or fnmatchcase(name, pattern) for name in (self.name, self.channel))
+
+
+def decide(
+    tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, clock: Clock | None, times: Sequence[Any] = ()
+) -> list[Column]:
+    """Return what is done with each column of the first of some tables, by all of them.
+
+    ``times`` are those of the rows of each table [s]; their numbers by default.
+    """
+    table = tables[0]
+    times = times or [np.arange(len(next(iter(t.values()), ())), dtype=np.float64) for t in tables]
+    named = _named(table)
+    made, seen = list[Column](), dict[bytes, str]()
+    for header, column in named.items():
+        every = [t[header] for t in tables if header in t]
+        role, why = _by_name(header, column, layout, clock, table)
+        chosen = any(column.matches(p) for p in (*layout.channels, *layout.action))
+        if role == "sense" and not chosen:
+            role, why = _by_behaviour(column, every, times)
+            same = seen.setdefault(np.ascontiguousarray(column.values, np.float64).tobytes(), column.name)
+            if role == "sense" and same != column.name and is_command(same) == is_command(column.name):
+                role, why = "copy", f"equals {same}"
+        if role == "sense":
+            role = "command" if is_command(column.name) else "sense"
+            turn = max(turn_of(values, column.unit) for values in every if is_numeric(values))
+            code = next((c for values in every if not math.isnan(c := code_of(values))), math.nan)
+            column = column._replace(turn=turn, code=code)
+        made.append(column._replace(role=role, why=why))
+    return [c._replace(why=_said(c)) for c in _restored(made)]
+
+
+def _named(table: Mapping[str, NDArray[Any]]) -> dict[str, Column]:
+    """The columns by their headers, with unit, channel and element."""
+    bare = {header: split_unit(header) for header in table}
+    found = {header: element_of(name) for header, (name, _) in bare.items() if is_numeric(table[header])}
+    stems = [element.channel for element in found.values() if element]
+    whole = {name for name, _ in bare.values()}
+    made = {}
+    for header, (name, unit) in bare.items():
+        element = found.get(header)
+        grouped = element and (element.named or stems.count(element.channel) > 1) and element.channel not in whole
+        channel, part = (element.channel, element.name) if element and grouped else (name, "")
+        made[header] = Column(name, unit, "sense", channel, part, table[header])
+    return made
+
+
+def _by_name(
+    header: str, column: Column, layout: LogLayout, clock: Clock | None, table: Mapping[str, NDArray[Any]]
+) -> tuple[str, str]:
+    """The role of a column by its name, by the options, and by the kind of its cells; else a sense."""
+    if any(column.matches(pattern) or header == pattern for pattern in layout.ignore):
+        return "ignored", "--ignore"
+    if clock is not None and header in clock.columns:
+        return "clock", "tells the time of rows"
+    if is_label(column.name, layout.labels):
+        return "label", "marks what is wrong, by its name"
+    if layout.channels and not any(column.matches(pattern) for pattern in layout.channels):
+        return "ignored", "not among --channels"
+    if any(header in other.columns for other in clocks_among(table)) and not layout.channels:
+        return "pace", "another clock"
+    if DOUBLED in header:
+        return "double", f"differs from another column of the name {header.partition(DOUBLED)[0]!r}"
+    if not is_numeric(column.values):
+        return _words(column)
+    if not np.isfinite(column.values).any():
+        return "empty", "holds no number"
+    return "sense", ""
+
+
+def _words(column: Column) -> tuple[str, str]:
+    """Whether a column of text holds words, or numbers with words among them."""
+    if column.values.dtype.kind in "Mm":
+        return "pace", "another clock"
+    empty = np.array([not str(cell).strip() for cell in column.values], np.bool_)
+    numbers = np.isfinite(numbers_in(column.values)) | empty
+    if empty.all():
+        return "empty", "holds nothing"
+    if numbers.mean() < MIXED or numbers[~empty].mean() < MIXED:
+        return "words", "holds words"
+    row = int(np.argmin(numbers))
+    return "mixed", f"must hold numbers, got {str(column.values[row])[:40]!r} in row {row + 1}"
+
+
+def _by_behaviour(
+    column: Column, every: Sequence[NDArray[Any]], times: Sequence[NDArray[np.float64]]
+) -> tuple[str, str]:
+    """The role of a column of numbers by what it does in every table."""
+    if all(map(is_constant, every)):
+        return "constant", "never moves"
+    if column.unit in UNITS or SENSE.fullmatch(column.name):
+        return "sense", ""
+    moving = [(values, t) for values, t in zip(every, times, strict=False) if not is_constant(values)]
+    fewest = 2 if column.name.lower() in COUNTERS else FEWEST
+    if all(counts(values, fewest) for values, _ in moving):
+        return "counter", "rises by a constant"
+    if all(len(values) == len(t) and follows(values, t) for values, t in moving):
+        return "pace", "goes on as the clock does"
+    return "sense", ""
+
+
+def _restored(columns: list[Column]) -> list[Column]:
+    """The columns, those of a channel kept together: one joint that stands, or turns steadily, is none the less one."""
+    moving = {c.channel for c in columns if c.read and c.element}
+    alone = not any(c.read for c in columns)  # nothing else is left
+    if alone:
+        moving |= {c.channel for c in columns if c.role in BY_BEHAVIOUR and c.why != "another clock"}
+    return [
+        c._replace(role="command" if is_command(c.name) else "sense", why="" if alone else f"{c.why}, beside others")
+        if c.role in BY_BEHAVIOUR and c.role != "copy" and c.why != "another clock" and c.channel in moving
+        else c
+        for c in columns
+    ]
+
+
+OPTIONS = {
+    **{"constant": "--channels", "counter": "--channels", "pace": "--channels", "copy": "--channels"},
+    **{"mixed": "--ignore", "double": "--ignore"},
+}
+"""The option that overrides a role."""
+
+
+def _said(column: Column) -> str:
+    """Why a column has its role, and what overrides it."""
+    option = OPTIONS.get(column.role)
+    why = column.why
+    if column.turn:
+        why += f"{'; ' * bool(why)}turns over at {column.turn:g}: read as its sine and cosine"
+    if not math.isnan(column.code):
+        why += f"{'; ' * bool(why)}{column.code:g} is taken for missing data"
+    if option == "--channels":
+        return f"{why}; name it among --channels to read it"
+    return f"{why}; --ignore '{column.name}' leaves it out" if option else why

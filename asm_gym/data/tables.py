@@ -1,0 +1,178 @@
+"""Bring the table of a log into one layout: a column a sense, a row a moment.
+
+names in cells   name0, position0, name1, …     position[elbow] of each joint that a row names, in any order
+long             time, joint, position          a row a joint: position[elbow], a row a time
+several rates    empty cells between            the rows of the fastest columns; a slower one keeps its newest value
+lists            (T, k)                         q[0], …, q[k-1]
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.names import is_clock, split_unit
+from asm_gym.data.reader_notes import note
+from asm_gym.validation import short_repr
+
+Columns = dict[str, NDArray[Any]]
+Named = dict[str, dict[str, str]]  # values by their kind, by the column that names them
+
+_NAMES = re.compile(r"(?P<of>.*?)(?:joint_?)?names?[_.]?\[?(?P<place>\d+)\]?", re.I)
+_KEY = re.compile(r"(.*[^a-z])?(joint|motor|axis|servo|actuator|name)s?([^a-z].*)?", re.I)
+MOST_KEYS = 64  # joints of a long table
+MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
+SPARSE = 0.55  # share of filled rows up to which a column comes at a lower rate: at most at every other row
+HELD = 3.0  # for so many of its own periods a slower column keeps its newest value
+
+
+def table_of(frame: Any) -> Columns:
+    """Return the columns (T,) of a dictionary, a frame of pandas or Polars, or an Arrow table by name."""
+    names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
+    if names is None or callable(names):
+        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}")
+    if len({str(name) for name in names}) < len(list(names)):
+        raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
+    made: Columns = {}
+    for name in names:
+        values = as_array(frame[name])
+        if values.ndim > 2:
+            note(f"{name}: of {values.ndim} dimensions, left out")
+        elif values.ndim == 2:
+            bare, unit = split_unit(str(name))
+            made |= {f"{bare}[{k}]" + (f" [{unit}]" if unit else ""): v for k, v in enumerate(values.T)}
+        else:
+            made[str(name)] = values
+    return made
+
+
+def as_array(column: Any) -> NDArray[Any]:
+    """Return an array (T,) or, of lists of one length, (T, k)."""
+    array = np.asarray(column)
+    if array.dtype == object and len(array) and all(isinstance(row, list | tuple | np.ndarray) for row in array):
+        return np.array(array.tolist()) if len({len(row) for row in array}) == 1 else array
+    return array
+
+
+def is_numeric(values: NDArray[Any]) -> bool:
+    """Tell whether a column holds numbers."""
+    return values.dtype.kind in "biuf"
+
+
+def named_columns(names: Iterable[str]) -> Named:
+    """Return the columns whose cells name others, and these by their kind: ``position`` of ``position0``."""
+    names = list(names)
+    found: Named = {}
+    for name in names:
+        if match := _NAMES.fullmatch(name):
+            kind = re.compile(rf"({re.escape(match['of'])}.*?[^\W\d])[_.]?\[?{match['place']}\]?")
+            others = {other: kind.fullmatch(other) for other in names if other != name and not _NAMES.fullmatch(other)}
+            found[name] = {hit[1].rstrip("_.["): other for other, hit in others.items() if hit}
+    return {name: kinds for name, kinds in found.items() if kinds}
+
+
+def named_row(row: Mapping[str, Any], named: Named) -> dict[str, Any]:
+    """Return a row whose cells name its values, by those names: ``position[elbow]``."""
+    made = dict(row)
+    for name, kinds in named.items():
+        for kind, column in kinds.items():
+            if column in made and str(row.get(name) or "").strip():
+                made[f"{kind}[{str(row[name]).strip()}]"] = made.pop(column)
+    return made
+
+
+def _with_names(table: Columns) -> Columns:
+    """The table with the columns that cells name: a message may name other joints, or the same in another order."""
+    named = {name: kinds for name, kinds in named_columns(table).items() if not is_numeric(table[name])}
+    made = {name: values for name, values in table.items() if all(name not in k.values() for k in named.values())}
+    for name, kinds in named.items():
+        words = np.array([str(cell).strip() for cell in made.pop(name)])
+        for word in dict.fromkeys(words.tolist()):
+            at = words == word
+            for kind, column in kinds.items() if word else ():
+                values = made.setdefault(f"{kind}[{word}]", np.full(len(words), np.nan))
+                values[at] = table[column][at]
+    return made
+
+
+def _pivoted(table: Columns) -> Columns:
+    """A long table as a wide one; others as they are."""
+    import pandas as pd
+
+    key = next((name for name in table if _is_key(name, table[name])), None)
+    if key is None:
+        return table
+    clock = next((name for name in table if is_clock(name) and len(table[name]) > 1), None)
+    frame = pd.DataFrame(table)
+    round_of = frame.groupby(key, sort=False).cumcount()
+    new = frame[clock] != frame[clock].shift() if clock is not None else None
+    if new is not None and not new.all():  # joints of a moment share a stamp
+        round_of = new.cumsum()
+    values = [name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)]
+    wide = frame.assign(_round=round_of).pivot_table(values, "_round", key, aggfunc="last", sort=False)
+    made: Columns = {} if clock is None else {clock: frame.groupby(round_of.to_numpy())[clock].first().to_numpy()}
+    made |= {f"{name}[{word}]": wide[name, word].to_numpy() for name, word in wide.columns}
+    note(f"a row a joint: put side by side by {key!r}, as {next(reversed(made))} and {len(made) - 1} others")
+    return made
+
+
+def _is_key(name: str, values: NDArray[Any]) -> bool:
+    """Whether a column says whose row it is: it goes round and round the same few words, or numbers if called so."""
+    if len(values) < 4 or (is_numeric(values) and (values.dtype.kind not in "iu" or not _KEY.fullmatch(name))):
+        return False
+    words = values if is_numeric(values) else np.array([str(cell) for cell in values])
+    if is_clock(name) or _NAMES.fullmatch(name):
+        return False
+    size = len(np.unique(words[: 4 * MOST_KEYS]))
+    return bool(2 <= size <= min(MOST_KEYS, len(words) // 2) and np.mean(words[size:] == words[:-size]) >= MOSTLY) and (
+        len(np.unique(words[:size])) == size
+    )
+
+
+def _joined(table: Columns) -> Columns:
+    """A table whose columns come at several rates, at the rate of the fastest ones."""
+    filled = {n: np.isfinite(v) for n, v in table.items() if is_numeric(v) and v.dtype.kind == "f" and not is_clock(n)}
+    filled = {name: mask for name, mask in filled.items() if mask.any()}
+    groups = defaultdict[bytes, list[str]](list)
+    for name, mask in filled.items():
+        groups[mask.tobytes()].append(name)
+    masks = {names[0]: filled[names[0]] for names in groups.values()}
+    apart = len(masks) > 1 and bool(
+        np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY
+    )  # a row has one of them
+    fastest = max(masks, key=lambda name: masks[name].sum()) if apart else ""
+    rows = masks[fastest] if apart else np.ones(len(next(iter(table.values()), ())), np.bool_)
+    of_fastest = groups[rows.tobytes()] if apart else []
+    most = 1.0 if apart else SPARSE
+    slower = {n: m for n, m in filled.items() if n not in of_fastest and m.mean() <= most and _regular(m)}
+    if not slower:
+        return table
+    rate = f"of {fastest!r}" if fastest else "of the table"
+    note(f"columns come at several rates: rows are those {rate}, {', '.join(slower)[:120]} keep their newest value")
+    return {name: _held(values, slower.get(name))[rows] for name, values in table.items()}
+
+
+def _regular(mask: NDArray[np.bool_]) -> bool:
+    """Whether filled cells (T,) come at a steady rate, and not in a stretch of their own."""
+    steps = np.diff(np.flatnonzero(mask))
+    return len(steps) >= 4 and bool(np.quantile(steps, 0.9) <= 2.5 * max(float(np.median(steps)), 1 / mask.mean()))
+
+
+def _held(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
+    """(T,) the newest value of a slower column, as long as it is not old."""
+    if mask is None:
+        return values
+    newest = np.maximum.accumulate(np.where(mask, np.arange(len(mask)), -1))
+    old = (newest < 0) | (np.arange(len(mask)) - newest > HELD / mask.mean())
+    return np.where(old, np.nan, values[newest])
+
+
+def laid_out(table: Columns) -> Columns:
+    """Return a table with a column a sense, and a row a moment."""
+    lengths = {len(values) for values in table.values()}
+    return table if len(lengths) != 1 else _joined(_pivoted(_with_names(table)))
