@@ -158,9 +158,12 @@ def _joined(table: Columns) -> Columns:
 
 
 def _regular(mask: NDArray[np.bool_]) -> bool:
-    """Whether filled cells (T,) come at a steady rate, and not in a stretch of their own."""
-    steps = np.diff(np.flatnonzero(mask))
-    return len(steps) >= 4 and bool(np.quantile(steps, 0.9) <= 2.5 * max(float(np.median(steps)), 1 / mask.mean()))
+    """Whether filled cells (T,) come at a steady rate all the time, and not in a stretch of their own."""
+    filled = np.flatnonzero(mask)
+    if len(filled) < 5 or filled[-1] - filled[0] < MOSTLY * (len(mask) - 2 / mask.mean()):
+        return False
+    steps = np.diff(filled)
+    return bool(np.quantile(steps, 0.9) <= 2.5 * max(float(np.median(steps)), 1 / mask.mean()))
 
 
 def _held(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
