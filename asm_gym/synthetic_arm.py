@@ -59,6 +59,7 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         source="SyntheticArm",
     )
     dt = DT
+    action_means = "velocity"
 
     def __init__(self, horizon: int = 400) -> None:
         self.horizon = horizon

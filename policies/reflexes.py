@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.data.action_meaning import DELTA, VELOCITY
+
 
 @runtime_checkable
 class HoldsItself(Protocol):
@@ -22,7 +24,8 @@ class Hold:
     """Stay, and keep the grip, so that nothing is dropped.
 
     An environment that can hold itself, as all of this package can, is told to before each step, under any controller
-    and wrapper. In any other environment a zero action is taken to mean "stay".
+    and wrapper. In any other environment a zero action means "stay" where its attribute ``action_means`` is
+    ``"delta"`` or ``"velocity"``.
 
     Args:
         env: one with a Box action space.
@@ -30,7 +33,7 @@ class Hold:
 
     Raises:
         TypeError: the action space is no Box.
-        ValueError: ``safe_action`` does not fit the action space, or no action is known that arrives as zero.
+        ValueError: ``safe_action`` does not fit the action space, or no action is known for which the robot stays.
     """
 
     def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
@@ -44,7 +47,7 @@ class Hold:
         if safe_action is not None:
             self._rest = np.array(safe_action, np.float32)
         else:
-            self._rest = nearest_to_rest(space) if self._robot else resting_action(env)
+            self._rest = nearest_to_rest(space) if self._robot else _zero_that_rests(env)
         if not space.contains(self._rest):
             raise ValueError(f"safe_action {self._rest} is not in {space}")
         self._grip = np.asarray(getattr(inner, "gripper_actions", ()), dtype=int)
@@ -73,6 +76,18 @@ class Hold:
         if self._robot is not None:
             self._robot.holding = True
         return self._rest.copy()
+
+
+def _zero_that_rests(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
+    """Return the resting action. Raises ValueError where the environment does not say that zero makes it stay."""
+    means = env.get_wrapper_attr("action_means") if env.has_wrapper_attr("action_means") else ()
+    each = {means} if isinstance(means, str) else set(means or ())
+    if not each or not each <= {DELTA, VELOCITY}:
+        raise ValueError(
+            f'{env.unwrapped} does not say by action_means="delta" or "velocity" that a zero action makes it stay: '
+            "use Hold(env, safe_action=...), or on_alarm=\"hold\" with NeuralASMSafety's action_means"
+        )
+    return resting_action(env)
 
 
 def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:

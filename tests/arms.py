@@ -49,6 +49,7 @@ class Arm(gym.Env):
     """Plays an episode of the arm back; what is sensed is the observation, and there is no stream."""
 
     metadata = {"render_fps": 20}  # noqa: RUF012
+    action_means = "delta"
 
     def __init__(self, broken=lambda t, row: None):
         self.observation_space = spaces.Box(-50, 50, (5,), np.float32)

@@ -27,6 +27,7 @@ class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.observation_space = spaces.Box(-100.0, 100.0, (2,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.gripper_actions = (2,)
+        self.action_means = "delta"
         self.length, self.actions = length, []  # type: tuple[int, list[NDArray[np.float32]]]
         self.first = first
         self.render_mode = "rgb_array"

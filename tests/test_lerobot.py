@@ -136,6 +136,50 @@ def test_what_is_missing_or_not_finite_is_held_at_once_at_finite_numbers(monitor
     assert abs(sent["wrist_roll.pos"] - arm.q[4]) < 8  # near where it stands
 
 
+@pytest.mark.filterwarnings("ignore:(policy. the action|reflex).*finite")
+@pytest.mark.parametrize("on_alarm", ["hold", "stop", "monitor"])
+@pytest.mark.parametrize("rows", [1, 60])
+@pytest.mark.parametrize("what", ["observation", "action"])
+@pytest.mark.parametrize("value", [None, "?", float("nan"), float("inf"), "missing"])
+def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hold(
+    monitor, on_alarm, rows, what, value
+):
+    guard, arm = LeRobotGuard(monitor, on_alarm, clock=ticks()), Arm(208)
+    for k in range(60):
+        given = {"observation": arm.get_observation(), "action": arm.policy(k)}
+        if k < rows:
+            given[what]["elbow_flex.pos"] = value
+            if value == "missing":
+                del given[what]["elbow_flex.pos"]
+        sent = guard(given)["action"]
+        assert np.isfinite(list(sent.values())).all()
+        if k < rows:
+            assert guard.alarm or guard.intervened
+            assert what == "action" or on_alarm == "monitor" or not sent
+        elif on_alarm != "monitor":
+            assert set(sent) == set(MOTORS)
+        arm.q[[MOTORS.index(name) for name in sent]] = [*sent.values()]
+
+
+@pytest.mark.filterwarnings("ignore:policy. the action must be finite")
+def test_a_velocity_is_held_by_zero_and_what_no_name_tells_must_be_told(monitor):
+    names = [f"{what}[{m.replace('.pos', '.vel')}]" for what in ("observation.state", "action") for m in MOTORS]
+    other = recorded(0)
+    named = Episode.from_table(
+        dict(zip(names, other.stream.T.astype(float), strict=True)), rate=RATE, action=["action*"]
+    )
+    rolls = make_monitor("kalman+evidence", named.spec)
+    rolls = rolls.with_learned(monitor.learned_)
+    rolls.threshold_ = monitor.threshold
+    observation = dict(zip((m.replace(".pos", ".vel") for m in MOTORS), np.arange(6.0), strict=True))
+    guard = LeRobotGuard(rolls, clock=ticks())
+    sent = guard({"observation": observation, "action": dict.fromkeys(observation, float("nan"))})["action"]
+    assert list(sent.values())[:5] == [0.0] * 5
+    guard = LeRobotGuard(monitor, action_means="torque", clock=ticks())
+    with pytest.raises(ValueError, match="action_means"):
+        guard({"observation": Arm(0).get_observation(), "action": Arm(0).policy(0)})
+
+
 def test_a_monitor_that_fails_ends_in_the_hold(monitor, monkeypatch):
     guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(205)
     run(guard, arm, rows=60, jam=-1)

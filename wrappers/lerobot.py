@@ -3,7 +3,8 @@
     row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before it is sent
 
 From an alarm on, until ``quiet_s`` without one, a hold is sent and judged in place of the policy's action. A memory
-that was fitted without rests is surprised by a hold, which then does not end.
+that was fitted without rests is surprised by a hold, which then does not end. Only finite numbers are sent; until every
+joint has been sensed or commanded once, an alarm sends nothing.
 
 Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 """
@@ -21,18 +22,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.action_meaning import MEANINGS, TARGET, TORQUE, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
 from asm_gym.data.gaps import blamed, reason
-from asm_gym.data.rows import Pace
+from asm_gym.data.rows import ClockWentBack, Pace
 from asm_gym.guard.checks import check_monitor
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
 from asm_gym.monitors import Monitor, load_monitor
-from asm_gym.policies.base import Policy
 from asm_gym.validation import check_choice, check_number
 
-Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
 _log = logging.getLogger("asm_gym.lerobot")
@@ -43,16 +43,6 @@ _MOTOR = re.compile(r"(?P<what>observation\.state|action)\[(?P<motor>.*\D.*)\]")
 _GRIPPER = re.compile(r".*(gripper|hand|jaw).*")
 
 
-class _Stay:
-    """Stays where the arm stood when the override began: the first observation (A,), which is also its state."""
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Floats32, Any]:
-        held = observation if state is None else np.where(np.isfinite(state), state, observation)
-        return held.astype(np.float32), held
-
-
 class LeRobotGuard:
     """A processor step; where LeRobot is installed it counts as one of its own.
 
@@ -60,6 +50,8 @@ class LeRobotGuard:
         monitor: calibrated, on a LeRobot dataset of this robot (``asm-gym fit DATASET``); or its file.
         on_alarm: one of ``ON_ALARM``.
         quiet_s: how long without an alarm until the policy acts again [s].
+        action_means: as in ``NeuralASMSafety``, by the order of the memory's actions. By default ``.pos`` is a target
+            and ``.vel`` a velocity.
         clock: a clock in seconds, for the rate.
 
     Attributes:
@@ -76,6 +68,7 @@ class LeRobotGuard:
         monitor: Monitor | str | Path,
         on_alarm: str = "hold",
         quiet_s: float = 1.0,
+        action_means: ActionMeans | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("on_alarm", on_alarm, ON_ALARM)
@@ -86,6 +79,7 @@ class LeRobotGuard:
         self._spec = self.monitor.spec
         check_monitor(self.monitor, self._spec)
         self._motors = [_motor_of(label) for label in self._spec.labels]
+        self._told = action_means
         self._clock = clock
         try:
             from lerobot.processor import ProcessorStep
@@ -99,7 +93,6 @@ class LeRobotGuard:
         """Begin a new episode; a stop is over."""
         self._engine: Engine | None = None  # made once the names of the actions are known
         self._pace = Pace(self._spec.dt)
-        self._sent: dict[str, float] = {}
         self.alarm = self.intervened = False
         self.last_alarm: dict[str, Any] = {}
 
@@ -108,49 +101,80 @@ class LeRobotGuard:
         observation, action = transition["observation"] or {}, transition["action"]
         if not isinstance(action, Mapping):
             raise TypeError(f"LeRobotGuard needs actions with names, got {type(action).__name__}")
-        sent = self.guarded(observation, dict(action))
+        sent = self.guarded(observation, action)
         asm = {"alarm": self.alarm, "intervened": self.intervened, **self.last_alarm}
         return {**transition, "action": sent, "info": {**(transition.get("info") or {}), "asm": asm}}
 
-    def guarded(self, observation: Mapping[str, Any], action: dict[str, Any]) -> dict[str, Any]:
-        """Return what is to be sent in place of an action; nothing where no place to stay is known."""
-        self._pace.lost(self._clock())
-        if self._pace.change:
-            _log.warning(self._pace.change)
+    def guarded(self, observation: Mapping[str, Any], action: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what is to be sent in place of an action: finite numbers only, and nothing while no place is known."""
+        self._follow_clock()
         if self._engine is None:
-            self._names = tuple(action)
-            self._engine = self._guard()
+            commanded = [name for is_command, name in self._motors if is_command]
+            self._names = tuple(dict.fromkeys([*commanded, *action]))
+            self._engine, self._sent = self._guard(), np.full((1, len(self._names)), np.nan, np.float32)
         engine, acts = self._engine, self.on_alarm != "monitor"
-        wanted = np.array([action.get(name, np.nan) for name in self._names], np.float64)
-        present = np.array([self._present(name, observation) for name in self._names])
-        asked = wanted.astype(np.float32)
+        asked = np.array([_number(action, name) for name in self._names], np.float32)[None]
 
-        executed: Floats32 = engine.act(asked[None], lambda _: present).actions[0] if acts else asked
-        row = self._row(observation, executed)
+        row = self._row(observation, asked[0])
+        engine.sense(row[None])
+        executed = engine.act(asked, lambda _: None).actions if acts else asked
+        row = self._row(observation, executed[0])
         overriding, in_alarm = bool(engine.overriding[0]), self.alarm
-        report = engine.judge(row[None], executed[None])
-        self.alarm, self.intervened = bool(report.alarm[0]), bool(engine.overriding[0])
+        report = engine.judge(row[None], self._sent)
+        self.alarm, self.intervened = bool(report.alarm[0]), overriding or bool(engine.overriding[0])
         if self.alarm:
             self.last_alarm = self._described(row, report)
             if not (overriding or in_alarm):
                 _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
         if self.intervened and not overriding:
-            executed = engine.act(asked[None], lambda _: present).actions[0]
-            engine.amend(self._row(observation, executed)[None])
-        if self.intervened:
-            action = {n: float(value) for n, value in zip(self._names, executed, strict=True) if np.isfinite(value)}
-        self._sent = {name: float(value) for name, value in action.items() if np.isfinite(value)}
-        return action
+            executed = engine.act(asked, lambda _: None).actions
+            engine.amend(self._row(observation, executed[0])[None])
+        if not self.intervened:
+            self._sent = np.where(np.isfinite(asked), asked, self._sent)
+            return {name: value for name, value in action.items() if np.isfinite(_number(action, name))}
+        if not np.isfinite(executed).all():
+            return {}  # a place that is not known
+        self._sent = executed
+        return dict(zip(self._names, executed[0].tolist(), strict=True))
+
+    def _follow_clock(self) -> None:
+        """Say where rows come at another rate than the memory reads."""
+        try:
+            self._pace.lost(self._clock())
+        except ClockWentBack as error:
+            self._pace = Pace(self._spec.dt)
+            _log.warning("%s", error)
+        if self._pace.change:
+            _log.warning(self._pace.change)
 
     def _guard(self) -> Engine:
-        """Return the engine of one arm whose actions are known by name alone: no action of zeros makes it stay."""
-        dt = self._spec.dt
-        low, high, unknown = (np.full(len(self._names), value, np.float32) for value in (-np.inf, np.inf, np.nan))
-        robots = Robots(1, low, high, rest=unknown, rests=False, dt=dt)
-        policies: list[Policy] = [] if self.on_alarm == "monitor" else [_Stay()]
+        """Return the engine of one arm whose actions are known by name."""
+        dt, size = self._spec.dt, len(self._names)
+        low, high, unknown = (np.full(size, value, np.float32) for value in (-np.inf, np.inf, np.nan))
+        grip = np.flatnonzero([bool(_GRIPPER.fullmatch(name.lower())) for name in self._names])
+        robots = Robots(1, low, high, rest=unknown, grip=grip, dt=dt, meaning=self._meaning())
         quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
-        options = GuardOptions(policies[0] if policies else "monitor", quiet_rows, 1.0, contact_limits=None)
-        return Engine(robots, self.monitor, options, policies)
+        reaction = "hold" if self.on_alarm != "monitor" else "monitor"
+        return Engine(robots, self.monitor, GuardOptions(reaction, quiet_rows, 1.0, contact_limits=None))
+
+    def _meaning(self) -> ActionMeaning:
+        """Return what the actions mean: what is told, or what LeRobot's names say.
+
+        Raises:
+            ValueError: some are torques, or neither a position nor a velocity by their names.
+        """
+        state = {name: column for column, (is_command, name) in enumerate(self._motors) if not is_command}
+        means = [VELOCITY if n.endswith(".vel") else TARGET if n.endswith(".pos") else UNKNOWN for n in self._names]
+        if self._told is not None:
+            means = list(ActionMeaning.told(self._told, len(means)).means)
+        if wrong := [n for n, m in zip(self._names, means, strict=True) if m in (UNKNOWN, TORQUE)]:
+            raise ValueError(
+                f"nothing makes {', '.join(wrong)} stay: say what they mean by action_means, a name of "
+                f'{", ".join(MEANINGS[:3])} for all or for each, or watch with on_alarm="monitor"'
+            )
+        senses = [state.get(n, -1) if m == TARGET else -1 for n, m in zip(self._names, means, strict=True)]
+        slopes = [float(sense >= 0) for sense in senses]
+        return ActionMeaning(tuple(means), tuple(senses), tuple(slopes), (0.0,) * len(means))
 
     def _described(self, row: Floats32, report: RowReport) -> dict[str, Any]:
         """Return what there is to say of an alarm."""
@@ -161,19 +185,11 @@ class LeRobotGuard:
             "channel": "" if at is None else self._spec.labels[at],
         }
 
-    def _present(self, name: str, observation: Mapping[str, Any]) -> float:
-        """Return where to stay: what is sensed; for a gripper the last command, or it would let go; for a speed 0."""
-        if name.endswith(".vel"):
-            return 0.0
-        sensed = float(observation.get(name, np.nan))
-        last = self._sent.get(name, sensed)
-        return last if _GRIPPER.fullmatch(name.lower()) or not np.isfinite(sensed) else sensed
-
     def _row(self, observation: Mapping[str, Any], action: Floats32) -> Floats32:
         """Return (D,) the row of the stream; NaN where something is missing."""
         commanded = dict(zip(self._names, action.tolist(), strict=True))
-        known = ((commanded if is_command else observation).get(name, np.nan) for is_command, name in self._motors)
-        return np.array([float(value) for value in known], np.float32)
+        known = (_number(commanded if is_command else observation, name) for is_command, name in self._motors)
+        return np.array(list(known), np.float32)
 
     def get_config(self) -> dict[str, Any]:
         """Return what LeRobot saves of this step."""
@@ -189,6 +205,14 @@ class LeRobotGuard:
     def transform_features(self, features: Any) -> Any:
         """Return the features unchanged."""
         return features
+
+
+def _number(values: Mapping[str, Any], name: str) -> float:
+    """Return a number by name; NaN where there is none."""
+    try:
+        return float(values.get(name, np.nan))
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def _motor_of(label: str) -> tuple[bool, str]:

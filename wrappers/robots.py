@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -9,6 +10,7 @@ import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
+from asm_gym.data.action_meaning import ACTIONS, DELTA, TARGET, TORQUE, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
 from asm_gym.guard.checks import LOG
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.severity import nothing_felt
@@ -60,10 +62,18 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     return inner
 
 
-def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | None]:
+def robots_of(
+    env: AnyEnv, spec: StreamSpec, found: ActionMeaning | None = None, told: ActionMeans | None = None
+) -> tuple[Robots, ObservationMap | None]:
     """Return the robots of an environment or a vector environment, and where their streams stand in observations.
 
-    Raises TypeError where members of a vector environment cannot be asked what they are.
+    Args:
+        found: what recorded episodes tell of the meaning of their actions.
+        told: what the user says of it.
+
+    Raises:
+        TypeError: members of a vector environment cannot be asked what they are.
+        ValueError: ``told`` does not fit the actions.
     """
     members, many = Members(env), isinstance(env, VectorEnv)
     actions: Any = env.single_action_space if isinstance(env, VectorEnv) else env.action_space
@@ -74,12 +84,18 @@ def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | N
         return Robots(1, none, none, none, dt=dt), None
     first = members.first
     changed, holds_itself = _changed(env), members.ask("holding") is not None
-    rest, refused = nearest_to_rest(actions), {}
+    rest, refused, meaning = nearest_to_rest(actions), {}, None
+    told = first("action_means") if told is None else told
+    if found is not None and len(found.means) != rest.size:
+        found = None
+    given = None if told is None else ActionMeaning.told(told, rest.size, found)
     try:
         if not holds_itself:
-            rest = _resting_action(env, actions, changed)
+            meaning = _meaning(env, given, found)
+            if meaning is None or given is not None:
+                rest = _resting_action(env, actions, changed, meaning)
     except ValueError as error:  # no action is known to rest
-        refused["hold"] = str(error)
+        refused["hold"], meaning = str(error), None
     grip = np.asarray(first("gripper_actions", ()), np.intp)
     if grip.size and grip.max() >= rest.size:  # a wrapper inside takes other numbers
         grip = grip[:0]
@@ -107,6 +123,7 @@ def robots_of(env: AnyEnv, spec: StreamSpec) -> tuple[Robots, ObservationMap | N
         high=np.float32(actions.high).ravel(),
         rest=rest.ravel(),
         rests="hold" not in refused,
+        meaning=meaning,
         brakes=holds_itself and members.ask("keeps_holding") is not None,
         grip=grip,
         dt=dt,
@@ -133,12 +150,60 @@ def _changed(env: AnyEnv) -> str:
     return changed
 
 
-def _resting_action(env: AnyEnv, actions: gym.spaces.Box, changed: str) -> NDArray[np.float32]:
-    """Return the action (A,) for which robots that do not hold by themselves stay. Raises ValueError without one."""
-    if not isinstance(env, VectorEnv):
+def _meaning(env: AnyEnv, told: ActionMeaning | None, found: ActionMeaning | None) -> ActionMeaning | None:
+    """Return what the actions mean by which a robot stays; None where a zero action makes it stay.
+
+    Raises:
+        ValueError: nothing tells what some of them mean, or they are torques.
+    """
+    meaning = found if told is None else told
+    if meaning is None or UNKNOWN in meaning.means:
+        unknown = "" if meaning is None else f"numbers {', '.join(map(str, np.flatnonzero(_are(meaning, UNKNOWN))))} of "
+        raise ValueError(
+            f"nothing tells what {unknown}the actions of {env.unwrapped} mean, so that no hold is known: say it by "
+            'action_means="delta", "target" or "velocity", or one of them for each number; or use Hold(env, '
+            'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
+        )
+    if TORQUE in meaning.means:
+        raise ValueError(
+            f"actions of {env.unwrapped} are torques, and none of them makes an arm stay: use Hold(env, "
+            'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
+        )
+    if told is not None and found is not None and (wrong := _contradicted(told, found)):
+        warnings.warn(f"action_means contradicts the recorded episodes: {wrong}", stacklevel=6)
+    return None if told is not None and set(told.means) <= {DELTA, VELOCITY} else meaning
+
+
+def _are(meaning: ActionMeaning, name: str) -> NDArray[np.bool_]:
+    return np.array([own == name for own in meaning.means])
+
+
+def _contradicted(told: ActionMeaning, found: ActionMeaning) -> str:
+    """Return in which numbers of the action (A,) recorded episodes contradict what was told."""
+    pairs = enumerate(zip(told.means, found.means, strict=True))
+    both = ((k, own, was) for k, (own, was) in pairs if was in (TARGET, DELTA, VELOCITY) and TARGET in (own, was))
+    return "; ".join(f"number {k} is told to be a {own}, and moves as a {was}" for k, own, was in both if own != was)
+
+
+def found_in(monitor: Any) -> ActionMeaning | None:
+    """Return what a monitor has found in the episodes that it was fitted on."""
+    found = getattr(monitor, "about", {}).get(ACTIONS)
+    return None if found is None else ActionMeaning.from_json(found)
+
+
+def _resting_action(
+    env: AnyEnv, actions: gym.spaces.Box, changed: str, meaning: ActionMeaning | None
+) -> NDArray[np.float32]:
+    """Return the action (A,) for which robots that do not hold by themselves stay; of targets it does not count.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if not isinstance(env, VectorEnv) and meaning is None:
         return resting_action(env)
     rest = nearest_to_rest(actions)
-    if changed or np.any(rest):
+    moved = rest.ravel() if meaning is None else rest.ravel()[~_are(meaning, TARGET)]
+    if changed or np.any(moved):
         raise ValueError(changed or no_rest(actions))
     return rest
 

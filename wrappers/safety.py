@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
@@ -24,7 +25,7 @@ from asm_gym.policies.reflexes import HoldsItself
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource
 from asm_gym.validation import as_float32, check_choice, short_repr
-from asm_gym.wrappers.robots import body_memory, felt_by, policy_for, robots_of, sensing_within_steps
+from asm_gym.wrappers.robots import body_memory, felt_by, found_in, policy_for, robots_of, sensing_within_steps
 
 
 class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -73,12 +74,17 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the defaults, raised where
             the monitor's calibration episodes exceed them. None for none; ``"graded"`` then holds at every alarm but a
             sensor's.
+        action_means: ``"delta"``, ``"target"``, ``"velocity"`` or ``"torque"``, or one for each number of an action, for
+            environments that cannot hold by themselves: a target arm is held by the target at which it is, others by
+            zero. None for what the environment says by its attribute ``action_means``, or else the episodes that the
+            monitor was fitted on.
         info: ``"full"``, or ``"flat"`` for the scalars without ``info["asm"]``.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response; a response that lets a pressing arm go on; a reflex
             made for another environment; a monitor fitted for another stream or rate (the message names what differs);
-            no shipped memory that fits (the message lists them); ``"recall"`` with a monitor that expects no action; a
+            no shipped memory that fits (the message lists them); a hold where nothing tells what
+            actions mean, or where they are torques; ``"recall"`` with a monitor that expects no action; a
             wrapper inside that changes actions, where a reflex cannot know what reaches the robot.
         RuntimeError: the monitor is not calibrated.
 
@@ -108,6 +114,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
+        action_means: ActionMeans | None = None,
         info: Literal["full", "flat"] = "full",
     ) -> None:
         self._options = GuardOptions(
@@ -121,6 +128,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             adaptive_threshold=adaptive_threshold,
             responses=responses,
             contact_limits=contact_limits,
+            action_means=action_means,
         )
         recorded = {"monitor": monitor, "monitor_freq": monitor_freq, "info": info, **vars(self._options)}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
@@ -150,7 +158,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
         policies = () if isinstance(chosen, str) else (policy_for(chosen, self.env),)
-        robots, self._places = robots_of(self.env, monitor.spec)
+        robots, self._places = robots_of(self.env, monitor.spec, found_in(monitor), self._options.action_means)
         self._engine = Engine(robots, monitor, self._options, policies, self._rows_per_step)
         self._robots, self._monitor = robots, monitor
         self._next, self._taken_up = monitor, Fitted.of(monitor, self._spec)
@@ -174,6 +182,8 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             nothing = self._engine.begin()
         self._limit_contact(anew=True)
         self._observation, self._alarms, self._failed = observation, 0, ""
+        if self._robots.meaning is not None:
+            self._engine.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
         self._report(info, [nothing], None)
         return observation, info

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
+from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
@@ -21,7 +22,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
-from asm_gym.wrappers.robots import Members, askable, body_memory, felt_by, policy_for, robots_of
+from asm_gym.wrappers.robots import Members, askable, body_memory, felt_by, found_in, policy_for, robots_of
 
 Mask = NDArray[np.bool_]
 
@@ -70,6 +71,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
+        action_means: ActionMeans | None = None,
         info: Literal["full", "flat"] = "full",
     ) -> None:
         super().__init__(env)
@@ -79,7 +81,9 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         check_choice("info", info, INFO)
         self._full = info == "full"
         options = on_alarm, release_after, release_below, max_override, try_after, truncate
-        self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold)
+        self._options = GuardOptions(
+            *options, responses, contact_limits, adaptive_threshold, action_means=action_means
+        )
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:
             raise ValueError(
@@ -121,7 +125,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         check_answer(monitor)
         check_monitor(monitor, self._spec)
         chosen = self._options.reaction(diagnosis_of(monitor) is not None)
-        self._robots, self._places = robots_of(self.env, monitor.spec)
+        self._robots, self._places = robots_of(self.env, monitor.spec, found_in(monitor), self._options.action_means)
         policies = () if isinstance(chosen, str) else [policy_for(chosen, self.env)] * self.num_envs
         self._engine = Engine(self._robots, monitor, self._options, policies)
         self._monitor = self._next = monitor

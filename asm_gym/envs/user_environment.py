@@ -42,6 +42,13 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         robots = "+".join(robot.name for robot in self.robosuite_env.robots)
         self.stream_spec = StreamSpec((*channels, action), self.dt, robots)
 
+    @property
+    def action_means(self) -> str | None:
+        """``"delta"`` where all controllers of the arms take changes of pose or angles; else None."""
+        parts = [(robot, arm) for robot in self.robosuite_env.robots for arm in robot.arms]
+        controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in parts]
+        return "delta" if all(getattr(c, "input_type", "") == "delta" for c in controllers) else None
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         if seed is not None or not self._seeded:

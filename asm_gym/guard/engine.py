@@ -134,6 +134,10 @@ class Engine:
         self._warned = {(i, who) for i, who in self._warned if not which[i]}
         return self.nothing()
 
+    def sense(self, rows: NDArray[np.float32]) -> None:
+        """Tell where the robots are, by rows (n, D) that are not judged."""
+        self._motions.places.sense(rows)
+
     def nothing(self) -> RowReport:
         """Return that there is nothing to say of any robot."""
         return RowReport.nothing(self._count, self._spec.size, self.threshold)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.guard.observer import joined
+from asm_gym.guard.places import Places
 from asm_gym.guard.reflexes import Motion, Reflexes
 from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.policies.base import Policy
@@ -52,6 +53,7 @@ class Motions:
     ) -> None:
         self._robots, self._reflexes, self._policies = robots, reflexes, policies
         self._take_over, self._warn, self._reacts = take_over, warn, reflexes is not None or bool(policies)
+        self.places = Places(robots.count, robots.meaning, robots.rest) if reflexes is None else reflexes.places
         self._last = np.zeros((robots.count, robots.rest.size), np.float32)  # executed last
         self._before = np.zeros_like(self._last)  # executed last before the override
         self.nobody: Mask = np.zeros(robots.count, bool)  # (n,) never written to
@@ -60,7 +62,8 @@ class Motions:
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        self._last[which] = self._before[which] = 0.0
+        self._last[which] = self._before[which] = self._robots.rest
+        self.places.begin(which)
         if self._reflexes is not None:
             self._reflexes.begin(which)
         self._memory = {robot: state for robot, state in self._memory.items() if not which[robot]}
@@ -68,6 +71,7 @@ class Motions:
     def start(self, robot: int, executed: Floats32) -> None:
         """The override of a robot has begun, after it has ``executed`` (A,)."""
         self._before[robot] = executed
+        self.places.start(robot, executed)
         self._memory.pop(robot, None)
 
     def choose(
@@ -85,7 +89,7 @@ class Motions:
         failures, brakes = {}, np.zeros(len(actions), bool)
         overridden: Mask = (acts | ~np.isfinite(actions).all(axis=1)) & ~idle
         refused = overridden & ~acts
-        executed[idle] = np.clip(0.0, robots.low, robots.high)
+        executed[idle] = np.clip(np.nan_to_num(robots.rest), robots.low, robots.high)
         for robot in np.flatnonzero(overridden).tolist():
             said = ""
             if refused[robot]:
@@ -102,6 +106,7 @@ class Motions:
 
     def feel(self, rows: Floats32, executed: Floats32, intervened: Mask, active: Mask) -> None:
         """Let the reflexes feel rows (n, D), and what was executed (n, A)."""
+        self.places.sense(rows)
         r = self._reflexes
         if r is not None and r.feels:
             _feel(rows, r.torques, executed, intervened, active, r.torque, r.usual, r.path, r.steps)
@@ -109,12 +114,12 @@ class Motions:
     def expect(self, expected: Floats32) -> None:
         """Take up what the memory expects to be commanded next (n, A)."""
         if self._reflexes is not None:
-            self._reflexes.expected = np.nan_to_num(expected)
+            self._reflexes.expected = expected
 
     def _reaction(self, robot: int, name: str, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
         """Return what is done, whether the robot brakes, and what failed; where nothing reacts the robot stays."""
         robots, failed = self._robots, ""
-        stay = Motion(robots.rest, robots.brakes, keeps_grip=robots.rests)
+        stay = Motion(self.places.stay(robot), robots.brakes, keeps_grip=robots.rests)
         try:
             motion = self._asked(robot, name, seen) if self._reacts else stay
             action = np.array(as_float32(motion.action)).reshape(-1)
@@ -124,9 +129,10 @@ class Motions:
             # Whatever a user's policy does, an alarm must not end in no action.
             failed = f"reflex: {error!r}"
             self._warn(robot, failed, "the robot holds instead")
-            motion, action = stay, robots.rest.copy()
+            motion, action = stay, stay.action.copy()
         if motion.keeps_grip:
-            action[robots.grip] = self._before[robot, robots.grip]
+            grip = self._before[robot, robots.grip]
+            action[robots.grip] = np.where(np.isfinite(grip), grip, action[robots.grip])
         return np.clip(action, robots.low, robots.high), motion.brakes, failed
 
     def _asked(self, robot: int, name: str, seen: Callable[[int], Any]) -> Motion:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection.adaptive import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.reflexes import GRADED, REFLEXES
@@ -60,6 +61,7 @@ class GuardOptions:
     contact_limits: ContactLimits | str | None = "memory"
     adaptive_threshold: AdaptiveThreshold | None = None
     online_learning_rate: float = 0.0
+    action_means: ActionMeans | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:

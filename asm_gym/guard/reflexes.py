@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.guard.places import Places
 from asm_gym.guard.robots import Robots, named
 from asm_gym.spec import StreamSpec
 
@@ -61,13 +62,14 @@ class Reflexes:
         self.torque, self.usual = np.zeros((n, len(self.torques))), np.zeros((n, len(self.torques)))
         # (n, PATH, A) what the policy did last, the newest last, and (n,) how much of it there is
         self.path, self.steps = np.zeros((n, PATH, actions), np.float32), np.zeros(n, np.int64)
-        self.expected = np.zeros((n, actions), np.float32)  # (n, A) what is likely to be commanded next
+        self.expected = np.zeros((n, actions), np.float32)  # (n, A) what is likely to be commanded next; NaN: unknown
+        self.places = Places(n, robots.meaning, robots.rest)
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
         self.torque[which] = self.usual[which] = 0.0
         self.steps[which] = 0
-        self.expected[which] = self.robots.rest
+        self.expected[which] = np.nan
 
     def move(self, robot: int, name: str) -> Motion:
         """Return what a robot does; it stays where it cannot do what is asked for."""
@@ -76,7 +78,7 @@ class Reflexes:
 
 def hold(felt: Reflexes, robot: int) -> Motion:
     """Stay, by a brake beneath the controller where there is one."""
-    return Motion(felt.robots.rest.copy(), felt.robots.brakes)
+    return Motion(felt.places.stay(robot), felt.robots.brakes)
 
 
 def retract(felt: Reflexes, robot: int) -> Motion:
@@ -98,8 +100,9 @@ def comply(felt: Reflexes, robot: int) -> Motion:
 
 
 def recall(felt: Reflexes, robot: int) -> Motion:
-    """Go on along what the memory expects to be commanded, grip included."""
-    return Motion(felt.expected[robot].copy(), keeps_grip=False)
+    """Go on along what the memory expects to be commanded, grip included; stay where it expects nothing yet."""
+    expected = felt.expected[robot]
+    return Motion(expected.copy(), keeps_grip=False) if np.isfinite(expected).all() else hold(felt, robot)
 
 
 REFLEXES: dict[str, Callable[[Reflexes, int], Motion]] = {f.__name__: f for f in (hold, retract, comply, recall)}

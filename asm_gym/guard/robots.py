@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.action_meaning import ActionMeaning
 from asm_gym.detection.kinematics import Chain
 from asm_gym.spec import Channel, StreamSpec
 
@@ -32,7 +33,8 @@ class Robots:
     low: NDArray[np.float32]  # (A,) bounds of the actions
     high: NDArray[np.float32]
     rest: NDArray[np.float32]  # (A,) the action for which a robot stays, or what comes nearest to it
-    rests: bool = True  # ``rest`` is known to make a robot stay
+    rests: bool = True  # ``rest``, or ``meaning``, is known to make a robot stay
+    meaning: ActionMeaning | None = None  # of the actions, where no one action makes a robot stay everywhere
     brakes: bool = False  # the robots stay by themselves where they are told to, whatever the action is
     grip: NDArray[np.intp] = field(default_factory=lambda: NO_COLUMNS)  # (G,) places in the action of grippers
     dt: float = 1.0  # control period [s]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
+from asm_gym.data.action_meaning import ACTIONS, found_meaning
 from asm_gym.data.episode import Episode
 from asm_gym.detection import Detection, Nominal
 from asm_gym.detection.base import Arrays
@@ -130,6 +131,8 @@ class CalibratedMonitor(Calibrated):
         new = self._copy()  # an interrupt leaves this one as it was
         new._learn(episodes, progress or (lambda done, total: None), warm_start)
         new.about = {**self.about, "specialised_on": len(episodes)} if warm_start else {}
+        if len(self.spec.motor) and not warm_start:
+            new.about[ACTIONS] = found_meaning(episodes).to_json()
         vars(self).update(vars(new))
         return self
 
