@@ -85,7 +85,7 @@ def _zero_that_rests(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     if not each or not each <= {DELTA, VELOCITY}:
         raise ValueError(
             f'{env.unwrapped} does not say by action_means="delta" or "velocity" that a zero action makes it stay: '
-            "use Hold(env, safe_action=...), or on_alarm=\"hold\" with NeuralASMSafety's action_means"
+            'use Hold(env, safe_action=...), or on_alarm="hold" with NeuralASMSafety\'s action_means'
         )
     return resting_action(env)
 

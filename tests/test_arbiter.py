@@ -2,8 +2,6 @@
 
 import math
 from itertools import product
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from asm_gym.guard.arbiter import STATES, Arbiter, Judged, Situation, State, fol
 from asm_gym.guard.options import ReleaseRule
 from asm_gym.guard.reflexes import COMPLIANCE, Reflexes
 from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
+from asm_gym.guard.robots import Robots
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 ACTING = (State.POLICY, State.TRIAL)
@@ -123,9 +122,8 @@ SPEC = StreamSpec((Channel("external_torque", 2), Channel("action", 2, group=MOT
 
 
 def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> Reflexes:
-    robots: Any = SimpleNamespace(
-        count=1, rest=np.zeros(2, np.float32), refused=refused or {}, brakes=False, dt=0.05, turn=lambda _, turns: turns
-    )
+    low, rest, high = (np.full(2, value, np.float32) for value in (-1, 0, 1))
+    robots = Robots(1, low, high, rest, dt=0.05, turn=lambda _, turns: np.float32(turns), refused=refused or {})
     made = Reflexes(robots, spec, on_alarm)
     made.begin(np.ones(1, bool))
     return made

@@ -141,9 +141,7 @@ def test_what_is_missing_or_not_finite_is_held_at_once_at_finite_numbers(monitor
 @pytest.mark.parametrize("rows", [1, 60])
 @pytest.mark.parametrize("what", ["observation", "action"])
 @pytest.mark.parametrize("value", [None, "?", float("nan"), float("inf"), "missing"])
-def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hold(
-    monitor, on_alarm, rows, what, value
-):
+def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hold(monitor, on_alarm, rows, what, value):
     guard, arm = LeRobotGuard(monitor, on_alarm, clock=ticks()), Arm(208)
     for k in range(60):
         given = {"observation": arm.get_observation(), "action": arm.policy(k)}

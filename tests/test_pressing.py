@@ -28,6 +28,7 @@ class Solid(gym.Env):
 
     metadata = {"render_fps": 20}  # noqa: RUF012
     stream_spec = SOLID
+    action_means = "delta"
     observation_layout = {"joint_position": 2}  # noqa: RUF012
     observation_space = gym.spaces.Box(-50, 50, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (2,), np.float32)

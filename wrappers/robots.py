@@ -158,7 +158,9 @@ def _meaning(env: AnyEnv, told: ActionMeaning | None, found: ActionMeaning | Non
     """
     meaning = found if told is None else told
     if meaning is None or UNKNOWN in meaning.means:
-        unknown = "" if meaning is None else f"numbers {', '.join(map(str, np.flatnonzero(_are(meaning, UNKNOWN))))} of "
+        unknown = (
+            "" if meaning is None else f"numbers {', '.join(map(str, np.flatnonzero(_are(meaning, UNKNOWN))))} of "
+        )
         raise ValueError(
             f"nothing tells what {unknown}the actions of {env.unwrapped} mean, so that no hold is known: say it by "
             'action_means="delta", "target" or "velocity", or one of them for each number; or use Hold(env, '

@@ -81,9 +81,7 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         check_choice("info", info, INFO)
         self._full = info == "full"
         options = on_alarm, release_after, release_below, max_override, try_after, truncate
-        self._options = GuardOptions(
-            *options, responses, contact_limits, adaptive_threshold, action_means=action_means
-        )
+        self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold, action_means=action_means)
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:
             raise ValueError(

@@ -97,7 +97,9 @@ def found_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
     rows = _rows_of(episodes)
     found = [_meaning(spec, rows, k) for k in range(len(spec.motor))] if len(rows.change) >= FEWEST else None
     found = found or [(UNKNOWN, -1, 0.0, 0.0)] * len(spec.motor)
-    return ActionMeaning(*(tuple(part) for part in zip(*found, strict=True))) if found else ActionMeaning((), (), (), ())
+    return (
+        ActionMeaning(*(tuple(part) for part in zip(*found, strict=True))) if found else ActionMeaning((), (), (), ())
+    )
 
 
 @dataclass(frozen=True)
