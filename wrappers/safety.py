@@ -74,8 +74,8 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the defaults, raised where
             the monitor's calibration episodes exceed them. None for none; ``"graded"`` then holds at every alarm but a
             sensor's.
-        action_means: ``"delta"``, ``"target"``, ``"velocity"`` or ``"torque"``, or one for each number of an action, for
-            environments that cannot hold by themselves: a target arm is held by the target at which it is, others by
+        action_means: ``"delta"``, ``"target"``, ``"velocity"`` or ``"torque"``, or one for each number of an action,
+            for environments that cannot hold by themselves: a target arm is held by the target at which it is, others by
             zero. None for what the environment says by its attribute ``action_means``, or else the episodes that the
             monitor was fitted on.
         info: ``"full"``, or ``"flat"`` for the scalars without ``info["asm"]``.

@@ -76,7 +76,7 @@ class ActionMeaning:
         same = [told == was or {told, was} == {DELTA, VELOCITY} for told, was in zip(each, found.means, strict=True)]
         parts = zip(same, found.senses, found.slopes, found.offsets, strict=True)
         known = [part if as_found else (-1, 0.0, 0.0) for as_found, *part in parts]
-        return cls(each, *(tuple(values) for values in zip(*known, strict=True)))  # type: ignore[arg-type]
+        return cls(each, *(tuple(values) for values in zip(*known, strict=True)))
 
     def staying(self, row: NDArray[np.floating[Any]], executed: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """Return the action (A,) for which a robot stays where it is sensed to be in ``row`` (D,).
@@ -146,7 +146,8 @@ def _rates(spec: StreamSpec, change: Floats, now: Floats) -> NDArray[np.bool_]:
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(a.T @ b) / scale  # (S, S) of the change of each, and of each
     np.fill_diagonal(alike, 0.0)
-    return np.array(named, bool) | (np.nan_to_num(alike).max(axis=0, initial=0.0) > RATE)
+    found: NDArray[np.bool_] = np.array(named, bool) | (np.nan_to_num(alike).max(axis=0, initial=0.0) > RATE)
+    return found
 
 
 def _meaning(spec: StreamSpec, rows: _Rows, k: int) -> tuple[str, int, float, float]:
