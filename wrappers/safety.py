@@ -75,9 +75,9 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             the monitor's calibration episodes exceed them. None for none; ``"graded"`` then holds at every alarm but a
             sensor's.
         action_means: ``"delta"``, ``"target"``, ``"velocity"`` or ``"torque"``, or one for each number of an action,
-            for environments that cannot hold by themselves: a target arm is held by the target at which it is, others by
-            zero. None for what the environment says by its attribute ``action_means``, or else the episodes that the
-            monitor was fitted on.
+            where an environment cannot hold by itself: a target arm is held by the target at which it is, others by
+            zero. None for what its attribute ``action_means`` says, or else the episodes that the monitor was
+            fitted on.
         info: ``"full"``, or ``"flat"`` for the scalars without ``info["asm"]``.
 
     Raises:
