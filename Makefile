@@ -14,7 +14,7 @@ pytest = $(one_thread) $(bin)/python -m pytest -n $(JOBS) --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo reproduce doctor test test-all test-floats extras soak check format docs wheel clean
+.PHONY: help demo reproduce doctor test test-all test-floats extras matrix soak check format docs wheel clean
 
 help: ## list the commands
 	@sed -nE 's/^([a-z-]+):.* ## (.*)/  make \1\t\2/p' Makefile | expand -t 20
@@ -40,6 +40,9 @@ test-floats: $(stamp) ## run experts and closed loops with the rounding of an ol
 
 extras: $(stamp) ## install every extra in a fresh environment and run its tests; ARGS=learners for one
 	$(one_thread) $(bin)/python -m tests.extras $(ARGS)
+
+matrix: $(stamp) ## run `make test` in fresh environments of every Python and NumPy; needs uv; ARGS="'3.13 numpy>=2'" for one
+	$(bin)/python -m tests.extras matrix $(ARGS)
 
 soak: $(stamp) ## kill commands at random moments, and run the hypothesis machines a hundred times longer
 	$(one_thread) $(bin)/python -m tests.kills $(ARGS)

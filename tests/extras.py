@@ -3,6 +3,7 @@
     python -m tests.extras              all of them, minutes each; make extras
     python -m tests.extras learners     one
     python -m tests.extras pairs        every two resolved together, and each installed after robosuite
+    python -m tests.extras matrix       `make test` under every Python and NumPy; make matrix. What is committed counts.
 
 A test may be skipped where it says another extra that it needs, and for no other reason.
 """
@@ -126,8 +127,39 @@ def pairs(wheel: Path) -> str:
     return "; ".join(wrong)
 
 
+MATRIX = ("3.11 numpy<2", "3.12 numpy<2", "3.11 numpy>=2", "3.12 numpy>=2", "3.13 numpy>=2")
+"""Pythons and NumPys; NumPy 1.26 has no build for Python 3.13."""
+
+
+def matrix(asked: str = "") -> int:
+    """Run `make test` in fresh clones and environments, and return how many failed; ``asked`` picks some by name."""
+    wrong = 0
+    for name in (each for each in MATRIX if asked in each):
+        python, numpy = name.split()
+        # The tested versions; with NumPy 1 what still goes with it, but the same PyTorch.
+        keep = "torch==" if numpy == "numpy<2" else ""
+        with TemporaryDirectory(prefix="asm-gym-matrix-") as folder:
+            pins = (line for line in (ROOT / "constraints.txt").read_text().splitlines(keepends=True) if keep in line)
+            Path(folder, "pins.txt").write_text("".join(pins))
+            steps = (
+                f"git clone -q --depth 1 file://{ROOT} tree",
+                f"uv venv -q --python {python} tree/.venv",
+                f"uv pip install -q --python tree/.venv -c pins.txt -e 'tree[dev]' '{numpy}'",
+                f"uv pip install -q --python tree/.venv --no-deps {ROBOSUITE}",
+                "touch tree/.venv/.installed",
+                "make -C tree test",
+            )
+            there = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+            failed = next((s for s in steps if subprocess.run(s, shell=True, cwd=folder, env=there).returncode), None)
+        print(f"{name:<14} {failed or 'ok'}", flush=True)
+        wrong += failed is not None
+    return wrong
+
+
 def main(names: list[str]) -> int:
     """Checks some or all, and returns 1 where one is wrong."""
+    if names[:1] == ["matrix"]:
+        return int(matrix(*names[1:]) > 0)
     with TemporaryDirectory() as folder:
         wheel = build_wheel(Path(folder))
         wrong = 0
