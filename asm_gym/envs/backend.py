@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.compiled_substeps import touching
+from asm_gym.envs.mujoco_views import Floats
 from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.extras import require
 from asm_gym.spec import Channel
@@ -30,15 +34,46 @@ _CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("n
 def import_robosuite() -> Any:
     """Return robosuite, without the warnings it prints at import about optional parts."""
     logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
-    try:
+    with suppress(ImportError):
         import cv2  # noqa: F401
-    except ImportError:  # for want of libGL: only robosuite's own viewer would use it
+    if no_viewer := "cv2" not in sys.modules:  # for want of libGL: only robosuite's own viewer would use it
         sys.modules["cv2"] = ModuleType("cv2")
-        try:
-            return require("robosuite", what="a robosuite environment")
-        finally:
+    try:
+        robosuite = require("robosuite", what="a robosuite environment")
+    finally:
+        if no_viewer:
             del sys.modules["cv2"]
-    return require("robosuite", what="a robosuite environment")
+    _fit_to_mujoco()
+    return robosuite
+
+
+def _fit_to_mujoco() -> None:
+    """Mend what robosuite 1.5.2 asks of MuJoCo and newer ones answer otherwise.
+
+    From 3.10 on ``mj_fullM`` takes other arguments, from 3.11 on ``data.qM`` is gone, and from 3.17 on a type of joint
+    does not compare equal to the number on its right.
+    """
+    from robosuite.controllers.parts import controller
+    from robosuite.utils.binding_utils import MjData, MjModel
+
+    def whole_mass_matrix(model: mujoco.MjModel, whole: Floats, triangle: Floats) -> None:
+        rows, columns = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
+        whole[:] = 0.0
+        whole[rows, columns] = whole[columns, rows] = triangle
+
+    def address(first: str, wide: dict[int, int]) -> Callable[[Any, str], Any]:
+        def of(model: Any, name: str) -> Any:
+            joint = model.joint_name2id(name)
+            at, count = getattr(model, first)[joint], wide.get(int(model.jnt_type[joint]), 1)
+            return at if count == 1 else (at, at + count)
+
+        return of
+
+    free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+    MjModel.get_joint_qpos_addr = address("jnt_qposadr", {free: 7, ball: 4})
+    MjModel.get_joint_qvel_addr = address("jnt_dofadr", {free: 6, ball: 3})
+    MjData.qM = property(lambda data: data._data.M)
+    controller.mujoco = SimpleNamespace(mj_fullM=whole_mass_matrix)
 
 
 def row_substeps(rate: int, control_freq: int) -> int:

@@ -54,7 +54,7 @@ _step2: Any = types.ExternalFunction("mj_step2", _on_data)
 _kinematics: Any = types.ExternalFunction("mj_kinematics", _on_data)
 _com_pos: Any = types.ExternalFunction("mj_comPos", _on_data)
 _com_vel: Any = types.ExternalFunction("mj_comVel", _on_data)
-_mass: Any = types.ExternalFunction("mj_makeM" if hasattr(mujoco, "mj_makeM") else "mj_crb", _on_data)
+_mass: Any = types.ExternalFunction("mj_makeM", _on_data)
 _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, types.int32, types.intp))
 
 
@@ -74,7 +74,7 @@ def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
 def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
     """Write the sensor values of every arm after substep ``k`` into samples (A, K, SAMPLE)."""
     edited = nominal.model != 0
-    mass = nominal.mass if edited else views.qM
+    mass = nominal.mass if edited else views.M
     bias = nominal.bias if edited else views.qfrc_bias
     needed = np.empty(JOINTS)
     for a in range(len(arms.joints)):
@@ -85,15 +85,14 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
             i = arms.tree[a, t]
             if i < 0:
                 break
-            j, at = i, views.dof_Madr[i]
-            while j >= 0:
+            first = views.M_rowadr[i]
+            for at in range(first + views.M_rownnz[i] - 1, first - 1, -1):
+                j = views.M_colind[at]
                 for r in range(n):
                     if arms.dofs[a, r] == i:
                         needed[r] += mass[at] * views.qacc[j]
                     elif arms.dofs[a, r] == j:
                         needed[r] += mass[at] * views.qacc[i]
-                at += 1
-                j = views.dof_parentid[j]
         for i in range(n):
             dof = arms.dofs[a, i]
             damped = views.qfrc_passive[dof] + (views.dof_damping[dof] - nominal.damping[dof]) * views.qvel[dof]

@@ -71,16 +71,13 @@ def solve(M: Floats, n: int, b: Floats) -> None:
 def mass_matrix(sparse: Floats, views: Views, dofs: Ints, n: int, M: Floats) -> None:
     """Write the mass matrix of one arm's joints (n, n), numbered from the base on, into M."""
     for i in range(n):
-        at = views.dof_Madr[dofs[i]]
-        j, column = dofs[i], i
-        while j >= 0 and column >= 0:
-            while column >= 0 and dofs[column] > j:
+        first, column = views.M_rowadr[dofs[i]], i
+        for at in range(first + views.M_rownnz[dofs[i]] - 1, first - 1, -1):
+            while column >= 0 and dofs[column] > views.M_colind[at]:
                 column -= 1
-            if column >= 0 and dofs[column] == j:
+            if column >= 0 and dofs[column] == views.M_colind[at]:
                 M[i, column] = sparse[at]
                 M[column, i] = sparse[at]
-            at += 1
-            j = views.dof_parentid[j]
 
 
 @compiled
@@ -194,7 +191,7 @@ def _believed(views: Views, nominal: NominalViews, arms: Arms, a: int, M: Floats
     """Write mass matrix (n, n) and bias (n,) of arm ``a``, as the robot knows itself, into M and h."""
     n, dofs = arms.joints[a], arms.dofs[a]
     edited = nominal.model != 0
-    mass_matrix(nominal.mass if edited else views.qM, views, dofs, n, M)
+    mass_matrix(nominal.mass if edited else views.M, views, dofs, n, M)
     for i in range(n):
         h[i] = nominal.bias[dofs[i]] if edited else views.qfrc_bias[dofs[i]]
 

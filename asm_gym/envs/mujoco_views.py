@@ -24,7 +24,7 @@ class Views(NamedTuple):
     qvel: Floats  # (nv,)
     qacc: Floats  # (nv,)
     ctrl: Floats  # (nu,)
-    qM: Floats  # noqa: N815  # (nM,) the sparse mass matrix
+    M: Floats  # (nC,) the lower triangle of the mass matrix, its rows one after the other
     qfrc_bias: Floats  # (nv,) Coriolis, centrifugal and gravity
     qfrc_passive: Floats  # (nv,)
     qfrc_actuator: Floats  # (nv,)
@@ -38,8 +38,9 @@ class Views(NamedTuple):
     xfrc_applied: Floats  # (nbody, 6) applied force: force, then torque
     actuator_ctrlrange: Floats  # (nu, 2)
     dof_damping: Floats  # (nv,)
-    dof_Madr: NDArray[np.int32]  # noqa: N815  # (nv,) where a row of `qM` begins
-    dof_parentid: NDArray[np.int32]  # (nv,) the next joint towards the base, -1 at its end
+    M_rowadr: NDArray[np.int32]  # noqa: N815  # (nv,) where a row of `M` begins
+    M_rownnz: NDArray[np.int32]  # noqa: N815  # (nv,) how many numbers it has; the last is the diagonal's
+    M_colind: NDArray[np.int32]  # noqa: N815  # (nC,) their columns: the joints between the base and the row's
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Views:

@@ -190,7 +190,7 @@ class NominalDynamics:
         self._live = {name: getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA}
         self._frozen = {name: live.copy() for name, live in self._live.items()}
         v = views
-        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.qM, v.qfrc_bias, v.dof_damping.copy())
+        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.M, v.qfrc_bias, v.dof_damping.copy())
         """Views of the live model, valid while the robots' masses are as they were loaded."""
         self._copy: tuple[mujoco.MjModel, mujoco.MjData, NominalViews] | None = None
 
@@ -203,7 +203,7 @@ class NominalDynamics:
             for name in self._INERTIA:
                 getattr(model, name)[:] = self._frozen[name].reshape(getattr(model, name).shape)
             data = mujoco.MjData(model)
-            addresses, motion = (model._address, data._address), (data.qpos, data.qvel, data.qM)
+            addresses, motion = (model._address, data._address), (data.qpos, data.qvel, data.M)
             nominal = NominalViews(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)
             self._copy = model, data, nominal
         return self._copy[2]
