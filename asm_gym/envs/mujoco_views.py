@@ -38,9 +38,9 @@ class Views(NamedTuple):
     xfrc_applied: Floats  # (nbody, 6) applied force: force, then torque
     actuator_ctrlrange: Floats  # (nu, 2)
     dof_damping: Floats  # (nv,)
-    M_rowadr: NDArray[np.int32]  # noqa: N815  # (nv,) where a row of `M` begins
-    M_rownnz: NDArray[np.int32]  # noqa: N815  # (nv,) how many numbers it has; the last is the diagonal's
-    M_colind: NDArray[np.int32]  # noqa: N815  # (nC,) their columns: the joints between the base and the row's
+    M_rowadr: NDArray[np.int32]  # (nv,) where a row of `M` begins
+    M_rownnz: NDArray[np.int32]  # (nv,) how many numbers it has; the last is the diagonal's
+    M_colind: NDArray[np.int32]  # (nC,) their columns: the joints between the base and the row's
 
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Views:
