@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from asm_gym.data.episode import Episode
@@ -34,11 +33,11 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.files import writable
-from asm_gym.monitors import MONITORS, make_monitor, monitor_class
-from asm_gym.monitors.arm_inputs import Derived
+from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import option, run
 from asm_gym.scripts.log_options import LogOptions
@@ -181,17 +180,29 @@ def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
 
 
 def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
-    """Yield notes on which columns of a log are commands, and which are joints of the body model."""
+    """Yield notes on which columns of a log are commands."""
     names = ", ".join(c.name for c in spec.channels if c.group == MOTOR)
     if spec.source == "table" and not names:
         yield "no command is recorded: it is guessed from the motion, and faults are found later; --action names one"
     elif spec.source == "table" and not args.action:
         yield f"taken as commanded, by name: {names}; the output of a controller would hide pushes"
-    if args.urdf is not None:
-        links = Derived.of(spec, read_urdf(args.urdf)).links
-        assert links is not None
-        joints = ", ".join(links.names[i] for i in np.argsort(links.columns))
-        yield f"the angles are taken for these joints of {args.urdf}, in this order: {joints}"
+
+
+def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
+    """Yield notes on what the body model is worth, and which columns it takes for which joints."""
+    judging = monitor.values_.monitor if isinstance(monitor, NeuralASM) else monitor
+    model = judging.model if judging is not None else None
+    if args.urdf is None or not isinstance(model, ValueAssociation):
+        return
+    left = f"it leaves {model.left_by_body:.2f} of what is left of unseen torques without it"
+    if model.links is None:
+        yield f"{args.urdf} is not used, for {left}: does it hold this arm's masses, and name joints as the log?"
+        return
+    joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
+    how = (
+        "by name" if model.links.by_name else "in the order that explains the torques best, for no column names a joint"
+    )
+    yield f"{args.urdf} is used: {left}; angles are taken {how}: {joints}"
 
 
 def hours_of(episodes: list[Episode]) -> float:
@@ -220,7 +231,7 @@ def fit(args: Args, console: Console) -> None:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
-    for line in [*notes, *notes_on_columns(args, spec)]:
+    for line in [*notes, *notes_on_columns(args, spec), *notes_on_body(args, monitor)]:
         say(f"Note: {line}.")
     rows = sum(map(len, fitting))
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import permutations
 
 import mujoco
 import numpy as np
@@ -89,6 +90,60 @@ def test_joints_are_those_that_columns_name_or_the_longest_chain():
     assert BodyModel.of(arm(), SENSED).columns.tolist() == [1, 2, 0]
     by_order = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"])
     assert (by_order.names, by_order.columns.tolist()) == (("lift", "shoulder", "elbow"), [0, 1, 2])
+    assert not by_order.by_name
+    in_part = BodyModel.of(arm(), ["q.elb.elbow_left", "q[lift]", "q[finger]", "q.the_shoulder"])
+    assert (in_part.by_name, in_part.columns.tolist()) == (True, [1, 3, 0])
+    numbered = arm().replace('"lift"', '"panda_joint1"').replace('"shoulder"', '"panda_joint2"')
+    numbered = numbered.replace('"elbow"', '"panda_joint3"')
+    labels = ["position[fer_joint3]", "position[fer_joint1]", "position[fer_joint2]"]
+    assert BodyModel.of(numbered, labels).columns.tolist() == [1, 2, 0]
+
+
+def test_several_roots_stand_side_by_side():
+    more = arm().replace("</robot>", '<link name="camera"/></robot>')
+    told = np.random.default_rng(0).uniform(-1, 1, (3, 6, 3))
+    for one, other in zip(
+        BodyModel.of(arm(), SENSED).torques(*told), BodyModel.of(more, SENSED).torques(*told), strict=True
+    ):
+        np.testing.assert_allclose(one, other)
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_unnamed_joints_are_taken_in_the_order_that_explains_the_torques(order):
+    columns = recorded(20)
+    q, v, torque = (columns[name][:, order] for name in ("position", "velocity", "effort"))
+    body = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"]).in_best_order(q, v, np.gradient(v, 0.01, axis=0), torque)
+    assert [order[k] for k in body.columns] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("case", ["named", "unnamed", "without masses"])
+def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_found_in_any_order(case):
+    names, order = ("lift", "shoulder", "elbow"), [2, 0, 1]
+    named = "[{}]" if case == "named" else "_{}"
+    columns = recorded(30)
+    table = {"time": columns.pop("time")} | {
+        f"{kind}{named.format(names[j] if case == 'named' else k)}": values[:, j]
+        for kind, values in columns.items()
+        for k, j in enumerate(order)
+    }
+    cut = pieces(Episode.from_table(table), 1.0)
+    urdf = re.sub("<inertial>.*?</inertial>", "", arm()) if case == "without masses" else arm()
+    found = {}
+    for body in ("", urdf):
+        monitor = (
+            make_monitor("association_values+largest", cut[0].spec, urdf=body).fit(cut[:20]).calibrate(cut[20:], 0.1)
+        )
+        stream = cut[25].stream.copy()
+        stream[50:, -1] += 1.5
+        found[body] = monitor.score(Episode.from_stream(stream, cut[0].spec)).value.max() / monitor.threshold
+    model = monitor.model
+    assert isinstance(model, ValueAssociation)
+    if case == "without masses":
+        assert (model.links, model.left_by_body > 1.0, found[urdf]) == (None, True, found[""])
+    else:
+        assert model.left_by_body < 0.5
+        assert [joint for _, joint in model.joints] == [names[j] for j in order]
+        assert found[urdf] > max(1.0, found[""])
 
 
 def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_without_mass_weigh_nothing():
@@ -170,8 +225,8 @@ def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
     command = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "x.asm"), "--split", "1", "--quick"]
     command += ["--urdf", str(tmp_path / "arm.urdf")]
     assert main([*command, "--monitor", "association_values+evidence", "--false-alarm-rate", "0.1"]) == 0
-    assert "are taken for these joints" in (said := capsys.readouterr().out)
-    assert "in this order: lift, shoulder, elbow." in said
+    said = capsys.readouterr().out
+    assert "position[0] for lift, position[1] for shoulder, position[2] for elbow" in said
     assert load_monitor(tmp_path / "x.asm").get_params()["urdf"].startswith("<robot")
     assert main([*command, "--monitor", "kalman"]) == 2
     assert capsys.readouterr().err.strip().endswith("kalman takes no body model: leave --urdf out")

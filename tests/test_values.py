@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
@@ -12,7 +14,8 @@ from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_mo
 from asm_gym.monitors.arm_inputs import forces, motion
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.baselines.linear import FrictionRule
-from asm_gym.monitors.value_association import ValueAssociation
+from asm_gym.monitors.stream_model import model_outputs
+from asm_gym.monitors.value_association import ValueAssociation, averaged
 from asm_gym.monitors.values import Values
 from tests.streams import pendulum_columns
 
@@ -44,6 +47,47 @@ def pushed(piece: Episode, size: float) -> Episode:
     return Episode.from_stream(stream, piece.spec)
 
 
+def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_in_unseen_rows():
+    cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
+    model = ValueAssociation(cut[0].spec).fit(cut[:20], np.random.default_rng(0), lambda done, total: None)
+    state, found, left = model.start(1), [], []
+    for row in cut[25].stream.astype(np.float64):
+        state, output = model.predict(state, row[None])
+        left.append(state.left[0, -1])
+        found.append(output.errors[0])
+    padded = np.vstack([np.zeros((9, 2)), left])
+    expected = [padded[t : t + 10].sum(axis=0) / 10 / model.learned_["largest"] for t in range(100)]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(averaged(np.array(left), 10), np.array(expected) * model.learned_["largest"], atol=1e-12)
+    most = [np.abs(o.errors).max(axis=0) for o in model_outputs(model, cut[:20])]
+    assert (np.max(most, axis=0) < 1.0).all()  # rows that it has learned from: cross-fitted ones err more
+
+
+@given(
+    centre=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+    spread=st.tuples(st.floats(0.2, 1.0), st.floats(0.2, 1.0)),
+    seed=st.integers(0, 99),
+)
+def test_values_pass_the_threshold_as_often_as_changes_do(centre, spread, seed):
+    rng = np.random.default_rng(seed)
+    changes, values = (np.exp(c + s * rng.normal(size=400)) for c, s in zip(centre, spread, strict=True))
+    spec = Episode.from_table({"q": np.zeros((9, 2))}, rate=10.0).spec
+
+    class Told:
+        def __init__(self):
+            self.spec = spec
+
+        def score_episodes(self, episodes):
+            return [Surprise(np.array([v]), np.zeros((1, 2))) for v in values]
+
+    scores = [Surprise(np.array([c]), np.zeros((1, 2))) for c in changes]
+    now = Values(Told()).balanced(scores, [])
+    weighted = now.balance * values**now.power
+    assert np.median(weighted) == pytest.approx(np.median(changes), rel=0.02)
+    if spread[0] < 2.5 * spread[1]:
+        assert np.log(weighted).std() == pytest.approx(np.log(changes).std(), rel=0.1)
+
+
 def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_is_not():
     columns = pendulum_columns(3000)
     columns["effort"][:, 1] = 0.05 * np.random.default_rng(1).normal(size=3000)  # nothing tells it
@@ -70,8 +114,9 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
     assert np.argmax(score.attribution[-1]) == 4
     assert asm.values_.monitor is not None
-    body = asm.values_.monitor.score(faulty[0]).value
-    assert (score.value >= body).all()
+    values = asm.values_
+    body = values.balance * values.monitor.score(faulty[0]).value ** values.power
+    assert (score.value >= body - 1e-9).all()
 
 
 def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_says():
@@ -81,7 +126,7 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     senses = values.monitor.model.senses_
     z = [np.hstack([senses.read_episode(e.stream).inputs, np.ones((len(e), 1))]) for e in (*cut[:20], cut[25])]
     shown, asked = np.concatenate(z[:-1]).astype(np.float64), z[-1].astype(np.float64)
-    inverse = np.linalg.inv(shown.T @ shown + 1e-2 * len(shown) * np.eye(shown.shape[1]))
+    inverse = np.linalg.inv(shown.T @ shown + 1e-3 * len(shown) * np.eye(shown.shape[1]))
     h, usual = (np.einsum("ni,ij,nj->n", rows, inverse, rows) for rows in (asked, shown))
     root = np.sqrt(np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual))))  # a tenth of a second is 10 rows
     one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))

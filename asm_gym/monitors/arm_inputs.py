@@ -11,6 +11,7 @@ the chain: a linear model can say neither without. Source: Stribeck friction smo
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -81,7 +82,7 @@ class Derived(NamedTuple):
         speed = steps[:, self.speeds] if self.from_steps else values[:, self.speeds] / spread[self.speeds]
         parts = [np.tanh(speed / width) for width in WIDTHS]
         if self.links is not None:
-            parts += self._carried(self.links, values, steps, rate)
+            parts += self.links.torques(*self.motion(values, steps, spread, rate))
         elif len(self.angles):
             q = values[:, self.angles] * self.radians
             single = np.hstack([np.sin(q), np.cos(q)])
@@ -90,12 +91,15 @@ class Derived(NamedTuple):
             parts += [single, np.sin(sums), np.cos(sums), products]
         return np.hstack(parts)
 
-    def _carried(self, links: BodyModel, values: Floats, steps: Floats, rate: Floats) -> tuple[Floats, Floats]:
-        """Return torques (N, J) by weight, and by motion."""
-        q, pace = values[:, self.angles] * self.radians, (steps * rate)[:, self.speeds]
-        if self.from_steps:
-            return links.torques(q, pace * self.radians, np.zeros_like(q))
-        return links.torques(q, values[:, self.speeds] * self.radians, pace * self.radians)
+    def with_joints(self, columns: NDArray[np.intp]) -> Derived:
+        """Return it with the columns (M,) of angles that belong to the joints of the body model."""
+        assert self.links is not None
+        return self._replace(links=replace(self.links, columns=columns))
+
+    def motion(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return angles, speeds and accelerations (N, J) of what ``__call__`` takes."""
+        q, pace = values[:, self.angles] * self.radians, (steps * rate)[:, self.speeds] * self.radians
+        return (q, pace, np.zeros_like(q)) if self.from_steps else (q, values[:, self.speeds] * self.radians, pace)
 
 
 def _links(spec: StreamSpec, columns: NDArray[np.intp], urdf: str) -> BodyModel | None:

@@ -3,14 +3,17 @@
     τ = g(q) + [M(q) q̈ + c(q, q̇)]      weight, and motion
 
 Joints that no column senses are fixed at 0, and so are joints that mimic others. Damping, friction and limits of the
-file are left out. MuJoCo comes with the extra ``robosuite``.
+file are left out, and so are its meshes; several roots stand side by side. MuJoCo comes with the extra ``robosuite``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Container, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Self
 from xml.etree import ElementTree
@@ -18,12 +21,17 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from asm_gym.extras import require
 
 Floats = NDArray[np.float64]
 
 LARGEST = 10_000_000  # characters of a file: no arm has more
+
+SHOWN = 300  # rows by which orders of joints are compared
+TINY = 1e-12
+GROUND = "ground_of_all_roots"
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -42,13 +50,16 @@ COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-12
 class BodyModel:
     """The joints of an arm that are sensed, and the links that they move."""
 
-    names: tuple[str, ...]  # (J,) of the joints, from the base outwards
-    columns: NDArray[np.intp]  # (J,) which column of ``torques`` belongs to each joint
+    names: tuple[str, ...]  # (M,) of the joints, from the base outwards
+    columns: NDArray[np.intp]  # (M,) which of the J columns of ``torques`` belongs to each joint
+    by_name: bool  # the columns are named as the joints are; otherwise they are taken in the order of the chain
     model: Any  # MuJoCo's
 
     @classmethod
     def of(cls, urdf: str, labels: Sequence[str]) -> Self:
         """Read a URDF for the joints that labels name (``position[elbow]``), or the first ones of its longest chain.
+
+        Labels that name no joint, as those of fingers, belong to no joint where most do.
 
         Raises:
             ValueError: it is no URDF, MuJoCo cannot read it, or it has fewer joints than there are labels.
@@ -56,17 +67,41 @@ class BodyModel:
         root = _parsed(urdf)
         every = _compiled(root, None)
         names = _joints(every)
-        # Each label names a joint by the longest name in it, if all name one of their own.
-        asked = [max((n for n in names if n in label), key=len, default="") for label in labels]
-        if not all(asked) or len(set(asked)) < len(asked):
-            asked = [names[j] for j in _longest_chain(every)[: len(labels)]]
-        if len(asked) < len(labels):
-            raise ValueError(
-                f"{len(labels)} joints are sensed, and the body's longest chain has {len(asked)} that move"
-            )
-        model = _compiled(root, asked)
+        place = _matched(names, labels)
+        by_name = 2 * len(place) > len(labels)
+        if not by_name:
+            place = {names[j]: k for k, j in enumerate(_longest_chain(every)[: len(labels)])}
+            if len(place) < len(labels):
+                raise ValueError(
+                    f"{len(labels)} joints are sensed, and the body's longest chain has {len(place)} that move: name "
+                    f"the columns as its joints are named ({', '.join(names) or 'it has none'})"
+                )
+        model = _compiled(root, place)
         order = _joints(model)
-        return cls(tuple(order), np.array([asked.index(name) for name in order], np.intp), model)
+        return cls(tuple(order), np.array([place[name] for name in order], np.intp), by_name, model)
+
+    def in_best_order(self, q: Floats, speed: Floats, acceleration: Floats, torque: Floats) -> Self:
+        """Return it with the order of columns by which it explains measured torques (N, J) best.
+
+        Starts are the order of the chain and the alphabet, as ROS publishes joints; pairs are swapped while that helps.
+        """
+        rows = np.linspace(0, len(q) - 1, min(len(q), SHOWN)).astype(np.intp)
+        q, speed, acceleration, torque = (a[rows] for a in (q, speed, acceleration, torque))
+        friction = np.stack([speed, np.tanh(10 * speed / np.maximum(speed.std(axis=0), TINY)), np.ones_like(speed)])
+
+        def unexplained(columns: tuple[int, ...]) -> float:
+            told = [*replace(self, columns=np.array(columns, np.intp)).torques(q, speed, acceleration), *friction]
+            total = 0.0
+            for j in columns:
+                inputs = np.stack([part[:, j] for part in told], axis=1)
+                solved = np.linalg.lstsq(inputs, torque[:, j], rcond=None)[0]
+                total += float(np.var(torque[:, j] - inputs @ solved) / max(np.var(torque[:, j]), TINY))
+            return total
+
+        by_alphabet = tuple(int(k) for k in np.argsort(np.argsort(self.names)))
+        tried = {order: unexplained(order) for order in (tuple(self.columns.tolist()), by_alphabet)}
+        found = [_swapped(order, unexplained, tried) for order in tuple(tried)]
+        return replace(self, columns=np.array(min(found, key=tried.__getitem__), np.intp))
 
     def torques(self, q: Floats, speed: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
         """Return the torques (N, J) of weight and of motion [N m; N where a joint slides].
@@ -94,6 +129,48 @@ def read_urdf(path: str | Path) -> str:
         return ElementTree.tostring(_parsed(text), encoding="unicode")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _swapped(
+    order: tuple[int, ...], cost: Callable[[tuple[int, ...]], float], tried: dict[tuple[int, ...], float]
+) -> tuple[int, ...]:
+    """Return the order that no swap of two betters, from one on; what was tried is added to ``tried``."""
+    while True:
+        near = []
+        for a, b in combinations(range(len(order)), 2):
+            swapped = list(order)
+            swapped[a], swapped[b] = order[b], order[a]
+            near.append(tuple(swapped))
+        for other in near:
+            if other not in tried:
+                tried[other] = cost(other)
+        best = min(near, key=tried.__getitem__, default=order)
+        if not tried[best] < tried[order]:
+            return order
+        order = best
+
+
+def _matched(names: Sequence[str], labels: Sequence[str]) -> dict[str, int]:
+    """Return the place of the label that means each joint, by the words that the two share.
+
+    A word counts the less, the more joints have it; a name that stands in a label as it is counts most.
+    """
+    words = [_words(name) for name in names]
+    common = Counter(word for own in words for word in own)
+    score = np.zeros((len(labels), len(names)))
+    for k, label in enumerate(labels):
+        for j, name in enumerate(names):
+            score[k, j] = sum(1.0 / common[word] for word in _words(label) & words[j])
+            score[k, j] += len(name) if name in label else 0.0
+    found = {}
+    for k, j in zip(*linear_sum_assignment(-score), strict=True):
+        if score[k, j] > np.delete(score[k], j).max(initial=0.0):  # no other joint is meant as much
+            found[names[j]] = int(k)
+    return found
+
+
+def _words(name: str) -> set[str]:
+    return set(re.findall(r"[a-z]+\d*|\d+", name.lower()))
 
 
 def _mujoco() -> Any:
@@ -133,6 +210,12 @@ def _compiled(root: Element, asked: Container[str] | None) -> Any:
             joint.set("type", "fixed")
     for inertial in body.iter("inertial"):
         _align(inertial)
+    if len(roots := _roots(body)) > 1:
+        ElementTree.SubElement(body, "link", name=GROUND)
+        for name in roots:
+            fixed = ElementTree.SubElement(body, "joint", name=f"{GROUND}_{name}", type="fixed")
+            ElementTree.SubElement(fixed, "parent", link=GROUND)
+            ElementTree.SubElement(fixed, "child", link=name)
     ElementTree.SubElement(ElementTree.SubElement(body, "mujoco"), "compiler", COMPILER)
     try:
         model = _mujoco().MjModel.from_xml_string(ElementTree.tostring(body, encoding="unicode"))
@@ -141,6 +224,12 @@ def _compiled(root: Element, asked: Container[str] | None) -> Any:
     if not all(np.isfinite(part).all() for part in (model.body_mass, model.body_inertia, model.body_pos)):
         raise ValueError("the body cannot be read: masses, inertias and positions must be finite")
     return model
+
+
+def _roots(body: Element) -> list[str]:
+    """Return the links that are no joint's child."""
+    children = {child.get("link") for child in body.iterfind("joint/child")}
+    return [name for link in body.iterfind("link") if (name := link.get("name", "")) not in children]
 
 
 def _align(inertial: Element) -> None:

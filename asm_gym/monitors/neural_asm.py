@@ -250,6 +250,14 @@ class NeuralASM(CalibratedMonitor):
             self._kernel, self._kernel_of = RowKernel(memory, evidence, self.excuses_), now
         return self._kernel
 
+    def _balanced(self, episodes: Sequence[Episode]) -> Self:
+        if self.values_.monitor is None:
+            return self
+        other = self._copy()
+        other.values_ = self.values_._replace(balance=0.0)  # changes alone
+        other.values_ = self.values_.balanced(other.score_episodes(episodes), episodes)
+        return other
+
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         super()._learn(episodes, progress, warm_start)
         self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()

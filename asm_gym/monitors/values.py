@@ -1,11 +1,12 @@
 """Values beside changes: a push that is held is explained by its own past for changes, and not by the other senses.
 
-    s = max(s_changes / √f, s_values)       each is 1 at what it seldom exceeds in nominal episodes
+    s = max(s_changes / √f, b s_values^p)   log b + p log s: as log s_changes in centre and spread of nominal maxima
     f = max(1, (1 + τ h)/(1 + τ h̃))         h: leverage of a row, h̃ its median in the episodes learned from
     h = zᵀ (ZᵀZ + λ N)⁻¹ z                  z: inputs that changes are predicted from, and 1;  τ: rows of a tenth of a s
 
-A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
-a tenth of a second count as one. Errors of values are not whitened: a few minutes do not show their correlations.
+``calibrate`` finds b and p, so that both are as likely to pass the one threshold: each has a threshold of its own so,
+and the promised rate is shared. A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each
+other are alike, so that those of a tenth of a second count as one.
 """
 
 from __future__ import annotations
@@ -17,17 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection import EvidenceDetection
+from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.evidence import TINY
+from asm_gym.detection.scores import Largest
 from asm_gym.monitors.base import State, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next
-from asm_gym.monitors.value_association import MOST_INPUTS, STIFFNESS, ValueAssociation
+from asm_gym.monitors.value_association import ALIKE_S, MOST_INPUTS, STIFFNESS, ValueAssociation
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
+SCALARS = "usual", "balance", "power"
+PRIOR_COUNT, PRIOR_SPREADS = 4, (0.3, 0.15)  # maxima that p rests on before any, and spread of their logarithms
+MOST_POWER = 3.0
 PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
-ALIKE_S = 0.1  # τ [s]
 
 
 class Values(NamedTuple):
@@ -37,11 +42,15 @@ class Values(NamedTuple):
         monitor: of values alone.
         leverage: (I + 1, I + 1) of which zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs.
         usual: 1 / (1 + τ h̃).
+        balance: b, 1 before ``calibrate``.
+        power: p, 2 before ``calibrate``: changes are judged by squares.
     """
 
     monitor: CalibratedMonitor | None = None
     leverage: NDArray[np.float64] = np.zeros((0, 0))
     usual: float = 1.0
+    balance: float = 1.0
+    power: float = 2.0
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self:
@@ -64,19 +73,34 @@ class Values(NamedTuple):
         """Restore it from arrays by their names without the prefix. Raises where they do not fit."""
         if not arrays:
             return cls()
-        own = {n: a for n, a in arrays.items() if n not in ("leverage", "usual")}
+        own = {n: a for n, a in arrays.items() if n not in ("leverage", *SCALARS)}
         monitor, leverage = _monitor(spec, seed, urdf).with_learned(own), arrays["leverage"]
         size = _senses(monitor).inputs + 1
         if leverage.shape not in ((size, size), (0, 0)):
             raise ValueError(f"the leverage of values should be of shape {(size, size)}, found {leverage.shape}")
-        return cls(monitor, leverage, float(arrays["usual"]))
+        return cls(monitor, leverage, *(float(arrays[name]) for name in SCALARS))
+
+    def balanced(self, changes: Sequence[Surprise], episodes: Sequence[Episode]) -> Self:
+        """Return it with b and p from nominal episodes, of whose changes ``join`` made this with b of 0."""
+        assert self.monitor is not None
+        both = changes, self.monitor.score_episodes(episodes)
+        dt = self.monitor.spec.dt
+        logs = [np.log(np.maximum(Blocks.of([s.value for s in scores], dt).maxima, TINY)) for scores in both]
+        variance = [
+            (len(of) * np.var(of) + PRIOR_COUNT * prior**2) / (len(of) + PRIOR_COUNT)
+            for of, prior in zip(logs, PRIOR_SPREADS, strict=True)
+        ]
+        power = min(float(np.sqrt(variance[0] / variance[1])), MOST_POWER)
+        balance = float(np.exp(np.median(logs[0]) - power * np.median(logs[1])))
+        return self._replace(balance=balance, power=power)
 
     @property
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """Arrays to keep in a checkpoint, by name."""
         if self.monitor is None:
             return {}
-        kept = {**self.monitor.learned_, "leverage": self.leverage, "usual": np.array(self.usual)}
+        scalars = {name: np.array(getattr(self, name)) for name in SCALARS}
+        kept = {**self.monitor.learned_, "leverage": self.leverage, **scalars}
         return {PREFIX + name: array for name, array in kept.items()}
 
     def start(self, batch: int) -> State:
@@ -97,10 +121,13 @@ class Values(NamedTuple):
         assert self.monitor is not None
         root = self.spread(state, rows)
         new, values = self.monitor.observe(state, rows)
-        excused, value = values.value / divisor, changes.value / root
+        weighted = self.balance * values.value**self.power
+        excused, value = weighted / divisor, changes.value / root
         held = excused > value
-        own, others = values.attribution / divisor[:, None], changes.attribution / root[:, None]
-        raw = None if changes.raw is None else np.maximum(changes.raw / root, values.value)
+        known = np.isfinite(excused) & (values.value > 0)
+        share = np.divide(excused, values.value, out=np.ones_like(excused), where=known)
+        own, others = share[:, None] * values.attribution, changes.attribution / root[:, None]
+        raw = None if changes.raw is None else np.maximum(changes.raw / root, weighted)
         joined = np.where(held, excused, value), np.where(held[:, None], own, others)
         return new, changes._replace(value=joined[0], attribution=joined[1], raw=raw)
 
@@ -108,15 +135,14 @@ class Values(NamedTuple):
         """Return √f (B,) of the next rows (B, D)."""
         if not len(self.leverage) or self.monitor is None:
             return np.ones(len(rows))
-        _, read, known = read_next(_senses(self.monitor), state.model, rows)
+        _, read, known = read_next(_senses(self.monitor), state.model.history, rows)
         f = self.usual + _squares(_with_one(read.inputs), self.leverage)
         root: NDArray[np.float64] = np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
         return root
 
 
 def _monitor(spec: StreamSpec, seed: int, urdf: str) -> CalibratedMonitor:
-    detection = EvidenceDetection(spec, shrinkage=1.0, habituates=False)
-    return CalibratedMonitor(ValueAssociation(spec, urdf=urdf), detection, seed=seed)
+    return CalibratedMonitor(ValueAssociation(spec, urdf=urdf), Largest(spec), seed=seed)
 
 
 def _senses(monitor: CalibratedMonitor) -> StreamScaler:
