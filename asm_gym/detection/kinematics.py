@@ -31,14 +31,18 @@ class Chain(NamedTuple):
 
     def at(self, angles: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(9,) the hand by the angles (J,) [rad]."""
-        found: NDArray[np.float64] = hand_at(np.asarray(angles, np.float64), self.axes, self.anchors, self.hand)
-        return found
+        place = np.empty(HAND)
+        hand_at(np.asarray(angles, np.float64), self.axes, self.anchors, self.hand, place)
+        return place
 
 
 @compiled
-def hand_at(angles: Any, axes: Any, anchors: Any, hand: Any) -> Any:
-    """(9,) see ``Chain.at``."""
-    x = hand.copy()
+def hand_at(angles: Any, axes: Any, anchors: Any, hand: Any, place: Any) -> None:
+    """Write ``place`` (9,), see ``Chain.at``."""
+    x = place.reshape((3, 3))
+    for k in range(3):
+        for i in range(3):
+            x[k, i] = hand[k, i]
     for j in range(len(angles) - 1, -1, -1):
         s, c = np.sin(angles[j]), np.cos(angles[j])
         a0, a1, a2 = axes[j, 0], axes[j, 1], axes[j, 2]
@@ -50,4 +54,3 @@ def hand_at(angles: Any, axes: Any, anchors: Any, hand: Any) -> Any:
             x[k, 0] = o0 + c * v0 + s * (a1 * v2 - a2 * v1) + along * a0
             x[k, 1] = o1 + c * v1 + s * (a2 * v0 - a0 * v2) + along * a1
             x[k, 2] = o2 + c * v2 + s * (a0 * v1 - a1 * v0) + along * a2
-    return x.ravel()

@@ -86,6 +86,8 @@ class HandAgainstJoints:
         how = self._at, *self._geometry, self._late, self._weights, self._gain, ONE * LIMIT / self._gain, LIMIT
         state = self._mean, self._size_of, self._whole, self._recent, self._kept, self._good
         self.arguments: tuple[Any, ...] = *how, *state  # of ``compare``, after the rows
+        # Compiled or loaded here, so that the first contradiction does not wait for it.
+        self._explained(0, self._recent[0, 0], np.ones(len(self._q), bool), np.zeros(HAND, bool))
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
@@ -189,7 +191,7 @@ def compare(rows: Any, at: Any, *known: Any) -> bool:
     axes, anchors, hand, late, weights, gain, cap, limit, mean, size, whole, recent, kept, good = known
     some = False
     J, newest = axes.shape[1], recent.shape[1] - 1
-    row = np.empty(len(at))
+    row, angles, z = np.empty(len(at)), np.empty(J), np.empty(HAND)
     for n in range(len(rows)):
         finite = True
         for i in range(len(at)):
@@ -198,9 +200,9 @@ def compare(rows: Any, at: Any, *known: Any) -> bool:
         if not finite:
             size[n], whole[n] = -1.0, 0
             continue
-        place = hand_at(row[:J] - late[n] * row[J : 2 * J], axes[n], anchors[n], hand[n])
-        z = (row[2 * J :] - place) * weights[n]
-        length = np.sqrt(np.sum(z * z))
+        for j in range(J):
+            angles[j] = row[j] - late[n] * row[J + j]
+        length = np.sqrt(_left(angles, row[2 * J :], weights[n], axes[n], anchors[n], hand[n], z))
         share = 1.0 if length <= cap else cap / length
         total = 0.0
         for k in range(len(z)):
@@ -209,35 +211,74 @@ def compare(rows: Any, at: Any, *known: Any) -> bool:
         size[n] = np.sqrt(total)
         whole[n] += 1
         kept[n] = min(kept[n] + 1, newest + 1)
-        for k in range(newest):
-            recent[n, k] = recent[n, k + 1]
-        recent[n, newest] = row
+        for i in range(len(at)):
+            for k in range(newest):
+                recent[n, k, i] = recent[n, k + 1, i]
+            recent[n, newest, i] = row[i]
         if size[n] <= limit:
-            good[n] = row[:J]
+            for j in range(J):
+                good[n, j] = row[j]
         else:
             some = True
     return some
 
 
 @compiled
+def _left(q: Any, x: Any, weights: Any, axes: Any, anchors: Any, hand: Any, z: Any) -> float:
+    """Write z (9,), what angles (J,) leave of the hand; return |z|²."""
+    hand_at(q, axes, anchors, hand, z)
+    total = 0.0
+    for k in range(len(z)):
+        z[k] = (x[k] - z[k]) * weights[k]
+        total += z[k] * z[k]
+    return total
+
+
+@compiled
+def _solve(H: Any, b: Any, n: int) -> None:
+    """Write the solution of H x = b to ``b`` (n,), for a symmetric H (n, n) that is positive definite."""
+    for i in range(n):
+        for j in range(i + 1):
+            for k in range(j):
+                H[i, j] -= H[i, k] * H[j, k]
+            H[i, j] = np.sqrt(H[i, i]) if i == j else H[i, j] / H[j, j]
+            if j < i:
+                b[i] -= H[i, j] * b[j]
+        b[i] /= H[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            b[i] -= H[k, i] * b[k]
+        b[i] /= H[i, i]
+
+
+@compiled
 def _fit(q: Any, x: Any, free: Any, weights: Any, about: Any, error: Any, axes: Any, anchors: Any, hand: Any) -> Any:
     """Gauss and Newton's angles (J,), of which those that are ``free`` are looked for, and |z|² of what is left."""
-    q, which = q.copy(), np.flatnonzero(free)
-    n, step = len(which), 1e-6
-    slope = np.zeros((len(x), n))
+    J, step, n = len(q), 1e-6, 0
+    found, which, z, moved = np.empty(J), np.empty(J, np.intp), np.empty(HAND), np.empty(HAND)
+    slope, H, b = np.empty((HAND, J)), np.empty((J, J)), np.empty(J)
+    for j in range(J):
+        found[j] = q[j]
+        if free[j]:
+            which[n] = j
+            n += 1
     for _ in range(8 if n else 0):
-        z = (x - hand_at(q, axes, anchors, hand)) * weights
+        _left(found, x, weights, axes, anchors, hand, z)
         for i in range(n):
-            moved = q.copy()
-            moved[which[i]] += step
-            slope[:, i] = ((hand_at(moved, axes, anchors, hand) - x) * weights + z) / step
-        H, b = slope.T @ slope, slope.T @ z
+            j = which[i]
+            was, trust = found[j], 1.0 / error[j] ** 2
+            found[j] += step
+            _left(found, x, weights, axes, anchors, hand, moved)
+            found[j] = was
+            b[i] = trust * (about[j] - was)
+            for k in range(HAND):
+                slope[k, i] = (z[k] - moved[k]) / step
+                b[i] += slope[k, i] * z[k]
+            for m in range(i + 1):
+                H[i, m] = trust + 1.0 if m == i else 0.0
+                for k in range(HAND):
+                    H[i, m] += slope[k, i] * slope[k, m]
+        _solve(H, b, n)
         for i in range(n):
-            trust = 1.0 / error[which[i]] ** 2
-            H[i, i] += trust + 1.0
-            b[i] += trust * (about[which[i]] - q[which[i]])
-        change = np.linalg.solve(H, b)
-        for i in range(n):
-            q[which[i]] += min(max(change[i], -0.5), 0.5)
-    z = (x - hand_at(q, axes, anchors, hand)) * weights
-    return q, np.sum(z * z)
+            found[which[i]] += min(max(b[i], -0.5), 0.5)
+    return found, _left(found, x, weights, axes, anchors, hand, z)

@@ -119,14 +119,9 @@ class Completion:
 
     def filling(self, missing: Mask) -> Filling:
         """Return how to complete the senses of ``missing`` (D,) from all others."""
-        known = ~self.involved(missing)
-        wanted = np.flatnonzero(missing[self.spec.sensory])  # sensory entries come first in y
-        C = self.covariance
-        W = np.zeros((len(wanted), len(C)))
-        ridge = C[np.ix_(known, known)] + PENALTY * np.eye(int(known.sum()))
-        W[:, known] = np.linalg.solve(ridge, C[np.ix_(known, wanted)]).T
-        left = C[wanted, wanted] - np.einsum("my,ym->m", W, C[:, wanted])
-        columns = self.spec.sensory[wanted]
+        C, (places, W) = self.covariance, self._weights(missing)
+        columns = self.spec.sensory[places]
+        left = C[places, places] - np.einsum("my,ym->m", W, C[:, places])
         # The error of one missing sensor was measured; that of several follows from C.
         error = np.sqrt(np.maximum(left, 0.0))
         return Filling(columns, W, np.maximum(error, self.error[columns]) * self.senses.spread[columns])
@@ -143,19 +138,31 @@ class Completion:
         return np.searchsorted(self.spec.sensory, columns)
 
     @cached_property
+    def precision(self) -> Floats:
+        """P = (C + λ)⁻¹ (Y, Y)."""
+        found: Floats = np.linalg.inv(self.covariance + PENALTY * np.eye(len(self.covariance)))
+        return found
+
+    def _weights(self, missing: Mask) -> tuple[NDArray[np.intp], Floats]:
+        """Return the places (M,) of the senses of ``missing`` (D,) in y, and the weights (M, Y) that complete them.
+
+        With E, every entry in which they take part: C_MO (C_OO + λ)⁻¹ are the rows M of -(P_EE)⁻¹ P_EO. E is short.
+        """
+        E, P = np.flatnonzero(self.involved(missing)), self.precision
+        places = np.flatnonzero(missing[self.spec.sensory])  # sensory entries come first in y
+        W: Floats = -np.linalg.solve(P[np.ix_(E, E)], P[E])[np.searchsorted(E, places)]
+        W[:, E] = 0.0
+        return places, W
+
+    @cached_property
     def each_alone(self) -> Floats:
-        """Weights (S, Y) that complete each sensor alone; all from one inverse."""
-        Y, sensory = len(self.covariance), self.spec.sensory
-        P = np.linalg.inv(self.covariance + PENALTY * np.eye(Y))
-        W = np.zeros((len(sensory), Y))
+        """Weights (S, Y) that complete each sensor alone."""
+        W = np.zeros((len(self.spec.sensory), len(self.covariance)))
         for _, columns in self.sensors:
             missing = np.zeros(self.spec.size, bool)
             missing[columns] = True
-            E = np.flatnonzero(self.involved(missing))
-            solved = -np.linalg.solve(P[np.ix_(E, E)], P[E])
-            solved[:, E] = 0.0
-            places = self._places(columns)
-            W[places] = solved[np.searchsorted(E, places)]
+            places, W_M = self._weights(missing)
+            W[places] = W_M
         return W
 
     def unexplained(self, lifted: Floats) -> Floats:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
-from asm_gym.memory.completion import PENALTY, Completion
+from asm_gym.memory.completion import Completion
 from asm_gym.spec import MOTOR
 
 FAMILIES = ("sensor", "contact", "actuator", "action", "object", "unknown")
@@ -123,12 +123,9 @@ class Diagnosis:
     completion: Completion
     readout: Readout
 
-    @cached_property
-    def precision(self) -> NDArray[np.float64]:
-        """P (Y, Y)."""
-        C = self.completion.covariance
-        found: NDArray[np.float64] = np.linalg.inv(C + PENALTY * np.eye(len(C)))
-        return found
+    def __post_init__(self) -> None:
+        """Invert what there is to invert now: an alarm does not wait for it."""
+        _ = self._freed
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -148,7 +145,7 @@ class Diagnosis:
             missing = np.zeros(self.completion.spec.size, bool)
             missing[h.columns] = True
             E = np.flatnonzero(self.completion.involved(missing))
-            found.append((E, np.linalg.inv(self.precision[np.ix_(E, E)])))
+            found.append((E, np.linalg.inv(self.completion.precision[np.ix_(E, E)])))
         return found
 
     def evidence(
@@ -180,9 +177,9 @@ class Diagnosis:
     def _explained(self, lifted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return E (T,), and E_S of each hypothesis (T, H), for y (T, Y)."""
         y = lifted - self.completion.centre
-        g = y @ self.precision
+        g = y @ self.completion.precision
         energy = np.einsum("ty,ty->t", y, g)
-        left = [energy - np.einsum("te,ef,tf->t", g[:, E], Q, g[:, E]) for E, Q in self._freed]
+        left = [energy - np.einsum("te,te->t", g[:, E] @ Q, g[:, E]) for E, Q in self._freed]
         return energy, np.stack(left, axis=1)
 
     def __call__(
