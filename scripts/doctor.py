@@ -79,10 +79,10 @@ def cache() -> Check:
     """Check whether compiled code is kept for the next process."""
     try:
         from asm_gym.compilation import KEEP_NOWHERE, kept_in
-        from asm_gym.monitors.row_kernel import observe_rows
+        from asm_gym.monitors.row_kernel import expect_rows
     except ImportError as error:  # of what another check names
         return Check("compiled code", escape(str(error)), REINSTALL, needed=True)
-    folder = kept_in(observe_rows)
+    folder = kept_in(expect_rows)
     if folder is None or KEEP_NOWHERE in str(folder):
         return Check("compiled code", "lost when a process ends: neither the install nor HOME is writable", NAME_CACHE)
     return Check("compiled code", str(folder))
