@@ -15,17 +15,16 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
 from tests.streams import swing
 
-rerun = needs("rerun")
+chunk = needs("rerun.chunk")  # of rerun-sdk 0.41
 
 ARM = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.05)
 
 
-def column(path, entity, kind="Scalar"):
+def column(path, entity, kind="Scalars:scalars"):
     """(T, n) what a recording holds of an entity, row by row."""
-    recording = rerun.dataframe.load_recording(str(path))
-    table = recording.view(index="time", contents=f"/{entity}/**").select().read_all()
-    name = next(n for n in table.column_names if n.endswith(f":{kind}") and entity in n)
-    return [row for row in table[name].to_pylist() if row is not None]
+    chunks = chunk.RrdReader(path).stream().to_chunks()
+    of_entity = (c.to_record_batch() for c in chunks if c.entity_path.startswith(f"/{entity}"))
+    return [row for batch in of_entity for row in batch[kind].to_pylist()]
 
 
 @pytest.fixture(scope="module")
@@ -52,4 +51,4 @@ def test_a_log_is_written_for_the_viewer_with_the_band_of_predictions_that_a_stu
     inside = (low <= sensed) & (sensed <= high)
     assert inside[1:40].mean() > 0.8
     assert inside[41:].mean() < 0.2
-    assert column(path, "log", "Text")[0][0].startswith("alarm: ")
+    assert column(path, "log", "TextLog:text")[0][0].startswith("alarm: ")

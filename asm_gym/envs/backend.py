@@ -50,8 +50,8 @@ def import_robosuite() -> Any:
 def _fit_to_mujoco() -> None:
     """Mend what robosuite 1.5.2 asks of MuJoCo and newer ones answer otherwise.
 
-    From 3.10 on ``mj_fullM`` takes other arguments, from 3.11 on ``data.qM`` is gone, and from 3.17 on a type of joint
-    does not compare equal to the number on its right.
+    From 3.10 on ``mj_fullM`` takes other arguments, from 3.11 on ``data.qM`` is gone, and from 3.12 on a type of joint
+    equals no NumPy integer on its right.
     """
     from robosuite.controllers.parts import controller
     from robosuite.utils.binding_utils import MjData, MjModel

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.backend import reseed
+from asm_gym.envs.backend import import_robosuite, reseed
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 UNITS = {"_cos": "1", "_sin": "1", "joint_pos": "rad", "joint_vel": "rad/s", "joint_acc": "rad/s2", "_pos": "m"}
@@ -27,6 +27,7 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
 
     def __init__(self, make: type[Any], **arguments: Any) -> None:
+        import_robosuite()  # which fits it to MuJoCo
         self.robosuite_env: Any = make(**{"ignore_done": True, "control_freq": 20, **HEADLESS, **arguments})
         self.dt = 1.0 / self.robosuite_env.control_freq
         self._seeded = False
