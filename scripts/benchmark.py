@@ -8,16 +8,17 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice, repeat
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium.vector import SyncVectorEnv
+from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -25,6 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.data.episode import Episode
 from asm_gym.envs.backend import import_robosuite
+from asm_gym.envs.vector import ThreadedVectorEnv, cores
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -33,10 +35,12 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_number
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.robots import body_memory
 
 NAMES = "monitor", "safety", "env"
+SECOND = 20  # control steps of a second
 PARTS = 10  # parts of a measurement; a ratio's spread is that of the ratios of their medians
 Rivals = dict[str, Callable[[], Any]]
 
@@ -46,13 +50,15 @@ class Args(Options):
     """Speeds as ratios against rivals."""
 
     what: tuple[str, ...] = option(NAMES, least=1, known=NAMES, positional=True)
-    """One call of observe(); the safety wrapper's share of a step; an environment's step against robosuite's."""
+    """One call of observe(); steps under the guard against those without; environments against MuJoCo and robosuite."""
     task: str = option("Lift", check=env_id, metavar="TASK")
     """Task of the environments, with the Panda."""
     steps: int = option(400, quick=20, least=1)
-    """Control steps of each rival; five times as many calls of observe()."""
-    members: int = option(4, least=1)
-    """Environments under one vector wrapper."""
+    """Control steps of each rival, in parts of a second; five times as many calls of observe()."""
+    members: tuple[int, ...] = option(
+        (1, 2, 4, 16), quick=(1, 2), least=1, check=partial(check_number, "members", low=1)
+    )
+    """Environments side by side in one vector, on as many threads as there are cores."""
     out: Path = option(Path("runs/benchmark"), metavar="FOLDER")
     """Folder of benchmark.md."""
 
@@ -115,61 +121,139 @@ def measure_monitor(args: Args, console: Console) -> Table:
     return compared("observe(), 256 hidden units, 60 channels", "µs", seconds, dict.fromkeys(rivals, rival))
 
 
-def _made(task: str, rate: int | None = None, **settings: Any) -> gym.Env[Any, Any]:
-    return gym.make(env_id(task), horizon=10**9, stream_freq=rate, disable_env_checker=True, **settings)
+def _made(task: str, rate: int | None = None) -> gym.Env[Any, Any]:
+    return gym.make(env_id(task), horizon=10**9, stream_freq=rate, disable_env_checker=True)
+
+
+class Members:
+    """Environments, and vectors of the first few of them, which share them."""
+
+    def __init__(self, task: str, count: int) -> None:
+        self.envs = [_made(task) for _ in range(count)]
+        self._vectors: list[ThreadedVectorEnv] = []
+
+    def first(self, count: int) -> ThreadedVectorEnv:
+        """Return a vector of the first ``count``; kept, since one that is collected closes its members."""
+        self._vectors.append(ThreadedVectorEnv([partial(self.envs.__getitem__, i) for i in range(count)]))
+        return self._vectors[-1]
+
+    def close(self) -> None:
+        for vector in self._vectors:
+            vector.close()
+
+
+def stepping(step: Callable[[Any], Any], actions: Iterable[Any]) -> Callable[[], None]:
+    """Return a function that takes the steps of the next second."""
+    turns = iter(actions)
+
+    def second() -> None:
+        for action in islice(turns, SECOND):
+            step(action)
+
+    return second
+
+
+def speeds(
+    name: object, members: int, seconds: dict[str, NDArray[np.float64]], rivals: Sequence[str]
+) -> tuple[str, ...]:
+    """Return a row: steps a second of all members together, and the first's as a share of each rival's."""
+    ours, *_ = seconds
+    numbers = (f"{SECOND * members / np.median(taken):,.0f}" for taken in seconds.values())
+    return str(name), *numbers, *(ratio(seconds[rival], seconds[ours]).text(digits=2) for rival in rivals)
 
 
 def measure_safety(args: Args, console: Console) -> Table:
-    """Compare a step under the wrapper with the same step without it, at 20 and 100 Hz and of several members."""
-    envs: dict[str, Any] = {}
-    memories: dict[str, NeuralASM] = {}
-    for rate, name in ((None, "20 Hz"), (100, "100 Hz")):
-        envs[name], inner = _made(args.task, rate), _made(args.task, rate)
-        memories[name] = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)  # no step is overridden
-        envs[f"{name}, guarded"] = NeuralASMSafety(inner, memories[name], monitor_freq=rate)
-    name = f"{args.members} members"
-    envs[name], within = (SyncVectorEnv([partial(_made, args.task)] * args.members) for _ in range(2))
-    envs[f"{name}, guarded"] = VectorNeuralASMSafety(within, memories["20 Hz"])
-    rivals: Rivals = {}
-    for each, env in envs.items():
-        env.reset(seed=args.seed)
-        rivals[each] = partial(env.step, np.zeros(env.action_space.shape, np.float32))
-    seconds = take_turns(rivals, args.steps, args.seed, console)
-    for env in envs.values():
-        env.close()
-    unguarded = {each: each.removesuffix(", guarded") for each in envs}
-    return compared(f"A control step of {args.task}, shipped memory", "ms", seconds, unguarded)
+    """Compare steps under the guard with the same steps without it: one environment at 20 and 100 Hz, and vectors."""
+    rows, turns = [], max(1, args.steps // SECOND)
+
+    def compare(name: object, count: int, bare: Any, guarded: Any) -> None:
+        rivals = {}
+        for each, env in (("guarded", guarded), ("bare", bare)):
+            env.reset(seed=args.seed)
+            rivals[each] = stepping(env.step, repeat(np.zeros(env.action_space.shape, np.float32)))
+        rows.append(speeds(name, count, take_turns(rivals, turns, args.seed, console), ["bare"]))
+
+    for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
+        bare, inner = _made(args.task, rate), _made(args.task, rate)
+        memory = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)  # no step is overridden
+        guarded = NeuralASMSafety(inner, memory, monitor_freq=rate)
+        compare(name, 1, bare, guarded)
+        bare.close()
+        guarded.close()
+    alone, watched = (Members(args.task, max(args.members)) for _ in range(2))
+    for n in args.members:
+        within = watched.first(n)
+        memory = body_memory(within, within.get_attr("stream_spec")[0]).with_threshold(1e300)
+        compare(f"vector of {n}", n, alone.first(n), VectorNeuralASMSafety(within, memory))
+    alone.close()
+    watched.close()
+    headings = "", "guarded", "bare", "guarded / bare"
+    return Table(f"Control steps of {args.task} a second, shipped memory", headings, rows)
+
+
+def physics_alone(envs: Sequence[gym.Env[Any, Any]], actions: NDArray[np.float32]) -> Callable[[], None]:
+    """Return a function that simulates the next second by ``mujoco.rollout``, on as many threads as there are cores.
+
+    It has the environments' models, states and motor commands, recorded here as they take ``actions`` (T, n, A): the
+    same motion to the last bit.
+    """
+    simulations = [env.get_wrapper_attr("simulation") for env in envs]
+    models = [simulation.model for simulation in simulations]
+    size = mujoco.mj_stateSize(models[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    recorded = []
+    for start in range(0, len(actions), SECOND):
+        states, warm, controls = [], [], []
+        for i, (env, simulation) in enumerate(zip(envs, simulations, strict=True)):
+            data, torques = simulation.data, []  # type: Any, list[NDArray[np.float64]]
+            states.append(np.empty(size))
+            mujoco.mj_getState(models[i], data, states[i], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            warm.append(data.qacc_warmstart.copy())
+            hooks = env.get_wrapper_attr("substep_hooks")
+            hooks.append(lambda _, data=data, torques=torques: torques.append(data.ctrl.copy()))
+            for action in actions[start : start + SECOND, i]:
+                env.step(action)
+            hooks.clear()
+            controls.append(torques)
+        recorded.append([np.array(part) for part in (states, controls, warm)])
+    turns, threads = iter(recorded), min(cores(), len(envs))
+    pool, data = Rollout(nthread=threads if threads > 1 else 0), [mujoco.MjData(models[0]) for _ in range(threads)]
+
+    def second() -> None:
+        states, controls, warm = next(turns)
+        pool.rollout(models, data, states, controls, initial_warmstart=warm)
+
+    return second
 
 
 def measure_env(args: Args, console: Console) -> Table:
-    """Compare a control step with robosuite's, and with its physics alone."""
-    ours, bare, floor = _made(args.task), _made(args.task, stream=(), sensor_noise=0.0), _made(args.task)
-    for env in (ours, bare, floor):
-        env.reset(seed=args.seed)
-    simulation: Any = floor.get_wrapper_attr("simulation")
+    """Compare vectors with MuJoCo's own threads, which simulate the same motion alone, and with robosuite's step."""
+    members, rows, turns = Members(args.task, max(args.members)), [], max(1, args.steps // SECOND)
     robosuite, robots = import_robosuite(), ["Panda"] * task_spec(args.task).arms
     control = [robosuite.load_composite_controller_config(robot=robot) for robot in robots]
     blind = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
     theirs = robosuite.make(
         args.task, robots, controller_configs=control, reward_shaping=True, ignore_done=True, **blind
     )
-    theirs.reset()
-    rng = np.random.default_rng(args.seed)
-
-    def drive(step: Callable[[Any], Any]) -> Callable[[], Any]:
+    for n in args.members:
+        ours, rng = members.first(n), np.random.default_rng(args.seed)
         # Each action is held for a second, as a policy's are: noise alone would keep the arm in place.
-        actions = rng.uniform(-0.3, 0.3, (2 + args.steps // 20, *(ours.action_space.shape or ())))
-        turns = iter(np.repeat(actions, 20, axis=0).astype(np.float32))
-        return lambda: step(next(turns))
-
-    rivals: Rivals = {
-        "asm_gym": drive(ours.unwrapped.step),
-        "asm_gym, no stream": drive(bare.unwrapped.step),
-        "robosuite": drive(theirs.step),
-        "mj_step alone": partial(mujoco.mj_step, simulation.model, simulation.data, simulation.substeps),
-    }
-    seconds = take_turns(rivals, args.steps, args.seed, console)
-    return compared(f"A control step of {args.task} at 20 Hz", "ms", seconds, dict.fromkeys(rivals, "robosuite"))
+        held = rng.uniform(-0.3, 0.3, (turns + 1, *(ours.action_space.shape or ())))
+        actions = np.repeat(held, SECOND, axis=0).astype(np.float32)
+        ours.reset(seed=args.seed)
+        physics = physics_alone(members.envs[:n], actions)
+        ours.reset(seed=args.seed)
+        theirs.reset()
+        rivals: Rivals = {
+            "asm_gym": stepping(ours.step, actions),
+            "mujoco.rollout": physics,
+            "robosuite": stepping(theirs.step, actions[:, 0]),
+        }
+        seconds = take_turns(rivals, turns, args.seed, console)
+        seconds["robosuite"] *= n  # which has no vectors
+        rows.append(speeds(n, n, seconds, ["mujoco.rollout", "robosuite"]))
+    members.close()
+    headings = "members", "asm_gym", "mujoco.rollout", "robosuite", "asm_gym / mujoco.rollout", "asm_gym / robosuite"
+    return Table(f"Control steps of {args.task} a second, at 20 Hz", headings, rows)
 
 
 BENCHMARKS: dict[str, Callable[[Args, Console], Table]] = {

@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.envs.commands import clip, in_units
 from asm_gym.envs.robots import gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
 
 _CHANGES = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes of the arm's pose
-_LEAST, _MOST = np.float32(-1.0), np.float32(1.0)
 
 
 class Actions:
@@ -43,14 +43,14 @@ class Actions:
         action = as_float32(action, "the action")
         if action.shape != self.space.shape:
             raise ValueError(f"{self._task} takes an action of shape {self.space.shape}, got {action.shape}")
-        if not np.isfinite(action).all():
+        clipped = np.empty_like(action)
+        if not clip(action, clipped):
             raise ValueError(f"the action must be finite, got {action}")
-        return np.minimum(np.maximum(action, _LEAST), _MOST)
+        return clipped
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""
-        found: NDArray[np.float64] = self._low + self._half * (action.astype(np.float64) + 1.0)
-        return found
+        return in_units(action, self._low, self._half)
 
     def slowed(self, simulation: Simulation, action: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
         """Return the action (A,) scaled so that no hand is commanded to go faster than ``limit`` [m/s].

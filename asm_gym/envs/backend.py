@@ -187,9 +187,21 @@ def speed_up_contacts(env: Any) -> None:
         grippers = gripper.values() if isinstance(gripper, dict) else (gripper,)
         ways = [place(target, target_type) - grip_site(each) for each in grippers]
         way = ways[0] if len(ways) == 1 else min(ways, key=np.linalg.norm)
-        return np.linalg.norm(way) if return_distance else way
+        return np.sqrt(way.dot(way)) if return_distance else way  # as NumPy's norm does it
 
     env.check_contact, env._check_grasp, env._gripper_to_target = check_contact, check_grasp, gripper_to_target
+
+
+class _Asked(dict[str, Any]):
+    """A dict that notes the names whose values it was asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        self.names.add(name)
+        return super().__getitem__(name)
 
 
 class ObjectSensors:
@@ -204,8 +216,8 @@ class ObjectSensors:
         hands = [f"robot{i}_eef_{what}" for i in range(len(env.robots)) for what in ("pos", "quat")]
         # Never shown, but others compute from them.
         hidden = [n for n in of_objects if n.startswith("world_pose_in")]
-        self._inputs = [observables[n] for n in (*hands, *hidden) if n in observables]
         chosen = task.name in _CHOSEN
+        inputs = [observables[n] for n in (*hands, *hidden) if n in observables]
         self._observables = [o for n, o in of_objects.items() if n not in hidden and (chosen or o.is_active())]
         sizes = [int(np.prod(o._data_shape)) or 1 for o in self._observables]
         self.channels = tuple(
@@ -214,6 +226,10 @@ class ObjectSensors:
         self._rest = [np.zeros(size) for size in sizes]
         # Relative poses are computed from absolute ones, which robosuite lists after them.
         self._in_order = sorted(self._observables, key=lambda o: "_to_" in o.name)
+        seen = _Asked()
+        for observable in (*inputs, *self._in_order):
+            seen[observable.name] = observable._sensor(seen)
+        self._inputs = [o for o in inputs if o.name in seen.names]
 
     def read(self) -> list[NDArray[np.float64]]:
         """One array for each of ``channels``."""

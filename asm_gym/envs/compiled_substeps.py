@@ -30,6 +30,7 @@ from asm_gym.envs.mujoco_views import (
     STAYED,
     SUBSTEPS,
     Arms,
+    Bound,
     Floats,
     Goals,
     Ints,
@@ -151,31 +152,29 @@ def must_stay(limits: SubstepLimits) -> bool:
     return bool(now)
 
 
+@compiled
+def bind(*parts: Any) -> Bound:
+    """Return what ``run`` works on.
+
+    Args:
+        parts: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``SubstepLimits``, and three arrays: the action in
+            metres and radians (A, JOINTS), the rotation that it asks for (A, 3, 3), and samples (A, K, SAMPLE).
+    """
+    return Bound(parts)
+
+
 @partial(compiled, nogil=True)
-def run(
-    views: Views,
-    nominal: NominalViews,
-    arms: Arms,
-    goals: Goals,
-    limits: SubstepLimits,
-    deltas: Floats,
-    turns: Floats,
-    samples: Floats,
-    fresh: bool,
-    first: int,
-    count: int,
-) -> None:
+def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
     """Run ``count`` physics substeps, controllers and sensors included.
 
     Args:
-        deltas: (A, JOINTS) the action in metres and radians.
-        turns: (A, 3, 3) the rotation that it asks for.
-        samples: (A, K, SAMPLE), written at ``first`` and after.
+        bound: of ``bind``; samples are written at ``first`` and after.
         fresh: the action moves the set-points in the first of these substeps.
         first: index of the first substep within the row.
 
     From the substep after a limit is passed, the arms stay where they are, where the limits ask for that.
     """
+    views, nominal, arms, goals, limits, deltas, turns, samples = bound.parts
     for k in range(first, first + count):
         _step1(views.model, views.data)
         if nominal.model != 0:
@@ -188,7 +187,7 @@ def run(
                 set_goal(views, arms, goals, a, deltas[a], turns[a])
             control(views, nominal, arms, goals, a)
         _step2(views.model, views.data)
-        sample(views, nominal, arms, k, samples)
+        sample(views, nominal, arms, k, samples)  # the place for all that is measured in every substep
         feel(arms, limits, k, samples)
 
 
@@ -206,9 +205,24 @@ def sense(sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Float
 
 
 @compiled
-def quantise(row: Floats, steps: Floats, carried: Ints, stream: NDArray[np.float32]) -> tuple[bool, bool]:
-    """Round a row (M,) in place to resolutions ``steps`` (M,), 0 for none, and write its numbers ``carried`` (D,) into
-    the stream (D,); return whether row and stream are finite in single precision."""
+def finish(
+    row: Floats,
+    steps: Floats,
+    carried: Ints,
+    stream: NDArray[np.float32],
+    seen: Ints,
+    bound: float,
+    observation: NDArray[np.float32],
+) -> tuple[bool, bool]:
+    """Round a row (M,) in place to resolutions ``steps`` (M,), 0 for none, and share its numbers out.
+
+    Args:
+        carried, seen: which numbers go into the stream (D,), and which into the observation (S,).
+        bound: to which the observation is clipped; NaN becomes 0 there.
+
+    Returns:
+        Whether row and stream are finite in single precision.
+    """
     row_finite = stream_finite = True
     for n in range(len(row)):
         if steps[n] > 0.0:
@@ -217,6 +231,9 @@ def quantise(row: Floats, steps: Floats, carried: Ints, stream: NDArray[np.float
     for n in range(len(carried)):
         stream[n] = np.float32(row[carried[n]])
         stream_finite = stream_finite and np.isfinite(stream[n])
+    for n in range(len(seen)):
+        value = row[seen[n]]
+        observation[n] = min(max(value, -bound), bound) if value == value else 0.0
     return row_finite, stream_finite
 
 
@@ -266,10 +283,11 @@ def touching(pairs: Ints, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> b
 
 
 @compiled
-def edited(live: Floats, frozen: Floats, rows: Ints) -> bool:
-    """Whether two arrays (N, M) differ in any of ``rows``."""
-    for r in rows:
-        for c in range(live.shape[1]):
-            if live[r, c] != frozen[r, c]:
-                return True
+def edited(live: tuple[Floats, ...], frozen: tuple[Floats, ...], rows: Ints) -> bool:
+    """Whether arrays (N, M) differ from others in any of ``rows``."""
+    for k in range(len(live)):
+        for r in rows:
+            for c in range(live[k].shape[1]):
+                if live[k][r, c] != frozen[k][r, c]:
+                    return True
     return False

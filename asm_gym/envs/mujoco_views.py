@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numba import types
+from numba.experimental import structref
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -104,3 +106,21 @@ class SubstepLimits(NamedTuple):
 ARMED, ACTS, SUBSTEPS, PASSED_IN, STAYED = range(5)
 """Of ``SubstepLimits.state``: whether limits are compared; whether the arms stay once one is passed; substeps since the
 control step began; the first of them in which a limit was passed, -1 for none; whether the arms were stopped."""
+
+
+@structref.register
+class _BoundType(types.StructRef):  # type: ignore[misc]
+    """The compiler's type of ``Bound``."""
+
+
+class Bound(structref.StructRefProxy):  # type: ignore[misc]
+    """All that the compiled loop works on, in one object: ``parts`` is a tuple of it.
+
+    Numba takes an array apart at every call that it is given to, which for all of these together takes longer than some
+    substeps; it takes this apart once.
+    """
+
+    parts: tuple[Any, ...]
+
+
+structref.define_proxy(Bound, _BoundType, ["parts"])

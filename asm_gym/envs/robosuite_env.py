@@ -195,7 +195,7 @@ class RobosuiteEnv(SteppedEnv):
         self._action = np.zeros(self._actions.size, np.float32)
         self._reading = self._read()
         self._ended = False
-        return self._senses.observation(self._reading.row), self._info(bool(env._check_success()))
+        return self._senses.observation(self._reading), self._info(bool(env._check_success()))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Run one control step.
@@ -220,6 +220,7 @@ class RobosuiteEnv(SteppedEnv):
         if unstable := self._divergences() != self._diverged or not (self._finite and self._reading.row_finite):
             # The simulation then holds MuJoCo's initial state as a rule, which no sensor of the robot could read.
             self._reading.row[:] = self._reading.stream[:] = np.nan
+            self._reading.seen[:] = 0.0
             reward, success = 0.0, False
         info = self._info(success, unstable)
         if self._row_substeps < self.substeps and "stream" in info:
@@ -227,7 +228,7 @@ class RobosuiteEnv(SteppedEnv):
         terminated = self.terminate_on_success and success
         truncated = self._steps_taken >= self.horizon or unstable
         self._ended = terminated or truncated
-        return self._senses.observation(self._reading.row), reward, terminated, truncated, info
+        return self._senses.observation(self._reading), reward, terminated, truncated, info
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
         stream = {"stream": self._reading.stream} if self._senses.stream_spec else {}

@@ -187,8 +187,8 @@ class NominalDynamics:
 
     def __init__(self, model: mujoco.MjModel, views: Views, robots: Ints) -> None:
         self._model, self._robots = model, robots
-        self._live = {name: getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA}
-        self._frozen = {name: live.copy() for name, live in self._live.items()}
+        self._live = tuple(getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA)
+        self._frozen = tuple(live.copy() for live in self._live)
         v = views
         self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.M, v.qfrc_bias, v.dof_damping.copy())
         """Views of the live model, valid while the robots' masses are as they were loaded."""
@@ -196,12 +196,12 @@ class NominalDynamics:
 
     def now(self) -> NominalViews:
         """Return views of the live model, or of a copy once somebody has edited the robots' masses."""
-        if not any(kernels.edited(self._live[n], self._frozen[n], self._robots) for n in self._INERTIA):
+        if not kernels.edited(self._live, self._frozen, self._robots):
             return self.unedited
         if self._copy is None:
             model = copy.copy(self._model)
-            for name in self._INERTIA:
-                getattr(model, name)[:] = self._frozen[name].reshape(getattr(model, name).shape)
+            for name, frozen in zip(self._INERTIA, self._frozen, strict=True):
+                getattr(model, name)[:] = frozen.reshape(getattr(model, name).shape)
             data = mujoco.MjData(model)
             addresses, motion = (model._address, data._address), (data.qpos, data.qvel, data.M)
             nominal = NominalViews(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)

@@ -156,6 +156,7 @@ class Reading(NamedTuple):
 
     row: NDArray[np.float64]  # (M,) everything
     stream: NDArray[np.float32]  # (D,) the part that the stream carries
+    seen: NDArray[np.float32]  # (S,) the part that is observed; finite whatever the row holds
     row_finite: bool
     stream_finite: bool
 
@@ -192,10 +193,11 @@ class Senses:
         self._needs_objects = "object" in groups
         names = [c.name for c in spec.channels if c.name.endswith(_OBSERVED) or c.group == "object"]
         self._observed = _columns(spec, names)
-        self._slices = {name: spec.slices[name] for name in names}
         self._flat = flat
-        self.sizes = {name: s.stop - s.start for name, s in self._slices.items()}
+        self.sizes = {name: spec.slices[name].stop - spec.slices[name].start for name in names}
         """The observation's parts in order, and how many numbers each has."""
+        ends = np.cumsum([0, *self.sizes.values()]).tolist()
+        self._parts = dict(zip(names, map(slice, ends, ends[1:]), strict=False))
 
     def read(
         self,
@@ -211,12 +213,13 @@ class Senses:
         Within a step, objects keep their last pose if the stream does not carry them.
         """
         if faults or self._needs_objects or not within_step:
-            self._object_poses = np.concatenate([*objects.read(), np.zeros(0)])
-        row = sense(np.concatenate([self._object_poses, action]), self._noise, rng)
+            self._object_poses = objects.read()
+        row = sense(np.concatenate([*self._object_poses, action], dtype=np.float64), self._noise, rng)
         for corrupt in faults:
             corrupt(row)
-        stream = np.empty(len(self._carried), np.float32)
-        return Reading(row, stream, *kernels.quantise(row, self._steps, self._carried, stream))
+        stream, seen = np.empty(len(self._carried), np.float32), np.empty(len(self._observed), np.float32)
+        finite = kernels.finish(row, self._steps, self._carried, stream, self._observed, _BOUND, seen)
+        return Reading(row, stream, seen, *finite)
 
     def space(self) -> spaces.Space[Any]:
         """Return the space of observations."""
@@ -224,18 +227,9 @@ class Senses:
             return _box(len(self._observed))
         return spaces.Dict({name: _box(size) for name, size in self.sizes.items()})
 
-    def observation(self, row: NDArray[np.float64]) -> Any:
-        """Return the observation of a row (M,); finite whatever the row holds."""
-        if self._flat:
-            return _clipped(row[self._observed])
-        row32 = _clipped(row)
-        return {name: row32[s] for name, s in self._slices.items()}
-
-
-def _clipped(row: NDArray[np.float64]) -> NDArray[np.float32]:
-    if not np.isfinite(row).all():
-        row = np.nan_to_num(row)
-    return row.clip(-_BOUND, _BOUND).astype(np.float32)
+    def observation(self, reading: Reading) -> Any:
+        """Return the observation of a reading."""
+        return reading.seen if self._flat else {name: reading.seen[part] for name, part in self._parts.items()}
 
 
 def _box(size: int) -> spaces.Space[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,8 +13,21 @@ from numpy.typing import NDArray
 from asm_gym.compilation import must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs.commands import move_arms, move_gripper, scaling_of
 from asm_gym.envs.control import hold_at
-from asm_gym.envs.mujoco_views import ACTS, ARMED, FELT, JOINTS, PASSED_IN, Floats, Goals, SubstepLimits, Views
+from asm_gym.envs.mujoco_views import (
+    ACTS,
+    ARMED,
+    FELT,
+    JOINTS,
+    PASSED_IN,
+    Bound,
+    Floats,
+    Goals,
+    NominalViews,
+    SubstepLimits,
+    Views,
+)
 from asm_gym.envs.robots import NominalDynamics, bodies, describe, is_compilable
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.spec import Channel
@@ -38,7 +50,6 @@ class Simulation:
         self.model: mujoco.MjModel = env.sim.model._model
         self.data: mujoco.MjData = env.sim.data._data
         self.warnings: Any = self.data.warning.number  # a view
-        self._rotations = importlib.import_module("robosuite.utils.transform_utils")
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
         robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self.parts]))
@@ -68,12 +79,19 @@ class Simulation:
         splits = [robot._action_split_indexes[arm] for robot, arm in self.parts]
         self.moves = [slice(start + low, start + high) for start, (low, high) in zip(starts, splits, strict=False)]
         """Each arm's part of the action."""
-        self._grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
+        grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
+        self._grips = [grip for grip in grips if grip is not None]
         self.compiled = all(is_compilable(robot, arm) for robot, arm in self.parts)  # whether control runs compiled
         self.arms = describe(self.parts, self.model)
+        n = len(self.parts)
+        first, count = (np.array([getattr(part, end) for part in self.moves]) for end in ("start", "stop"))
+        scalings = np.zeros((n, 5, JOINTS))
+        for scaling, controller, size in zip(scalings, self.controllers, count - first, strict=True):
+            if self.compiled:
+                scaling[:, :size] = scaling_of(controller, size)
+        self._moving = first, count - first, scalings
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
-        n = len(self.parts)
         self._limits.state[:] = 0, 0, 0, -1, 0
         self._limits_set: ContactLimits | None = None
         # Arm and index in the limits of each number that limits apply to, and its column in a sample.
@@ -85,6 +103,7 @@ class Simulation:
         self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64))
         self._deltas = np.zeros((n, JOINTS))
         self._turns = np.tile(np.eye(3), (n, 1, 1))
+        self._bound: tuple[NominalViews, Bound] | None = None
         self._samples[:] = 0.0
         if must_compile(kernels.run):
             print("asm-gym: compiling the simulation loop, once on this machine (about 20 s)", file=sys.stderr)
@@ -117,12 +136,9 @@ class Simulation:
         self._action = action
         self._fresh = True
         if self.compiled:
-            for a, (controller, moves, grip) in enumerate(zip(self.controllers, self.moves, self._grips, strict=True)):
-                self._deltas[a, : moves.stop - moves.start] = controller.scale_action(action[moves])
-                # robosuite rounds this rotation to single precision, which shows after a while.
-                self._turns[a] = self._rotations.quat2mat(self._rotations.axisangle2quat(self._deltas[a, 3:6]))
-                if grip is not None:
-                    grip(action)
+            move_arms(action, *self._moving, self._deltas, self._turns)
+            for grip in self._grips:
+                grip(action)
 
     def advance(self, count: int) -> None:
         """Run ``count`` substeps of the control step that was begun."""
@@ -156,9 +172,11 @@ class Simulation:
             hold_at(self.views, self.arms, self._goals, a)
 
     def _run(self, count: int) -> None:
-        first = self._done - self._row_began
-        state = self.views, self.nominal.now(), self.arms, self._goals, self._limits
-        kernels.run(*state, self._deltas, self._turns, self._samples, self._fresh, first, count)
+        nominal = self.nominal.now()
+        if self._bound is None or self._bound[0] is not nominal:
+            state = self.views, nominal, self.arms, self._goals, self._limits
+            self._bound = nominal, kernels.bind(*state, self._deltas, self._turns, self._samples)
+        kernels.run(self._bound[1], self._fresh, self._done - self._row_began, count)
 
     def begin_row(self) -> None:
         """Begin another row of the stream; the contact force goes on to be that of the whole control step."""
@@ -228,17 +246,15 @@ class Simulation:
         if low == high:
             return None
         controller, motors = robot.composite_controller.part_controllers[name], robot._ref_actuators_indexes_dict[name]
-        controller.scale_action(np.zeros(controller.control_dim))  # which works out the numbers below
-        c, gripper, ctrl = controller, robot.gripper[arm], self.views.ctrl
+        c, gripper, ctrl, motors = controller, robot.gripper[arm], self.views.ctrl, np.asarray(motors, np.int64)
+        scaling = scaling_of(c, c.control_dim)
         middle, half = 0.5 * (c.actuator_max + c.actuator_min), 0.5 * (c.actuator_max - c.actuator_min)
-        least, most = self.views.actuator_ctrlrange[motors].T.copy()
+        ranges = np.array([middle, half, *self.views.actuator_ctrlrange[motors].T])
 
         def move(action: NDArray[np.float64]) -> None:
             # As robosuite's controller does it, less its reading of the joints, which nothing here uses.
-            asked = gripper.format_action(action[start + low : start + high])
-            goal = np.minimum(np.maximum(asked, c.input_min), c.input_max)
-            goal = (goal - c.action_input_transform) * c.action_scale + c.action_output_transform
-            ctrl[motors] = np.minimum(np.maximum(middle + half * goal, least), most)
+            asked = np.asarray(gripper.format_action(action[start + low : start + high]), np.float64)
+            move_gripper(asked, scaling, ranges, motors, ctrl)
 
         return move
 

@@ -67,7 +67,7 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         threads: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        wanted = _cores() if threads is None else check_number("threads", threads, low=1, whole=True)
+        wanted = cores() if threads is None else check_number("threads", threads, low=1, whole=True)
         super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
         self.threads = min(wanted, self.num_envs)
         parts = np.array_split(np.arange(self.num_envs), self.threads)
@@ -182,7 +182,7 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
                     pool.shutdown()
 
 
-def _cores() -> int:
+def cores() -> int:
     """Return how many cores this process may run on."""
     affinity = getattr(os, "sched_getaffinity", None)  # of Linux
     return len(affinity(0)) if affinity else os.cpu_count() or 1
