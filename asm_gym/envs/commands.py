@@ -56,7 +56,8 @@ def within(value: float, least: float, most: float) -> float:
 def scaled(action: float, scaling: Floats, i: int) -> float:
     """Return input ``i`` of a controller in its own units."""
     x = within(action, scaling[LEAST, i], scaling[MOST, i])
-    return (x - scaling[MIDDLE, i]) * scaling[SCALE, i] + scaling[OFFSET, i]
+    found: float = (x - scaling[MIDDLE, i]) * scaling[SCALE, i] + scaling[OFFSET, i]
+    return found
 
 
 @compiled
@@ -69,7 +70,7 @@ def rotation(turn: Floats, matrix: Floats) -> None:
         q[0] = np.cos(angle / 2.0)
         for i in range(3):
             q[1 + i] = turn[i] / angle * np.sin(angle / 2.0)
-    norm = 0.0
+    norm = np.float64(0.0)
     for i in range(4):
         norm += np.float64(q[i] * q[i])
     scale = np.sqrt(2.0 / np.float64(np.float32(norm)))

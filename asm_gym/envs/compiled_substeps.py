@@ -160,7 +160,7 @@ def bind(*parts: Any) -> Bound:
         parts: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``SubstepLimits``, and three arrays: the action in
             metres and radians (A, JOINTS), the rotation that it asks for (A, 3, 3), and samples (A, K, SAMPLE).
     """
-    return Bound(parts)
+    return Bound(parts)  # type: ignore[no-untyped-call]
 
 
 @partial(compiled, nogil=True)

@@ -109,11 +109,11 @@ control step began; the first of them in which a limit was passed, -1 for none; 
 
 
 @structref.register
-class _BoundType(types.StructRef):  # type: ignore[misc]
+class _BoundType(types.StructRef):
     """The compiler's type of ``Bound``."""
 
 
-class Bound(structref.StructRefProxy):  # type: ignore[misc]
+class Bound(structref.StructRefProxy):
     """All that the compiled loop works on, in one object: ``parts`` is a tuple of it.
 
     Numba takes an array apart at every call that it is given to, which for all of these together takes longer than some
@@ -123,4 +123,4 @@ class Bound(structref.StructRefProxy):  # type: ignore[misc]
     parts: tuple[Any, ...]
 
 
-structref.define_proxy(Bound, _BoundType, ["parts"])
+structref.define_proxy(Bound, _BoundType, ["parts"])  # type: ignore[no-untyped-call]
