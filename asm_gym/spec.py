@@ -6,6 +6,8 @@ The sensors are read after the control step in which the action was commanded (t
 from __future__ import annotations
 
 import json
+import math
+import warnings
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from numbers import Real
@@ -242,9 +244,39 @@ def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.fl
 
 
 def control_period(env: gym.Env[Any, Any]) -> float:
-    """Return the control period of any environment [s]; 1 where it has none."""
-    dt = getattr(env.unwrapped, "dt", None)
-    if isinstance(dt, int | float) and dt > 0:
-        return float(dt)
-    rate = (env.metadata or {}).get("render_fps") or getattr(env, "control_freq", None)  # robosuite's GymWrapper
-    return 1.0 / rate if rate else 1.0
+    """Return the control period of any environment [s], by what it says of time; 1 where it says nothing.
+
+    It may say ``dt``, ``tau``, ``control_timestep``, ``frame_skip`` of a model's ``timestep``, or a frequency of
+    control or of its policy. The rate of its videos is taken where nothing else is said, with a warning.
+    """
+    bare = env.unwrapped
+    for name in ("dt", "tau", "control_timestep"):
+        found = getattr(bare, name, None)
+        if _is_positive(found := found() if callable(found) else found):
+            return float(found)
+    skipped, step = getattr(bare, "frame_skip", None), getattr(getattr(bare, "model", None), "opt", None)
+    if _is_positive(skipped) and _is_positive(step := getattr(step, "timestep", None)):
+        return float(skipped * step)
+    config = getattr(bare, "config", None)
+    for name in ("control_freq", "policy_frequency", "control_frequency"):
+        own = config.get(name) if isinstance(config, dict) else None
+        if _is_positive(rate := own or getattr(env, name, None) or getattr(bare, name, None)):
+            return 1.0 / float(rate)
+    rate = (env.metadata or {}).get("render_fps")
+    if not _is_positive(rate):
+        return 1.0
+    warnings.warn(
+        f"{type(bare).__name__} says nothing of its control period: {1 / rate:g} s is taken from the rate of its "
+        "videos; where steps are of another length, give it an attribute dt [s]",
+        PeriodWarning,
+        stacklevel=2,
+    )
+    return 1.0 / float(rate)
+
+
+class PeriodWarning(UserWarning):
+    """How long a control step takes was guessed."""
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and 0 < float(value) < math.inf

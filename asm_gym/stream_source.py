@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -65,6 +65,23 @@ class StreamSource:
         """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""
         found: NDArray[np.float32] = info["streams"] if "streams" in info else self.row(observation, action, info)[None]
         return found
+
+
+def stepped(env: gym.Env[Any, Any], action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    """Return what a step of an environment returns. Raises TypeError unless it is the five values of Gymnasium."""
+    found: Any = env.step(action)
+    if not isinstance(found, tuple) or len(found) != 5:
+        size = len(found) if isinstance(found, tuple) else 1
+        cost = (
+            "; of Safety-Gymnasium, safety_gymnasium.wrappers.SafetyGymnasium2Gymnasium(env) makes them"
+            if size == 6
+            else ""
+        )
+        raise TypeError(
+            f"step of {type(env.unwrapped).__name__} returns {size} values, and Gymnasium's returns observation, "
+            f"reward, terminated, truncated, info{cost}"
+        )
+    return found
 
 
 def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:

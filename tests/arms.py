@@ -50,6 +50,7 @@ class Arm(gym.Env):
 
     metadata = {"render_fps": 20}  # noqa: RUF012
     action_means = "delta"
+    dt = 0.05
 
     def __init__(self, broken=lambda t, row: None):
         self.observation_space = spaces.Box(-50, 50, (5,), np.float32)

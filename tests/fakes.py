@@ -22,6 +22,7 @@ class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """Runs for ``length`` steps; in step t it senses ``first`` + t, and it keeps every action it was given."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    dt = 0.05
 
     def __init__(self, length: int = 20, own_stream: bool = True, first: int = 0) -> None:
         self.observation_space = spaces.Box(-100.0, 100.0, (2,), np.float32)

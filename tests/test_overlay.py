@@ -55,6 +55,7 @@ class ScriptedEnv(gym.Env[Any, Any]):
     """Reports what it is told to report, step by step: dicts of info."""
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+    dt = 0.1
     observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 

@@ -27,6 +27,7 @@ class Solid(gym.Env):
     """Two joints that swing, until from step 60 on something presses the second, or not, and blocks it, or both."""
 
     metadata = {"render_fps": 20}  # noqa: RUF012
+    dt = 0.05
     stream_spec = SOLID
     action_means = "delta"
     observation_layout = {"joint_position": 2}  # noqa: RUF012

@@ -11,6 +11,7 @@ from gymnasium.utils import RecordConstructorArgs
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
 from asm_gym.faults.anywhere import FaultyInterface
+from asm_gym.stream_source import stepped
 from asm_gym.validation import short_repr, typed
 
 
@@ -74,7 +75,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 next(self._running.setdefault(k, fault.inject(self._inner)))
             elif k in self._running:
                 self._running.pop(k).close()
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = stepped(self.env, action)
         active = [self.faults[k] for k in self._running]
         info["fault"] = (*info.get("fault", ()), *(f.name for f in active if not f.harmless))
         info["variation"] = (*info.get("variation", ()), *(f.name for f in active if f.harmless))

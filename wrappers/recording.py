@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
 from asm_gym.spec import StreamSpec, flat
-from asm_gym.stream_source import StreamSource
+from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32
 
 
@@ -62,7 +62,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, {**info, "stream": self._source.first(observation, info)}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = stepped(self.env, action)
         info = {**info, "stream": self._source.row(observation, action, info)}
         # Copies: an environment, a driver or a policy may use its arrays again.
         rows = np.array(self._source.rows(observation, action, info))

@@ -23,7 +23,7 @@ from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself
 from asm_gym.spec import control_period
-from asm_gym.stream_source import StreamSource
+from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, check_choice, short_repr
 from asm_gym.wrappers.robots import body_memory, felt_by, found_in, policy_for, robots_of, sensing_within_steps
 
@@ -238,7 +238,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         if self._holds:
             self._inner.keeps_holding = True
         try:
-            return self.env.step(self._executed)
+            return stepped(self.env, self._executed)
         finally:
             if self._holds:
                 self._inner.keeps_holding = self._inner.holding = False

@@ -4,8 +4,9 @@
     geometry_msgs/WrenchStamped      force[x], …, torque[z]
     std_msgs/Float64MultiArray       data[0], …           such as commands
 
-Each column is named after its topic, ``joint_states.position[panda_joint1]``. A row is a message of the topic of
-JointState that has most of them, at the time in its header, with the newest values of the other topics.
+Each column is named after its topic, ``joint_states.position[panda_joint1]``. A row is a message of JointState: of the
+ones with the same joints, on one topic, the most frequent. It stands at the time in its header, with the newest values
+of all others, such as a gripper on the same topic, as long as these are not old.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.data.tables import Columns
+from asm_gym.data.reader_notes import note
+from asm_gym.data.tables import HELD, Columns
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
@@ -58,7 +60,10 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        raise ValueError(f"{path} is damaged: {error}") from error
+        mend = (
+            "; a recorder that was killed leaves such a file: mcap recover mends it" if path.suffix == ".mcap" else ""
+        )
+        raise ValueError(f"it is damaged: {error}{mend}") from error
 
 
 def _columns(bag: Any) -> Columns:
@@ -67,15 +72,27 @@ def _columns(bag: Any) -> Columns:
     if not any(c.msgcount for c in states):
         topics = ", ".join(f"{c.topic} ({c.msgtype})" for c in bag.connections) or "none"
         raise ValueError(f"it holds no sensor_msgs/JointState; its topics: {topics}")
-    clock = max(states, key=lambda c: c.msgcount).topic
-    latest: Numbers = {}
-    rows: list[Numbers] = []
+    heard: dict[tuple[str, ...], list[tuple[float, Numbers]]] = {}  # of a topic's messages of the same joints
+    order: list[tuple[tuple[str, ...], float, Numbers]] = []
     for connection, written, raw in bag.messages(connections=chosen):
         message = bag.deserialize(raw, connection.msgtype)
         numbers = MESSAGES[connection.msgtype](message)
-        latest |= {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
-        if connection.topic == clock:
-            rows.append({"time": stamp_of(message) or 1e-9 * written, **latest})
+        key = (connection.topic, *sorted(getattr(message, "name", ())))
+        named = {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
+        order.append((key, stamp_of(message) or 1e-9 * written, named))
+        heard.setdefault(key, []).append(order[-1][1:])
+    topics = {c.topic for c in states}
+    clock = max((key for key in heard if key[0] in topics), key=lambda key: len(heard[key]))
+    if len(heard) > 1:
+        note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
+    old = {key: HELD * (said[-1][0] - said[0][0]) / max(len(said) - 1, 1) for key, said in heard.items()}
+    latest: dict[tuple[str, ...], tuple[float, Numbers]] = {}
+    rows: list[Numbers] = []
+    for key, time, numbers in order:
+        latest[key] = time, numbers
+        if key == clock:
+            fresh = [said for other, (at, said) in latest.items() if time - at <= old[other] or other == clock]
+            rows.append({"time": time} | {name: value for said in fresh for name, value in said.items()})
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
     return columns | {"time": columns["time"] - columns["time"][0]}  # seconds since 1970 would cost digits

@@ -45,6 +45,8 @@ def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
     if len(found) < fewest or len(found) < len(values) or (found != np.rint(found)).any():
         return False
     steps = np.diff(found)
+    if len(rises := steps[steps != 0]) > 1 and len(rises) < len(steps) and (rises == rises[0]).all() and rises[0] > 0:
+        return len(np.unique(found)) > 2  # an index, of episodes or of cycles
     usual = float(np.median(steps))
     if usual <= 0 or np.mean(steps == usual) < STEADY:
         return False

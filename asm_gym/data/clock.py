@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import CLOCK, SECONDS, is_clock, ratio, split_unit
+from asm_gym.data.names import CLOCK, COUNTERS, SECONDS, is_clock, ratio, split_unit
 from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
@@ -246,11 +246,17 @@ def _with_unit(clock: Clock, table: Mapping[str, NDArray[Any]], dt: float | None
 def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock | None:
     """A clock that is not called so: its numbers rise, and its name, their size, or a coarse clock tells the unit."""
     for name, values in table.items():
+        unnamed = name.strip().lower() in COUNTERS
+        if unnamed and values.dtype.kind == "O" and len(values):
+            with suppress(ValueError):
+                if (np.diff(_seconds_of_text(name, values)) > 0).all():
+                    return Clock((name,))
         if values.dtype.kind not in "biuf" or values.ndim != 1 or len(values) < 3 or not np.isfinite(values).all():
             continue
         if any(name in clock.columns for clock in coarse) or not np.mean(np.diff(values) > 0) > 1 - MOST_DOUBLED:
             continue
         unit = _named_unit(name) or (_epoch(float(values[0])) if values[0] >= EPOCHS[1][0] else None)
+        unit = 1.0 if unit is None and unnamed and (values != np.rint(values)).any() else unit  # an index of seconds
         span = float(values[-1]) - float(values[0])
         for clock in coarse if unit is None else ():
             whole = float(np.ptp(clock.seconds(table)))

@@ -25,6 +25,7 @@ Named = dict[str, dict[str, str]]  # values by their kind, by the column that na
 
 _NAMES = re.compile(r"(?P<of>.*?)(?:joint_?)?names?[_.]?\[?(?P<place>\d+)\]?", re.I)
 _KEY = re.compile(r"(.*[^a-z])?(joint|motor|axis|servo|actuator|name)s?([^a-z].*)?", re.I)
+HEADING = "heading label"  # the column of the words above blocks of a table
 MOST_KEYS = 64  # joints of a long table
 MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
 SPARSE = 0.55  # share of filled rows up to which a column comes at a lower rate: at most at every other row
@@ -129,9 +130,10 @@ def _is_key(name: str, values: NDArray[Any]) -> bool:
     if is_clock(name) or _NAMES.fullmatch(name):
         return False
     size = len(np.unique(words[: 4 * MOST_KEYS]))
-    return bool(2 <= size <= min(MOST_KEYS, len(words) // 2) and np.mean(words[size:] == words[:-size]) >= MOSTLY) and (
-        len(np.unique(words[:size])) == size
-    )
+    if not 2 <= size <= min(MOST_KEYS, len(words) // 2) or len(np.unique(words[:size])) < size:
+        return False
+    changes, again = np.mean(words[1:] != words[:-1]), np.mean(words[size:] == words[:-size])
+    return bool(changes >= MOSTLY and again >= MOSTLY)
 
 
 def _joined(table: Columns) -> Columns:
@@ -154,7 +156,9 @@ def _joined(table: Columns) -> Columns:
         return table
     rate = f"of {fastest!r}" if fastest else "of the table"
     note(f"columns come at several rates: rows are those {rate}, {', '.join(slower)[:120]} keep their newest value")
-    return {name: _held(values, slower.get(name))[rows] for name, values in table.items()}
+    made = {name: _held(values, slower.get(name))[rows] for name, values in table.items()}
+    start = max(int(np.argmax(np.isfinite(made[name]))) for name in slower)  # before that the slower ones said nothing
+    return {name: values[start:] for name, values in made.items()}
 
 
 def _regular(mask: NDArray[np.bool_]) -> bool:

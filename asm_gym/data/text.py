@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.names import split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns
+from asm_gym.data.tables import HEADING, Columns
 from asm_gym.files import regular_file
 
 if TYPE_CHECKING:
@@ -93,6 +93,7 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     numbered, complete = _lines(path)
     if not numbered:
         raise ValueError("it needs a header and at least one row, got 0 lines")
+    blocks, numbered = _blocks(numbered) if columns else ([], numbered)
     at = 0 if columns else _header_at([line for _, line in numbered[: MOST_PREAMBLE + AGREE]])
     if at:
         note(f"{path}: its first {at} lines are no part of the table, and are left out")
@@ -129,7 +130,22 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     except ValueError as error:
         raise ValueError(f"it is no table of text: {' '.join(str(error).split())}") from error
     cells = [_column(frame[k], dialect.comma) for k in range(len(names))]
+    if blocks:
+        names, cells = [*names, HEADING], [*cells, np.array(blocks, object)]
     return _merged([(n, c) for n, c in zip(names, cells, strict=True) if n or c.dtype.kind == "O" or _any(c)])
+
+
+def _blocks(numbered: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int, str]]]:
+    """The heading of each row where words stand above blocks of a table, and its rows; else no headings."""
+    headings, rows, heading = list[str](), list[tuple[int, str]](), ""
+    for n, line in numbered:
+        if len(line.split()) == 1 and re.fullmatch(r"[^\W\d]\w*", line.strip()):
+            heading = f"{line.strip()} {n}"
+        else:
+            headings.append(heading)
+            rows.append((n, line))
+    found = len(set(headings)) > 1 and all(headings)
+    return (headings, rows) if found else ([], numbered)
 
 
 def _any(values: NDArray[Any]) -> bool:
@@ -227,12 +243,16 @@ def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[s
     cells = _cells_of_header(dialect, line)
     numbers = [dialect.is_number(cell) for cell in cells if cell.strip()]
     if columns:
+        columns = ["", *columns] if cells and not cells[0].strip() and len(columns) == len(cells) - 1 else columns
         if len(columns) != len(cells):
             raise ValueError(f"{len(columns)} columns are named, and its first line has {len(cells)} cells")
         return header_of(columns, "it"), not any(numbers)
     if numbers and sum(numbers) > len(numbers) / 2:
         said = f"is of {len(numbers)} numbers" if all(numbers) else f"holds {sum(numbers)} numbers"
-        raise ValueError(f"its first line {said} and no header: name its columns with --columns")
+        example = " ".join(f"x{k}" for k in range(len(cells)))
+        raise ValueError(
+            f"its first line {said} and no header: name its {len(cells)} columns, --columns {example[:60]}"
+        )
     return header_of(cells, "it"), True
 
 
@@ -258,11 +278,11 @@ def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
 
     text = pd.Series(cells).astype("string").str.strip()
     plain = text.str.replace(",", ".", regex=False) if comma else text
-    values = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
-    hexadecimal = text.str.fullmatch(_HEX).fillna(False)
-    if hexadecimal.any():
-        values[hexadecimal] = [float(int(cell, 16)) for cell in text[hexadecimal]]
-    return values.to_numpy(np.float64, na_value=np.nan)
+    found = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
+    values = found.to_numpy(np.float64, na_value=np.nan)
+    hexadecimal = text.str.fullmatch(_HEX).fillna(False).to_numpy(bool)
+    values[hexadecimal] = [float(int(cell, 16)) for cell in text[hexadecimal]]
+    return values
 
 
 def _column(cells: pd.Series[Any], comma: bool) -> NDArray[Any]:
@@ -293,6 +313,11 @@ def read_json_lines(path: Path, columns: Sequence[str] = ()) -> Columns:
             raise ValueError(f"line {n} is no row: {error}") from error
     if not rows:
         raise ValueError("it needs at least one row, got none")
+    within = json.loads(numbered[0][1])
+    within = within if isinstance(within, dict) else {}
+    lost = [k for k, v in within.items() if isinstance(v, list) and v and isinstance(v[0], dict | list)]
+    if lost:
+        note(f"left out: {', '.join(lost)}: lists of objects; a row is to be a line of its own")
     frame = pd.DataFrame(rows)
     return {name: _column(frame[name], comma=False) for name in frame.columns}
 
