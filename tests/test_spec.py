@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -10,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asm_gym.data.episode import Episode, EpisodeLabel, load_episode, save_episode
-from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.spec import MOTOR, Channel, PeriodWarning, StreamSpec, control_period
+from asm_gym.wrappers.recording import StreamRecorder
 
 SPEC = StreamSpec(
     (
@@ -154,3 +157,34 @@ def test_a_damaged_file_is_named(tmp_path):
             load_episode(path)
     with pytest.raises(FileNotFoundError):
         load_episode(tmp_path / "none.npz")
+
+
+def test_the_control_period_is_what_an_environment_says_of_time_and_never_silently_its_videos():
+    def env(**said):
+        kind = type("Foreign", (gym.Env,), {"metadata": {"render_fps": 10}} | said)
+        return gym.Wrapper(kind())
+
+    model = SimpleNamespace(opt=SimpleNamespace(timestep=0.002))
+    for said, dt in (
+        ({"dt": 0.05}, 0.05),
+        ({"tau": 0.02}, 0.02),
+        ({"control_timestep": lambda self: 0.04}, 0.04),
+        ({"frame_skip": 5, "model": model}, 0.01),
+        ({"config": {"policy_frequency": 5}}, 0.2),
+        ({"control_freq": 20}, 0.05),
+    ):
+        assert control_period(env(**said)) == pytest.approx(dt)
+    with pytest.warns(PeriodWarning, match="Foreign says nothing of its control period: 0.1 s"):
+        assert control_period(env()) == pytest.approx(0.1)
+    assert control_period(env(metadata={})) == 1.0
+
+
+def test_an_environment_whose_step_returns_six_values_is_refused_with_the_wrapper_that_mends_it():
+    space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    zeros = np.zeros(2, np.float32)
+    said = {"observation_space": space, "action_space": space, "dt": 0.1}
+    said |= {"reset": lambda self, **_: (zeros, {}), "step": lambda self, a: (zeros, 0.0, 1.0, False, False, {})}
+    recorder = StreamRecorder(type("Six", (gym.Env,), said)())
+    recorder.reset()
+    with pytest.raises(TypeError, match=r"step of Six returns 6 values.*SafetyGymnasium2Gymnasium\(env\)"):
+        recorder.step(zeros)

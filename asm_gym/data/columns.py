@@ -81,14 +81,15 @@ def decide(
     table = tables[0]
     times = times or [np.arange(len(next(iter(t.values()), ())), dtype=np.float64) for t in tables]
     named = _named(table)
-    made, seen = list[Column](), dict[bytes, str]()
+    made, seen = list[Column](), dict[tuple[bytes, ...], str]()
     for header, column in named.items():
         every = [t[header] for t in tables if header in t]
         role, why = _by_name(header, column, layout, clock, table)
         chosen = any(column.matches(p) for p in (*layout.channels, *layout.action))
         if role == "sense" and not chosen:
             role, why = _by_behaviour(column, every, times)
-            same = seen.setdefault(np.ascontiguousarray(column.values, np.float64).tobytes(), column.name)
+            cells = tuple(np.ascontiguousarray(v, np.float64).tobytes() for v in every if is_numeric(v))
+            same = seen.setdefault(cells, column.name)
             if role == "sense" and same != column.name and is_command(same) == is_command(column.name):
                 role, why = "copy", f"equals {same}"
         if role == "sense":

@@ -98,6 +98,7 @@ class RobosuiteEnv(SteppedEnv):
             raise ValueError(f"render_size must be two whole numbers, got {short_repr(render_size)}")
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": control_freq}
+        self.dt = 1.0 / control_freq
         self.terminate_on_success = check_flag("terminate_on_success", terminate_on_success)
         self.sensor_noise = check_number("sensor_noise", sensor_noise, low=0, high=1e3)
         self._groups = tuple(stream)

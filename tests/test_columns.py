@@ -1,0 +1,236 @@
+"""What a column is: told by its behaviour, said with the option that overrides it, and read so everywhere."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from asm_gym.data.behaviour import code_of, counts, follows, stands_still, turn_of
+from asm_gym.data.channels import ColumnPlan, read_recorded
+from asm_gym.data.clock import find_clock, seconds_a_row
+from asm_gym.data.columns import LogLayout, decide
+from asm_gym.data.episode import Episode
+from asm_gym.data.logs import read_logs
+from asm_gym.data.reader_notes import LogWarning, noted
+from asm_gym.data.rows import RowReader
+from asm_gym.scripts.cli import main
+from asm_gym.spec import StreamSpec
+from tests.streams import arm_table
+
+ROWS = 200
+T = np.arange(ROWS) / 50.0
+RNG = np.random.default_rng(0)
+Q = np.sin(2 * T) + 1e-3 * RNG.normal(size=ROWS)
+pytestmark = pytest.mark.filterwarnings("default::asm_gym.data.reader_notes.LogWarning")
+
+
+@pytest.mark.parametrize(
+    ("values", "is_counter"),
+    [
+        (np.arange(ROWS), True),
+        (30_000 + 12 * np.arange(ROWS), True),
+        (np.arange(ROWS) % 64, True),  # wraps
+        (np.delete(np.arange(ROWS + 5), [7, 8, 50, 120, 121]), True),  # rows were lost
+        (np.arange(ROWS) // 25, True),  # an index of episodes
+        (np.arange(ROWS)[::-1], False),
+        (np.round(20 * np.sin(T)), False),
+        (np.arange(ROWS) % 2, False),
+        (np.where(T > 2, 1, 0), False),  # a gripper that closes
+        (Q, False),
+    ],
+)
+def test_a_counter_rises_by_a_constant_and_may_wrap_and_lose_rows(values, is_counter):
+    assert counts(values) == is_counter
+
+
+def test_a_second_clock_goes_on_as_the_first_does():
+    assert follows(3600 + T / 3600, T)
+    assert follows((T * 1e9).astype(np.int64) + RNG.integers(0, 1000, ROWS), T)
+    assert not follows(Q, T)
+    assert not follows(np.exp(T / 4), T)  # warms up
+    assert not follows(np.zeros(ROWS), T)
+
+
+@pytest.mark.parametrize("turn", [360.0, 2 * np.pi])
+@pytest.mark.parametrize("low", [-0.5, 0.0])
+def test_an_angle_that_turns_over_is_found(turn, low):
+    angle = 0.7 * turn * np.sin(T) + 0.4 * turn
+    over = (angle - low * turn) % turn + low * turn
+    assert turn_of(over, "") == pytest.approx(turn)
+    assert turn_of(angle, "") == 0
+    assert turn_of(np.where(T % 1 < 0.5, -turn / 2, turn / 2), "") == 0  # a switch
+    assert turn_of(Q, "rad") == 0
+
+
+def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat():
+    for code in (-99999.0, 9999.0, -1e38):
+        coded = Q.copy()
+        coded[[5, 60, 61, 150]] = code
+        assert code_of(coded) == code
+    assert np.isnan(code_of(Q))
+    assert np.isnan(code_of(np.where(T > 3.5, 2.0, Q)))  # a stop
+    assert np.isnan(code_of(np.where(np.arange(ROWS) == 9, 500.0, Q)))  # once: a glitch
+
+
+def test_a_frozen_sense_is_told_from_an_arm_at_rest():
+    frozen = np.where((T > 1) & (T < 3), Q[50], Q)
+    assert stands_still(frozen, np.cos(2 * T)[:, None]) > 90
+    assert stands_still(frozen, frozen[:, None]) == 0
+
+
+HEALTHY = {"time": T, "q0": Q, "q1": np.cos(2 * T) + 1e-3 * RNG.normal(size=ROWS)}
+ASIDE = {
+    "sequence": (np.arange(ROWS), "counter"),
+    "hours": (T / 3600, "pace"),
+    "mode": (np.full(ROWS, 7), "constant"),
+    "again": (Q, "copy"),
+    "nothing": (np.full(ROWS, np.nan), "empty"),
+    "frame_id": (np.array(["base"] * ROWS, object), "words"),
+    "y_true": (np.zeros(ROWS), "label"),
+    "stamp_nsec": ((1e9 * T).astype(np.int64), "pace"),
+}
+
+
+@pytest.mark.parametrize("name", ASIDE)
+def test_what_is_no_sense_is_set_aside_and_changes_nothing(name):
+    """The same motion, read by a memory, whatever such a column does later."""
+    values, role = ASIDE[name]
+    table = HEALTHY | {name: values}
+    columns = {c.name: c for c in decide([table], LogLayout(), find_clock(table), [T])}
+    assert columns[name].role == role
+    found = read_recorded(table, LogLayout())
+    assert found.spec.labels == ("q[0]", "q[1]")
+    later = table | {name: values + 30_000 if values.dtype.kind in "iuf" else values}
+    np.testing.assert_array_equal(read_recorded(later, LogLayout(found.spec)).stream, found.stream)
+    if role in ("counter", "pace", "constant", "copy"):
+        assert "--channels" in columns[name].why
+        assert name in Episode.from_table(table, channels=["q*", name]).spec.labels
+
+
+def test_a_joint_that_stands_while_others_move_is_read_and_one_that_all_logs_leave_alone_is_not():
+    table = HEALTHY | {"q2": np.zeros(ROWS), "brake": np.ones(ROWS)}
+    assert read_recorded(table, LogLayout()).spec.labels == ("q[0]", "q[1]", "q[2]")
+    moves = HEALTHY | {"q2": np.zeros(ROWS), "brake": (T > 2).astype(float)}
+    assert "brake" in read_recorded(table, LogLayout(), [moves]).spec.labels
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_a_bias_of_an_angle_is_the_same_wherever_it_turns_over_in_files_and_live(unit):
+    turn = {"deg": 360.0, "rad": 2 * np.pi}[unit]
+    angle = 0.1 * turn * np.sin(2 * T) + 0.5 * turn
+    over = (angle + turn / 2) % turn - turn / 2
+    table = {"time": T, f"yaw [{unit}]": over, "q": Q}
+    found = read_recorded(table, LogLayout())
+    assert found.spec.labels == ("yaw[sin]", "yaw[cos]", "q")
+    np.testing.assert_allclose(found.stream[:, 0], np.sin(2 * np.pi * angle / turn), atol=1e-6)
+    saved = StreamSpec.from_json(found.spec.to_json())
+    lines = [json.dumps({name: float(values[k]) for name, values in table.items()}) for k in range(20)]
+    live = np.array([row.numbers for row, _ in RowReader(saved).rows(lines)])
+    np.testing.assert_allclose(live, found.stream[:20], atol=1e-6)
+
+
+def test_codes_for_missing_data_are_kept_with_the_memory_and_missing_live_too():
+    q = Q.copy()
+    q[[9, 50, 90]] = -99999
+    spec = read_recorded(HEALTHY | {"q0": q}, LogLayout()).spec
+    plan = ColumnPlan(["q0", "q1"], StreamSpec.from_json(spec.to_json()))
+    np.testing.assert_array_equal(plan.row({"q0": -99999, "q1": 1.0}), [np.nan, 1.0])
+
+
+def test_clocks_that_disagree_are_said_and_the_user_chooses():
+    table = HEALTHY | {"stamp": 2 * T}
+    with pytest.warns(LogWarning, match="'time' and 'stamp' disagree, 50 and 25 rows a second"):
+        assert Episode.from_table(table).spec.dt == pytest.approx(0.02)
+    assert Episode.from_table(table, clock="stamp").spec.dt == pytest.approx(0.04)
+    assert Episode.from_table(HEALTHY | {"tick": 40 * np.arange(ROWS)}, clock="tick [ms]").spec.dt == pytest.approx(
+        0.04
+    )
+    with pytest.warns(LogWarning, match="by --rate 500 it is not read"):
+        assert Episode.from_table(HEALTHY, rate=500).spec.dt == pytest.approx(0.002)
+    backwards = HEALTHY | {"time": T[::-1]}
+    assert len(Episode.from_table(backwards, rate=50)) == ROWS
+
+
+def test_velocities_tell_how_far_apart_rows_are():
+    assert seconds_a_row({"q [deg]": np.degrees(Q), "qd [rad/s]": np.gradient(Q, 0.02)}) == pytest.approx(
+        0.02, rel=0.01
+    )
+    assert seconds_a_row({"arm_velocity": np.gradient(Q, 1e-3), "arm_position": Q}) == pytest.approx(1e-3, rel=0.01)
+    assert seconds_a_row({"q": Q, "v": RNG.normal(size=ROWS)}) is None
+    with pytest.raises(ValueError, match=r"--rate.*positions and velocities say about 50"):
+        Episode.from_table({"q": Q, "v": np.gradient(Q, 0.02)})
+
+
+@pytest.mark.parametrize(
+    ("lines", "message", "remedy"),
+    [
+        (
+            ["time,q,w"] + [f"{t},{q},{'?' if k == 3 else q}" for k, (t, q) in enumerate(zip(T, Q, strict=True))],
+            "in row 4",
+            ["--ignore", "w"],
+        ),
+        (["time,q,q"] + [f"{t},{q},{-q}" for t, q in zip(T, Q, strict=True)], "differs", ["--ignore", "q #2"]),
+        (["q,p"] + [f"{q},{q * q}" for q in Q], "--rate", ["--rate", "50"]),
+        (
+            ["time,q,p"]
+            + [f"{t},{q},{q * q}" for t, q in zip(np.roll(T, 1) * (-1) ** np.arange(ROWS), Q, strict=True)],
+            "--rate",
+            ["--rate", "50"],
+        ),
+        ([f"{t},{q},{q * q}" for t, q in zip(T, Q, strict=True)], "--columns x0 x1 x2", ["--columns", "t", "x1", "x2"]),
+    ],
+)
+def test_every_refusal_names_what_gets_the_file_read_and_that_works_when_typed(
+    lines, message, remedy, tmp_path, capsys
+):
+    path = tmp_path / "x.csv"
+    path.write_text("\n".join(lines) + "\n")
+    how = [
+        str(path),
+        "--out",
+        str(tmp_path / "m.asm"),
+        "--monitor",
+        "kalman",
+        "--split",
+        "0.2",
+        "--false-alarm-rate",
+        "0.2",
+    ]
+    assert main(["fit", *how]) == 2
+    assert message in capsys.readouterr().err
+    assert main(["fit", *how, *remedy]) == 0
+    assert main(["inspect", str(path), "--out", str(tmp_path / "i"), *remedy]) == 0
+    assert main(["watch", str(path), "--monitor", str(tmp_path / "m.asm"), "--out", str(tmp_path / "w"), *remedy]) in (
+        0,
+        1,
+    )
+
+
+def test_a_logger_that_was_started_twice_makes_two_logs_and_headings_make_one_each(tmp_path):
+    frame = pd.DataFrame(HEALTHY).to_csv(index=False)
+    (tmp_path / "x.csv").write_text(frame + frame)
+    with noted() as notes:
+        assert [len(log.episode) for log in read_logs(tmp_path / "x.csv")] == [ROWS, ROWS]
+    assert any("cut there" in line for line in notes)
+    block = "\n".join(f"\t{k}\t{k % 3}" for k in range(15))
+    (tmp_path / "y.dat").write_text(f"normal\n{block}\n\n\ncollision\n{block}\n\n")
+    logs = list(read_logs(tmp_path / "y.dat", LogLayout(columns=["fx", "fy"], rate=3.0)))
+    assert [bool(log.episode.faults.any()) for log in logs] == [False, True]
+
+
+def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_in_time(tmp_path, capsys):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "x.parquet").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    assert main(["fit", str(tmp_path / "a")]) == 2
+    assert "git lfs pull" in capsys.readouterr().err
+    (tmp_path / "b").mkdir()
+    pd.DataFrame(arm_table(0)).to_csv(tmp_path / "b" / "0.csv", index=False)
+    pd.DataFrame(HEALTHY).to_csv(tmp_path / "b" / "1.csv", index=False)
+    assert main(["fit", str(tmp_path / "b")]) == 2
+    assert "1.csv: the memory reads channels that are not there: torque" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(["fit", str(tmp_path / "b"), "--out", str(tmp_path / "file" / "m.asm")]) == 2
+    assert str(tmp_path / "file") in capsys.readouterr().err
