@@ -300,7 +300,7 @@ def test_text_is_read_in_the_encodings_of_loggers(encoding, tmp_path):
         ("a,b\n1,2\n3,oops\n4,5\n", [], "b must hold numbers, got 'oops' in row 2; --ignore 'b' leaves it out"),
         ("a,b\n1,2\n3,4,5\n", [], "line 3 has 3 cells, its header 2"),
         ("a,b\n1,2\n3\n", [], "line 3 has 1 cells, its header 2"),
-        ("0,1\n1,2\n", [], "its first line is of 2 numbers and no header: name its columns with --columns"),
+        ("0,1\n1,2\n", [], "its first line is of 2 numbers and no header: name its 2 columns, --columns x0 x1"),
         ("0,1\n1,2\n", ["t"], "1 columns are named, and its first line has 2 cells"),
         ("a,b\n1," + "9" * 1_000_000 + "\n", [], "line 2 has 1000002 characters: at most 8192 columns"),
         (",".join(f"x{k}" for k in range(10_000)) + "\n", [], "it has 10000 columns, and at most 8192"),

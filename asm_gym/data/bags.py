@@ -72,26 +72,26 @@ def _columns(bag: Any) -> Columns:
     if not any(c.msgcount for c in states):
         topics = ", ".join(f"{c.topic} ({c.msgtype})" for c in bag.connections) or "none"
         raise ValueError(f"it holds no sensor_msgs/JointState; its topics: {topics}")
-    heard: dict[tuple[str, ...], list[tuple[float, Numbers]]] = {}  # of a topic's messages of the same joints
-    order: list[tuple[tuple[str, ...], float, Numbers]] = []
+    order: list[tuple[tuple[str, ...], float, float, Numbers]] = []
+    heard: dict[tuple[str, ...], list[float]] = {}  # when messages of the same joints came on a topic [s]
     for connection, written, raw in bag.messages(connections=chosen):
         message = bag.deserialize(raw, connection.msgtype)
         numbers = MESSAGES[connection.msgtype](message)
         key = (connection.topic, *sorted(getattr(message, "name", ())))
         named = {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
-        order.append((key, stamp_of(message) or 1e-9 * written, named))
-        heard.setdefault(key, []).append(order[-1][1:])
+        order.append((key, stamp_of(message) or 1e-9 * written, 1e-9 * written, named))
+        heard.setdefault(key, []).append(1e-9 * written)
     topics = {c.topic for c in states}
     clock = max((key for key in heard if key[0] in topics), key=lambda key: len(heard[key]))
     if len(heard) > 1:
         note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
-    old = {key: HELD * (said[-1][0] - said[0][0]) / max(len(said) - 1, 1) for key, said in heard.items()}
+    old = {key: HELD * (came[-1] - came[0]) / max(len(came) - 1, 1) for key, came in heard.items()}
     latest: dict[tuple[str, ...], tuple[float, Numbers]] = {}
     rows: list[Numbers] = []
-    for key, time, numbers in order:
-        latest[key] = time, numbers
+    for key, time, came, numbers in order:
+        latest[key] = came, numbers
         if key == clock:
-            fresh = [said for other, (at, said) in latest.items() if time - at <= old[other] or other == clock]
+            fresh = [said for other, (at, said) in latest.items() if came - at <= old[other] or other == clock]
             rows.append({"time": time} | {name: value for said in fresh for name, value in said.items()})
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
