@@ -81,23 +81,27 @@ def cache() -> Check:
         from asm_gym.compilation import KEEP_NOWHERE, kept_in
         from asm_gym.monitors.row_kernel import expect_rows
     except ImportError as error:  # of what another check names
-        return Check("compiled code", escape(str(error)), REINSTALL, needed=True)
+        return Check("cache", str(error), REINSTALL, needed=True)
     folder = kept_in(expect_rows)
     if folder is None or KEEP_NOWHERE in str(folder):
-        return Check("compiled code", "lost when a process ends: neither the install nor HOME is writable", NAME_CACHE)
-    return Check("compiled code", str(folder))
+        return Check(
+            "cache", "compiled code is lost with the process: neither the install nor HOME is writable", NAME_CACHE
+        )
+    return Check("cache", str(folder))
 
 
 def report(args: Args, console: Console) -> int:
     """Print the table and its verdict; return the exit code."""
-    table, checks = Table("check", "state", "found", "what to do"), run_checks()
+    table, checks = Table("check", "state", "found"), run_checks()
     for check in checks:
         state = "[green]ok" if not check.remedy else "[red]needed" if check.needed else "[yellow]optional"
-        table.add_row(check.name, state, escape(check.found), escape(check.remedy))
+        table.add_row(check.name, state, escape(check.found))
     missing = [check for check in checks if check.remedy]
     console.print(table)
+    for check in missing:  # whole lines, to be copied
+        console.print(f"{check.name}: {check.remedy}", markup=False, highlight=False, soft_wrap=True)
     if any(check.needed for check in missing):
-        console.print("[red]asm-gym cannot run here yet:[/] do what stands on the right, from the top.")
+        console.print("[red]asm-gym cannot run here yet:[/] do what is said above, from the top.")
         return BAD_NEWS
     names = escape(", ".join(check.name for check in missing))
     console.print(f"asm-gym runs here, without {names}." if missing else "[green]Everything is here.")

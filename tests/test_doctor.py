@@ -105,13 +105,14 @@ def test_a_simulator_out_of_range_is_refused_before_it_is_imported(
         extras.check_simulator()
 
 
-def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(machine: Any) -> None:
+def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(machine: Any, capsys: Any) -> None:
     machine(numba=None, torch=None, robosuite=None)
     found = failed()
     assert (found["numba"].needed, found["numba"].remedy) == (True, doctor.REINSTALL)
     assert (found["torch"].needed, found["torch"].remedy) == (False, "pip install 'asm-gym[agents]'")
     assert found["robosuite"].remedy == extras.INSTALL_ROBOSUITE
     assert doctor.main([]) == 1
+    assert extras.INSTALL_ROBOSUITE in capsys.readouterr().out  # in one line, however narrow the terminal is
 
 
 @pytest.mark.parametrize(("version", "ok"), [("3.10.14", False), ("3.11.0", True), ("3.13.0", True)])
@@ -125,7 +126,7 @@ def test_a_machine_that_keeps_no_compiled_code_is_told_which_variable_names_a_fo
 ) -> None:
     machine()
     monkeypatch.setattr(compilation, "kept_in", lambda function: tmp_path / f"{compilation.KEEP_NOWHERE}x")
-    assert "NUMBA_CACHE_DIR" in failed()["compiled code"].remedy
+    assert "NUMBA_CACHE_DIR" in failed()["cache"].remedy
 
 
 def test_robosuite_is_pinned_alike_for_users_and_for_the_clone() -> None:
