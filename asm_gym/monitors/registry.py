@@ -91,7 +91,7 @@ _RIVALS = {
     "gru": ("baselines.recurrent:GRU", "mahalanobis"),
     "kalman": ("baselines.linear:Kalman", "mahalanobis"),
     "association_linear": ("baselines.linear:LinearAssociation", "mahalanobis"),
-    "association_values": ("value_association:ValueAssociation", "mahalanobis"),
+    "association_values": ("value_association:ValueAssociation", "largest"),
     "external_torque_limit": ("baselines.limits:ExternalTorqueLimit", "largest"),
     "force_limit": ("baselines.limits:ForceLimit", "squares"),
 }

@@ -18,7 +18,7 @@ Sources: Hoerl and Kennard 1970; for h, the leverage: Hoaglin and Welsch 1978 (T
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -29,7 +29,7 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.linear import check_inputs
 from asm_gym.memory.temporal import RowHistory
-from asm_gym.monitors.arm_inputs import Derived, forces, motion
+from asm_gym.monitors.arm_inputs import WIDTHS, Derived, forces, motion
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.body_model import BodyModel
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
@@ -52,6 +52,41 @@ class _Fitted(NamedTuple):
     weights: Floats  # (X, I)
     left: Floats  # (N, X) cross-fitted errors
     R2: Floats  # (X,) cross-fitted
+    alone: Floats  # (X,) 1 where a value is predicted from its joint alone
+
+
+class _Normal(NamedTuple):
+    """Normal equations of each fold of rows, and of all."""
+
+    fold: NDArray[np.intp]  # (N,)
+    grams: Floats  # (FOLDS, I, I)
+    crosses: Floats  # (FOLDS, I, X)
+
+    @classmethod
+    def of(cls, inputs: Floats, targets: Floats, fold: NDArray[np.intp]) -> Self:
+        parts = [(inputs[fold == f], targets[fold == f]) for f in range(FOLDS)]
+        return cls(fold, np.array([z.T @ z for z, _ in parts]), np.array([z.T @ x for z, x in parts]))
+
+    def weights(self, used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
+        """Return the weights (U, M) of the used inputs for some targets."""
+        N = len(self.fold)
+        gram, cross = self.grams.sum(axis=0)[np.ix_(used, used)], self.crosses.sum(axis=0)[np.ix_(used, mine)]
+        found: Floats = np.linalg.solve(gram / N + penalty * np.eye(len(used)), cross / N)
+        return found
+
+    def left(self, inputs: Floats, targets: Floats, used: NDArray[np.intp], mine: NDArray[np.intp]) -> Iterator[Floats]:
+        """Yield the cross-fitted errors (N, M) of some targets, predicted from the used inputs, by each penalty."""
+        spectra = []
+        for f in range(FOLDS):
+            rows = max(int((self.fold != f).sum()), 1)
+            gram, cross = (a.sum(axis=0) - a[f] for a in (self.grams, self.crosses))
+            values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / rows)
+            spectra.append((np.maximum(values, 0.0)[:, None], vectors, vectors.T @ cross[np.ix_(used, mine)] / rows))
+        for penalty in PENALTIES:
+            errors = targets[:, mine].copy()
+            for f, (values, vectors, projected) in enumerate(spectra):
+                errors[self.fold == f] -= inputs[self.fold == f][:, used] @ (vectors @ (projected / (values + penalty)))
+            yield errors
 
 
 class _Read(NamedTuple):
@@ -142,7 +177,7 @@ class ValueAssociation(ScaledModel):
         for g in judging:
             matrix, factor = _far(inputs, fold, own[g])
             far.append(matrix)
-            left[:, senses.groups[judged] == g] /= factor[:, None]
+            left[:, (senses.groups[judged] == g) & (given.alone[judged] == 0)] /= factor[:, None]
         ends = np.cumsum(lengths)[:-1]
         largest = [np.abs(averaged(part, self.window)).max(axis=0) for part in np.split(left, ends)]
         progress(1, 1)
@@ -153,6 +188,7 @@ class ValueAssociation(ScaledModel):
             "judged_values": judged * 1.0,
             "R2_values": given.R2,
             "D": given.weights[judged],
+            "joint_alone": given.alone[judged],
             "largest": np.maximum(np.max(largest, axis=0), FAINTEST),
             "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
         }
@@ -210,7 +246,25 @@ class ValueAssociation(ScaledModel):
         inputs = np.hstack([*read[:3], (derived - middle) / width, read.commands])
         check_inputs(inputs.shape[1])
         own = self._own()
-        return inputs, (middle, width), own, _crossfitted(inputs, read.values, fold, self.senses_.groups, own)
+        return (
+            inputs,
+            (middle, width),
+            own,
+            _crossfitted(inputs, read.values, fold, self.senses_.groups, own, self._joint_inputs(inputs.shape[1])),
+        )
+
+    def _joint_inputs(self, size: int) -> dict[int, NDArray[np.intp]]:
+        """Return the inputs, of ``size``, of each torque's own joint: its speed, friction and body, and commands."""
+        X, derived, loads = len(self.spec.sensory), self._derived, self._places(forces(self.spec))
+        S, J = len(derived.speeds), len(derived.angles)
+        if len(loads) != S or (derived.links is not None and J != S):
+            return {}
+        speed = derived.speeds + (X if derived.from_steps else 0)
+        parts = [speed, *(3 * X + w * S + np.arange(S) for w in range(len(WIDTHS)))]
+        if derived.links is not None:
+            parts += [3 * X + len(WIDTHS) * S + n * J + np.arange(J) for n in range(2)]
+        commands = np.arange(size - len(self.spec.motor) - 1, size)
+        return {k: np.append([part[n] for part in parts], commands).astype(np.intp) for n, k in enumerate(loads)}
 
     def _places(self, columns: NDArray[np.intp]) -> list[int]:
         """Return the places of columns among the senses."""
@@ -228,9 +282,9 @@ class ValueAssociation(ScaledModel):
 
     def _farther(self, inputs: Floats) -> Floats:
         """Return the factors (N, V) of the spreads of judged values, for inputs (N, I)."""
-        found = np.ones((len(inputs), len(self._values)))
-        groups = self.senses_.groups[self._values]
-        for group, far in zip(np.unique(groups), self.learned_.get("far", ()), strict=False):
+        found, learned = np.ones((len(inputs), len(self._values))), self.learned_
+        groups = np.where(learned["joint_alone"] > 0, -1, self.senses_.groups[self._values])
+        for group, far in zip(np.unique(self.senses_.groups[self._values]), learned["far"], strict=False):
             found[:, groups == group] = np.sqrt(np.maximum(1.0, ((inputs @ far) * inputs).sum(axis=1)))[:, None]
         return found
 
@@ -255,36 +309,45 @@ def _folds(lengths: Sequence[int]) -> NDArray[np.intp]:
 
 
 def _crossfitted(
-    inputs: Floats, targets: Floats, fold: NDArray[np.intp], groups: NDArray[np.intp], own: list[NDArray[np.intp]]
+    inputs: Floats,
+    targets: Floats,
+    fold: NDArray[np.intp],
+    groups: NDArray[np.intp],
+    own: list[NDArray[np.intp]],
+    joints: Mapping[int, NDArray[np.intp]],
 ) -> _Fitted:
-    """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there."""
-    N, size = inputs.shape
-    weights, left, R2 = np.zeros((targets.shape[1], size)), np.zeros(targets.shape), np.zeros(targets.shape[1])
-    grams = [inputs[fold == f].T @ inputs[fold == f] for f in range(FOLDS)]
-    crosses = [inputs[fold == f].T @ targets[fold == f] for f in range(FOLDS)]
-    gram, cross = sum(grams), sum(crosses)
+    """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there.
+
+    ``own`` are the inputs that each group is not predicted from, ``joints`` those of the joint of a value: a value is
+    predicted from these alone where that leaves less.
+    """
+    (N, size), X = inputs.shape, targets.shape[1]
+    fitted = _Fitted(np.zeros((X, size)), np.zeros((N, X)), np.zeros(X), np.zeros(X))
+    normal = _Normal.of(inputs, targets, fold)
+    for k, used in joints.items():
+        errors = next(normal.left(inputs, targets, used, np.array([k])))[:, 0]
+        fitted.left[:, k], fitted.alone[k] = errors, 1.0
+        fitted.weights[k, used] = normal.weights(used, np.array([k]), PENALTIES[0])[:, 0]
     for g, withheld in enumerate(own):
-        mine = np.flatnonzero(groups == g)
-        used = np.setdiff1d(np.arange(size), withheld)
-        errors = np.zeros((len(PENALTIES), N, len(mine)))
-        for f in range(FOLDS):
-            rest = (gram - grams[f])[np.ix_(used, used)]
-            rows = max(int((fold != f).sum()), 1)
-            eigenvalues, vectors = np.linalg.eigh(rest / rows)
-            projected = vectors.T @ ((cross - crosses[f])[np.ix_(used, mine)] / rows)
-            tried, wanted = inputs[fold == f][:, used] @ vectors, targets[fold == f][:, mine]
-            for n, penalty in enumerate(PENALTIES):
-                kept = projected / (np.maximum(eigenvalues, 0.0) + penalty)[:, None]
-                errors[n, fold == f] = wanted - tried @ kept
-        best = np.argmin((errors**2).sum(axis=1), axis=0)
-        left[:, mine] = errors[best, :, np.arange(len(mine))].T
-        R2[mine] = 1.0 - (left[:, mine] ** 2).mean(axis=0) / np.maximum(targets[:, mine].var(axis=0), FAINTEST**2)
-        whole = gram[np.ix_(used, used)] / N
-        for n in np.unique(best):
-            solved = np.linalg.solve(whole + PENALTIES[n] * np.eye(len(used)), cross[np.ix_(used, mine)] / N)
-            for k in np.flatnonzero(best == n):
-                weights[mine[k], used] = solved[:, k]
-    return _Fitted(weights, left, R2)
+        mine, used = np.flatnonzero(groups == g), np.setdiff1d(np.arange(size), withheld)
+        errors = np.array(list(normal.left(inputs, targets, used, mine)))  # (P, N, X of the group)
+        squares = (errors**2).sum(axis=1)
+        best, better = (
+            squares.argmin(axis=0),
+            squares.min(axis=0) < np.where(fitted.alone[mine] > 0, (fitted.left[:, mine] ** 2).sum(axis=0), np.inf),
+        )
+        for n in np.unique(best[better]):
+            taken = np.flatnonzero(better & (best == n))
+            fitted.left[:, mine[taken]], fitted.alone[mine[taken]] = errors[n][:, taken], 0.0
+            fitted.weights[mine[taken]] = 0.0
+            fitted.weights[np.ix_(mine[taken], used)] = normal.weights(used, mine[taken], PENALTIES[n]).T
+    return fitted._replace(R2=_explained(fitted.left, targets))
+
+
+def _explained(left: Floats, targets: Floats) -> Floats:
+    """Return R² (X,) of targets (N, X) with errors (N, X)."""
+    R2: Floats = 1.0 - (left**2).mean(axis=0) / np.maximum(targets.var(axis=0), FAINTEST**2)
+    return R2
 
 
 def averaged(left: Floats, window: int) -> Floats:

@@ -4,6 +4,9 @@ The recordings are of others and lie in a folder; a missing one is named, with w
 that did nothing wrong, cut into pieces. A quarter of them is tested, in turn; of the others two in three are learned
 from, and the greatest surprise of the rest is the threshold. Each tested piece is watched as it is, and with each fault
 from its middle on. Pieces are of one trajectory: no table says how a monitor fares on another.
+
+    push, payload    τ + Jᵀ F      J of the arm's own kinematics, by the tables of Denavit and Hartenberg (1955) that
+                                   Franka and Universal Robots publish; efforts of both recordings are in N m
 """
 
 from __future__ import annotations
@@ -16,36 +19,41 @@ from itertools import product, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from asm_gym.data.bags import read_bag
-from asm_gym.data.episode import Episode, spans
+from asm_gym.data.episode import Episode
 from asm_gym.data.selection import complete_parts, pieces
+from asm_gym.detection.conformal import alarms_in
 from asm_gym.detection.scores import Largest
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.body_model import read_urdf
-from asm_gym.rollouts.collect import environment
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
-from asm_gym.tasks import env_id
 
 Floats = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
 
 RULE = "friction_rule"
-SETTINGS: dict[str, dict[str, Any]] = {
-    "neural_asm": {"values": True},
-    "association_values+evidence": {"shrinkage": 1.0},
-}
-"""The first as ``asm-gym fit`` fits a log, the other without whitening, as the first has it."""
-WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "association_values+evidence"}
-"""Monitors with a body model in place of sines of angles."""
+SETTINGS: dict[str, dict[str, Any]] = {"neural_asm": {"values": True}}
+"""As ``asm-gym fit`` fits a log."""
+WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "association_values", f"{RULE}, body": RULE}
+"""Monitors with a body model."""
 PIECE_S, FOLDS = 1.0, 4  # length of a piece [s], and folds of which one is tested at a time
+
+
+class Kinematics(NamedTuple):
+    """Denavit-Hartenberg parameters (J,) of an arm."""
+
+    a: tuple[float, ...]  # [m]
+    d: tuple[float, ...]  # [m]
+    alpha: tuple[float, ...]  # [rad]
+    modified: bool  # as Craig has them: α and a of the link before
 
 
 class RealArm(NamedTuple):
@@ -54,13 +62,24 @@ class RealArm(NamedTuple):
     robot: str
     place: str  # file below the folder of all recordings
     urdf: str  # file of its body model, in the folder ``urdf`` of that of all recordings
+    links: Kinematics  # up to between the fingers, or to the flange
 
 
 SOURCE = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
 """Where the recordings are published: repository at a commit, licence."""
+RIGHT = np.pi / 2
+PANDA = Kinematics(
+    (0, 0, 0, 0.0825, -0.0825, 0, 0.088),
+    (0.333, 0, 0.316, 0, 0.384, 0, 0.107 + 0.1034),
+    (0, -RIGHT, RIGHT, RIGHT, -RIGHT, RIGHT, RIGHT),
+    True,
+)
+UR10 = Kinematics(
+    (0, -0.612, -0.5723, 0, 0, 0), (0.1273, 0, 0, 0.163941, 0.1157, 0.0922), (RIGHT, 0, 0, RIGHT, -RIGHT, 0), False
+)
 ARMS = {
-    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", "panda.urdf"),
-    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", "ur10_robot.urdf"),
+    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", "panda.urdf", PANDA),
+    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", "ur10_robot.urdf", UR10),
 }
 
 
@@ -82,7 +101,7 @@ class Piece(NamedTuple):
     episode: Episode
     onset: int  # row
     ranges: Floats  # (J,) of each effort in the whole recording
-    panda: bool  # whether the arm is a Panda, whose effort is in N m
+    links: Kinematics  # of the arm
 
     def column(self, name: str) -> Floats:
         """Return position or effort (T, J)."""
@@ -94,27 +113,33 @@ STEP_SHARE, SLIP, LATE_S, RISE_S = 0.2, 0.05, 0.1, 0.1
 MOVES = 0.02  # angle that an encoder must move by after the onset, or nothing shows that it is frozen [rad]
 FAULTS = dict.fromkeys(("push", "payload", "step"), "effort")
 FAULTS |= {"frozen": "position", "slipped": "position", "late": "effort"}
-"""Column that each fault changes: a push of 20 N sideways or a payload of 1 kg at a Panda's hand, through its Jacobian;
-a step of 20 % of a joint's effort range on another arm; an encoder that freezes or slips by 0.05 rad; an effort that
-comes 0.1 s late. None of them happened, and every table that counts them says so."""
+"""Column that each fault changes: a push of 20 N sideways or a payload of 1 kg at the hand; a step of 20 % of a joint's
+effort range; an encoder that freezes or slips by 0.05 rad; an effort that comes 0.1 s late. None of them happened, and
+every table that counts them says so."""
 
 
-def jacobian(q: Floats) -> Floats:
-    """Return the velocity of a Panda's hand [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
-    arm: Any = environment(env_id("Lift")).unwrapped
-    robot, model = arm.robosuite_env.robots[0], arm.simulation.model
-    data, found = mujoco.MjData(model), np.zeros((3, model.nv))
-    data.qpos[robot._ref_joint_pos_indexes] = q
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_jacSite(model, data, found, None, robot.eef_site_id["right"])
-    return found[:, robot._ref_joint_vel_indexes]
+def jacobian(links: Kinematics, q: Floats) -> Floats:
+    """Return the velocity of the hand [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
+    pose, axes, places = np.eye(4), [], []
+    for a, d, alpha, angle in zip(links.a, links.d, links.alpha, q, strict=True):
+        turn, link = _screw("z", angle, d), _screw("x", alpha, a)
+        pose = pose @ link if links.modified else pose
+        axes.append(pose[:3, 2])
+        places.append(pose[:3, 3])
+        pose = pose @ turn if links.modified else pose @ turn @ link
+    return np.stack([np.cross(z, pose[:3, 3] - p) for z, p in zip(axes, places, strict=True)], axis=1)
+
+
+def _screw(axis: str, angle: float, along: float) -> Floats:
+    """Return the pose (4, 4) after a turn about an axis and a shift along it."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
+    pose["xyz".index(axis), 3] = along
+    return pose
 
 
 def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
-    """Return the piece with a fault from the onset on; None where the arm or the piece does not allow it."""
-    if kind in ("push", "payload", "step") and (kind == "step") is piece.panda:
-        return None
+    """Return the piece with a fault from the onset on; None where the piece does not allow it."""
     episode, onset, dt = piece.episode, piece.onset, piece.episode.spec.dt
     q, effort = piece.column("position"), piece.column("effort")
     after, strong = slice(onset, len(q)), np.flatnonzero(piece.ranges > 0.1 * piece.ranges.max())
@@ -125,7 +150,7 @@ def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | N
         if kind == "push":
             angle = rng.uniform(0, 2 * np.pi)
             force = NEWTONS * np.array([np.cos(angle), np.sin(angle), 0.0])
-        added[:] = np.array([jacobian(row).T @ force for row in q[after]]) * rise[:, None]
+        added[:] = np.array([jacobian(piece.links, row).T @ force for row in q[after]]) * rise[:, None]
     elif kind == "step":
         j = int(rng.choice(strong))
         added[:, j] = rng.choice([-1, 1]) * STEP_SHARE * piece.ranges[j] * rise
@@ -161,10 +186,10 @@ class Config(kit.Config):
     """Recordings; missing ones are left out, and named."""
     monitors: tuple[str, ...] = option(
         (
-            *("neural_asm", "association_values+evidence", "association_linear+evidence", "kalman+evidence"),
-            *("gru+evidence", RULE),
+            *("neural_asm", "association_values", "association_linear+evidence", "kalman+evidence", "gru+evidence"),
+            RULE,
         ),
-        quick=("association_values+evidence", RULE),
+        quick=("association_values", RULE),
         least=1,
         known=(*MONITORS, *WITH_BODY, RULE),
     )
@@ -207,11 +232,11 @@ def examined(job: Job, folder: Path) -> list[Record]:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
     learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
     monitor = fitted(job, learned, folder / "urdf" / arm.urdf)
-    threshold = max(float(s.value.max()) for s in monitor.score_episodes(calibration))
+    threshold = monitor.calibrate(calibration, 1.0 / (len(calibration) + 1)).threshold
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
     watched = [("", cut[i]) for i in tested]
     for i, kind in ((i, kind) for i in tested for kind in FAULTS):
-        faulty = with_fault(kind, Piece(cut[i], len(cut[i]) // 2, ranges, job.experiment == "panda"), rng)
+        faulty = with_fault(kind, Piece(cut[i], len(cut[i]) // 2, ranges, arm.links), rng)
         watched += [] if faulty is None else [(kind, faulty)]
     scores = monitor.score_episodes([episode for _, episode in watched])
     ratios = [s.value / threshold for s in scores]
@@ -219,22 +244,22 @@ def examined(job: Job, folder: Path) -> list[Record]:
 
 
 def fitted(job: Job, episodes: Sequence[Episode], urdf: Path) -> Any:
-    """Return the monitor of a job, fitted but not calibrated: no rate could be promised of so few pieces."""
+    """Return the monitor of a job, fitted."""
     spec, name = episodes[0].spec, WITH_BODY.get(job.monitor, job.monitor)
-    if job.monitor == RULE:
-        return CalibratedMonitor(FrictionRule(spec), Largest(spec), seed=job.seed).fit(list(episodes))
     settings = SETTINGS.get(name, {})
     if job.monitor in WITH_BODY:
         if not urdf.is_file():
             raise FileNotFoundError(f"{urdf} is missing: it is in example-robot-data 6.0.0 (PyPI)")
         settings = settings | {"urdf": read_urdf(urdf)}
+    if name == RULE:
+        return CalibratedMonitor(FrictionRule(spec, **settings), Largest(spec), seed=job.seed).fit(list(episodes))
     return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
 
 
 def judged(kind: str, value: Floats, dt: float) -> Record:
     """Return the record of a piece by its surprise as a multiple of the threshold (T,)."""
     if not kind:
-        counted = {"alarms": len(spans(value > 1)), "alarm_s": (value > 1).sum() * dt, "seconds": len(value) * dt}
+        counted = {"alarms": alarms_in(value, 1.0, dt), "alarm_s": (value > 1).sum() * dt, "seconds": len(value) * dt}
         return {"kind": kind, **counted, "excess": float(value.max())}
     before, after = np.split(value, [len(value) // 2])
     over = np.flatnonzero(after > 1)

@@ -3,6 +3,7 @@
     Kalman      x_t = A x_{t-1} + B u_t + c + w, w ~ N(0, Q)      y_t = x_t + v, v ~ N(0, R)     ε: innovations
     ridge       ε_t = (Δ_t - D a_t)/s                             D, s, a_t: association without hidden units
     friction    r_j = mean over 0.1 s of τ_j - (c_0 + c_1 v_j + Σ_w c_w tanh(v_j/w s_j))    ε = r_j / spread_j
+                with a body model also less c_g g_j + c_m (M q̈ + c)_j, see ``body_model``
 
 R is the sensor noise that the stream's spec states; A, B, c by ridge regression; Q is what is left of the residuals.
 What the memory's hidden units, precision and temporal network are worth is what it finds beyond ``LinearAssociation``.
@@ -23,7 +24,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
-from asm_gym.monitors.arm_inputs import WIDTHS, forces, speeds
+from asm_gym.monitors.arm_inputs import WIDTHS, Derived, forces, speeds
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel, StreamModel, no_context, read_next
 from asm_gym.scaling import StreamScaler, rows_apart
@@ -129,6 +130,10 @@ class _Averaged(NamedTuple):
 class FrictionRule(StreamModel):
     """Torque beyond friction; it needs channels of torque or current, and of speed or position.
 
+    Args:
+        spec: the stream it is to expect.
+        urdf: text of a body model, whose weight and inertia are no push either.
+
     Raises:
         ValueError: the stream has none of them.
     """
@@ -136,8 +141,9 @@ class FrictionRule(StreamModel):
     kind = "friction_rule"
     held_out = 0
 
-    def __init__(self, spec: StreamSpec) -> None:
+    def __init__(self, spec: StreamSpec, urdf: str = "") -> None:
         super().__init__(spec)
+        self.urdf, self._body = urdf, Derived.of(spec, urdf)
         self._torques = forces(spec)
         self._speeds, self._from_positions = speeds(spec)
         joints = min(len(self._torques), len(self._speeds))
@@ -153,17 +159,15 @@ class FrictionRule(StreamModel):
         return self._torques
 
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
-        parts = []
-        for episode in episodes:
-            rows = episode.stream.astype(np.float64)
-            parts.append((rows[self.lag :, self._torques], self._speed(rows[self.lag :], rows[: -self.lag])))
-        torque, speed = (np.concatenate([p[k] for p in parts]) for k in range(2))
-        width = np.maximum(speed.std(axis=0), 1e-9)
-        inputs = _friction_inputs(speed, width)
+        streams = [e.stream.astype(np.float64) for e in episodes]
+        pairs = [(rows[self.lag :], rows[: -self.lag]) for rows in streams]
+        width = np.maximum(np.concatenate([self._speed(*pair) for pair in pairs]).std(axis=0), 1e-9)
+        parts = [(rows[:, self._torques], self._inputs(rows, before, width)) for rows, before in pairs]
+        torque, inputs = (np.concatenate([p[k] for p in parts]) for k in range(2))
         solved = [np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in range(torque.shape[1])]
         weights, smoothed = np.array(solved), []
-        for tau, v in parts:
-            left = tau - np.einsum("njk,jk->nj", _friction_inputs(v, width), weights)
+        for tau, told in parts:
+            left = tau - np.einsum("njk,jk->nj", told, weights)
             means = [left[max(0, n - self.window + 1) : n + 1].mean(axis=0) for n in range(len(left))]
             smoothed.append(np.array(means))
         spread = np.maximum(np.concatenate(smoothed).std(axis=0), 1e-9)
@@ -174,8 +178,8 @@ class FrictionRule(StreamModel):
         return _Averaged(RowHistory.empty(batch, self.lag, self.spec.size), residuals)
 
     def predict(self, state: _Averaged, rows: Floats) -> tuple[_Averaged, ModelOutput]:
-        speed = self._speed(rows, state.history.past(rows)[0])
-        friction = np.einsum("njk,jk->nj", _friction_inputs(speed, self.learned_["width"]), self.learned_["weights"])
+        inputs = self._inputs(rows, state.history.past(rows)[0], self.learned_["width"])
+        friction = np.einsum("njk,jk->nj", inputs, self.learned_["weights"])
         left = rows[:, self._torques] - friction
         residuals = np.concatenate([state.residuals[:, 1:], left[:, None]], axis=1)
         ready = np.isfinite(residuals).all(axis=1)  # (B, J)
@@ -187,10 +191,15 @@ class FrictionRule(StreamModel):
         now = rows[:, self._speeds]
         return (now - before[:, self._speeds]) / (self.lag * self.spec.dt) if self._from_positions else now
 
-
-def _friction_inputs(speed: Floats, width: Floats) -> Floats:
-    """Return 1, the speed and its smooth signs (N, J, K)."""
-    return np.stack([np.ones_like(speed), speed, *(np.tanh(speed / (w * width)) for w in WIDTHS)], axis=2)
+    def _inputs(self, rows: Floats, before: Floats, width: Floats) -> Floats:
+        """Return 1, the speed and its smooth signs, and what the body model tells (N, J, K)."""
+        speed, body = self._speed(rows, before), self._body
+        parts = [np.ones_like(speed), speed, *(np.tanh(speed / (w * width)) for w in WIDTHS)]
+        if body.links is not None:
+            q, now = rows[:, self.spec.sensory[body.angles]] * body.radians, speed * body.radians
+            pace = now - (now if self._from_positions else before[:, self._speeds] * body.radians)
+            parts += body.links.torques(q, now, pace / (self.lag * self.spec.dt))
+        return np.stack(parts, axis=2)
 
 
 def _scale(rows: Floats) -> tuple[Floats, Floats]:
