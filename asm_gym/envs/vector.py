@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import chain
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -20,17 +20,6 @@ from asm_gym.validation import check_number
 
 Result = TypeVar("Result")
 Mask = NDArray[np.bool_]
-
-
-class Outcome(NamedTuple):
-    """What one member returned in a step of the vector."""
-
-    observation: Any
-    reward: Any
-    terminated: bool
-    truncated: bool
-    info: dict[str, Any]
-    final: dict[str, Any]  # last observation and info of an episode that ended, under ``AutoresetMode.SAME_STEP``
 
 
 class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
@@ -120,47 +109,46 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         if len(given) != self.num_envs:
             raise ValueError(f"actions must be one of each of {self.num_envs} environments, got {len(given)}")
         outcomes = self._of_each(lambda i: self._outcome(i, given[i]))
-        self._env_obs, rewards, terminated, truncated, infos, finals = (list(x) for x in zip(*outcomes, strict=True))
+        self._env_obs, rewards, terminated, truncated, infos = map(list, zip(*outcomes, strict=True))
         ended = np.array(terminated, bool), np.array(truncated, bool)
         self._autoreset_envs = ended[0] | ended[1]
-        merged: dict[str, Any] = {}
-        for i, final in enumerate(finals):
-            merged = self._add_info(merged, final, i) if final else merged
-        return self._stacked(), np.array(rewards, np.float64), *ended, self._merged(infos, merged)
+        return self._stacked(), np.array(rewards, np.float64), *ended, self._merged(infos)
 
-    def _outcome(self, i: int, action: Any) -> Outcome:
+    def _outcome(self, i: int, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step member ``i``, or begin its next episode."""
         env, mode = self.envs[i], self.autoreset_mode
-        if self._autoreset_envs[i]:
-            if mode == AutoresetMode.DISABLED:
-                raise gym.error.ResetNeeded(f"the episode of environment {i} has ended: reset it by its reset_mask")
-            if mode == AutoresetMode.NEXT_STEP:
-                observation, info = env.reset()
-                return Outcome(observation, 0.0, False, False, info, {})
+        if self._autoreset_envs[i] and mode == AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded(f"the episode of environment {i} has ended: reset it by its reset_mask")
+        if self._autoreset_envs[i] and mode == AutoresetMode.NEXT_STEP:
+            observation, info = env.reset()
+            return observation, 0.0, False, False, info
         observation, reward, terminated, truncated, info = env.step(action)
-        final: dict[str, Any] = {}
         if mode == AutoresetMode.SAME_STEP and (terminated or truncated):
             final = {"final_obs": observation, "final_info": info}
             observation, info = env.reset()
-        return Outcome(observation, reward, terminated, truncated, info, final)
+            info = info | final
+        return observation, reward, bool(terminated), bool(truncated), info
 
     def _stacked(self) -> Any:
         """Return the members' observations in a batch of its own."""
         space = self.single_observation_space
+        if isinstance(space, gym.spaces.Box):
+            return np.array(self._env_obs, space.dtype)
         batch: Any = create_empty_array(space, self.num_envs, np.empty)
         return concatenate(space, self._env_obs, batch)
 
-    def _merged(self, infos: list[dict[str, Any]], merged: dict[str, Any]) -> dict[str, Any]:
-        """Add the infos of all members to ``merged``, as ``_add_info`` does one by one."""
-        first, everyone = infos[0], np.ones(self.num_envs, bool)
-        alike = {key for key, value in first.items() if _is_number(value) or isinstance(value, np.ndarray)}
-        alike = {key for key in alike if all(_alike(first[key], info.get(key)) for info in infos)} - {"final_obs"}
-        for key in first:
-            if key in alike:
-                merged[key], merged[f"_{key}"] = np.array([info[key] for info in infos]), everyone
-        for i, info in enumerate(infos):
-            rest = {key: value for key, value in info.items() if key not in alike}
-            merged = self._add_info(merged, rest, i) if rest else merged
+    def _merged(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
+        """Return the infos of all members, as ``_add_info`` puts them together one by one."""
+        merged: dict[str, Any] = {}
+        everyone = np.ones(self.num_envs, bool)
+        for key, first in infos[0].items():
+            form, values = _form(first), [info.get(key) for info in infos]
+            if form is not None and key != "final_obs" and all(_form(value) == form for value in values):
+                merged[key], merged[f"_{key}"] = np.array(values), everyone
+        if any(key not in merged for info in infos for key in info):
+            rest = [{key: value for key, value in info.items() if key not in merged} for info in infos]
+            for i, info in enumerate(rest):
+                merged = self._add_info(merged, info, i)
         return merged
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -188,14 +176,11 @@ def cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float, bool) or isinstance(value, np.number)
-
-
-def _alike(one: Any, other: Any) -> bool:
-    """Whether two values, the first of them a number or an array, make one array."""
-    same = type(one) is type(other)
-    return same and (not isinstance(one, np.ndarray) or (one.shape == other.shape and one.dtype == other.dtype))
+def _form(value: Any) -> Any:
+    """Return what numbers or arrays of several members must have in common to make one array; None for other values."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype
+    return type(value) if isinstance(value, int | float | np.number) else None
 
 
 def make(num_envs: int = 1, task: str = "Lift", **settings: Any) -> ThreadedVectorEnv:
