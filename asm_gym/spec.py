@@ -249,21 +249,21 @@ def control_period(env: gym.Env[Any, Any]) -> float:
     It may say ``dt``, ``tau``, ``control_timestep``, ``frame_skip`` of a model's ``timestep``, or a frequency of
     control or of its policy. The rate of its videos is taken where nothing else is said, with a warning.
     """
-    bare = env.unwrapped
+    bare: Any = env.unwrapped
     for name in ("dt", "tau", "control_timestep"):
         found = getattr(bare, name, None)
-        if _is_positive(found := found() if callable(found) else found):
-            return float(found)
-    skipped, step = getattr(bare, "frame_skip", None), getattr(getattr(bare, "model", None), "opt", None)
-    if _is_positive(skipped) and _is_positive(step := getattr(step, "timestep", None)):
-        return float(skipped * step)
+        if dt := _positive(found() if callable(found) else found):
+            return dt
+    timestep = getattr(getattr(getattr(bare, "model", None), "opt", None), "timestep", None)
+    if dt := _positive(getattr(bare, "frame_skip", None)) * _positive(timestep):
+        return dt
     config = getattr(bare, "config", None)
     for name in ("control_freq", "policy_frequency", "control_frequency"):
         own = config.get(name) if isinstance(config, dict) else None
-        if _is_positive(rate := own or getattr(env, name, None) or getattr(bare, name, None)):
-            return 1.0 / float(rate)
-    rate = (env.metadata or {}).get("render_fps")
-    if not _is_positive(rate):
+        if rate := _positive(own or getattr(env, name, None) or getattr(bare, name, None)):
+            return 1.0 / rate
+    rate = _positive((env.metadata or {}).get("render_fps"))
+    if not rate:
         return 1.0
     warnings.warn(
         f"{type(bare).__name__} says nothing of its control period: {1 / rate:g} s is taken from the rate of its "
@@ -271,12 +271,14 @@ def control_period(env: gym.Env[Any, Any]) -> float:
         PeriodWarning,
         stacklevel=2,
     )
-    return 1.0 / float(rate)
+    return 1.0 / rate
 
 
 class PeriodWarning(UserWarning):
     """How long a control step takes was guessed."""
 
 
-def _is_positive(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and 0 < float(value) < math.inf
+def _positive(value: Any) -> float:
+    """A number that is positive; 0 for anything else."""
+    known = isinstance(value, Real) and value is not True and 0 < float(value) < math.inf
+    return float(value) if known else 0.0

@@ -15,17 +15,20 @@ from __future__ import annotations
 
 import inspect
 import os
+import shlex
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import gymnasium as gym
 
 from asm_gym.validation import check_choice
+from asm_gym.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -191,6 +194,19 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
             raise
         print(f"{prog}: {one_line(error)}", file=sys.stderr)
         return REFUSED
+
+
+def origin(name: str, args: Any) -> dict[str, str]:
+    """Return how to make a report again: the whole command, the version, and when it was made."""
+    words = ["asm-gym", name]
+    for each in fields(args):
+        value = getattr(args, each.name)
+        if value == each.default or value in (None, ()):
+            continue
+        words += [] if each.metadata.get("positional") else [f"--{each.name.replace('_', '-')}"]
+        words += [] if value is True else map(str, value) if isinstance(value, tuple) else [str(value)]
+    made = datetime.now(UTC).astimezone().isoformat(timespec="seconds")
+    return {"command": shlex.join(words), "version": f"asm-gym {__version__}", "date": made}
 
 
 def one_line(error: BaseException) -> str:

@@ -27,15 +27,15 @@ from asm_gym.data.gaps import SURPRISING, bridge_of, bridged
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, traces_of, write_rerun
+from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, sensed_peak, traces_of, write_rerun
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
-from asm_gym.files import writable
+from asm_gym.files import named, writable
 from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
+from asm_gym.scripts.command import BAD_NEWS, DONE, option, origin, run
 from asm_gym.scripts.log_options import LogOptions
 from asm_gym.validation import check_number
 
@@ -81,13 +81,13 @@ def review(args: Args, monitor: Any, console: Console) -> int:
             over += sum(int(bridged(log.episode.stream, monitor.spec.dt, bridge).sum()) for log in group)
             alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
             excused.update(event for trace in traces for event in Counter(excused_in(trace)).elements())
-            worst = sorted([*worst, *traces], key=lambda trace: -float(trace.surprise.max()))[: args.figures]
+            worst = sorted([*worst, *traces], key=lambda trace: -sensed_peak(trace))[: args.figures]
             episodes += len(group)
             progress(episodes, episodes)
     summary = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
     summary += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
     args.out.mkdir(parents=True, exist_ok=True)
-    with (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
+    with named(args.out / "alarms.csv"), (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
     written = publish(args, summary, alarms, worst)
     if args.rerun is not None:
@@ -132,7 +132,7 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
         f"{summary}, as {args.monitor} sees them.",
         [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
         dict(drawn.values()),
-        details={"command": f"asm-gym watch {args.source} --monitor {args.monitor}"},
+        details=origin("watch", args),
     )
     return f"Wrote {args.out / 'report.html'} and alarms.csv"
 

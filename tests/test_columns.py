@@ -99,7 +99,7 @@ def test_what_is_no_sense_is_set_aside_and_changes_nothing(name):
     """The same motion, read by a memory, whatever such a column does later."""
     values, role = ASIDE[name]
     table = HEALTHY | {name: values}
-    columns = {c.name: c for c in decide([table], LogLayout(), find_clock(table), [T])}
+    columns = {c.name: c for c in decide([table], LogLayout(), find_clock(table))}
     assert columns[name].role == role
     found = read_recorded(table, LogLayout())
     assert found.spec.labels == ("q[0]", "q[1]")

@@ -77,8 +77,8 @@ def _along_time(arrays: Columns) -> Columns:
     return {name: array for name, array in turned.items() if len(array) == rows}
 
 
-def read_hdf5(path: Path) -> dict[str, tuple[Columns, float | None, bool]]:
-    """Return columns, rate [Hz] and success of each demonstration of robomimic; of other HDF5, all under an empty name.
+def read_hdf5(path: Path) -> dict[str, tuple[Columns, float | None]]:
+    """Return columns and rate [Hz] of each demonstration of robomimic; of other HDF5, all under an empty name.
 
     Observations are columns of their names, and actions are called so. Source: robomimic, "Dataset Contents".
     """
@@ -87,11 +87,11 @@ def read_hdf5(path: Path) -> dict[str, tuple[Columns, float | None, bool]]:
         check_hdf5(path)
         with h5py.File(path, "r") as file:
             if "data" not in file or not isinstance(file["data"], h5py.Group):
-                return {"": (_along_time(_datasets(h5py, file)), None, True)}
+                return {"": (_along_time(_datasets(h5py, file)), None)}
             about = json.loads(file["data"].attrs.get("env_args", "{}"))
             rate = about.get("env_kwargs", {}).get("control_freq")
             names = sorted(file["data"], key=lambda name: (len(name), name))
-            return {name: (_demonstration(h5py, file["data"][name]), rate, True) for name in names}
+            return {name: (_demonstration(h5py, file["data"][name]), rate) for name in names}
     except (OSError, KeyError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
 

@@ -81,8 +81,8 @@ def _columns(bag: Any) -> Columns:
         named = {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
         order.append((key, stamp_of(message) or 1e-9 * written, 1e-9 * written, named))
         heard.setdefault(key, []).append(1e-9 * written)
-    topics = {c.topic for c in states}
-    clock = max((key for key in heard if key[0] in topics), key=lambda key: len(heard[key]))
+    of_states = {c.topic for c in states}
+    clock = max((key for key in heard if key[0] in of_states), key=lambda key: len(heard[key]))
     if len(heard) > 1:
         note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
     old = {key: HELD * (came[-1] - came[0]) / max(len(came) - 1, 1) for key, came in heard.items()}

@@ -30,7 +30,7 @@ STANDS = 20  # equal readings in a row from which on a sense that others leave a
 
 def known(values: NDArray[Any]) -> Floats:
     """Return the numbers of a column that are finite."""
-    return values[np.isfinite(values)].astype(np.float64)
+    return np.asarray(values[np.isfinite(values)], np.float64)
 
 
 def is_constant(values: NDArray[Any]) -> bool:
@@ -57,14 +57,14 @@ def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
 
 def follows(values: NDArray[Any], times: Floats) -> bool:
     """Tell whether a column (T,) is a second clock: it goes on as ``times`` (T,) do."""
-    if len(values) < FEWEST or not np.isfinite(values).all():
+    if len(values) < FEWEST or not np.isfinite(values).all() or not np.isfinite(times).all():
         return False
     since = values.astype(np.float64) - float(values[0])
     span = float(np.ptp(since))
     if not span or (np.diff(since) < 0).any():
         return False
-    slope = np.polynomial.Polynomial.fit(times, since, 1)
-    return float(np.abs(since - slope(times)).max()) <= PACE * span
+    slope, offset = np.polyfit(times - times.mean(), since, 1)
+    return float(np.abs(since - offset - slope * (times - times.mean())).max()) <= PACE * span
 
 
 def turn_of(values: NDArray[Any], unit: str) -> float:

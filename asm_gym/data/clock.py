@@ -52,7 +52,7 @@ class Clock(NamedTuple):
     def seconds(self, table: Mapping[str, NDArray[Any]]) -> Floats:
         """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits."""
         parts = [_seconds(c, u, table[c], len(self.columns) > 1) for c, u in zip(self.columns, self.units, strict=True)]
-        return np.sum(parts, axis=0, dtype=np.float64)
+        return np.asarray(np.sum(parts, axis=0), np.float64)
 
     def moment(self, row: Mapping[str, Any]) -> float | None:
         """Return the time of a row [s]; None where it has none. Raises ValueError where it cannot be read."""
@@ -93,14 +93,15 @@ def _seconds_of_text(column: str, values: NDArray[Any]) -> Floats:
     text = pd.Series(values).astype("string").str.strip().replace("", pd.NA)
     numbers = pd.to_numeric(text, errors="coerce")
     if (numbers.notna() | text.isna()).all():
-        return numbers.to_numpy(np.float64, na_value=np.nan)
+        return np.asarray(numbers.to_numpy(np.float64, na_value=np.nan))
     if text.str.fullmatch(_TIME_OF_DAY.pattern).fillna(True).all():
         day = (pd.to_timedelta(text) / pd.Timedelta(seconds=1)).to_numpy(np.float64)
         return np.asarray(day + 86400.0 * np.concatenate([[0], np.cumsum(np.diff(day) < -43200)]))
     for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": True}):
         with suppress(ValueError, TypeError):
-            moments = pd.to_datetime(text, utc=True, **how)  # type: ignore[call-overload]
-            return ((moments - moments.min()) / pd.Timedelta(seconds=1)).to_numpy(np.float64, na_value=np.nan)
+            moments = pd.to_datetime(text, utc=True, **how)
+            since = (moments - moments.min()) / pd.Timedelta(seconds=1)
+            return np.asarray(since.to_numpy(np.float64, na_value=np.nan))
     odd = next(str(cell) for cell in text[numbers.isna() & text.notna()])
     raise ValueError(f"the clock {column!r} must hold a time, got {odd[:40]!r}: --rate HZ reads the rows without it")
 

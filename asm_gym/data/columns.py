@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
@@ -71,15 +72,10 @@ class Column(NamedTuple):
         return any(name == pattern or fnmatchcase(name, pattern) for name in (self.name, self.channel))
 
 
-def decide(
-    tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, clock: Clock | None, times: Sequence[Any] = ()
-) -> list[Column]:
-    """Return what is done with each column of the first of some tables, by all of them.
-
-    ``times`` are those of the rows of each table [s]; their numbers by default.
-    """
+def decide(tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, clock: Clock | None) -> list[Column]:
+    """Return what is done with each column of the first of some tables, by all of them; ``clock`` is that of all."""
     table = tables[0]
-    times = times or [np.arange(len(next(iter(t.values()), ())), dtype=np.float64) for t in tables]
+    times = [_times(each, clock) for each in tables]
     named = _named(table)
     made, seen = list[Column](), dict[tuple[bytes, ...], str]()
     for header, column in named.items():
@@ -99,6 +95,14 @@ def decide(
             column = column._replace(turn=turn, code=code)
         made.append(column._replace(role=role, why=why))
     return [c._replace(why=_said(c)) for c in _restored(made)]
+
+
+def _times(table: Mapping[str, NDArray[Any]], clock: Clock | None) -> NDArray[np.float64]:
+    """When the rows of a table were sensed (T,) [s]; their numbers where no clock tells."""
+    if clock is not None:
+        with suppress(ValueError, KeyError):
+            return clock.seconds(table)
+    return np.arange(max(map(len, table.values()), default=0), dtype=np.float64)
 
 
 def _named(table: Mapping[str, NDArray[Any]]) -> dict[str, Column]:

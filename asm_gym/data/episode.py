@@ -147,7 +147,7 @@ class Episode:
             ValueError: bad columns; the rate is unknown or differs from the spec's; time runs backwards.
         """
         spec = channels if isinstance(channels, StreamSpec) else None
-        chosen = () if spec is not None else tuple(channels or ())
+        chosen = () if isinstance(channels, StreamSpec) else tuple(channels or ())
         layout = LogLayout(spec, rate, action, chosen, labels, ignore=ignore, clock=clock)
         found = read_recorded(frame, layout)
         return cls(found.stream, found.spec, **{"faults": found.faults} | fields)

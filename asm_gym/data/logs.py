@@ -128,9 +128,9 @@ def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
                 if file.suffix == ".npz" and _is_episode(file):
                     yield Source(name, {}, load_episode(file))
                 elif file.suffix in HDF5:
-                    for part, (columns, rate, success) in read_hdf5(file).items():
-                        source = Source(f"{name} {part}".strip(), columns, None, rate, success, str(file))
-                        yield from _parts(source, layout)
+                    for part, (columns, often) in read_hdf5(file).items():
+                        named = f"{name} {part}".strip()
+                        yield from _parts(Source(named, columns, rate=often, file=str(file)), layout)
                 else:
                     yield from _parts(Source(name, FILES[file.suffix](file, layout), file=str(file)), layout)
             except (ValueError, zipfile.BadZipFile) as error:

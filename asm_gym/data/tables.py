@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,10 @@ def table_of(frame: Any) -> Columns:
 
 
 def as_array(column: Any) -> NDArray[Any]:
-    """Return an array (T,) or, of lists of one length, (T, k)."""
+    """Return an array (T,), None being NaN, or, of lists of one length, (T, k)."""
     array = np.asarray(column)
+    if array.dtype == object and all(cell is None or isinstance(cell, Real) for cell in array):
+        return np.array([np.nan if cell is None else cell for cell in array], np.float64)
     if array.dtype == object and len(array) and all(isinstance(row, list | tuple | np.ndarray) for row in array):
         return np.array(array.tolist()) if len({len(row) for row in array}) == 1 else array
     return array

@@ -101,7 +101,8 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     dialect = Dialect.of(first)
     names, has_header = _header(dialect, first, columns)
     rows = rows if has_header else numbered
-    if len(rows) > 1 and has_header and _are_units(dialect, rows[0][1], rows[1][1]):
+    below = [line for _, line in rows[:2]] if has_header else []
+    if len(below) == 2 and below[0].strip() != first.strip() and _are_units(dialect, *below):
         units = [cell.strip() for cell in dialect.cells(rows.pop(0)[1])]
         names = [f"{n} [{u.strip('[]()')}]" if u and n else n for n, u in zip(names, units, strict=False)]
     again = sum(line.strip() == first.strip() for _, line in rows) if has_header else 0
@@ -129,10 +130,9 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
         )
     except ValueError as error:
         raise ValueError(f"it is no table of text: {' '.join(str(error).split())}") from error
-    cells = [_column(frame[k], dialect.comma) for k in range(len(names))]
-    if blocks:
-        names, cells = [*names, HEADING], [*cells, np.array(blocks, object)]
-    return _merged([(n, c) for n, c in zip(names, cells, strict=True) if n or c.dtype.kind == "O" or _any(c)])
+    made = [(name, _column(frame[k], dialect.comma)) for k, name in enumerate(names)]
+    made += [(HEADING, np.array(blocks, object))] if blocks else []
+    return _merged([(n, c) for n, c in made if n or c.dtype.kind == "O" or np.isfinite(c).any()])
 
 
 def _blocks(numbered: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int, str]]]:
@@ -146,10 +146,6 @@ def _blocks(numbered: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int,
             rows.append((n, line))
     found = len(set(headings)) > 1 and all(headings)
     return (headings, rows) if found else ([], numbered)
-
-
-def _any(values: NDArray[Any]) -> bool:
-    return bool(np.isfinite(values).any())
 
 
 def _header_at(lines: Sequence[str]) -> int:
@@ -195,6 +191,8 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
     regular_file(path)
     raw = path.read_bytes()
     wide = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
+    if not wide and raw[1:200:2].count(0) > 80:  # UTF-16 of Windows, without its mark
+        raw, wide = b"\xff\xfe" + raw, True
     if b"\x00" in raw[:LONGEST_LINE] and not wide:
         raise ValueError("it is no text")
     try:
@@ -279,7 +277,7 @@ def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
     text = pd.Series(cells).astype("string").str.strip()
     plain = text.str.replace(",", ".", regex=False) if comma else text
     found = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
-    values = found.to_numpy(np.float64, na_value=np.nan)
+    values: NDArray[np.float64] = found.to_numpy(np.float64, na_value=np.nan)
     hexadecimal = text.str.fullmatch(_HEX).fillna(False).to_numpy(bool)
     values[hexadecimal] = [float(int(cell, 16)) for cell in text[hexadecimal]]
     return values
@@ -288,12 +286,12 @@ def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
 def _column(cells: pd.Series[Any], comma: bool) -> NDArray[Any]:
     """A column of numbers, or of words where it holds one."""
     if cells.dtype.kind in "biuf":
-        return cells.to_numpy()
+        return np.asarray(cells)
     text = cells.astype("string").str.strip()
     values = numbers_in(text, comma)
-    if np.isfinite(values[(text.notna() & (text != "")).to_numpy(bool)]).all():
+    if not np.isnan(values[(text.notna() & (text != "")).to_numpy(bool)]).any():
         return values
-    return text.fillna("").str[:LONGEST_WORD].to_numpy(dtype=object)
+    return np.asarray(text.fillna("").str[:LONGEST_WORD], object)
 
 
 def read_json_lines(path: Path, columns: Sequence[str] = ()) -> Columns:

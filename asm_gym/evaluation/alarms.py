@@ -33,21 +33,32 @@ class Alarm(NamedTuple):
         return self.log, f"{self.start:.3f}", f"{self.end:.3f}", self.channel, self.why, f"{self.excess:.2f}"
 
 
+TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
 HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds")
 
 
 def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
-    """Return every alarm of an episode, in order."""
+    """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one."""
     detail = trace.detail
     assert detail is not None
-    found = []
+    found = list[Alarm]()
     for first, stop in spans(trace.alarm):
         row = np.zeros(len(detail.channels)) if detail.stream is None else detail.stream[first]
-        at = blamed(row, detail.attribution[first])
-        channel = "" if at is None else detail.channels[at]
+        why, start = reason(row), (first + 1) * trace.dt
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
-        found.append(Alarm(trace.kind, (first + 1) * trace.dt, stop * trace.dt, channel, reason(row), excess))
+        if found and found[-1].why == why and start - found[-1].end <= TOGETHER_S:
+            found[-1] = found[-1]._replace(end=stop * trace.dt, excess=max(excess, found[-1].excess))
+            continue
+        at = blamed(row, detail.attribution[first])
+        found.append(Alarm(trace.kind, start, stop * trace.dt, "" if at is None else detail.channels[at], why, excess))
     return found
+
+
+def sensed_peak(trace: ScoredEpisode) -> float:
+    """Return the largest surprise of an episode in rows that lack nothing: missing data are no degree of surprise."""
+    stream = None if trace.detail is None else trace.detail.stream
+    whole = np.ones(len(trace), np.bool_) if stream is None else ~np.isnan(stream).any(axis=1)
+    return float(trace.surprise[whole].max(initial=0.0))
 
 
 def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[ScoredEpisode]:
