@@ -16,6 +16,8 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import LogWarning, noted
 from asm_gym.data.rows import RowReader
+from asm_gym.evaluation.alarms import alarms_of, sensed_peak
+from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 from asm_gym.scripts.cli import main
 from asm_gym.spec import StreamSpec
 from tests.streams import arm_table
@@ -219,6 +221,20 @@ def test_a_logger_that_was_started_twice_makes_two_logs_and_headings_make_one_ea
     (tmp_path / "y.dat").write_text(f"normal\n{block}\n\n\ncollision\n{block}\n\n")
     logs = list(read_logs(tmp_path / "y.dat", LogLayout(columns=["fx", "fy"], rate=3.0)))
     assert [bool(log.episode.faults.any()) for log in logs] == [False, True]
+
+
+def test_alarms_of_one_cause_are_one_and_missing_data_are_apart():
+    surprise, stream = np.zeros(300), np.zeros((300, 1), np.float32)
+    surprise[[50, 60, 70, 200]] = 2.0  # at 50 Hz: a push, and another one
+    surprise[65], stream[65] = np.inf, np.nan
+    detail = TraceDetail(np.zeros((300, 1)), ("q",), np.zeros(300, np.bool_), stream)
+    trace = ScoredEpisode("x", 0, 0.02, 1.0, surprise, detail=detail)
+    found = alarms_of(trace)
+    assert [(a.why, round(a.start, 2)) for a in found if a.why == "surprise"] == [
+        ("surprise", 1.02),
+        ("surprise", 4.02),
+    ]
+    assert sensed_peak(trace) == 2.0
 
 
 def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_in_time(tmp_path, capsys):

@@ -85,14 +85,14 @@ def turn_of(values: NDArray[Any], unit: str) -> float:
 
 def code_of(values: NDArray[Any]) -> float:
     """Return the number that stands for missing data in a column (T,), such as -99999; NaN where there is none."""
-    found = np.unique(known(values))
-    if len(found) < 3:
-        return math.nan
-    for code, others in ((found[0], found[1:]), (found[-1], found[:-1])):
-        often = int(np.sum(values == code))
+    found = known(values)
+    for code in (found.min(), found.max()) if len(found) else ():
+        others = found[found != code]
+        often = len(found) - len(others)
         whole = (code == np.rint(code) and abs(code) >= LEAST_CODE) or abs(code) > 1e30
-        apart = float(np.abs(others - code).min()) > CODE_APART * float(np.ptp(others)) > 0
-        if whole and apart and 2 <= often <= CODES_AT_MOST * len(values):
+        if not whole or not 2 <= often <= CODES_AT_MOST * len(values):
+            continue
+        if float(np.abs(others - code).min()) > CODE_APART * float(np.ptp(others)) > 0:
             return float(code)
     return math.nan
 

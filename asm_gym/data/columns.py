@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -77,20 +78,21 @@ def decide(tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, cloc
     table = tables[0]
     times = [_times(each, clock) for each in tables]
     named = _named(table)
-    made, seen = list[Column](), dict[tuple[bytes, ...], str]()
+    stamps = {name for other in clocks_among(table) for name in other.columns}
+    made, seen = list[Column](), dict[tuple[int, ...], str]()
     for header, column in named.items():
-        every = [t[header] for t in tables if header in t]
-        role, why = _by_name(header, column, layout, clock, table)
+        every = [t[header] for t in tables if header in t and is_numeric(t[header])]
+        role, why = _by_name(header, column, layout, clock, header in stamps)
         chosen = any(column.matches(p) for p in (*layout.channels, *layout.action))
         if role == "sense" and not chosen:
             role, why = _by_behaviour(column, every, times)
-            cells = tuple(np.ascontiguousarray(v, np.float64).tobytes() for v in every if is_numeric(v))
+            cells = tuple(hash(np.ascontiguousarray(v, np.float64).tobytes()) for v in every)
             same = seen.setdefault(cells, column.name)
             if role == "sense" and same != column.name and is_command(same) == is_command(column.name):
                 role, why = "copy", f"equals {same}"
         if role == "sense":
             role = "command" if is_command(column.name) else "sense"
-            turn = max(turn_of(values, column.unit) for values in every if is_numeric(values))
+            turn = max(turn_of(values, column.unit) for values in every)
             code = next((c for values in every if not math.isnan(c := code_of(values))), math.nan)
             column = column._replace(turn=turn, code=code)
         made.append(column._replace(role=role, why=why))
@@ -109,20 +111,18 @@ def _named(table: Mapping[str, NDArray[Any]]) -> dict[str, Column]:
     """The columns by their headers, with unit, channel and element."""
     bare = {header: split_unit(header) for header in table}
     found = {header: element_of(name) for header, (name, _) in bare.items() if is_numeric(table[header])}
-    stems = [element.channel for element in found.values() if element]
+    stems = Counter(element.channel for element in found.values() if element)
     whole = {name for name, _ in bare.values()}
     made = {}
     for header, (name, unit) in bare.items():
         element = found.get(header)
-        grouped = element and (element.named or stems.count(element.channel) > 1) and element.channel not in whole
+        grouped = element and (element.named or stems[element.channel] > 1) and element.channel not in whole
         channel, part = (element.channel, element.name) if element and grouped else (name, "")
         made[header] = Column(name, unit, "sense", channel, part, table[header])
     return made
 
 
-def _by_name(
-    header: str, column: Column, layout: LogLayout, clock: Clock | None, table: Mapping[str, NDArray[Any]]
-) -> tuple[str, str]:
+def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None, is_stamp: bool) -> tuple[str, str]:
     """The role of a column by its name, by the options, and by the kind of its cells; else a sense."""
     if any(column.matches(pattern) or header == pattern for pattern in layout.ignore):
         return "ignored", "--ignore"
@@ -132,7 +132,7 @@ def _by_name(
         return "label", "marks what is wrong, by its name"
     if layout.channels and not any(column.matches(pattern) for pattern in layout.channels):
         return "ignored", "not among --channels"
-    if any(header in other.columns for other in clocks_among(table)) and not layout.channels:
+    if is_stamp and not layout.channels:
         return "pace", "another clock"
     if DOUBLED in header:
         return "double", f"differs from another column of the name {header.partition(DOUBLED)[0]!r}"
@@ -165,11 +165,11 @@ def _by_behaviour(
         return "constant", "never moves"
     if column.unit in UNITS or SENSE.fullmatch(column.name):
         return "sense", ""
-    moving = [(values, t) for values, t in zip(every, times, strict=False) if not is_constant(values)]
+    moving = [values for values in every if not is_constant(values)]
     fewest = 2 if column.name.lower() in COUNTERS else FEWEST
-    if all(counts(values, fewest) for values, _ in moving):
+    if all(counts(values, fewest) for values in moving):
         return "counter", "rises by a constant"
-    if all(len(values) == len(t) and follows(values, t) for values, t in moving):
+    if all(any(len(values) == len(t) and follows(values, t) for t in times) for values in moving):
         return "pace", "goes on as the clock does"
     return "sense", ""
 

@@ -172,14 +172,14 @@ def _are_units(dialect: Dialect, line: str, below: str) -> bool:
 
 def _merged(columns: Sequence[tuple[str, NDArray[Any]]]) -> Columns:
     """The columns by name; of one name, equal ones are one, and others get a number."""
-    made: Columns = {}
+    by_name: dict[str, list[NDArray[Any]]] = {}
     for name, values in columns:
-        same = [kept for kept in made if kept.partition(DOUBLED)[0] == name]
-        if any(_equal(made[kept], values) for kept in same):
+        same = by_name.setdefault(name, [])
+        if any(_equal(kept, values) for kept in same):
             note(f"columns of the same name are equal, and read as one: {name}")
         else:
-            made[f"{name}{DOUBLED}{len(same) + 1}" if same else name] = values
-    return made
+            same.append(values)
+    return {f"{n}{DOUBLED}{k}" if k > 1 else n: v for n, same in by_name.items() for k, v in enumerate(same, 1)}
 
 
 def _equal(one: NDArray[Any], other: NDArray[Any]) -> bool:

@@ -41,14 +41,16 @@ def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
     """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one."""
     detail = trace.detail
     assert detail is not None
-    found = list[Alarm]()
+    found, newest = list[Alarm](), dict[str, int]()
     for first, stop in spans(trace.alarm):
         row = np.zeros(len(detail.channels)) if detail.stream is None else detail.stream[first]
         why, start = reason(row), (first + 1) * trace.dt
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
-        if found and found[-1].why == why and start - found[-1].end <= TOGETHER_S:
-            found[-1] = found[-1]._replace(end=stop * trace.dt, excess=max(excess, found[-1].excess))
+        before = found[newest[why]] if why in newest else None
+        if before is not None and start - before.end <= TOGETHER_S:
+            found[newest[why]] = before._replace(end=stop * trace.dt, excess=max(excess, before.excess))
             continue
+        newest[why] = len(found)
         at = blamed(row, detail.attribution[first])
         found.append(Alarm(trace.kind, start, stop * trace.dt, "" if at is None else detail.channels[at], why, excess))
     return found
