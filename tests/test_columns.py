@@ -92,7 +92,7 @@ ASIDE = {
     "nothing": (np.full(ROWS, np.nan), "empty"),
     "frame_id": (np.array(["base"] * ROWS, object), "words"),
     "y_true": (np.zeros(ROWS), "label"),
-    "stamp_nsec": ((1e9 * T).astype(np.int64), "pace"),
+    "stamp_nsec": ((1e9 * T).astype(np.int64), "clock"),
 }
 
 
@@ -107,7 +107,7 @@ def test_what_is_no_sense_is_set_aside_and_changes_nothing(name):
     assert found.spec.labels == ("q[0]", "q[1]")
     later = table | {name: values + 30_000 if values.dtype.kind in "iuf" else values}
     np.testing.assert_array_equal(read_recorded(later, LogLayout(found.spec)).stream, found.stream)
-    if role in ("counter", "pace", "constant", "copy"):
+    if role in ("counter", "pace", "constant", "copy", "clock"):
         assert "--channels" in columns[name].why
         assert name in Episode.from_table(table, channels=["q*", name]).spec.labels
 

@@ -30,7 +30,8 @@ from asm_gym.data.text import DOUBLED, numbers_in
 from asm_gym.spec import StreamSpec
 
 READ = ("sense", "command")
-BY_BEHAVIOUR = ("constant", "counter", "pace", "copy")
+KEPT_TOGETHER = ("constant", "counter", "pace")  # roles by behaviour that the elements of a channel do not get alone
+BACK = "; name it among --channels to read it"
 MIXED = 0.5  # share of numbers from which on a column with words is one of numbers
 
 
@@ -89,14 +90,16 @@ def decide(tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, cloc
             cells = tuple(hash(np.ascontiguousarray(v, np.float64).tobytes()) for v in every)
             same = seen.setdefault(cells, column.name)
             if role == "sense" and same != column.name and is_command(same) == is_command(column.name):
-                role, why = "copy", f"equals {same}"
+                role, why = "copy", f"equals {same}{BACK}"
         if role == "sense":
             role = "command" if is_command(column.name) else "sense"
             turn = max(turn_of(values, column.unit) for values in every)
             code = next((c for values in every if not math.isnan(c := code_of(values))), math.nan)
-            column = column._replace(turn=turn, code=code)
+            said = [f"turns over at {turn:g}: read as its sine and cosine"] if turn else []
+            said += [] if math.isnan(code) else [f"{code:g} is taken for missing data"]
+            column, why = column._replace(turn=turn, code=code), "; ".join(said)
         made.append(column._replace(role=role, why=why))
-    return [c._replace(why=_said(c)) for c in _restored(made)]
+    return _restored(made)
 
 
 def _times(table: Mapping[str, NDArray[Any]], clock: Clock | None) -> NDArray[np.float64]:
@@ -125,17 +128,18 @@ def _named(table: Mapping[str, NDArray[Any]]) -> dict[str, Column]:
 def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None, is_stamp: bool) -> tuple[str, str]:
     """The role of a column by its name, by the options, and by the kind of its cells; else a sense."""
     if any(column.matches(pattern) or header == pattern for pattern in layout.ignore):
-        return "ignored", "--ignore"
+        return "ignored", "by --ignore"
     if clock is not None and header in clock.columns:
-        return "clock", "tells the time of rows"
+        return "clock", "tells the rate"
     if is_label(column.name, layout.labels):
-        return "label", "marks what is wrong, by its name"
+        return "label", "rows it marks are not learned from"
     if layout.channels and not any(column.matches(pattern) for pattern in layout.channels):
         return "ignored", "not among --channels"
     if is_stamp and not layout.channels:
-        return "pace", "another clock"
+        return "clock", f"another clock{BACK}"
     if DOUBLED in header:
-        return "double", f"differs from another column of the name {header.partition(DOUBLED)[0]!r}"
+        other = header.partition(DOUBLED)[0]
+        return "double", f"differs from another column of the name {other!r}; --ignore '{header}' leaves it out"
     if not is_numeric(column.values):
         return _words(column)
     if not np.isfinite(column.values).any():
@@ -146,7 +150,7 @@ def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None
 def _words(column: Column) -> tuple[str, str]:
     """Whether a column of text holds words, or numbers with words among them."""
     if column.values.dtype.kind in "Mm":
-        return "pace", "another clock"
+        return "clock", f"another clock{BACK}"
     empty = np.array([not str(cell).strip() for cell in column.values], np.bool_)
     numbers = np.isfinite(numbers_in(column.values)) | empty
     if empty.all():
@@ -154,7 +158,8 @@ def _words(column: Column) -> tuple[str, str]:
     if numbers.mean() < MIXED or numbers[~empty].mean() < MIXED:
         return "words", "holds words"
     row = int(np.argmin(numbers))
-    return "mixed", f"must hold numbers, got {str(column.values[row])[:40]!r} in row {row + 1}"
+    what = f"must hold numbers, got {str(column.values[row])[:40]!r} in row {row + 1}"
+    return "mixed", f"{what}; --ignore '{column.name}' leaves it out"
 
 
 def _by_behaviour(
@@ -162,15 +167,15 @@ def _by_behaviour(
 ) -> tuple[str, str]:
     """The role of a column of numbers by what it does in every table."""
     if all(map(is_constant, every)):
-        return "constant", "never moves"
+        return "constant", f"never moves{BACK}"
     if column.unit in UNITS or SENSE.fullmatch(column.name):
         return "sense", ""
     moving = [values for values in every if not is_constant(values)]
     fewest = 2 if column.name.lower() in COUNTERS else FEWEST
     if all(counts(values, fewest) for values in moving):
-        return "counter", "rises by a constant"
+        return "counter", f"rises by a constant{BACK}"
     if all(any(len(values) == len(t) and follows(values, t) for t in times) for values in moving):
-        return "pace", "goes on as the clock does"
+        return "pace", f"goes on as the clock does{BACK}"
     return "sense", ""
 
 
@@ -178,31 +183,12 @@ def _restored(columns: list[Column]) -> list[Column]:
     """The columns, those of a channel kept together: one joint that stands, or turns steadily, is none the less one."""
     moving = {c.channel for c in columns if c.read and c.element}
     alone = not any(c.read for c in columns)  # nothing else is left
-    if alone:
-        moving |= {c.channel for c in columns if c.role in BY_BEHAVIOUR and c.why != "another clock"}
     return [
-        c._replace(role="command" if is_command(c.name) else "sense", why="" if alone else f"{c.why}, beside others")
-        if c.role in BY_BEHAVIOUR and c.role != "copy" and c.why != "another clock" and c.channel in moving
+        c._replace(
+            role="command" if is_command(c.name) else "sense",
+            why="" if alone else f"{c.why.removesuffix(BACK)}, beside others that do not",
+        )
+        if c.role in KEPT_TOGETHER and (alone or c.channel in moving)
         else c
         for c in columns
     ]
-
-
-OPTIONS = {
-    **{"constant": "--channels", "counter": "--channels", "pace": "--channels", "copy": "--channels"},
-    **{"mixed": "--ignore", "double": "--ignore"},
-}
-"""The option that overrides a role."""
-
-
-def _said(column: Column) -> str:
-    """Why a column has its role, and what overrides it."""
-    option = OPTIONS.get(column.role)
-    why = column.why
-    if column.turn:
-        why += f"{'; ' * bool(why)}turns over at {column.turn:g}: read as its sine and cosine"
-    if not math.isnan(column.code):
-        why += f"{'; ' * bool(why)}{column.code:g} is taken for missing data"
-    if option == "--channels":
-        return f"{why}; name it among --channels to read it"
-    return f"{why}; --ignore '{column.name}' leaves it out" if option else why

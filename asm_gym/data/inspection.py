@@ -20,12 +20,6 @@ from asm_gym.readings import noise_of, resolution, spans
 FEW_VALUES = 8  # A channel of fewer different values hardly moves
 JITTERS = 0.1  # share of a period that steps spread by from which on a clock jitters
 
-TREATMENT = {
-    "clock": "tells the rate",
-    "label": "rows it marks are not learned from",
-    "command": "commanded, by its name",
-}
-"""What is done with columns that are no senses; of others their reason says it."""
 SHOWN = {"pace": "clock", "mixed": "words", "double": "sense"}
 """How a role is called in the table, where not by its name."""
 
@@ -130,7 +124,8 @@ def _facts(column: Column, columns: Sequence[Column], clock: ClockFound) -> dict
         "repeats itself at rest: healthy": not still and bool(step) and repeats > 0.02 and different > 1,
         "a memory of radians reads it too": "deg" in column.unit or "°" in column.unit,
     }
-    remarks = [column.why] if column.why else []
+    remarks = ["commanded, by its name"] if column.role == "command" else []
+    remarks += [column.why] if column.why else []
     remarks += [words for words, holds in treatment.items() if holds] if column.role == "sense" else []
     return {
         "channel": column.name,
@@ -142,5 +137,5 @@ def _facts(column: Column, columns: Sequence[Column], clock: ClockFound) -> dict
         "resolution": step,
         "repeats": repeats,
         "missing": missing,
-        "what is done": TREATMENT.get(column.role) or "; ".join(remarks) or "read as it is",
+        "what is done": "; ".join(remarks) or "read as it is",
     }
