@@ -48,7 +48,7 @@ def inspect(args: Args, console: Console) -> int:
         for n, source in enumerate(sources):
             columns, nominal = table_of_source(source), replace(layout, nominal=source.rate)
             log = inspected(source.name, columns, nominal, [t for t in tables if t is not source.columns])
-            trouble = trouble or bool(log.clock.trouble)
+            trouble = trouble or bool(log.clock.trouble) or not log.clock.rate
             say(log.caption())
             lines = [*(table(log.facts) if first is None else []), *(f"- {line}" for line in log.remarks())]
             for line in lines:

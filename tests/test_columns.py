@@ -80,7 +80,8 @@ def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat()
 def test_a_frozen_sense_is_told_from_an_arm_at_rest():
     frozen = np.where((T > 1) & (T < 3), Q[50], Q)
     assert stands_still(frozen, np.cos(2 * T)[:, None]) > 90
-    assert stands_still(frozen, frozen[:, None]) == 0
+    assert stands_still(frozen, frozen[:, None]) == 0  # the arm rests
+    assert stands_still(np.round(np.clip(Q, -0.2, 0.2), 1), np.cos(2 * T)[:, None]) == 0  # a coarse encoder
 
 
 HEALTHY = {"time": T, "q0": Q, "q1": np.cos(2 * T) + 1e-3 * RNG.normal(size=ROWS)}

@@ -25,7 +25,7 @@ PACE = 2e-3  # how far a second clock is off a straight line, as a share of its 
 CODE_APART = 5.0  # how many ranges of all others a code for missing data is away from them
 CODES_AT_MOST = 0.5  # share of rows that may hold one
 LEAST_CODE = 99.0  # a code is at least so large
-STANDS = 20  # equal readings in a row from which on a sense that others leave alone is frozen
+STANDS, SELDOM = 20, 0.2  # equal readings in a row that make a sense frozen; share of others that repeat themselves
 
 
 def known(values: NDArray[Any]) -> Floats:
@@ -98,8 +98,10 @@ def code_of(values: NDArray[Any]) -> float:
 
 
 def stands_still(values: NDArray[Any], others: Floats) -> int:
-    """Return for how many rows in a row a column (T,) repeats itself while one of ``others`` (T, n) moves on; or 0."""
-    moving = others.std(axis=0) if others.size else np.zeros(0)
-    runs = [(start, stop) for start, stop in spans(np.diff(values) == 0) if stop - start >= STANDS]
-    frozen = [b - a + 1 for a, b in runs if (others[a : b + 1].std(axis=0) > 0.2 * moving).any()]
+    """Return for how many rows in a row a column (T,) that seldom repeats itself does, while ``others`` (T, n) move."""
+    again = np.diff(values) == 0
+    moving = others.std(axis=0)
+    runs = [(start, stop) for start, stop in spans(again) if stop - start >= STANDS]
+    seldom = again.sum() - sum(b - a for a, b in runs) < SELDOM * (len(again) - sum(b - a for a, b in runs))
+    frozen = [b - a + 1 for a, b in runs if seldom and (others[a : b + 1].std(axis=0) > 0.2 * moving).any()]
     return max(frozen, default=0)

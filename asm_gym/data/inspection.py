@@ -115,12 +115,12 @@ def _facts(column: Column, columns: Sequence[Column], clock: ClockFound) -> dict
     known = values[np.isfinite(values) & (values != column.code)]
     different, missing, step = len(np.unique(known)), len(values) - len(known), resolution(values)
     repeats = float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0
-    others = [c.values for c in columns if c.role == "sense" and c is not column and c.channel == column.channel]
+    others = [c.values for c in columns if c.role == "sense" and c is not column]
     still = stands_still(values, np.column_stack(others)) if column.role == "sense" and others else 0
     treatment = {
         f"hardly moves: {different} values; its spread has a floor": 1 < different < FEW_VALUES,
         "missing numbers: bridged, or cut there": missing > 0,
-        f"stands still for {still / (clock.rate or 1):.3g} s while {column.channel} moves: frozen?": still > 0,
+        f"stands still for {still / (clock.rate or 1):.3g} s while others move: frozen?": still > 0,
         "repeats itself at rest: healthy": not still and bool(step) and repeats > 0.02 and different > 1,
         "a memory of radians reads it too": "deg" in column.unit or "°" in column.unit,
     }
