@@ -10,6 +10,7 @@ import atexit
 import hashlib
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,6 +24,7 @@ from numba.core.config import reload_config
 from numba.core.registry import cpu_target
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 KEEP_NOWHERE = "asm-gym-numba-"  # begins the name of a folder that goes when the process ends
 
 
@@ -37,13 +39,7 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
         nogil: let other threads run Python meanwhile.
     """
     how: dict[str, Any] = {"nogil": nogil, "fastmath": fastmath, "forceinline": fastmath, "error_model": "numpy"}
-    try:
-        dispatcher: Any = numba.njit(cache=True, **how)(function)
-    except RuntimeError:  # numba found no folder that it may write to
-        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix=KEEP_NOWHERE)
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        reload_config()  # type: ignore[no-untyped-call]
-        dispatcher = numba.njit(cache=True, **how)(function)
+    dispatcher: Any = somewhere(lambda: numba.njit(cache=True, **how)(function))
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
@@ -51,6 +47,27 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
         cache._source_stamp = f"{how}" + "".join(map(_digest, (own, *(package / name for name in calls))))
         cache._load_index = partial(_index_of, cache._load_index)
     return cast(F, dispatcher)
+
+
+def somewhere(make: Callable[[], T]) -> T:
+    """Return what ``make`` returns, which keeps compiled code: in a temporary folder where no other can be written to.
+
+    From then on all code of this process is kept there, robosuite's too.
+    """
+    try:
+        return make()
+    except RuntimeError as error:
+        if "cannot cache" not in str(error):
+            raise
+    folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix=KEEP_NOWHERE)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    reload_config()  # type: ignore[no-untyped-call]
+    print(
+        "asm-gym: neither the install nor HOME is writable, so that compiled code is lost when this process ends: "
+        "name a folder that is, export NUMBA_CACHE_DIR=FOLDER",
+        file=sys.stderr,
+    )
+    return make()
 
 
 def _index_of(load: Callable[[], dict[Any, str]]) -> dict[Any, str]:

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import somewhere
 from asm_gym.envs.compiled_substeps import touching
 from asm_gym.envs.mujoco_views import Floats
 from asm_gym.envs.robots import PHYSICS_FREQ
@@ -39,7 +40,7 @@ def import_robosuite() -> Any:
     if no_viewer := "cv2" not in sys.modules:  # for want of libGL: only robosuite's own viewer would use it
         sys.modules["cv2"] = ModuleType("cv2")
     try:
-        robosuite = require("robosuite", what="a robosuite environment")
+        robosuite = somewhere(lambda: require("robosuite", what="a robosuite environment"))
     finally:
         if no_viewer:
             del sys.modules["cv2"]
