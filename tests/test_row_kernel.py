@@ -220,3 +220,18 @@ def test_episodes_too_short_to_have_a_change_are_refused():
     short = sine_episodes(1, spec=FAST, steps=(LAG, LAG))
     with pytest.raises(ValueError, match="episode 0 must be at least 4 steps long, got 3"):
         NeuralASM(FAST).fit(short)
+
+
+def test_a_state_that_is_written_again_says_the_same_and_leaves_what_was_returned_before_alone():
+    asm = NeuralASM(sine_spec(), hidden_size=8, association_size=8, epochs=1).fit(sine_episodes(4))
+    rows, state, free = sine_episodes(1)[0].stream[:, None], asm.initial_state(1), None
+    fresh, kept = state, []
+    for t, row in enumerate(rows[:20]):
+        fresh, expected = asm.observe(fresh, row)
+        before, (state, found) = state, asm.observe(state, row, free)
+        free = before if t else None  # the initial state stays as it is
+        kept.append((expected, found))
+    for expected, found in kept:
+        np.testing.assert_array_equal(found.value, expected.value)
+        np.testing.assert_array_equal(found.attribution, expected.attribution)
+    np.testing.assert_array_equal(state.detection.evidence.vector, fresh.detection.evidence.vector)

@@ -40,7 +40,7 @@ class Observer:
     def __init__(self, monitor: Monitor, count: int, rows: Rows, options: GuardOptions, recalls: bool) -> None:
         self._monitor, self._count, self._size, self._rows = monitor, count, monitor.spec.size, rows
         self._rate = options.online_learning_rate
-        self._copies = not isinstance(monitor, NeuralASM)  # another's arrays may be buffers that it uses again
+        self._ours = monitor if isinstance(monitor, NeuralASM) else None
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
         self._learns = monitor if isinstance(monitor, LearnsOnTheJob) and self._rate > 0 else None
@@ -63,12 +63,16 @@ class Observer:
             held: (n,) the reflex acts.
             active: (n,) whose rows count.
         """
-        self._before, start, latency, expected = self._state, time.perf_counter(), 0.0, None
+        free, self._before = self._before, self._state
+        start, latency, expected = time.perf_counter(), 0.0, None
         try:
-            state, surprise = self._monitor.observe(self._before, rows)
+            if self._ours is None:
+                state, surprise = self._monitor.observe(self._before, rows)
+                surprise = self._copied(surprise)  # its arrays may be buffers that it uses again
+            else:
+                reused = None if free is self._initial or free is self._before else free
+                state, surprise = self._ours.observe(self._before, rows, reused)
             latency = time.perf_counter() - start
-            if self._copies:
-                surprise = self._copied(surprise)
             if self._recalls is not None:
                 expected = self._expected(self._recalls, state)
             self._state = state

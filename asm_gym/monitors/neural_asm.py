@@ -178,7 +178,10 @@ class NeuralASM(CalibratedMonitor):
         excuses = np.zeros((batch, 0), np.int64) if self.excuses_ is None else self.excuses_.start(batch)
         return state._replace(excuses=excuses, values=self.values_.start(batch))
 
-    def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
+    def observe(
+        self, state: MonitorState, stream: NDArray[np.floating[Any]], out: MonitorState | None = None
+    ) -> tuple[MonitorState, Surprise]:
+        """As in ``CalibratedMonitor``; the new state is written to ``out``, a state that is needed no more."""
         kernel = self._row_kernel()
         if kernel is None:
             self._require_fitted()
@@ -187,7 +190,7 @@ class NeuralASM(CalibratedMonitor):
             now, surprise = super().observe(state, rows)
             now, divisor = now._replace(excuses=state.excuses), np.ones(len(rows))
         else:
-            now, surprise, divisor = kernel(state, rows)
+            now, surprise, divisor = kernel(state, rows, out)
         if self.values_.monitor is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
             now = now._replace(values=values)

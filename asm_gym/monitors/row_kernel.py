@@ -66,7 +66,7 @@ class RowKernel:
     def __init__(self, memory: Layout, detection: EvidenceDetection, excuses: Excuses | None) -> None:
         d = detection.fitted_detector
         if must_compile(expect_rows):
-            print("asm-gym: compiling the memory, once on this machine (about a minute)", file=sys.stderr)
+            print("asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr)
         arrays = {name: getattr(d, name) for name in detection.arrays[:-1]} | {"gains": d.gains}
         arrays |= dict(
             zip(("repetition_steps", "repetition_most", "repetition_offset"), detection.repeating, strict=True)
@@ -80,17 +80,17 @@ class RowKernel:
         self._memory: tuple[Any, ...] = *memory, bool(d.context_quantile[:-1].any())
         _, *self._judges = Layout.of(arrays, {"bound": d.bound} | excused)
         self._excuses = excuses
-        self._kinds: dict[int, list[tuple[tuple[int, ...], Any]]] = {}  # of the arrays of a state of B streams
 
     def __call__(
-        self, state: MonitorState, rows: NDArray[np.float64]
+        self, state: MonitorState, rows: NDArray[np.float64], out: MonitorState | None = None
     ) -> tuple[MonitorState, Surprise, NDArray[np.float64]]:
-        """Return the new state, the surprise of the next rows (B, D), perhaps not finite, and its divisor (B,)."""
+        """Return the new state, the surprise of the next rows (B, D), perhaps not finite, and its divisor (B,).
+
+        The new state is written to ``out``, where that is given, a state of as many streams.
+        """
         B, empty = len(rows), np.empty
-        (traces, expected, (before, earlier, steps), skill), (evidence, repetition) = state.model, state.detection
-        old: tuple[Any, ...] = traces, expected, before, earlier, steps, skill, *evidence, *repetition, state.excuses
-        kinds = self._kinds.get(B) or self._kinds.setdefault(B, [(a.shape, a.dtype) for a in old])
-        new = [empty(*kind) for kind in kinds]
+        old = _arrays(state)
+        new = [empty(array.shape, array.dtype) for array in old] if out is None else _arrays(out)
         value, attribution, raw, excuse, divisor = empty(B), empty(rows.shape), empty(B), empty(B, np.int8), empty(B)
         found: tuple[Any, ...] = value, attribution, raw, excuse, divisor
         with _ONE_THREAD if B > 1 else nullcontext():  # one row calls no BLAS
@@ -98,31 +98,49 @@ class RowKernel:
             judge_rows(rows, error, finite, new[1], *old[6:], *new[6:], *found, *self._judges)
         excused = (raw, excuse) if self._excuses is not None else (None, None)
         surprise = Surprise(value, attribution, None, *excused)
+        if out is not None:
+            return out, surprise, divisor
         memory = MemoryState(new[0], new[1], RowHistory(new[2], new[3], new[4]), new[5])
         detection = EvidenceState(Evidence(new[6], new[7], new[8]), Repetition(new[9], new[10], new[11]))
         return MonitorState(memory, detection, new[12]), surprise, divisor
 
 
+def _arrays(state: MonitorState) -> list[Any]:
+    """Return the arrays of a state, in the order in which the compiled functions take them."""
+    (traces, expected, history, skill), (evidence, repetition) = state.model, state.detection
+    return [traces, expected, *history, skill, *evidence, *repetition, state.excuses]
+
+
 class _OneThread:
-    """Limit BLAS to one thread: several are slower at products this small, above all where they share cores."""
+    """Limit BLAS to one thread: several are slower at products this small, above all where they share cores.
+
+    Only where it has several: ``threadpoolctl.limit`` takes as long as a row.
+    """
 
     def __init__(self) -> None:
         self._lock, self._inside = Lock(), 0
-        self._blas: ThreadpoolController | None = None
-        self._limit: Any = None
+        self._libraries: list[Any] = []
+        self._limited: list[tuple[Any, int]] = []
 
     def __enter__(self) -> None:
         with self._lock:
             if self._inside == 0:
-                self._blas = self._blas or ThreadpoolController()  # looks through all libraries, once
-                self._limit = self._blas.limit(limits=1, user_api="blas")
+                # Looks through all libraries, once.
+                self._libraries = self._libraries or ThreadpoolController().select(user_api="blas").lib_controllers
+                self._limited = [(library, n) for library in self._libraries if (n := library.num_threads) != 1]
+                self._set([(library, 1) for library, _ in self._limited])
             self._inside += 1
 
     def __exit__(self, *error: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                self._limit.restore_original_limits()
+                self._set(self._limited)
+
+    @staticmethod
+    def _set(threads: list[tuple[Any, int]]) -> None:
+        for library, n in threads:
+            library.set_num_threads(n)
 
 
 _ONE_THREAD = _OneThread()
@@ -147,9 +165,10 @@ def _compare(
         for i in range(rows.shape[1]):
             last[n, i] = before[n, 0, i] if steps[n] >= lag else rows[n, i]  # at first nothing moves
             past[n, i] = earlier[n, 0, i] if steps[n] >= 2 * lag else last[n, i]
-            for k in range(lag - 1):
-                new_before[n, k, i], new_earlier[n, k, i] = before[n, k + 1, i], earlier[n, k + 1, i]
             new_before[n, lag - 1, i], new_earlier[n, lag - 1, i] = rows[n, i], last[n, i]
+        for k in range(lag - 1):
+            for i in range(rows.shape[1]):
+                new_before[n, k, i], new_earlier[n, k, i] = before[n, k + 1, i], earlier[n, k + 1, i]
     return last, past
 
 
