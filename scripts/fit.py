@@ -35,6 +35,7 @@ from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
+from asm_gym.monitors.arm_inputs import judged_by_values
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
@@ -172,8 +173,8 @@ def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
     suitable: dict[str, Any] = {"seed": args.seed}
     if args.quick:
         suitable["epochs"] = QUICK_EPOCHS
-    if spec.source == "table":
-        suitable["values"] = True  # an arm's log holds pushes that last, and torques
+    if spec.source == "table" or judged_by_values(spec):
+        suitable["values"] = True
     if args.urdf is not None:
         suitable["urdf"] = read_urdf(args.urdf)
     known = monitor_class(args.monitor).hyperparameters
@@ -243,11 +244,14 @@ def fit(args: Args, console: Console) -> None:
     hours = hours_of(calibration)
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     if args.promise.per == EPISODE:
-        hourly = args.false_alarm_rate * len(calibration) / hours
-        promise = (
-            f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones, {hourly:.3g} an hour at their length"
-        )
+        promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
     say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promise}.")
+    expected, most = monitor.promise.hourly(hours)
+    more = "" if expected <= 1.0 else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
+    say(
+        f"False alarms to expect while the arm moves as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, "
+        f"at most {most:.3g} with 95 % confidence; motion that is not in them raises more.{more}"
+    )
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
 

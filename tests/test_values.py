@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,12 +13,14 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
 from asm_gym.detection.scores import Largest
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
-from asm_gym.monitors.arm_inputs import forces, motion
+from asm_gym.monitors.arm_inputs import forces, judged_by_values, motion
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.value_association import ValueAssociation, averaged
 from asm_gym.monitors.values import Values
+from asm_gym.spec import Channel
+from asm_gym.synthetic_arm import SyntheticArm
 from tests.streams import pendulum_columns
 
 
@@ -159,3 +163,11 @@ def test_the_rule_takes_friction_from_torque_and_needs_a_speed():
     assert np.argmax(score.attribution[-1]) == 4
     with pytest.raises(ValueError, match="a rule of friction needs a torque and a speed of each joint"):
         FrictionRule(Episode.from_table({"q": np.zeros((9, 2))}, rate=10).spec)
+
+
+def test_values_are_judged_where_torques_are_measured_and_nothing_feels_contact():
+    arm = SyntheticArm.stream_spec
+    assert judged_by_values(arm)
+    felt = replace(arm, channels=(*arm.channels, Channel("external_torque", 7, "N m", group="torque")))
+    assert not judged_by_values(felt)
+    assert not judged_by_values(Episode.from_table({"position": np.eye(9)}, rate=10.0).spec)

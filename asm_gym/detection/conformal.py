@@ -80,6 +80,11 @@ class Promise(NamedTuple):
         n, beyond = len(maxima), int((maxima > threshold).sum())
         return cls(n, (beyond + 1) / (n + 1), surely_below(beyond, n))
 
+    def hourly(self, hours: float) -> tuple[float, float]:
+        """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
+        each = self.episodes / hours if self.per == EPISODE else 1.0
+        return self.rate * each, self.at_most * each
+
 
 def surely_below(beyond: int, n: int) -> float:
     """Return the bound on the share of fresh maxima above a threshold that ``beyond`` of n exceed."""

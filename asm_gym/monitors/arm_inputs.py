@@ -135,6 +135,12 @@ def forces(spec: StreamSpec) -> NDArray[np.intp]:
     return np.setdiff1d(_named(spec, _FORCE), _named(spec, _COMMANDED)).astype(np.intp)
 
 
+def judged_by_values(spec: StreamSpec) -> bool:
+    """Tell whether a held push shows in values alone: torques are measured, and nothing feels contact itself."""
+    felt = any(c.group == "wrench" or "external" in c.name for c in spec.channels)
+    return bool(len(forces(spec)) and len(speeds(spec)[0])) and not felt
+
+
 def motion(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of positions and speeds, by their names."""
     found: NDArray[np.intp] = np.union1d(_named(spec, POSITION), _named(spec, SPEED)).astype(np.intp)
