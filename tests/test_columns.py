@@ -153,6 +153,8 @@ def test_clocks_that_disagree_are_said_and_the_user_chooses():
     )
     with pytest.warns(LogWarning, match="by --rate 500 it is not read"):
         assert Episode.from_table(HEALTHY, rate=500).spec.dt == pytest.approx(0.002)
+    both = {"time_s": T, "time_us": 1e6 * T, "q": Q}  # no pair: each counts all the time
+    assert Episode.from_table(both).spec.dt == pytest.approx(0.02)
     backwards = HEALTHY | {"time": T[::-1]}
     assert len(Episode.from_table(backwards, rate=50)) == ROWS
 

@@ -30,7 +30,7 @@ MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: 
 ALIKE = 0.2  # how far two clocks, or a clock and the velocities, may be off, as a share, and tell each other's unit
 
 _PAIR = re.compile(r"(?P<of>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nsecs?|ns|usecs?|us|micros)\]?", re.I)
-_SECONDS = ("secs", "sec", "seconds", "s", "")
+_SECONDS = ("secs", "sec", "seconds", "s")
 _SPEEDS = {
     **{"velocity": "position", "velocities": "positions", "vel": "pos", "qvel": "qpos", "qd": "q", "dq": "q"},
     **{"v": "q", "speed": "position"},
@@ -52,15 +52,17 @@ class Clock(NamedTuple):
     def seconds(self, table: Mapping[str, NDArray[Any]]) -> Floats:
         """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits."""
         parts = [_seconds(c, u, table[c], len(self.columns) > 1) for c, u in zip(self.columns, self.units, strict=True)]
-        return np.asarray(np.sum(parts, axis=0), np.float64)
+        if len(parts) == 1 or np.nanmax(parts[1], initial=0.0) >= 1.0:  # both count all the time
+            return parts[0]
+        return parts[0] + parts[1]
 
     def moment(self, row: Mapping[str, Any]) -> float | None:
         """Return the time of a row [s]; None where it has none. Raises ValueError where it cannot be read."""
         cells = [row.get(column) for column in self.columns]
         if any(cell is None for cell in cells):
             return None
-        pairs = zip(self.columns, self.units, cells, strict=True)
-        return sum(_moment(column, unit, str(cell)) for column, unit, cell in pairs)
+        found = [_moment(c, u, str(cell)) for c, u, cell in zip(self.columns, self.units, cells, strict=True)]
+        return found[0] if len(found) == 1 or found[1] >= 1.0 else found[0] + found[1]
 
 
 def _seconds(column: str, unit: float | None, values: NDArray[Any], paired: bool) -> Floats:
@@ -134,18 +136,14 @@ def clocks_among(names: Iterable[str]) -> list[Clock]:
         found = _PAIR.fullmatch(name)
         for end in _SECONDS if found else ():
             coarse = lower.get(name[: found.start("unit")].lower() + end + name[found.end("unit") :].lower())  # type: ignore[union-attr]
-            if coarse is not None and coarse != name and (end or is_clock(coarse)):
-                pairs[coarse] = Clock((coarse, name), (1.0, SECONDS[_spelled(found["unit"])]))  # type: ignore[index]
+            if coarse is not None and coarse != name:
+                unit = "ns" if found["unit"].lower().startswith("n") else "us"  # type: ignore[index]
+                pairs[coarse] = Clock((coarse, name), (1.0, SECONDS[unit]))
                 break
     fine = {pair.columns[1] for pair in pairs.values()}
     return [
         pairs.get(n, Clock((n,), (_named_unit(n),))) for n in names if n in pairs or (is_clock(n) and n not in fine)
     ]
-
-
-def _spelled(unit: str) -> str:
-    unit = unit.lower()
-    return "ns" if unit.startswith("n") else "us"
 
 
 def _named_unit(name: str) -> float | None:
