@@ -47,6 +47,8 @@ def inspect(args: Args, console: Console) -> int:
         sources, tables = first_tables(read_tables(args.log, layout))
         for n, source in enumerate(sources):
             columns, nominal = table_of_source(source), replace(layout, nominal=source.rate)
+            if source.episode is not None:  # its stream is what it is
+                nominal = replace(nominal, channels=("*",))
             log = inspected(source.name, columns, nominal, [t for t in tables if t is not source.columns])
             trouble = trouble or bool(log.clock.trouble) or not log.clock.rate
             say(log.caption())
