@@ -5,10 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from secrets import token_hex
 from typing import IO
 
 from asm_gym.validation import short_repr
@@ -23,7 +23,8 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     """A file to write that takes its place when the block ends well; a reader sees the old one or the new one.
 
-    A process that is killed leaves a hidden file that ends in ``.unfinished``. Missing folders are made.
+    A symbolic link that stands there is replaced, and what it points to stays as it is. A process that is killed leaves
+    a hidden file that ends in ``.unfinished``. Missing folders are made.
 
     Raises:
         ValueError: something stands there that is no file, such as a device; the path names no file.
@@ -32,15 +33,25 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is no regular file, and is not replaced by one")
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=UNFINISHED)
+    temporary = path.with_name(f".{path.name}.{token_hex(4)}{UNFINISHED}")
     try:
-        with named(path), os.fdopen(handle, "wb") as file:
+        with named(path), temporary.open("xb") as file:  # "x" follows no link; who may read it, the umask says
             yield file
-        os.chmod(temporary, 0o644)  # mkstemp makes it readable by its owner alone
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text as ``written_whole`` does."""
+    with written_whole(path) as file:
+        file.write(text.encode())
+
+
+def no_links(path: str, flags: int) -> int:
+    """Open a file that is not reached by a symbolic link; an ``opener`` for ``open``, which raises OSError for one."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 @contextmanager

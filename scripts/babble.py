@@ -21,6 +21,7 @@ from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import NOMINAL_ROLES
 from asm_gym.evaluation.tables import markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
+from asm_gym.files import write_text
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
@@ -167,7 +168,7 @@ def babble(args: Args, console: Console) -> None:
         marks = examined(args, memory, console) if args.exam_episodes else []
         if marks:
             table = card(marks, memory, WINDOW_S)
-            (args.out / "card.md").write_text(f"{markdown(table)}\n\n{summary(marks)}\n", encoding="utf-8")
+            write_text(args.out / "card.md", f"{markdown(table)}\n\n{summary(marks)}\n")
             console.print(table)
             console.print(summary(marks))
     console.print(

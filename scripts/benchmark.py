@@ -29,6 +29,7 @@ from asm_gym.envs.backend import import_robosuite
 from asm_gym.envs.vector import ThreadedVectorEnv, cores
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown
+from asm_gym.files import write_text
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -274,7 +275,7 @@ def measure(args: Args, console: Console) -> None:
         console.print(table)
         texts.append(markdown(table))
     file = args.out / "benchmark.md"
-    file.write_text("\n\n".join(texts) + "\n", encoding="utf-8")
+    write_text(file, "\n\n".join(texts) + "\n")
     console.print(f"Wrote {file}")
 
 

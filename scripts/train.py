@@ -18,6 +18,7 @@ from rich.console import Console
 
 from asm_gym.data.datasets import read_dataset
 from asm_gym.data.episode import load_episode
+from asm_gym.files import write_text
 from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
@@ -86,7 +87,7 @@ def train_agent(args: Args, console: Console) -> None:
         minutes = round((time.perf_counter() - start) / 60, 1)
         result = {"success": success, "episodes": args.final_episodes, "minutes": minutes}
         agent.save(args.out / "agent.npz", **result)
-        (args.out / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write_text(args.out / "result.json", json.dumps(result, indent=2) + "\n")
     console.print(f"success {success:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")
 
 

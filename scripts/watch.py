@@ -11,11 +11,13 @@ Exit codes: 0 no alarm, 1 alarms, 2 an error.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -27,11 +29,11 @@ from asm_gym.data.gaps import SURPRISING, bridge_of, bridged
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, sensed_peak, traces_of, write_rerun
+from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, plain_cell, sensed_peak, traces_of, write_rerun
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
-from asm_gym.files import named, writable
+from asm_gym.files import writable, write_text
 from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
@@ -86,9 +88,9 @@ def review(args: Args, monitor: Any, console: Console) -> int:
             progress(episodes, episodes)
     summary = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
     summary += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
-    args.out.mkdir(parents=True, exist_ok=True)
-    with named(args.out / "alarms.csv"), (args.out / "alarms.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([HEADINGS, *(alarm.cells() for alarm in alarms)])
+    table = io.StringIO(newline="")
+    csv.writer(table).writerows([HEADINGS, *(map(plain_cell, alarm.cells()) for alarm in alarms)])
+    write_text(args.out / "alarms.csv", table.getvalue())
     written = publish(args, summary, alarms, worst)
     if args.rerun is not None:
         write_rerun(args.rerun, monitor.spec, worst, getattr(monitor, "model", None))
@@ -120,7 +122,10 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
     except ImportError as error:
         return f"Wrote {args.out / 'alarms.csv'}; {error}"
     drawn = {
-        "surprise": ("Surprise over time in the most surprising episodes", figures.surprise_figure(worst)),
+        "surprise": (
+            f"Surprise over time in the {len(worst)} most surprising episodes (--figures)",
+            figures.surprise_figure(worst),
+        ),
         "attribution": ("Where surprise came from in the most surprising one", figures.attribution_figure(worst[0])),
         "stream": ("What its most surprising channels sensed", figures.stream_figure(worst[0])),
     }

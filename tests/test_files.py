@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from asm_gym.files import regular_file, written_whole
+from asm_gym.files import no_links, regular_file, write_text, written_whole
 
 
 def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path):
@@ -18,10 +18,35 @@ def test_a_reader_sees_the_old_file_until_the_new_one_is_whole(tmp_path):
         file.flush()
         assert path.read_bytes() == b"old"
     assert path.read_bytes() == b"new"
-    assert stat.S_IMODE(path.stat().st_mode) == 0o644
     with pytest.raises(KeyboardInterrupt), written_whole(path) as file:
         raise KeyboardInterrupt
     assert [p.name for p in path.parent.iterdir()] == ["x.asm"]
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o027])
+def test_the_umask_says_who_may_read_a_file(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        write_text(tmp_path / "x", "x")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "x").stat().st_mode) == 0o666 & ~mask
+
+
+def test_a_symbolic_link_is_replaced_and_what_it_points_to_stays(tmp_path):
+    (tmp_path / "own").write_text("precious")
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("alarms.csv", "new"):
+        (out / name).symlink_to(tmp_path / ("own" if name == "alarms.csv" else "none"))
+        write_text(out / name, "text")
+        assert (out / name).read_text() == "text"
+        assert not (out / name).is_symlink()
+    (out / "live").symlink_to(tmp_path / "own")
+    with pytest.raises(OSError, match="live"):
+        open(out / "live", "w", opener=no_links)
+    assert (tmp_path / "own").read_text() == "precious"
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_pipe_a_device_or_a_folder_is_neither_read_nor_replaced(tmp_path):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import csv
+import html
 import io
 import itertools
 import json
+import shlex
 from functools import partial
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -20,6 +24,7 @@ from asm_gym.guard.live import follow
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec
+from tests.needs import needs
 from tests.streams import swing
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
@@ -145,6 +150,51 @@ def test_a_pipe_and_a_file_are_watched_as_a_command(monitor, tmp_path, monkeypat
     live = ["watch", f"tail:{tmp_path / 'log.jsonl'}", "--monitor", str(tmp_path / "x.asm"), "--silence", "0.1"]
     assert main(live) == 1
     assert "the source has died" in capsys.readouterr().out
+
+
+def recording(folder, stream, names=("q[0]", "q[1]", "torque", "cmd"), name="log.csv"):
+    rows = [",".join(("time", *names)), *(",".join(map(str, (DT * k, *row))) for k, row in enumerate(stream))]
+    (folder / name).write_text("\n".join(rows) + "\n")
+    return str(folder / name)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("columns", [[1], [0, 1, 2, 3], [3]])
+def test_a_channel_that_is_never_finite_is_reported(value, columns, monitor, tmp_path, capsys):
+    needs("matplotlib")
+    monitor.save(tmp_path / "x.asm")
+    stream = episode(500).stream.astype(object)
+    stream[:, columns] = value
+    out = tmp_path / "out"
+    code = main(["watch", recording(tmp_path, stream), "--monitor", str(tmp_path / "x.asm"), "--out", str(out)])
+    assert "Axis limits" not in capsys.readouterr().err
+    if code != 2:  # a column that says nothing may be refused, in a line of its own
+        assert code == 1
+        assert (out / "report.html").stat().st_size > 10_000
+
+
+def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, tmp_path):
+    needs("matplotlib")
+    monitor.save(tmp_path / "x.asm")
+    stream = episode(500).stream.copy()
+    stream[40:, 0] += 3
+    out = tmp_path / "out"
+    out.mkdir()
+    names = ("alarms.csv", "report.html", "surprise.png", "attribution.png", "stream.png")
+    for name in names:
+        (tmp_path / f"own {name}").write_text("precious")
+        (out / name).symlink_to(tmp_path / f"own {name}")
+    source = recording(tmp_path, stream, name="@SUM(1).csv")
+    command = ["watch", source, "--monitor", str(tmp_path / "x.asm"), "--out", str(out), "--figures", "2"]
+    assert main(command) == 1
+    assert {(tmp_path / f"own {name}").read_text() for name in names} == {"precious"}
+    with (out / "alarms.csv").open(newline="") as file:
+        cells = [cell for row in csv.reader(file) for cell in row]
+    assert any("@SUM(1)" in cell for cell in cells)
+    assert not any(cell[:1] in ("=", "+", "-", "@", "\t", "\r") for cell in cells if cell)
+    report = html.unescape((out / "report.html").read_text())
+    assert shlex.join(["asm-gym", *command]) in report
+    assert version("asm-gym") in report
 
 
 @pytest.mark.parametrize("rate", [20, 100])

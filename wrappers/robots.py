@@ -117,6 +117,8 @@ def robots_of(
     except ValueError as error:
         places, refused["complete"] = None, str(error)
     felt, chains = first("felt_channels", ()), members.ask("hand_chains") or ()
+    limits_contact = bool(felt) and members.ask("contact_limits") is not None
+    efference = spec.motor if limits_contact and has_stream and not changed and len(spec.motor) == rest.size else None
     robots = Robots(
         count=members.count,
         low=np.float32(actions.low).ravel(),
@@ -129,7 +131,8 @@ def robots_of(
         dt=dt,
         chains=tuple(zip(*chains, strict=True)),
         felt_channels=felt,
-        limits_contact=bool(felt) and members.ask("contact_limits") is not None,
+        limits_contact=limits_contact,
+        efference=efference,
         read=None if places is None else places.shown,
         turn=(lambda i, turns: members.call("action_for", turns)[i]) if controller in DELTAS else None,
         refused=refused,

@@ -25,6 +25,7 @@ from asm_gym.policies.reflexes import HoldsItself
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, check_choice, short_repr
+from asm_gym.wrappers.episode_counts import relay_beneath_counts
 from asm_gym.wrappers.robots import body_memory, felt_by, found_in, policy_for, robots_of, sensing_within_steps
 
 
@@ -139,6 +140,8 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
         check_choice("info", info, INFO)
         self._full = info == "full"
+        self._relay = relay_beneath_counts(env, ends=on_alarm != "monitor")
+        self._stepped = self.env if self._relay is None else self._relay.env
         self._source = StreamSource(env)
         self._spec = self._source.spec
         if monitor_freq is not None:
@@ -181,10 +184,11 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
             self._watch_with(self._next)
             nothing = self._engine.begin()
         self._limit_contact(anew=True)
-        self._observation, self._alarms, self._failed = observation, 0, ""
+        self._observation, self._alarms, self._failed, self._solved = observation, 0, "", False
         if self._robots.meaning is not None:
             self._engine.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
+        self._executed = np.zeros(0, np.float32)
         self._report(info, [nothing], None)
         return observation, info
 
@@ -203,7 +207,13 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         self._rows: list[RowReport] = []
         observation, reward, terminated, truncated, info = self._run()
         info = dict(info)  # an environment may use its own again
+        if "success" in info:
+            self._solved |= bool(info["success"])
+            info.setdefault("is_success", self._solved)
         row, failure = self._sensed(observation, info)
+        done = self._executed
+        if self._box is not None:
+            done = self._robots.executed_in(row[None], done.reshape(1, -1))[0].reshape(done.shape)
         self._judge(row, failure, info)
         self._limit_contact()
         if repaired := self._engine.repaired:
@@ -213,12 +223,16 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
                 info["stream"] = row.copy()
         self._observation = observation
         info["overridden"] = overridden or bool(info.get("overridden"))
-        self._report(info, self._rows, self._executed)
+        self._report(info, self._rows, done)
         gave_up = self._rows[-1].state[0] == ENDED
         if gave_up or (self._engine.ends_on_alarm and any(row.ends[0] for row in self._rows)):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
-        return observation, reward, terminated, truncated, info
+        outcome = observation, reward, terminated, truncated, info
+        if self._relay is None:
+            return outcome
+        self._relay.outcome = outcome
+        return self.env.step(action)  # the wrappers in between count what came of it
 
     def _command(self, action: NDArray[np.float32]) -> Command:
         """Choose what is to be done next: the policy's ``action`` (A,), or something else."""
@@ -238,7 +252,7 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         if self._holds:
             self._inner.keeps_holding = True
         try:
-            return stepped(self.env, self._executed)
+            return stepped(self._stepped, self._executed)
         finally:
             if self._holds:
                 self._inner.keeps_holding = self._inner.holding = False
@@ -281,11 +295,16 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         alarm = True in [bool(row.alarm[0]) for row in rows]
         self._alarms += alarm
         if self._full:
-            failed, done = self._failed, None if executed is None else np.array(executed)
+            failed, robots, asked = self._failed, self._robots, self._executed
             more: dict[str, float] = {"alarms": self._alarms}
             if (running := self._engine.running) is not None:
                 more = more | {"ceiling": running.ceiling, "level": running.level}
-            info["asm"] = LazyInfo(lambda: report(rows, 0, self._spec, done, failed) | more)
+
+            def told() -> dict[str, Any]:
+                slowed = 0.0 if executed is None or self._box is None else robots.slowed(asked, executed)
+                return report(rows, 0, self._spec, executed, failed) | more | {"slowed": slowed}
+
+            info["asm"] = LazyInfo(told)
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
         info["asm_intervened"] = np.bool_(True in [bool(row.intervened[0]) for row in rows])
         info["cost_sum"] = np.float64(self._alarms)

@@ -178,7 +178,10 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         executed[begun] = np.nan
         self._ended = np.zeros_like(begun)
         self._begin(begun)
-        self._report(infos, report, executed, np.ones(self.num_envs, bool))
+        flat = executed.reshape(len(executed), -1)
+        done = self._robots.executed_in(rows, flat)
+        slowed = np.array([self._robots.slowed(*pair) for pair in zip(flat, done, strict=True)])
+        self._report(infos, report, done.reshape(executed.shape), np.ones(self.num_envs, bool), slowed)
         self._ended = terminated | truncated
         return self._observations, rewards, terminated, truncated, infos
 
@@ -252,7 +255,14 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
             self._members.set_attr("contact_limits", list(limits))
         self._limits = limits
 
-    def _report(self, infos: dict[str, Any], report: RowReport, executed: NDArray[np.float32], present: Mask) -> None:
+    def _report(
+        self,
+        infos: dict[str, Any],
+        report: RowReport,
+        executed: NDArray[np.float32],
+        present: Mask,
+        slowed: NDArray[np.float64] | None = None,
+    ) -> None:
         """Add ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
         self._alarms += report.alarm
         found: dict[str, Any] = {
@@ -263,7 +273,8 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
             "cost_sum": self._alarms.astype(np.float64),
         }
         if self._full:
-            asm: dict[str, Any] = {"executed_action": executed.copy(), "alarms": self._alarms.copy()}
+            slowed = np.zeros(self.num_envs) if slowed is None else slowed
+            asm: dict[str, Any] = {"executed_action": executed.copy(), "alarms": self._alarms.copy(), "slowed": slowed}
             if self._engine.running is not None:
                 n, running = self.num_envs, self._engine.running
                 asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}

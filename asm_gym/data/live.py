@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple, TextIO
 
 from asm_gym.data.rows import SourceDied
-from asm_gym.files import regular_file
+from asm_gym.files import no_links, regular_file
 from asm_gym.validation import check_number
 
 POLL_S = 0.002  # how often a source is looked at for more [s]
@@ -155,7 +155,7 @@ def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:
     to.parent.mkdir(parents=True, exist_ok=True)
     start = time.monotonic()
     why, seconds, rows = "the source ended", 0.0, 0
-    with to.open("w", encoding="utf-8") as file:
+    with open(to, "w", encoding="utf-8", opener=no_links) as file:
         try:
             for line in filter(str.strip, lines):
                 start = time.monotonic() if not rows else start

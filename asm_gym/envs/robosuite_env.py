@@ -32,7 +32,8 @@ class RobosuiteEnv(SteppedEnv):
 
     - ``stream`` (D,) float32: one row of the sensorimotor stream that ``stream_spec`` names; where the stream runs
       faster than control, a step's last row, and ``streams`` (n, D) all of them;
-    - ``success``: whether the task is solved now;
+    - ``success``: whether the task is solved now; ``is_success``: whether it was in this episode, as
+      Stable-Baselines3 reads it;
     - ``contact_force``: the largest net contact force on an arm within the step [N];
     - ``unstable``: the simulation diverged: the episode is truncated, its last stream NaN, its last observation 0.
 
@@ -195,7 +196,7 @@ class RobosuiteEnv(SteppedEnv):
         self.contact_limits = None
         self._action = np.zeros(self._actions.size, np.float32)
         self._reading = self._read()
-        self._ended = False
+        self._ended = self._solved = False
         return self._senses.observation(self._reading), self._info(bool(env._check_success()))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -233,7 +234,9 @@ class RobosuiteEnv(SteppedEnv):
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
         stream = {"stream": self._reading.stream} if self._senses.stream_spec else {}
-        return {**stream, "success": success, **self._forces(unstable), "unstable": unstable}
+        self._solved |= success
+        done = {"success": success, "is_success": self._solved}
+        return {**stream, **done, **self._forces(unstable), "unstable": unstable}
 
     @property
     def stream_spec(self) -> StreamSpec:

@@ -157,7 +157,7 @@ class Reading(NamedTuple):
     row: NDArray[np.float64]  # (M,) everything
     stream: NDArray[np.float32]  # (D,) the part that the stream carries
     seen: NDArray[np.float32]  # (S,) the part that is observed; finite whatever the row holds
-    row_finite: bool
+    row_finite: bool  # before faults
     stream_finite: bool
 
 
@@ -215,11 +215,12 @@ class Senses:
         if faults or self._needs_objects or not within_step:
             self._object_poses = objects.read()
         row = sense(np.concatenate([*self._object_poses, action], dtype=np.float64), self._noise, rng)
+        sound = bool(np.isfinite(row).all()) if faults else None  # a fault that reads NaN is no fault of the simulation
         for corrupt in faults:
             corrupt(row)
         stream, seen = np.empty(len(self._carried), np.float32), np.empty(len(self._observed), np.float32)
         finite = kernels.finish(row, self._steps, self._carried, stream, self._observed, _BOUND, seen)
-        return Reading(row, stream, seen, *finite)
+        return Reading(row, stream, seen, *(finite if sound is None else (sound, sound)))
 
     def space(self) -> spaces.Space[Any]:
         """Return the space of observations."""

@@ -34,6 +34,14 @@ class Alarm(NamedTuple):
 
 
 TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
+FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
+
+
+def plain_cell(text: str) -> str:
+    """Return a cell of CSV that no spreadsheet takes for a formula: a name that looks like one is quoted."""
+    return f"'{text}" if text[:1] in FORMULA and text else text
+
+
 HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds")
 
 

@@ -27,6 +27,7 @@ from asm_gym.data.inspection import Inspection, is_constant
 from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
 from asm_gym.evaluation.statistics import wilson_interval
+from asm_gym.files import written_whole
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#888888"
@@ -59,8 +60,8 @@ def figure(height: float, width: float = 8.0) -> Iterator[Figure]:
 def save(fig: Figure, path: str | Path) -> Path:
     """Write a PNG at 150 dpi; the same figure gives the same bytes."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, format="png", dpi=150, metadata={"Software": None})
+    with written_whole(path) as file:
+        fig.savefig(file, format="png", dpi=150, metadata={"Software": None})
     return path
 
 
@@ -215,7 +216,8 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
             _shade_fault(ax, trace)
             for ends in _alarm_times(trace):
                 ax.axvspan(*ends, color=VERMILLION, alpha=0.2, linewidth=0)
-            ax.plot(_times(trace), detail.stream[:, row], color=BLUE)
+            sensed = detail.stream[:, row]
+            ax.plot(_times(trace), np.where(np.isfinite(sensed), sensed, np.nan), color=BLUE)
             ax.set_title(detail.channels[row])
         axes[-1].set_xlabel("time [s]")
         handles = [Line2D([], [], color=BLUE, label="sensed"), Patch(color=VERMILLION, alpha=0.2, label="alarm")]
@@ -244,7 +246,7 @@ def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
         raise ValueError(f"a log axis needs thresholds > 0, got {sorted(thresholds)}")
     finite = np.concatenate([t.surprise[np.isfinite(t.surprise)] for t in traces])
     ceiling = max(float(finite.max(initial=0.0)), 10 * max(thresholds))
-    return max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling
+    return min(max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling / 10), ceiling
 
 
 def _detail(trace: ScoredEpisode) -> TraceDetail:

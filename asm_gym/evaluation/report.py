@@ -22,7 +22,7 @@ from asm_gym.evaluation.detection_tables import harmless_table, kept_table, kind
 from asm_gym.evaluation.scored_episode import window_steps
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import require
-from asm_gym.files import written_whole
+from asm_gym.files import write_text, written_whole
 
 _PAGE = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
 
@@ -110,7 +110,7 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         tables.insert(1, lead_table(result))
     if any(monitor.harmless for monitor in result.monitors.values()):
         tables.append(harmless_table(result, list(result.monitors)))
-    (folder / "results.md").write_text("\n\n".join(map(markdown, tables)) + "\n", encoding="utf-8")
+    write_text(folder / "results.md", "\n\n".join(map(markdown, tables)) + "\n")
     summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
     write_json(folder / "results.json", summary)
     intro = (

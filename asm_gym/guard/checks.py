@@ -33,8 +33,7 @@ class Fitted(NamedTuple):
     @property
     def stale(self) -> bool:
         """Whether it was fitted since."""
-        _, model, learned = _parts(self.monitor)
-        return model is not self.parts[1] or learned is not self.parts[2]
+        return any(now is not then for now, then in zip(_parts(self.monitor), self.parts, strict=True))
 
     def differs(self, other: Fitted) -> bool:
         """Return whether it is another monitor, or was fitted or calibrated in between."""
@@ -44,7 +43,7 @@ class Fitted(NamedTuple):
 
 def _parts(monitor: Monitor) -> tuple[Any, ...]:
     if isinstance(monitor, NeuralASM):
-        return monitor, monitor.model.completion_, monitor.model.network_
+        return monitor, monitor.model.completion_, monitor.model.senses_  # which ``adapt`` leaves as they are
     return monitor, getattr(monitor, "diagnosis_", None), None
 
 

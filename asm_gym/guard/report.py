@@ -124,7 +124,7 @@ def report(
         "response": caused.name,  # what is done about it under "graded"
         "case": caused.case,  # the row of the table of responses that says so
         "severity": last.severity.named(robot),  # how bad it is, see ``Severity``
-        "executed_action": None if executed is None else np.array(executed),  # before limits of the hand's speed
+        "executed_action": None if executed is None else np.array(executed),  # after the limit of the hand's speed
         "attribution": dict(zip(spec.labels, shares, strict=True)),  # what each number adds to the largest surprise
         "surprises": surprises,  # (k,) of all rows in this step
         "latency_us": 1e6 * max(row.latency for row in rows),  # the longest time that the monitor took for a row

@@ -17,6 +17,8 @@ from asm_gym.spec import Channel, StreamSpec
 
 NO_COLUMNS = np.zeros(0, np.intp)
 
+SMALLEST = 1e-6  # of a number of an action that can be slowed
+
 NOTHING: Mapping[int, Any] = MappingProxyType({})  # where there is nothing to say of any robot
 
 
@@ -44,12 +46,29 @@ class Robots:
     read: NDArray[np.bool_] | None = None  # (D,) the columns of the stream that are observed; None: not known
     turn: Callable[[int, NDArray[np.floating[Any]]], NDArray[np.float32]] | None = None
     """The action (A,) that turns the joints of robot i by so much (J,) [rad]; None where there is none."""
+    efference: NDArray[np.intp] | None = None
+    """(A,) columns of the stream that say what was executed, where robots slow down what they are told; else None."""
     refused: Mapping[str, str] = field(default_factory=dict)  # why they cannot do a reflex, by its name
 
     @cached_property
     def felt_size(self) -> int:
         """F, how many numbers the arms feel in physics substeps."""
         return sum(c.size for c in self.felt_channels)
+
+    def executed_in(self, rows: NDArray[np.float32], commanded: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the actions (n, A) that were executed in place of what was ``commanded``, by the rows (n, D) after."""
+        if self.efference is None:
+            return commanded
+        told = rows[:, self.efference]
+        return np.where(np.isfinite(told), told, commanded)
+
+    @staticmethod
+    def slowed(commanded: NDArray[np.float32], executed: NDArray[np.float32]) -> float:
+        """Return the greatest share of a number of the action (A,) that was taken from it: 0 none, 1 all."""
+        asked, done = commanded.ravel(), executed.ravel()
+        moved = np.abs(asked) > SMALLEST
+        taken = 1.0 - done[moved] / asked[moved]
+        return float(np.clip(np.nan_to_num(taken).max(initial=0.0), 0.0, 1.0))
 
     @classmethod
     def unknown(cls, spec: StreamSpec, read: NDArray[np.bool_] | None = None) -> Self:

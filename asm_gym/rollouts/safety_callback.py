@@ -12,7 +12,8 @@ class SafetyCallback(BaseCallback):
     """Log the mean over the episodes that have ended, to stable-baselines3's logger.
 
     ``safety/surprise``: the greatest, in thresholds. ``safety/alarms``: how often one began. ``safety/cost``: steps in
-    alarm. ``safety/overridden``: steps in which something else than the policy acted.
+    alarm. ``safety/overridden``: steps in which something else than the policy acted. ``safety/slowed``: the mean share
+    that the limit of the hand's speed took from the action.
     """
 
     def __init__(self) -> None:
@@ -21,18 +22,21 @@ class SafetyCallback(BaseCallback):
         """The numbers of all episodes that have ended."""
 
     def _on_training_start(self) -> None:
-        self._steps: list[list[tuple[float, bool, float, bool]]] = [[] for _ in range(self.training_env.num_envs)]
+        self._steps: list[list[tuple[float, bool, float, bool, float]]] = [
+            [] for _ in range(self.training_env.num_envs)
+        ]
 
     def _on_step(self) -> bool:
         for steps, info, done in zip(self._steps, self.locals["infos"], self.locals["dones"], strict=True):
             if "asm" not in info:
                 raise KeyError('info has no "asm": wrap the environment in NeuralASMSafety')
             surprise = float(info["asm_surprise"]) / float(info["asm"]["threshold"])
-            steps.append((surprise, bool(info["asm_alarm"]), float(info["cost"]), bool(info["asm_intervened"])))
+            flat = bool(info["asm_alarm"]), float(info["cost"]), bool(info["asm_intervened"])
+            steps.append((surprise, *flat, float(info["asm"]["slowed"])))
             if done:
-                worst, alarm, cost, overridden = zip(*steps, strict=True)
-                alarms = len(spans(np.array(alarm)))
-                self._log(surprise=max(worst), alarms=alarms, cost=sum(cost), overridden=sum(overridden))
+                worst, alarm, cost, overridden, slowed = zip(*steps, strict=True)
+                counts = {"alarms": len(spans(np.array(alarm))), "cost": sum(cost), "overridden": sum(overridden)}
+                self._log(surprise=max(worst), slowed=float(np.mean(slowed)), **counts)
                 steps.clear()
         return True
 

@@ -26,6 +26,7 @@ from threadpoolctl import threadpool_limits
 from asm_gym.evaluation.figures import look, save
 from asm_gym.evaluation.statistics import Estimate, Spread
 from asm_gym.evaluation.tables import Table, markdown
+from asm_gym.files import write_text, written_whole
 from asm_gym.rollouts import progress
 from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import versions
@@ -87,10 +88,11 @@ def write(path: Path, found: Findings, config: Any, seconds: float) -> list[str]
     written = [".csv", ".md", ".json"]
     if found.figure is not None:
         save(found.figure, path.with_suffix(".png"))
-        found.figure.savefig(path.with_suffix(".svg"), format="svg", metadata={"Date": None})
+        with written_whole(path.with_suffix(".svg")) as file:
+            found.figure.savefig(file, format="svg", metadata={"Date": None})
         written = [".png", ".svg", *written]
-    pd.DataFrame(found.records).to_csv(path.with_suffix(".csv"), index=False)
-    path.with_suffix(".md").write_text("\n\n".join(map(markdown, found.tables)) + "\n", encoding="utf-8")
+    write_text(path.with_suffix(".csv"), pd.DataFrame(found.records).to_csv(index=False))
+    write_text(path.with_suffix(".md"), "\n\n".join(map(markdown, found.tables)) + "\n")
     details = {
         "arguments": json.loads(json.dumps(asdict(config), default=str)),
         "seed": config.seed,
@@ -100,7 +102,7 @@ def write(path: Path, found: Findings, config: Any, seconds: float) -> list[str]
         "seconds": round(seconds, 1),
         **found.facts,
     }
-    path.with_suffix(".json").write_text(json.dumps(details, indent=2) + "\n", encoding="utf-8")
+    write_text(path.with_suffix(".json"), json.dumps(details, indent=2) + "\n")
     return written
 
 

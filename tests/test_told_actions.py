@@ -1,0 +1,141 @@
+"""What was done is told: slowed actions, ends of episodes for wrappers that count them, missing numbers."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import ClipAction, RecordEpisodeStatistics
+
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
+from tests.needs import needs
+
+LIMITS = ContactLimits(wrist_force=1e3, external_torque=1e3, hand_speed=0.1)
+STEPS = 30
+
+
+def lift(limits=LIMITS, **more):
+    env = gym.make("asm_gym/Lift-v0")
+    return NeuralASMSafety(env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=limits, **more)
+
+
+def joints(env):
+    return env.unwrapped.simulation.data.qpos.copy()
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.0])
+def test_the_action_that_is_told_moves_the_bare_environment_in_the_same_way(scale):
+    guarded, bare, rng = lift(), gym.make("asm_gym/Lift-v0"), np.random.default_rng(0)
+    guarded.reset(seed=0)
+    bare.reset(seed=0)
+    slowed = []
+    for _ in range(STEPS):
+        asked = np.float32(scale * rng.uniform(-1, 1, 7))
+        asm = guarded.step(asked)[4]["asm"]
+        bare.step(asm["executed_action"])
+        np.testing.assert_array_equal(joints(guarded), joints(bare))
+        slowed.append(asm["slowed"])
+        if not asm["slowed"]:
+            np.testing.assert_array_equal(asm["executed_action"], asked)
+        else:
+            part = asm["executed_action"][:3] / asked[:3]
+            np.testing.assert_allclose(1 - part, asm["slowed"], atol=1e-5)
+            assert not asm["intervened"]
+    assert np.mean(np.array(slowed) > 0) == (0.0 if scale < 1 else pytest.approx(1.0, abs=0.5))
+    guarded.close()
+    bare.close()
+
+
+def test_many_environments_tell_it_as_one_does():
+    envs = gym.make_vec("asm_gym/Lift-v0", num_envs=2)
+    monitor = FadingMonitor(spec=envs.get_attr("stream_spec")[0])
+    many = VectorNeuralASMSafety(envs, monitor, "hold", contact_limits=LIMITS)
+    one = lift()
+    many.reset(seed=[0, 1])
+    one.reset(seed=0)
+    for action in np.random.default_rng(0).uniform(-1, 1, (10, 2, 7)).astype(np.float32):
+        asm, told = many.step(action)[4]["asm"], one.step(action[0])[4]["asm"]
+        np.testing.assert_array_equal(asm["executed_action"][0], told["executed_action"])
+        assert asm["slowed"][0] == told["slowed"]
+    many.close()
+    one.close()
+
+
+def watched(wrapper=lambda env: env, cue=(2,), **more):
+    return NeuralASMSafety(wrapper(FakeEnv(6)), CueMonitor(cue), **{"on_alarm": "terminate", **more})
+
+
+def test_the_usual_route_of_stable_baselines_counts_every_episode_that_the_guard_ends():
+    util = needs("stable_baselines3.common.env_util")
+    envs = util.make_vec_env(
+        lambda: FakeEnv(6),
+        wrapper_class=NeuralASMSafety,
+        wrapper_kwargs={"monitor": CueMonitor((2,)), "on_alarm": "terminate"},
+        monitor_kwargs={"info_keywords": ("cost", "cost_sum", "is_success")},
+    )
+    envs.reset()
+    ended = [info["episode"] for _ in range(24) for info in envs.step(np.zeros((1, 3)))[3] if "episode" in info]
+    assert [(e["l"], e["r"], e["cost"], e["cost_sum"], e["is_success"]) for e in ended] == [
+        (3, 3.0, 1.0, 1.0, False)
+    ] * 8
+
+
+@pytest.mark.parametrize("on_alarm", ["terminate", "hold", "monitor"])
+def test_statistics_beneath_the_guard_see_what_it_reports(on_alarm):
+    env = watched(RecordEpisodeStatistics, on_alarm=on_alarm)
+    for seed in range(3):
+        env.reset(seed=seed)
+        ended, steps = False, 0
+        while not ended:
+            *_, terminated, truncated, info = env.step(np.zeros(3, np.float32))
+            ended, steps = terminated or truncated, steps + 1
+        assert steps == info["episode"]["l"] == (3 if on_alarm == "terminate" else 6)
+    assert list(env.get_wrapper_attr("length_queue")) == [steps] * 3
+
+
+def test_a_counting_wrapper_that_would_not_see_ends_is_refused():
+    for on_alarm in ("terminate", "hold", "graded", None):
+        with pytest.raises(ValueError, match=r"RecordEpisodeStatistics\(NeuralASMSafety\(env, monitor\)\)"):
+            watched(lambda env: ClipAction(RecordEpisodeStatistics(env)), on_alarm=on_alarm)
+    watched(lambda env: ClipAction(RecordEpisodeStatistics(env)), on_alarm="monitor")
+
+
+def test_success_is_told_by_the_name_that_learners_read():
+    class Solved(FakeEnv):
+        def step(self, action):
+            *out, info = super().step(action)
+            return *out, {**info, "success": self.t == 2}
+
+    env = NeuralASMSafety(Solved(6), CueMonitor())
+    for _ in range(2):
+        env.reset(seed=0)
+        told = [env.step(np.zeros(3, np.float32))[4]["is_success"] for _ in range(6)]
+        assert told == [False, True, True, True, True, True]
+    bare = gym.make("asm_gym/Lift-v0")
+    assert bare.reset(seed=0)[1]["is_success"] is False
+    bare.close()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("channel", ["joint_position", "wrist_force", "joint_velocity"])
+def test_a_number_that_a_sense_of_the_environment_lacks_is_missing_and_completed(channel, value):
+    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"))
+    env.reset(seed=0)
+    inner = env.unwrapped
+    place = inner.measured_spec.slices[channel].start
+    reasons = []
+    for t in range(20):
+        if t == 5:
+            inner.corruptions.append(lambda row: row.__setitem__(place, value))
+        observation, _, terminated, truncated, info = env.step(np.zeros(7, np.float32))
+        assert not (terminated or truncated or info["unstable"])
+        assert np.isfinite(observation).all()
+        reasons.append(info["asm"]["reason"])
+        if t >= 6:
+            assert info["asm"]["completed"]
+            assert not info["asm"]["intervened"]
+    assert reasons[:5] == [""] * 5
+    assert reasons[5] == "missing"
+    env.close()
