@@ -15,7 +15,7 @@ import io
 import math
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -29,12 +29,14 @@ from asm_gym.data.gaps import SURPRISING, bridge_of, bridged
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.ros2_dds import text_topic
 from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, plain_cell, sensed_peak, traces_of, write_rerun
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
 from asm_gym.files import writable, write_text
-from asm_gym.guard.live import follow
+from asm_gym.guard.alarm_outputs import AlarmCommand, as_json
+from asm_gym.guard.live import ALARM, LiveEvent, follow
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, origin, run
@@ -42,6 +44,7 @@ from asm_gym.scripts.log_options import LogOptions
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
+LIVE_ONLY = ("until_alarm", "json", "hook", "publish")  # options
 SHOWN_ROWS = 20  # alarms printed; the file holds them all
 
 
@@ -61,6 +64,12 @@ class Args(LogOptions):
     """For how long a live source may take to send its first row, or to come back after it has died."""
     until_alarm: bool = False
     """The first alarm of a live source ends the watch, with exit code 1: asm-gym watch ... --until-alarm || stop."""
+    json: bool = False
+    """Print what a live source gives as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
+    hook: str | None = option(None, metavar="COMMAND")
+    """Run at every alarm of a live source, with the alarm as a line of JSON on its standard input."""
+    publish: str | None = option(None, metavar="/TOPIC")
+    """Topic of ROS 2 on which every alarm of a live source is published, as std_msgs/String of JSON."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
@@ -142,6 +151,18 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
     return f"Wrote {args.out / 'report.html'} and alarms.csv"
 
 
+def alarm_outputs(args: Args, console: Console) -> list[Callable[[LiveEvent], None]]:
+    """Return what takes the events of a live source."""
+    shown = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    outputs: list[Callable[[LiveEvent], None]] = [lambda event: shown(as_json(event) if args.json else str(event))]
+    if args.hook is not None:
+        outputs.append(AlarmCommand(args.hook))
+    if args.publish is not None:
+        publish_text = text_topic(args.publish)
+        outputs.append(lambda event: publish_text(as_json(event)) if event.kind == ALARM else None)
+    return outputs
+
+
 def watch(args: Args, console: Console) -> int:
     """Watch a recording or a live source."""
     live = live_source(args.source)
@@ -149,15 +170,22 @@ def watch(args: Args, console: Console) -> int:
         if live is not None:
             raise ValueError(f"--rerun is for a recording, and {args.source} is live")
         require("rerun", what="a live view")
+    if live is None and (given := [n for n in LIVE_ONLY if getattr(args, n)]):
+        raise ValueError(f"--{given[0].replace('_', '-')} is for a live source, and {args.source} is a recording")
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if live is not None:
         opened = partial(lines_from, args.source, sys.stdin, args.silence)
-        say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+        outputs = alarm_outputs(args, console)
+
+        def say(event: LiveEvent) -> None:
+            for output in outputs:
+                output(event)
+
         bridge = bridge_of(args.bridge, monitor.spec.dt)
         lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
-        alarms = follow(lines, monitor, lambda event: say(str(event)), bridge, again, args.wait, args.until_alarm)
+        alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm)
         return BAD_NEWS if alarms else DONE
     return review(args, monitor, console)
 

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 
 from asm_gym.data.live import SourceDied, lines_from
+from asm_gym.data.ros2_dds import text_topic
+from asm_gym.data.rows import RowReader
+from asm_gym.spec import Channel, StreamSpec
 from tests.needs import needs
 
 domain, pub, topic = (needs(f"cyclonedds.{part}") for part in ("domain", "pub", "topic"))
@@ -57,9 +60,9 @@ def publish() -> Iterator[Callable[..., None]]:
     """Publishes messages on a topic at 200 Hz, for so many seconds, in a thread."""
     over, threads = threading.Event(), []
 
-    def start(name: str, message: Callable[[int], object], seconds: float = 5.0) -> None:
+    def start(name: str, message: Callable[[int], object], seconds: float = 5.0, quality: object = None) -> None:
         participant = domain.DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
-        writer = pub.DataWriter(participant, topic.Topic(participant, f"rt{name}", type(message(0))))
+        writer = pub.DataWriter(participant, topic.Topic(participant, f"rt{name}", type(message(0))), qos=quality)
 
         def run() -> None:
             for k in range(int(seconds * RATE)):
@@ -126,3 +129,45 @@ def test_a_topic_of_another_type_or_that_nobody_publishes_is_one_line(publish, m
     monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
     with pytest.raises(ValueError, match="ROS_DOMAIN_ID must be a number, got 'seven'"):
         next(lines())
+
+
+def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_read_right(publish):
+    core, spec = (
+        needs("cyclonedds.core"),
+        StreamSpec(
+            tuple(Channel(f"joint_states.{kind}", 2, elements=tuple(NAMES)) for kind in ("position", "velocity")),
+            1 / RATE,
+        ),
+    )
+
+    def shuffled(k: int) -> JointState:
+        made = joints(k - 3 if k == 40 else k)  # one comes late
+        if k % 2:
+            made.name, made.position = made.name[::-1], made.position[::-1]
+            made.velocity = made.velocity[::-1]
+        return joints(k + 1) if k in (20, 21) else made  # 20 is dropped, 21 sent twice
+
+    reliable = core.Policy.Reliability.Reliable(0)
+    publish("/joint_states", shuffled, quality=core.Qos(reliable, core.Policy.Durability.TransientLocal))
+    reader = RowReader(spec)
+    rows = [row for (row, _), _ in zip(reader.rows(lines()), range(80), strict=False)]
+    read = [row for row in rows if row.read]
+    assert all(row.numbers[0] == -row.numbers[1] == row.numbers[2] for row in read)
+    steps = np.diff([row.numbers[0] for row in read])
+    assert (steps == 1 + np.array([row.lost for row in read[1:]])).all()
+    assert sum(not row.read for row in rows) in (1, 2)  # late, and sent twice
+
+
+def test_an_alarm_is_published_for_who_is_there_and_who_comes_later():
+    participant = domain.DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
+    sub, core = needs("cyclonedds.sub"), needs("cyclonedds.core")
+    text_topic("/asm_gym/alarm")('{"kind": "alarm"}')
+    kept = text_topic("/asm_gym/alarm")
+    kept('{"kind": "alarm"}')
+    quality = core.Qos(core.Policy.Reliability.Reliable(0), core.Policy.Durability.TransientLocal)
+    reader = sub.DataReader(participant, topic.Topic(participant, "rt/asm_gym/alarm", Text), qos=quality)
+    until, found = time.monotonic() + 10, []
+    while not found and time.monotonic() < until:
+        found = [sample.data for sample in reader.take(N=5)]
+        time.sleep(0.05)
+    assert found[:1] == ['{"kind": "alarm"}']

@@ -108,15 +108,24 @@ def test_whatever_a_line_holds_reading_goes_on():
     assert all(row.numbers.tolist() == ROWS[0].tolist() for row in rows if not row.problem)
 
 
-@pytest.mark.parametrize("stamp", [-1.0, 0.02, 1e18, 1e300])
-def test_a_clock_that_is_set_anew_begins_anew(stamp):
-    named = [{"t": t, "q": [1, 2], "torque": 3, "cmd": 4} for t in (0, 0.02, stamp, 0.04, 0.06)]
-    rows = [row for row, _ in RowReader(SPEC).rows(map(json.dumps, named))]
-    assert [row.read for row in rows] == [True] * 5
-    assert [bool(row.problem) for row in rows] == [False, False, True, stamp > 1, False]
-    assert rows[-1].lost == 0
-    named[2]["t"] = "NaN"
-    assert [bool(p) for p in problems(map(json.dumps, named))] == [False, False, True, False, False]
+def stamped(*stamps):
+    named = ({"t": t, "q": [1, 2], "torque": 3, "cmd": 4} for t in stamps)
+    return [row for row, _ in RowReader(SPEC).rows(map(json.dumps, named))]
+
+
+@pytest.mark.parametrize("stamp", [-1.0, 0.0, 0.02, 1e18, 1e300, "NaN", "soon"])
+def test_one_row_that_comes_late_or_from_another_clock_is_left_out(stamp):
+    rows = stamped(0, 0.02, stamp, 0.04, 0.06)
+    assert [row.read for row in rows] == [True, True, False, True, True]
+    assert [bool(row.problem) for row in rows] == [False, False, True, False, False]
+    assert [row.lost for row in rows if row.read] == [0] * 4
+
+
+@pytest.mark.parametrize("start", [-1.0, 1e9])
+def test_a_clock_that_is_set_anew_begins_anew(start):
+    rows = stamped(0, 0.02, start, start + 0.02, start + 0.04)
+    assert [row.read for row in rows] == [True, True, False, True, True]
+    assert [bool(row.problem) for row in rows] == [False, False, True, True, False]
 
 
 def test_a_pipe_ends_where_its_writer_closes_it_and_dies_where_it_falls_silent():

@@ -8,6 +8,8 @@ import io
 import itertools
 import json
 import shlex
+import sys
+import time
 from functools import partial
 from importlib.metadata import version
 
@@ -20,7 +22,8 @@ from asm_gym.data.rows import SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.guard.live import follow
+from asm_gym.guard.alarm_outputs import as_json
+from asm_gym.guard.live import LiveEvent, follow
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -197,6 +200,50 @@ def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, t
     assert version("asm-gym") in report
 
 
+def live(monitor, folder, source, *options):
+    """What a watch of a source prints and returns."""
+    monitor.save(folder / "x.asm")
+    return main(["watch", source, "--monitor", str(folder / "x.asm"), *options])
+
+
+def test_alarms_leave_a_watch_as_json_and_by_a_command(monitor, tmp_path, monkeypatch, capsys):
+    rows = list(lines(episode(500).stream[:30]))
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join([*rows[:10], "no row", *rows[10:]])))
+    script = tmp_path / "stop.py"
+    script.write_text(f"import sys; open({str(tmp_path / 'heard')!r}, 'a').write(sys.stdin.read())")
+    hook = f"{sys.executable} {script}"
+    assert live(monitor, tmp_path, "-", "--json", "--hook", hook) == 1
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (alarm,) = [event for event in events if event["kind"] == "alarm"]
+    assert (alarm["reason"], events[-1]["kind"]) == ("unreadable", "summary")
+    until = time.monotonic() + 10
+    while not (tmp_path / "heard").exists() or not (tmp_path / "heard").read_text().endswith("\n"):
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    assert json.loads((tmp_path / "heard").read_text()) == alarm
+
+
+def test_an_infinite_surprise_is_json_too():
+    event = LiveEvent("alarm", 1.0, "q[0]  inf thresholds", "missing data", "q[0]", float("inf"), 0.1)
+    assert json.loads(as_json(event))["thresholds"] == "inf"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--hook", ""], "must not be empty"),
+        (["--hook", "no-such-program-here --now"], "there is no program no-such-program-here"),
+        (["--publish", "/"], "a topic has a name"),
+    ],
+)
+def test_an_output_that_makes_no_sense_is_refused(options, message, monitor, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", io.StringIO("[1, 2, 3, 4]\n"))
+    assert live(monitor, tmp_path, "-", *options) == 2
+    assert message in capsys.readouterr().err
+    assert live(monitor, tmp_path, str(tmp_path), "--json") == 2
+    assert "--json is for a live source" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("rate", [20, 100])
 def test_another_rate_is_said_once_and_is_an_alarm(rate, monitor):
     count, said = watched(lines(np.resize(episode(500).stream, (200, 4)), np.arange(200) / rate), monitor)
@@ -211,16 +258,16 @@ def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(
         opened.append(1)
         if len(opened) == 1:
             raise ConnectionRefusedError
-        return lines(rows, [5.0, 5.02, 1.0] if len(opened) == 2 else None)
+        return lines(rows, [5.0, 5.02, 1.0, 1.02] if len(opened) == 2 else None)
 
     count, said = watched(lines(rows, dies=True), monitor, 0.0, again, 5.0)
     assert count
     assert said.count("the source is back") == 1
-    assert "time must increase, got 1 s after 5.02 s: an alarm, and a new beginning" in said
+    assert "time must increase, got 1.02 s after 5.02 s: an alarm, and a new beginning" in said
     assert "23 rows" in said
-    count, said = watched(lines(rows, [5.0, 5.02, 1.0]), monitor)
+    count, said = watched(lines(rows, [5.0, 5.02, 1.0, 1.02]), monitor)
     assert count
-    assert "time must increase, got 1 s after 5.02 s: an alarm, and a new beginning" in said
+    assert "time must increase, got 1.02 s after 5.02 s: an alarm, and a new beginning" in said
 
     def never(first):
         raise OSError("no")

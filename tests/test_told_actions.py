@@ -118,6 +118,30 @@ def test_success_is_told_by_the_name_that_learners_read():
     bare.close()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
+def test_senses_that_repeat_bit_for_bit_are_missing_and_the_arm_is_held(share):
+    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"))
+    env.reset(seed=0)
+    inner, kept = env.unwrapped, []
+
+    def freeze(row):
+        kept.append(row.copy())
+        at = np.random.default_rng(0).permutation(len(row))[: round(share * len(row))]
+        row[at] = kept[0][at]
+
+    for t in range(30):
+        if t == 10:
+            inner.corruptions.append(freeze)
+        info = env.step(np.float32([0.3, 0, 0.3, 0, 0, 0, 0]))[4]
+        if not share or t < 11:
+            assert not info["cost"]
+        elif share == 1.0:
+            assert info["asm"]["intervened"] == (t > 11)
+        assert t != 11 or not share or info["asm"]["reason"] == "missing"
+    assert bool(info["asm"]["state"] == "policy") == (not share)
+    env.close()
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("channel", ["joint_position", "wrist_force", "joint_velocity"])
 def test_a_number_that_a_sense_of_the_environment_lacks_is_missing_and_completed(channel, value):
@@ -139,3 +163,18 @@ def test_a_number_that_a_sense_of_the_environment_lacks_is_missing_and_completed
     assert reasons[:5] == [""] * 5
     assert reasons[5] == "missing"
     env.close()
+
+
+@pytest.mark.parametrize("actions", [np.zeros((2, 2)), np.zeros(3), np.zeros((3, 3)), "none"])
+def test_actions_of_a_wrong_shape_end_no_episode(actions):
+    made = gym.vector.SyncVectorEnv([FakeEnv, FakeEnv])
+    many = VectorNeuralASMSafety(made, FadingMonitor(), "hold")
+    many.reset(seed=0)
+    with pytest.raises((ValueError, TypeError)):
+        many.step(actions)
+    many.step(np.zeros((2, 3), np.float32))
+    one = NeuralASMSafety(FakeEnv(), CueMonitor())
+    one.reset(seed=0)
+    with pytest.raises((ValueError, TypeError)):
+        one.step(actions)
+    one.step(np.zeros(3, np.float32))

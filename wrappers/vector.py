@@ -158,8 +158,11 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
         if self._ended is None or (not self._resets_itself and self._ended.any()):
             raise gym.error.ResetNeeded("call reset() before step(): an environment's episode is not running")
+        chosen = as_float32(actions, "actions").copy()
+        if chosen.shape != self.env.action_space.shape:
+            raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
         begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
-        executed, failed = self._command(actions, begun)
+        executed, failed = self._command(chosen, begun)
         observations, rewards, terminated, truncated, infos = self.env.step(executed.copy())
         infos = dict(infos)
         if self._forced.any():
@@ -185,11 +188,8 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         self._ended = terminated | truncated
         return self._observations, rewards, terminated, truncated, infos
 
-    def _command(self, actions: Any, begun: Mask) -> tuple[NDArray[np.float32], Mapping[int, str]]:
+    def _command(self, chosen: NDArray[np.float32], begun: Mask) -> tuple[NDArray[np.float32], Mapping[int, str]]:
         """Return (n, A) what is done, and what failed when it was chosen."""
-        chosen = as_float32(actions, "actions").copy()
-        if chosen.shape != self.env.action_space.shape:
-            raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
 
         def seen(robot: int) -> Any:
             return list(iterate(self.observation_space, self._observations))[robot]

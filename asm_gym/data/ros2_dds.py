@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -35,6 +35,7 @@ FIELDS: dict[str, dict[str, str]] = {
     "geometry_msgs/msg/Vector3": dict.fromkeys("xyz", "float64"),
     "geometry_msgs/msg/Wrench": dict.fromkeys(("force", "torque"), "geometry_msgs/msg/Vector3"),
     "geometry_msgs/msg/WrenchStamped": {"header": "std_msgs/msg/Header", "wrench": "geometry_msgs/msg/Wrench"},
+    "std_msgs/msg/String": {"data": "str"},
     "std_msgs/msg/MultiArrayDimension": {"label": "str", "size": "uint32", "stride": "uint32"},
     "std_msgs/msg/MultiArrayLayout": {"dim": "[std_msgs/msg/MultiArrayDimension]", "data_offset": "uint32"},
     "std_msgs/msg/Float64MultiArray": {"layout": "std_msgs/msg/MultiArrayLayout", "data": "[float64]"},
@@ -77,10 +78,7 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
     names = [name.strip() for name in topics.split(",")]
     if not all(name.strip("/") for name in names):
         raise ValueError(f"dds takes topics, as in dds:/joint_states, got {topics!r}")
-    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
-    if not domain.isdigit():
-        raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
-    participant, core = _dds("domain").DomainParticipant(int(domain)), _dds("core")
+    participant, core = _participant(), _dds("core")
     kinds = {name: _kind(participant, name) for name in names}
     quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(AT_ONCE))
     readers = {}
@@ -113,6 +111,30 @@ def follow_topics(topics: str, silence: float) -> Iterator[str]:
             if not rows:
                 raise OSError(f"no row came from {topics} for {silence:g} s")
             raise SourceDied(f"nothing came for {silence:g} s")
+
+
+def _participant() -> Any:
+    """Return a participant in the domain of ROS_DOMAIN_ID."""
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not domain.isdigit():
+        raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
+    return _dds("domain").DomainParticipant(int(domain))
+
+
+def text_topic(name: str) -> Callable[[str], None]:
+    """Return what publishes a text on a topic, as std_msgs/msg/String, reliably; who comes later has the last one.
+
+    Raises:
+        ValueError: no such name, or ROS_DOMAIN_ID is no number.
+    """
+    if not name.strip("/"):
+        raise ValueError(f"a topic has a name, such as /asm_gym/alarm, got {name!r}")
+    participant, core, kind = _participant(), _dds("core"), message("std_msgs/msg/String")
+    reliable = core.Policy.Reliability.Reliable(_dds("util").duration(seconds=1))
+    quality = core.Qos(reliable, core.Policy.Durability.TransientLocal, core.Policy.History.KeepLast(1))
+    topic = _dds("topic").Topic(participant, f"rt/{name.strip('/')}", kind)
+    writer = _dds("pub").DataWriter(participant, topic, qos=quality)
+    return lambda text: writer.write(kind(data=text))
 
 
 def _kind(participant: Any, name: str) -> str:

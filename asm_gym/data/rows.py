@@ -59,14 +59,15 @@ class Pace:
         """
         if not math.isfinite(stamp):
             raise ValueError(f"its time is {stamp}")
-        before, self._before, self.change = self._before, stamp, ""
-        self._rows += 1
-        if before is None:
-            return 0
-        step = stamp - before
+        before, self.change = self._before, ""
+        step = self.dt if before is None else stamp - before
         if not 0 < step <= LEAP_S:
             what = "leapt" if step > 0 else "must increase"
             raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
+        self._before = stamp
+        self._rows += 1
+        if before is None:
+            return 0
         self._steps.append(step)
         if self._rows % NEWEST == 1:
             own = median(self._steps)
@@ -108,6 +109,7 @@ class RowReader:
         self._first: float | None = None  # number of a clock whose unit is not known yet
         self._pace = Pace(spec.dt)
         self._known = False  # a row was read
+        self._aside: float | None = None  # time of the last row, where that is no successor of the one before [s]
 
     def begin(self) -> None:
         """Begin anew with the clock; columns stay."""
@@ -149,9 +151,13 @@ class RowReader:
         self._known = True
         if stamp is None:
             return Row(numbers)
+        aside, self._aside = self._aside, None
         try:
             lost = self._pace.lost(stamp)
         except ClockWentBack as error:
+            if aside is None or not 0 < stamp - aside <= LEAP_S:  # one row that came late is left out
+                self._aside = stamp
+                return Row(numbers, read=False, problem=f"{error}: the row is left out")
             self.begin()
             self._pace.lost(stamp)
             return Row(numbers, problem=str(error))

@@ -15,6 +15,7 @@ from asm_gym.compilation import compiled
 from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints, compare, no_hand
 from asm_gym.guard.repair import Repair
 from asm_gym.guard.robots import NOTHING, Robots
+from asm_gym.guard.stale import StaleSenses
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
@@ -51,6 +52,7 @@ class Rows:
         kept: int,
     ) -> None:
         self._spec, self._kept = spec, kept
+        self._stale = StaleSenses(robots.count, spec)
         self._completion = None if robots.read is None else completion
         if completion is not None and robots.read is None:
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
@@ -72,6 +74,7 @@ class Rows:
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
         self._seen[which] = 0
+        self._stale.begin(which)
         for hand in self._hands:
             hand.begin(which)
         for robot in np.flatnonzero(which):
@@ -82,6 +85,7 @@ class Rows:
         if self._end == self._history.shape[1]:
             self._history[:, : self._kept] = self._history[:, -self._kept :]
             self._end = self._kept
+        rows = self._stale.left_out(rows)
         found = _take_in(rows, self._history, self._end, self._seen, *self._first)
         contradictory = [hand.contradicting(found > 1) for hand in self._hands[:1]]
         contradictory += [hand.contradicting(compare(rows, *hand.arguments)) for hand in self._hands[1:]]
