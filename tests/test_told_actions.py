@@ -118,6 +118,17 @@ def test_success_is_told_by_the_name_that_learners_read():
     bare.close()
 
 
+def test_a_closed_environment_says_so():
+    env = lift()
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    with pytest.raises(gym.error.ClosedEnvironmentError, match="after close"):
+        env.reset(seed=0)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(7, np.float32))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.7, 1.0])
 def test_senses_that_repeat_bit_for_bit_are_missing_and_the_arm_is_held(share):
     env = NeuralASMSafety(gym.make("asm_gym/Lift-v0"))

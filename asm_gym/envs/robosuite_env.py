@@ -172,8 +172,11 @@ class RobosuiteEnv(SteppedEnv):
 
         Raises:
             ValueError: options are given.
+            gymnasium.error.ClosedEnvironmentError: it was closed.
         """
         self._ended = True  # until it has worked
+        if self.robosuite_env is None:
+            raise gym.error.ClosedEnvironmentError("reset() after close(): make a new environment")
         if options:
             raise ValueError(f"reset takes no options, got {short_repr(options)}")
         super().reset(seed=seed)
