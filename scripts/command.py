@@ -123,21 +123,6 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
     return kind(**vars(typed))
 
 
-def typed(name: str, args: Any) -> str:
-    """Return the whole command line that gives these options: those that are not the defaults."""
-    words = ["asm-gym", name]
-    for each in sorted(fields(args), key=lambda each: not each.metadata.get("positional")):
-        value, flag = getattr(args, each.name), f"--{each.name.replace('_', '-')}"
-        if value == each.default:
-            continue
-        values = [str(one) for one in value] if isinstance(value, tuple) else [str(value)]
-        if each.metadata.get("positional"):
-            words += values
-        else:
-            words += [flag] if value is True else [flag, *values]
-    return shlex.join(words)
-
-
 def _readable(kind: type[Any], quick: bool) -> Any:
     """Return a subclass of ``kind`` that tyro reads: annotated, and not checked while it is read."""
     import tyro

@@ -17,7 +17,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -30,7 +29,16 @@ from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.ros2_dds import text_topic
-from asm_gym.evaluation.alarms import HEADINGS, Alarm, alarms_of, excused_in, plain_cell, sensed_peak, traces_of, write_rerun
+from asm_gym.evaluation.alarms import (
+    HEADINGS,
+    Alarm,
+    alarms_of,
+    excused_in,
+    plain_cell,
+    sensed_peak,
+    traces_of,
+    write_rerun,
+)
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require

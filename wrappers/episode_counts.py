@@ -33,10 +33,11 @@ def relay_beneath_counts(env: gym.Env[Any, Any], ends: bool) -> Relay | None:
     Raises:
         ValueError: there is such a wrapper.
     """
-    layer, counting = env, None
+    layer: Any = env
+    counting: Any = None
     while isinstance(layer, gym.Wrapper) and _counts(layer):
         layer, counting = layer.env, layer
-    inner = layer
+    inner: Any = layer
     while ends and isinstance(inner, gym.Wrapper):
         if _counts(inner):
             name = type(inner).__name__
