@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from tests.needs import needs
 from tests.wheel import ROOT
 
 INFER = """
@@ -93,3 +94,27 @@ def test_code_that_another_processor_compiled_is_none(tmp_path):
         run, own = [sys.executable, "-c", "import arm"], env | processor
         said.append(subprocess.run(run, capture_output=True, text=True, env=own, check=True, cwd=tmp_path).stdout)
     assert said == ["True 4.0\n", "True 4.0\n", "False 4.0\n", "False 4.0\n"]
+
+
+ROBOSUITE_NOWHERE = """
+import numba.core.caching as caching
+kept = caching.InTreeCacheLocator.ensure_cache_path
+def ensured(self):
+    if "robosuite" in self._py_file:
+        raise OSError("read-only")
+    return kept(self)
+for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
+    locator.ensure_cache_path = ensured
+from asm_gym.compilation import kept_in
+from asm_gym.envs.backend import import_robosuite
+print(kept_in(import_robosuite().utils.transform_utils.quat2mat))
+"""
+
+
+def test_robosuites_code_is_kept_in_the_temporary_folder_too(tmp_path):
+    needs("robosuite")
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"TMPDIR": str(tmp_path)}
+    run = [sys.executable, "-c", ROBOSUITE_NOWHERE]
+    done = subprocess.run(run, capture_output=True, text=True, env=env, check=True, cwd=ROOT)
+    assert done.stdout.startswith(f"{tmp_path}/asm-gym-numba-")
+    assert "NUMBA_CACHE_DIR" in done.stderr
