@@ -100,7 +100,7 @@ ROBOSUITE_NOWHERE = """
 import numba.core.caching as caching
 kept = caching.InTreeCacheLocator.ensure_cache_path
 def ensured(self):
-    if "robosuite" in self._py_file:
+    if "robosuite" in self.get_cache_path() or isinstance(self, caching.UserWideCacheLocator):
         raise OSError("read-only")
     return kept(self)
 for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
