@@ -40,12 +40,19 @@ def import_robosuite() -> Any:
     if no_viewer := "cv2" not in sys.modules:  # for want of libGL: only robosuite's own viewer would use it
         sys.modules["cv2"] = ModuleType("cv2")
     try:
-        robosuite = somewhere(lambda: require("robosuite", what="a robosuite environment"))
+        robosuite = somewhere(_required)
     finally:
         if no_viewer:
             del sys.modules["cv2"]
     _fit_to_mujoco()
     return robosuite
+
+
+def _required() -> Any:
+    if "robosuite" not in sys.modules:  # parts that an import which failed has left are no attributes of a new one
+        for name in [name for name in sys.modules if name.startswith("robosuite.")]:
+            del sys.modules[name]
+    return require("robosuite", what="a robosuite environment")
 
 
 def _fit_to_mujoco() -> None:
