@@ -86,12 +86,25 @@ def test_a_jammed_joint_is_an_alarm_and_the_arm_stays_where_it_stood(monitor):
     alarms, others = run(guard, arm, rows=120)
     assert 100 < alarms[0] <= 115
     assert others[0] == alarms[0]
-    assert "elbow_flex" in guard.last_alarm["channel"]
+    assert guard.last_alarm["servo"] == "elbow_flex"
     held = arm.sent[alarms[0] :]
     np.testing.assert_array_equal(held, np.repeat(held[:1], len(held), axis=0))
     told_before = arm.sent[alarms[0] - 1]
     assert held[0][5] == pytest.approx(told_before[5], rel=1e-6)  # the gripper keeps its grip
     assert np.abs(held[0][:5] - arm.q[:5]).max() < 1.0
+
+
+@pytest.mark.parametrize(("hot", "fault"), [(25.0, "stalled"), (71.0, "overheated"), (None, "stalled")])
+def test_a_servo_that_stalls_or_overheats_is_named(monitor, hot, fault):
+    guard, arm = LeRobotGuard(monitor, "monitor", clock=ticks()), Arm(201)
+
+    def step(observation, action):
+        if hot is not None:
+            observation["elbow_flex.temperature"] = hot if arm.jammed[2] else 25.0
+        return guard({"observation": observation, "action": action})["action"]
+
+    run(guard, arm, rows=125, step=step)
+    assert (guard.last_alarm["servo"], guard.last_alarm["fault"]) == ("elbow_flex", fault)
 
 
 def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):

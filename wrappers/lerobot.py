@@ -15,6 +15,7 @@ import logging
 import re
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,11 @@ _log = logging.getLogger("asm_gym.lerobot")
 
 ON_ALARM = ("hold", "stop", "monitor")  # stay where the arm stood until it is quiet; stay until ``reset``; only report
 
+STALLED, OVERHEATED = "stalled", "overheated"  # what is told of a servo that an alarm points to
+STALL_S = 0.2  # for so long a stalled servo has not moved [s]
+STALL_SHARE = 3.0  # how many times further than it moved it was told to be, throughout
+TEMPERATURES, HOT_C = ("temperature", "temp"), 60.0  # names beside a servo's position; servos switch off at 70 °C
+
 _MOTOR = re.compile(r"(?P<what>observation\.state|action)\[(?P<motor>.*\D.*)\]")
 _GRIPPER = re.compile(r".*(gripper|hand|jaw).*")
 
@@ -56,7 +62,8 @@ class LeRobotGuard:
 
     Attributes:
         alarm, intervened: whether there was an alarm at the newest row, and whether a hold was sent.
-        last_alarm: surprise in thresholds, reason and channel of the newest alarm; empty before the first.
+        last_alarm: of the newest alarm its surprise in thresholds, reason, channel, servo, and the servo's fault,
+            "overheated", "stalled" or empty; empty before the first.
 
     Example:
         >>> guard = LeRobotGuard("so101.asm")  # doctest: +SKIP
@@ -80,6 +87,7 @@ class LeRobotGuard:
         check_monitor(self.monitor, self._spec)
         self._motors = [_motor_of(label) for label in self._spec.labels]
         self._told = action_means
+        self._rows_lately = max(2, round(STALL_S / self._spec.dt))
         self._clock = clock
         try:
             from lerobot.processor import ProcessorStep
@@ -93,6 +101,7 @@ class LeRobotGuard:
         """Begin a new episode; a stop is over."""
         self._engine: Engine | None = None  # made once the names of the actions are known
         self._pace = Pace(self._spec.dt)
+        self._lately: deque[tuple[Mapping[str, Any], Mapping[str, float]]] = deque(maxlen=self._rows_lately)
         self.alarm = self.intervened = False
         self.last_alarm: dict[str, Any] = {}
 
@@ -123,12 +132,13 @@ class LeRobotGuard:
         report = engine.judge(row[None], self._sent)
         self.alarm, self.intervened = bool(report.alarm[0]), overriding or bool(engine.overriding[0])
         if self.alarm:
-            self.last_alarm = self._described(row, report)
+            self.last_alarm = self._described(row, report, observation)
             if not (overriding or in_alarm):
                 _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
         if self.intervened and not overriding:
             executed = engine.act(asked, lambda _: None).actions
             engine.amend(self._row(observation, executed[0])[None])
+        self._lately.append((dict(observation), dict(zip(self._names, self._sent[0].tolist(), strict=True))))
         if not self.intervened:
             self._sent = np.where(np.isfinite(asked), asked, self._sent)
             return {name: value for name, value in action.items() if np.isfinite(_number(action, name))}
@@ -176,14 +186,32 @@ class LeRobotGuard:
         slopes = [float(sense >= 0) for sense in senses]
         return ActionMeaning(tuple(means), tuple(senses), tuple(slopes), (0.0,) * len(means))
 
-    def _described(self, row: Floats32, report: RowReport) -> dict[str, Any]:
+    def _described(self, row: Floats32, report: RowReport, observation: Mapping[str, Any]) -> dict[str, Any]:
         """Return what there is to say of an alarm."""
         at = blamed(row, report.surprise.attribution[0])
+        motor = "" if at is None else self._motors[at][1]
         return {
             "surprise": float(report.surprise.value[0] / report.threshold[0]),
             "reason": FAILURE if report.failure else reason(row),
             "channel": "" if at is None else self._spec.labels[at],
+            "servo": motor.rpartition(".")[0] or motor,
+            "fault": self._fault_of(motor, observation),
         }
+
+    def _fault_of(self, motor: str, observation: Mapping[str, Any]) -> str:
+        """Return whether a servo is overheated, or has stalled: it has long been told to move and did not; or empty.
+
+        Its temperature is read where the observation holds one beside the position, such as ``elbow_flex.temperature``.
+        """
+        servo = motor.rpartition(".")[0] or motor
+        degrees = max((_number(observation, f"{servo}.{name}") for name in TEMPERATURES), key=np.nan_to_num)
+        if degrees >= HOT_C:
+            return OVERHEATED
+        pairs = [(_number(sensed, motor), sent.get(motor, np.nan)) for sensed, sent in self._lately]
+        sensed, sent = np.array(pairs, np.float64).reshape(-1, 2).T
+        if len(pairs) < self._rows_lately or not (np.isfinite(sensed).all() and np.isfinite(sent).all()):
+            return ""
+        return STALLED if np.abs(sent - sensed).min() > STALL_SHARE * np.ptp(sensed) and np.ptp(sent) > 0 else ""
 
     def _row(self, observation: Mapping[str, Any], action: Floats32) -> Floats32:
         """Return (D,) the row of the stream; NaN where something is missing."""
