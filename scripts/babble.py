@@ -68,7 +68,7 @@ class Args(Options):
     exam_episodes: int = option(60, quick=0, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
     workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
     tasks: tuple[str, ...] | None = option(None)

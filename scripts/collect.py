@@ -41,7 +41,7 @@ class Args(Options):
     only_successful: bool = False
     """Leave failed episodes out of the dataset."""
     workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
     out: Path = option(Path("runs/collect"), metavar="FOLDER")
     """Folder of the episodes and of the dataset."""
 

@@ -28,7 +28,7 @@ class Args(Options):
     rounds: int = option(ROUNDS, quick=1, least=1)
     """How many rounds; each has as much of every task, and the first what is learned from."""
     workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
     out: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of the corpus."""
 

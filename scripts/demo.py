@@ -11,7 +11,7 @@ import os
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from rich.console import Console
@@ -21,20 +21,19 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
-from asm_gym.evaluation.metrics import DetectionMetrics, by_condition, false_alarms, hourly_alarms, typical
-from asm_gym.evaluation.report import write_json, write_report
+from asm_gym.evaluation.metrics import by_condition, typical
+from asm_gym.evaluation.report import write_report, write_tables
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.collect import collect
+from asm_gym.rollouts.collect import collect, watch_pair
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.rollouts.watched import watch_pair
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import TASKS, env_id
 
@@ -109,13 +108,6 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
     return file, Share.of([e.success for e in episodes])
 
 
-def as_json(m: DetectionMetrics) -> dict[str, Any]:
-    """Return the numbers of one condition."""
-    alarms = {"false_alarm_episodes": false_alarms(m.watched), "false_alarms_per_hour": hourly_alarms(m.watched).value}
-    numbers = {name: getattr(m, name) for name in ("detected", "delays", "auroc", "top_channels", "outcomes")}
-    return {"condition": m.name, "episodes": len(m.watched)} | alarms | numbers
-
-
 def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
@@ -135,9 +127,8 @@ def demonstrate(args: Args, console: Console) -> None:
     )
     console.print(result)
     examples = [typical(m.watched) for m in rows]
-    details = {**asdict(args), "out": str(args.out)}
-    numbers = {"arguments": details, "versions": versions("numba"), "window_s": WINDOW_S, "expert_success": expert}
-    write_json(args.out / "demo.json", numbers | {"results": [as_json(m) for m in rows]})
+    details = asdict(args) | versions("numba") | {"window_s": WINDOW_S}
+    write_tables(args.out / "demo.json", [table], details)
     drawn = {
         "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
         "Time until faults were noticed": figures.delay_figure(rows),
@@ -150,7 +141,6 @@ def demonstrate(args: Args, console: Console) -> None:
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
         f"watched others, some of them faulty. {result}"
     )
-    details = {"command": f"asm-gym demo {args.task} --seed {args.seed}", **details}
     report = args.out / "report.html"
     write_report(report, f"asm-gym demo: {args.task}", intro, [table], drawn, details)
     console.print(f"Wrote {report} and {memory}")

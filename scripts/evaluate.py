@@ -86,7 +86,7 @@ class Args(Options):
     false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
     workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a cluster that is running, as dask:tcp://host:8786 or ray:host:6379, which shares the folder."""
+    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
     corpus: Path | None = option(None, metavar="FOLDER")

@@ -53,7 +53,7 @@ class Args(Options):
     final_episodes: int = option(100, quick=2, least=1)
     """Episodes of the last evaluation, on other seeds."""
     workers: str = option("1", check=parse_workers, metavar="N")
-    """Processes that record demonstrations; or a running cluster, as dask:tcp://host:8786 or ray:host:6379."""
+    """Processes that record demonstrations; or a Dask cluster that is running, as dask:tcp://host:8786."""
     out: Path = option(Path("runs/train"), metavar="FOLDER")
     """Folder of the run."""
 

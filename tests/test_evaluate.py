@@ -82,7 +82,7 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
         ("--faulty-episodes 5", "at most 4, got 5"),
         ("--fit-episodes 0", "fit_episodes.*0"),
-        ("--workers dask", "address"),
+        ("--workers dask", "scheduler"),
         ("--workers many", "workers must be a number"),
         ("--policy door_sac", "door_sac takes observations of 41"),
         ("--policy nobody.npz", "nobody.npz"),

@@ -18,7 +18,7 @@ from asm_gym.evaluation import figures
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
 from asm_gym.evaluation.report import write_report
-from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.tables import Table, tabulate
 
 
@@ -33,8 +33,8 @@ def a_trace(condition: str, seed: int, acting: str = "policy alone") -> ScoredEp
     attribution = rng.dirichlet(np.ones(20), 60) * surprise[:, None]
     channels = tuple(f"joint_position[{i}]" for i in range(20))
     onset, outcome = 20 if fault.any() else None, InterventionOutcome(True, False, 10 * rng.random())
-    detail = TraceDetail(attribution, channels, fault)
-    made = ScoredEpisode(condition, seed, 0.05, 20.0, surprise, onset, acting=acting, outcome=outcome, detail=detail)
+    kept = {"attribution": attribution, "channels": channels, "fault": fault}
+    made = ScoredEpisode(condition, seed, 0.05, 20.0, surprise, onset, acting=acting, outcome=outcome, **kept)
     return made.attributed(attribution, channels)
 
 
@@ -87,29 +87,27 @@ def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces):
 
 def test_infinite_and_zero_surprise_can_be_drawn(traces, tmp_path: Path):
     good = next(t for t in traces if t.delay is not None)
-    surprise, attribution = good.surprise.copy(), good.detail.attribution.copy()
+    surprise, attribution = good.surprise.copy(), good.attribution.copy()
     surprise[:5], surprise[30:], attribution[30:] = 0.0, np.inf, np.inf
-    detail = dataclasses.replace(good.detail, attribution=attribution)
-    broken = dataclasses.replace(good, surprise=surprise, detail=detail)
+    broken = dataclasses.replace(good, surprise=surprise, attribution=attribution)
     for name, figure in figures_of([broken, *(t for t in traces if t.condition == "nominal")]).items():
         assert figures.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
 
 def test_the_most_surprising_channels_come_first(traces):
     trace = next(t for t in traces if t.delay is not None)
-    order = np.argsort(-trace.detail.attribution[20:].max(axis=0))[:3]
-    names = [trace.detail.channels[i] for i in order]
+    order = np.argsort(-trace.attribution[20:].max(axis=0))[:3]
+    names = [trace.channels[i] for i in order]
     labels = figures.attribution_figure(trace, top=3).axes[0].get_yticklabels()
     assert [text.get_text() for text in labels] == names
-    stream = np.random.default_rng(0).normal(size=(len(trace), len(trace.detail.channels)))
-    detail = dataclasses.replace(trace.detail, stream=stream)
-    axes = figures.stream_figure(dataclasses.replace(trace, detail=detail), top=3).axes
+    stream = np.random.default_rng(0).normal(size=(len(trace), len(trace.channels)))
+    axes = figures.stream_figure(dataclasses.replace(trace, stream=stream), top=3).axes
     assert [ax.get_title(loc="left") for ax in axes] == names
     np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), stream[:, order[0]])
     with pytest.raises(ValueError, match="without its stream"):
         figures.stream_figure(trace)
-    with pytest.raises(ValueError, match="without the detail"):
-        figures.attribution_figure(dataclasses.replace(trace, detail=None))
+    with pytest.raises(ValueError, match="without the attribution"):
+        figures.attribution_figure(dataclasses.replace(trace, attribution=None))
 
 
 class _Page(HTMLParser):

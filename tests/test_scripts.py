@@ -9,9 +9,9 @@ from rich.console import Console
 
 from asm_gym import collect
 from asm_gym.faults import FrozenEncoder, Push
+from asm_gym.rollouts.collect import watch
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.rollouts.watched import watch
 from asm_gym.scripts import command, demo
 from asm_gym.scripts.cli import main
 
@@ -54,9 +54,9 @@ def test_the_demo_writes_everything_it_promises(folder):
     written = {p.name for p in folder.iterdir()}
     assert written == {"report.html", "demo.json", "lift.asm"}
     figures = json.loads((folder / "demo.json").read_text())
-    assert [row["condition"] for row in figures["results"]] == list(CONDITIONS)
-    assert figures["arguments"]["seed"] == 0
-    assert figures["versions"]["robosuite"] == "1.5.2"
+    assert [row[0] for row in figures["tables"][0]["rows"]] == list(CONDITIONS)
+    assert figures["settings"]["seed"] == 0
+    assert figures["settings"]["robosuite"] == "1.5.2"
 
 
 def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(folder):

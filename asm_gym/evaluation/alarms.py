@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import spans
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
-from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.extras import require
 from asm_gym.memory.completion import Completion
 from asm_gym.spec import StreamSpec
@@ -47,11 +47,11 @@ HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds")
 
 def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
     """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one."""
-    detail = trace.detail
-    assert detail is not None
+    assert trace.attribution is not None
+    assert trace.stream is not None
     found, newest = list[Alarm](), dict[str, int]()
     for first, stop in spans(trace.alarm):
-        row = np.zeros(len(detail.channels)) if detail.stream is None else detail.stream[first]
+        row = trace.stream[first]
         why, start = reason(row), (first + 1) * trace.dt
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
         before = found[newest[why]] if why in newest else None
@@ -59,8 +59,8 @@ def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
             found[newest[why]] = before._replace(end=stop * trace.dt, excess=max(excess, before.excess))
             continue
         newest[why] = len(found)
-        at = blamed(row, detail.attribution[first])
-        found.append(Alarm(trace.kind, start, stop * trace.dt, "" if at is None else detail.channels[at], why, excess))
+        at = blamed(row, trace.attribution[first])
+        found.append(Alarm(trace.kind, start, stop * trace.dt, "" if at is None else trace.channels[at], why, excess))
     return found
 
 
@@ -80,9 +80,14 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
         over = bridged(episode.stream, spec.dt, bridge)
         shares = np.where(over[:, None], 0.0, surprise.attribution)
         value = np.where(over, 0.0, surprise.value)
-        detail = TraceDetail(shares, spec.labels, fault, episode.stream)
         excused = {event: np.where(over, 0.0, raw) for event, raw in surprise.excused_by_event.items()}
-        traces.append(ScoredEpisode(name, 0, spec.dt, monitor.threshold, value, excused=excused, detail=detail))
+        kept: dict[str, Any] = {
+            "attribution": shares,
+            "channels": spec.labels,
+            "fault": fault,
+            "stream": episode.stream,
+        }
+        traces.append(ScoredEpisode(name, 0, spec.dt, monitor.threshold, value, excused=excused, **kept))
     return traces
 
 
@@ -111,16 +116,16 @@ def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode], m
     recording.save(path)
     begin = 0.0
     for trace in traces:
-        assert trace.detail is not None
-        assert trace.detail.stream is not None
+        assert trace.attribution is not None
+        assert trace.stream is not None
         index = rr.TimeColumn("time", duration=begin + (np.arange(len(trace)) + 1) * trace.dt)
-        stream = trace.detail.stream.astype(np.float64)
+        stream = trace.stream.astype(np.float64)
         lines = {"sensed": stream} | (_predicted(completion, stream) if completion else {})
         columns = {"surprise": trace.surprise, "threshold": np.full(len(trace), trace.threshold)}
         for channel in spec.channels:
             place = spec.slices[channel.name]
             columns |= {f"senses/{channel.name}/{what}": values[:, place] for what, values in lines.items()}
-            columns[f"shares/{channel.name}"] = trace.detail.attribution[:, place].sum(axis=1)
+            columns[f"shares/{channel.name}"] = trace.attribution[:, place].sum(axis=1)
         for entity, values in columns.items():
             rr.send_columns(entity, [index], rr.Scalars.columns(scalars=values), recording=recording)
         for alarm in alarms_of(trace):

@@ -25,8 +25,8 @@ from asm_gym.data.columns import Column
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection, is_constant
 from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
-from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
-from asm_gym.evaluation.statistics import wilson_interval
+from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.evaluation.statistics import Share
 from asm_gym.files import written_whole
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -114,7 +114,7 @@ def delay_figure(groups: Sequence[DetectionMetrics]) -> Figure:
             x = np.concatenate([[0.0], found, [window_ms]])
             colour, line, _ = look(i)
             if len(faulty) <= MOST_BANDS:
-                low, high = np.array([wilson_interval(int(k), len(delays)) for k in counts]).T
+                low, high = np.array([Share(int(k), len(delays)).interval for k in counts]).T
                 ax.fill_between(x, 100 * low, 100 * high, step="post", color=colour, alpha=0.12, linewidth=0)
             label = f"{group.name} ({len(found)} of {len(delays)})"
             ax.step(x, 100 * counts / len(delays), where="post", color=colour, linestyle=line, linewidth=2, label=label)
@@ -175,8 +175,7 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
 
 def attribution_figure(trace: ScoredEpisode, top: int = 12) -> Figure:
     """Draw the shares of the ``top`` channels in the surprise over time, in units of the threshold."""
-    detail = _detail(trace)
-    share = detail.attribution / trace.threshold  # (T, D)
+    share = _attribution(trace) / trace.threshold  # (T, D)
     # An infinite share takes the brightest finite colour, or it would leave all others dark.
     share = np.nan_to_num(share, nan=0.0, posinf=float(share[np.isfinite(share)].max(initial=1.0)), neginf=0.0)
     rows = np.argsort(-share[trace.onset or 0 :].max(axis=0), kind="stable")[:top]
@@ -187,7 +186,7 @@ def attribution_figure(trace: ScoredEpisode, top: int = 12) -> Figure:
         norm = LogNorm(min(0.01, high / 100), high)
         drawn = np.clip(share[:, rows].T, norm.vmin, None)
         image = ax.imshow(drawn, norm=norm, cmap="cividis", aspect="auto", extent=ends, interpolation="nearest")
-        ax.set_yticks(range(len(rows)), [detail.channels[r] for r in rows])
+        ax.set_yticks(range(len(rows)), [trace.channels[r] for r in rows])
         ax.set_xlabel("time [s]")
         ax.spines[:].set_visible(False)
         if trace.onset is not None:
@@ -205,10 +204,9 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
     Raises:
         ValueError: the episode has no stream.
     """
-    detail = _detail(trace)
-    if detail.stream is None:
+    if trace.stream is None:
         raise ValueError("this trace was kept without its stream")
-    share = np.nan_to_num(detail.attribution[trace.onset or 0 :], posinf=1e30)
+    share = np.nan_to_num(_attribution(trace)[trace.onset or 0 :], posinf=1e30)
     rows = np.argsort(-share.max(axis=0), kind="stable")[:top]
     with figure(height=1.0 + 1.15 * len(rows)) as fig:
         axes = fig.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
@@ -216,9 +214,9 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
             _shade_fault(ax, trace)
             for ends in _alarm_times(trace):
                 ax.axvspan(*ends, color=VERMILLION, alpha=0.2, linewidth=0)
-            sensed = detail.stream[:, row]
+            sensed = trace.stream[:, row]
             ax.plot(_times(trace), np.where(np.isfinite(sensed), sensed, np.nan), color=BLUE)
-            ax.set_title(detail.channels[row])
+            ax.set_title(trace.channels[row])
         axes[-1].set_xlabel("time [s]")
         handles = [Line2D([], [], color=BLUE, label="sensed"), Patch(color=VERMILLION, alpha=0.2, label="alarm")]
         fig.legend(handles=handles, loc="outside right upper", ncols=2)
@@ -235,7 +233,7 @@ def _alarm_times(trace: ScoredEpisode) -> list[tuple[float, float]]:
 
 
 def _shade_fault(ax: Axes, trace: ScoredEpisode) -> None:
-    for start, stop in spans(trace.detail.fault) if trace.detail else []:
+    for start, stop in () if trace.fault is None else spans(trace.fault):
         ax.axvspan(start * trace.dt, stop * trace.dt, color=ORANGE, alpha=0.3, linewidth=0)
 
 
@@ -249,10 +247,10 @@ def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
     return min(max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling / 10), ceiling
 
 
-def _detail(trace: ScoredEpisode) -> TraceDetail:
-    if trace.detail is None:
-        raise ValueError("this trace was kept without the detail that the figure needs")
-    return trace.detail
+def _attribution(trace: ScoredEpisode) -> Any:
+    if trace.attribution is None:
+        raise ValueError("this trace was kept without the attribution that the figure needs")
+    return trace.attribution
 
 
 ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000  # panels side by side; channels drawn; points of a curve

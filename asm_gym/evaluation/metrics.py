@@ -12,7 +12,6 @@ be pooled.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -193,11 +192,6 @@ class DetectionMetrics:
     def detected(self) -> Share:
         """Faults detected within the window."""
         return Share.of(np.isfinite(delays_ms(self.faulty, self.window_s)))
-
-    @property
-    def top_channels(self) -> list[tuple[str, int]]:
-        """The three most frequent channels of greatest surprise at the alarms, with the number of episodes."""
-        return Counter(t.top_channel for t in self.watched if t.top_channel).most_common(3)
 
     @cached_property
     def outcomes(self) -> list[Outcomes]:

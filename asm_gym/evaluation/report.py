@@ -61,17 +61,12 @@ def write_report(
 
 
 def _table(table: Table) -> str:
-    head = "".join(f'<th scope="col">{escape(h)}</th>' for h in table.headings)
-    body = "\n".join(
-        f'<tr><th scope="row">{escape(str(row[0]))}</th>'
-        + "".join(f"<td>{escape(str(cell))}</td>" for cell in row[1:])
-        + "</tr>"
-        for row in table.rows
-    )
-    return (
-        f'<div class="scroll"><table><caption>{escape(table.caption)}</caption>\n'
-        f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
-    )
+    name, *headings = table.headings
+    cells = [list(map(str, row)) for row in table.rows]
+    frame = pd.DataFrame([c[1:] for c in cells], pd.Index([c[0] for c in cells]), headings).rename_axis(columns=name)
+    with pd.option_context("display.max_colwidth", None):
+        start, rest = frame.to_html(border=0).split("\n", 1)
+    return f'<div class="scroll">{start}<caption>{escape(table.caption)}</caption>\n{rest}</div>'
 
 
 def _figure(caption: str, figure: Figure) -> str:
@@ -84,20 +79,11 @@ def _figure(caption: str, figure: Figure) -> str:
     return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON; a number that is not finite becomes null."""
+def write_tables(path: Path, tables: Sequence[Table], settings: Mapping[str, Any]) -> None:
+    """Write tables and the settings that they follow from as JSON."""
+    summary = {"settings": settings, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
     with written_whole(path) as file:
-        file.write((json.dumps(_finite(content), indent=2, allow_nan=False, default=str) + "\n").encode())
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return _finite(value._asdict())
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        file.write((json.dumps(summary, indent=2, default=str) + "\n").encode())
 
 
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -> None:
@@ -111,8 +97,7 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
     if any(monitor.harmless for monitor in result.monitors.values()):
         tables.append(harmless_table(result, list(result.monitors)))
     write_text(folder / "results.md", "\n\n".join(map(markdown, tables)) + "\n")
-    summary = {"settings": details, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
-    write_json(folder / "results.json", summary)
+    write_tables(folder / "results.json", tables, details)
     intro = (
         f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
         "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."

@@ -28,23 +28,6 @@ class InterventionOutcome(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class TraceDetail:
-    """What only figures need of an episode: T rows of D channels.
-
-    Args:
-        attribution: (T, D) each channel's share of the surprise.
-        channels: D names.
-        fault: (T,) bool, the ground truth.
-        stream: (T, D) sensed values.
-    """
-
-    attribution: Floats
-    channels: tuple[str, ...]
-    fault: NDArray[np.bool_]
-    stream: Floats | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class ScoredEpisode:
     """The surprise of T rows of the stream, and the alarms at one threshold.
 
@@ -62,6 +45,9 @@ class ScoredEpisode:
         affected_channels: those in which the fault shows first.
         top_channel: the channel with the greatest share of surprise at ``first_alarm``; empty without an alarm.
         excused: by event (knock, stop), (T,) the surprise that it excused; 0 in other rows.
+        attribution, channels: (T, D) the shares of D channels in the surprise, and their names; kept for figures alone.
+        fault: (T,) the ground truth, for figures alone.
+        stream: (T, D) sensed values, where they are drawn.
     """
 
     kind: str
@@ -78,7 +64,10 @@ class ScoredEpisode:
     top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
     excused: Mapping[str, Floats] = field(default_factory=dict)
-    detail: TraceDetail | None = None
+    attribution: Floats | None = None
+    channels: tuple[str, ...] = ()
+    fault: NDArray[np.bool_] | None = None
+    stream: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):
@@ -89,8 +78,6 @@ class ScoredEpisode:
             raise ValueError(f"dt must be > 0, got {self.dt}")
         if self.onset is not None and (self.kind == NOMINAL or self.onset < 0):
             raise ValueError(f"onset must be >= 0, and None of a nominal episode, got {self.onset} of {self.kind}")
-        if self.detail is not None and len(self.detail.fault) != len(self):
-            raise ValueError(f"detail must be of {len(self)} rows, got {len(self.detail.fault)}")
 
     def __len__(self) -> int:
         return len(self.surprise)

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import stats
-
-from asm_gym.validation import check_number, short_repr
 
 Floats = NDArray[np.floating[Any]]
 
@@ -28,8 +26,11 @@ class Share(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % Wilson interval."""
-        return wilson_interval(self.k, self.n)
+        """95 % Wilson score interval; (0, 1) for none of none."""
+        if not self.n:
+            return 0.0, 1.0
+        low, high = stats.binomtest(self.k, self.n).proportion_ci(method="wilson")
+        return float(low), float(high)
 
     @classmethod
     def of(cls, outcomes: Sequence[bool] | NDArray[np.bool_]) -> Share:
@@ -86,24 +87,7 @@ class Spread(NamedTuple):
         return f"{scale * self.mean:.{digits}f}{deviation}"
 
 
-def wilson_interval(k: int, n: int) -> tuple[float, float]:
-    """Return the 95 % score interval of the proportion ``k`` in ``n`` (Wilson 1927); (0, 1) where ``n`` is 0."""
-    check_number("k", k, low=0, high=n, whole=True)
-    if n == 0:
-        return 0.0, 1.0
-    found = stats.binomtest(k, n).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
-
-
-def auroc(scores_pos: ArrayLike, scores_neg: ArrayLike) -> float:
-    """Return the probability that a positive scores higher than a negative, ties counted half (Mann-Whitney).
-
-    Raises:
-        ValueError: a score is NaN (infinite ones are fine), or one of the two holds none.
-    """
-    pos, neg = np.asarray(scores_pos, np.float64), np.asarray(scores_neg, np.float64)
-    for name, scores in (("scores_pos", pos), ("scores_neg", neg)):
-        if scores.ndim != 1 or not scores.size or np.isnan(scores).any():
-            raise ValueError(f"{name} must be numbers in the shape (n,), some and none NaN, got {short_repr(scores)}")
-    ranks = stats.rankdata(np.concatenate([pos, neg]))[: pos.size]
-    return float((ranks.sum() - pos.size * (pos.size + 1) / 2) / (pos.size * neg.size))
+def auroc(positive: Floats, negative: Floats) -> float:
+    """Return the probability that a positive (n,) scores higher than a negative (m,), ties counted half."""
+    found = stats.mannwhitneyu(positive, negative, method="asymptotic", nan_policy="raise")
+    return float(found.statistic / (len(positive) * len(negative)))

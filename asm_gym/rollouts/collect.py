@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode, save_episode
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.evaluation.scored_episode import NOMINAL
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, InterventionOutcome, ScoredEpisode
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
+from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.parallel import Progress, parallel_map
@@ -31,7 +32,7 @@ from asm_gym.rollouts.trial import EXECUTIONS, PASSING, PolicySource, RolloutCon
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
-from asm_gym.wrappers import StreamRecorder
+from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
 from asm_gym.wrappers.faults import FaultInjection
 
 _LATEST: dict[str, tuple[str, Any]] = {}
@@ -238,3 +239,50 @@ def _record_to(seed: int, folder: Path, spec: EnvSpec, config: RolloutConfig) ->
 def check(env_id: str, config: RolloutConfig) -> None:
     """Raise what the environment and the policy refuse, before anything runs."""
     policy_for(config.policy, StreamRecorder(environment(env_id, config.settings)), seed=0)
+
+
+# ------------------------------------------------------------------ under the guard
+
+
+@lru_cache(maxsize=1)
+def _memory(path: Path, written_ns: int) -> NeuralASM:
+    """Load once a process, and again when the file has changed."""
+    return NeuralASM.load(path)
+
+
+def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
+    """Run one trial under the guard in this process's environment, and return its scores."""
+    monitor = _memory(memory, memory.stat().st_mtime_ns)
+    infos: list[dict[str, Any]] = []
+    with staged(trial, config) as env:
+        guarded = NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm)
+        success = play(trial, config, guarded, infos.append)
+    asm = [info["asm"] for info in infos]
+    rows = len(asm[0]["surprises"])  # of each control step
+    fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
+    attribution = np.repeat([list(a["attribution"].values()) for a in asm], rows, axis=0)  # the step's greatest
+    trace = ScoredEpisode(
+        kind=trial.kind,
+        severity=trial.severity,
+        task=trial.task,
+        acting=trial.acting,
+        seed=trial.seed,
+        dt=monitor.spec.dt,
+        threshold=monitor.threshold,
+        surprise=np.concatenate([a["surprises"] for a in asm]),
+        onset=int(np.argmax(fault)) if fault.any() else None,
+        outcome=InterventionOutcome(
+            success,
+            ended_by_alarm=bool(asm[-1]["gave_up"] or (trial.acting == "terminate" and asm[-1]["alarm"])),
+            contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
+        ),
+        attribution=attribution,
+        channels=monitor.spec.labels,
+        fault=fault,
+    )
+    return trace.attributed(attribution, monitor.spec.labels)
+
+
+def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[ScoredEpisode]:
+    """Run one trial with the policy alone, and with its response."""
+    return [watch(replace(trial, acting=acting), config, memory) for acting in (POLICY_ALONE, trial.acting)]

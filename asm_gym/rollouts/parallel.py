@@ -1,4 +1,4 @@
-"""Map work over items in order: processes on this machine, or a running Dask or Ray cluster."""
+"""Map work over items in order: processes on this machine, or a running Dask cluster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
@@ -35,25 +35,23 @@ ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 """Environment of each worker: more threads would compete for the same cores."""
 
 
-def parse_workers(workers: int | str) -> tuple[str, Any]:
-    """Return the backend, and its number of processes or the address of its cluster.
+def parse_workers(workers: int | str) -> int | str:
+    """Return the number of processes, or the address of a cluster.
 
     Args:
-        workers: processes on this machine, 1 of which is this one; or a running cluster, ``dask:ADDRESS``,
-            ``ray:ADDRESS`` or ``ray``, whose workers have this package and share the folder of the results.
+        workers: processes on this machine, 1 of which is this one; or a running cluster, ``dask:ADDRESS``, whose
+            workers have this package and share the folder of the results.
 
     Raises:
         ValueError: it is none of these.
     """
     if not isinstance(workers, str) or workers.lstrip("-").isdecimal():
         count = int(workers) if isinstance(workers, str) else workers
-        return "loky", check_number("workers", count, low=1, high=MOST_WORKERS, whole=True)
+        return check_number("workers", count, low=1, high=MOST_WORKERS, whole=True)
     backend, _, address = workers.partition(":")
-    if backend not in ("dask", "ray"):
-        raise ValueError(f"workers must be a number, dask:ADDRESS or ray:ADDRESS, got {workers!r}")
-    if backend == "dask" and not address:
-        raise ValueError("dask needs the address of its scheduler, such as dask:tcp://host:8786")
-    return backend, address
+    if backend != "dask" or not address:
+        raise ValueError(f"workers must be a number, or a scheduler such as dask:tcp://host:8786, got {workers!r}")
+    return address
 
 
 @typed
@@ -73,7 +71,7 @@ def parallel_map(
         ConnectionError: there is no cluster at the address.
         ChildProcessError: a process was killed.
     """
-    backend, where = parse_workers(workers)
+    where = parse_workers(workers)
     report = progress or (lambda done, total: None)
     found: dict[int, Result] = {}
     if where == 1:
@@ -82,7 +80,7 @@ def parallel_map(
             report(len(found), len(items))
     elif items:
         pickled = _pickled(task)
-        with BACKENDS[backend](where, len(items)) as submit:
+        with _dask(where) if isinstance(where, str) else _loky(min(where, len(items))) as submit:
             index_of = {submit(pickled, item): index for index, item in enumerate(items)}
             for future in as_completed(index_of):
                 found[index_of[future]] = future.result()
@@ -117,9 +115,8 @@ def _call_on_cluster(task: bytes, item: Any) -> Any:
 
 
 @contextmanager
-def _loky(workers: int, items: int) -> Iterator[Submit]:
+def _loky(workers: int) -> Iterator[Submit]:
     get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
-    workers = min(workers, items)  # an executor starts all of them at once
     how = {"timeout": IDLE_S, "initializer": _end_with_parent, "initargs": (os.getpid(),), "env": ONE_THREAD}
     executor = get_reusable_executor(workers, **how)
     try:
@@ -144,7 +141,7 @@ def _end_with_parent(parent: int) -> None:
 
 
 @contextmanager
-def _dask(address: str, items: int) -> Iterator[Submit]:
+def _dask(address: str) -> Iterator[Submit]:
     distributed = require("distributed", what="a Dask cluster")
     try:
         client = distributed.Client(address, timeout=10)
@@ -152,21 +149,3 @@ def _dask(address: str, items: int) -> Iterator[Submit]:
         raise ConnectionError(f"no dask scheduler answers at {address}: {error}") from error
     with client:  # closing it cancels what still runs
         yield partial(client.get_executor(pure=False).submit, _call_on_cluster)
-
-
-@contextmanager
-def _ray(address: str, items: int) -> Iterator[Submit]:
-    ray = require("ray", what="a Ray cluster")
-    joined = not ray.is_initialized()
-    if joined:
-        ray.init(address=address or "auto", log_to_driver=False, logging_level="ERROR")
-    try:
-        remote = ray.remote(_call_on_cluster)
-        yield lambda task, item: remote.remote(task, item).future()
-    finally:
-        if joined:
-            ray.shutdown()
-
-
-BACKENDS: dict[str, Callable[[Any, int], AbstractContextManager[Submit]]] = {"loky": _loky, "dask": _dask, "ray": _ray}
-"""Each is a context that gives a function to submit a pickled task with an item."""

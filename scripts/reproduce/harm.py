@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
-from asm_gym.evaluation.statistics import wilson_interval
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
@@ -269,7 +269,7 @@ def headline(frame: pd.DataFrame, guards: Sequence[str]) -> Table:
 
     def row(guard: str) -> tuple[str, ...]:
         own = healthy[healthy.guard == guard]
-        low, high = wilson_interval(int(own.success.sum()), len(own))
+        low, high = Share(int(own.success.sum()), len(own)).interval
         solved = f"{100 * own.success.mean():.1f} % ({100 * low:.1f} to {100 * high:.1f})" if len(own) else ""
         overridden = _percent(own.held.sum() / max(own.steps.sum(), 1)) if len(own) else ""
         shares = (avoided(kind, guard) for kind in (untrained, healthy))

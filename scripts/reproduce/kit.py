@@ -20,7 +20,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
-from scipy.stats import t as student
+from scipy.stats import ttest_1samp
 from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.figures import look, save
@@ -130,27 +130,26 @@ def where(records: Sequence[Record], **values: Any) -> list[Record]:
     return [r for r in records if all(r.get(name) == value for name, value in values.items())]
 
 
+def by_seed(records: Sequence[Record], value: str, **values: Any) -> pd.Series[float]:
+    """Return the mean of a value in each seed, over the records with these values."""
+    chosen = pd.DataFrame(where(records, **values), columns=["seed", value]).dropna()
+    return chosen.astype({value: float}).groupby("seed")[value].mean()
+
+
 def over_seeds(records: Sequence[Record], value: str, **values: Any) -> Spread:
     """Return mean and spread of the means of each seed, over the records with these values; NaN without records."""
-    chosen = [r for r in where(records, **values) if r.get(value) is not None]
-    means = [np.mean([r[value] for r in where(chosen, seed=s)]) for s in dict.fromkeys(r["seed"] for r in chosen)]
-    return Spread.of([float(mean) for mean in means]) if means else Spread(float("nan"), float("nan"))
+    means = by_seed(records, value, **values)
+    return Spread(float(means.mean()), float(means.std()))
 
 
 def paired(records: Sequence[Record], value: str, one: Record, other: Record, **values: Any) -> Estimate:
     """Return the mean difference of ``one`` minus ``other``, seed by seed, with Student's 95 % interval."""
-
-    def by_seed(chosen: Record) -> dict[int, float]:
-        own = {r["seed"] for r in where(records, **values | chosen)}
-        return {seed: over_seeds(records, value, seed=seed, **values | chosen).mean for seed in own}
-
-    first, second = by_seed(one), by_seed(other)
-    difference = np.array([first[seed] - second[seed] for seed in sorted(first.keys() & second.keys())])
-    mean = float(difference.mean()) if len(difference) else float("nan")
+    first, second = (by_seed(records, value, **values | chosen) for chosen in (one, other))
+    difference = (first - second).dropna()
     if len(difference) < 2:
-        return Estimate(mean, float("-inf"), float("inf"))
-    half = float(student.ppf(0.975, len(difference) - 1) * difference.std(ddof=1) / np.sqrt(len(difference)))
-    return Estimate(mean, mean - half, mean + half)
+        return Estimate(float(difference.mean()), -np.inf, np.inf)
+    low, high = ttest_1samp(difference, 0.0).confidence_interval()
+    return Estimate(float(difference.mean()), float(low), float(high))
 
 
 # ------------------------------------------------------------------ tables and figures
