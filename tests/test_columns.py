@@ -17,7 +17,7 @@ from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import LogWarning, noted
 from asm_gym.data.rows import RowReader
 from asm_gym.evaluation.alarms import alarms_of, sensed_peak
-from asm_gym.evaluation.scored_episode import ScoredEpisode, TraceDetail
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.scripts.cli import main
 from asm_gym.spec import StreamSpec
 from tests.streams import arm_table
@@ -230,8 +230,7 @@ def test_alarms_of_one_cause_are_one_and_missing_data_are_apart():
     surprise, stream = np.zeros(300), np.zeros((300, 1), np.float32)
     surprise[[50, 60, 70, 200]] = 2.0  # at 50 Hz: a push, and another one
     surprise[65], stream[65] = np.inf, np.nan
-    detail = TraceDetail(np.zeros((300, 1)), ("q",), np.zeros(300, np.bool_), stream)
-    trace = ScoredEpisode("x", 0, 0.02, 1.0, surprise, detail=detail)
+    trace = ScoredEpisode("x", 0, 0.02, 1.0, surprise, attribution=stream, channels=("q",), stream=stream)
     found = alarms_of(trace)
     assert [(a.why, round(a.start, 2)) for a in found if a.why == "surprise"] == [
         ("surprise", 1.02),

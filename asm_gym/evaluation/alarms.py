@@ -66,9 +66,7 @@ def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
 
 def sensed_peak(trace: ScoredEpisode) -> float:
     """Return the largest surprise of an episode in rows that lack nothing: missing data are no degree of surprise."""
-    stream = None if trace.detail is None else trace.detail.stream
-    whole = np.ones(len(trace), np.bool_) if stream is None else ~np.isnan(stream).any(axis=1)
-    return float(trace.surprise[whole].max(initial=0.0))
+    return float(trace.surprise[~trace.missing].max(initial=0.0))
 
 
 def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[ScoredEpisode]:

@@ -144,20 +144,14 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
             Patch(color=ORANGE, alpha=0.3, label="fault active"),
             Line2D([], [], color=VERMILLION, linewidth=4, solid_capstyle="butt", label="in alarm"),
         ]
-        if any(len(_missing(trace)) for trace in traces):
+        if any(trace.missing.any() for trace in traces):
             handles.append(Patch(color=GREY, alpha=0.5, label="missing data"))
         fig.legend(handles=handles, loc="outside upper center", ncols=len(handles))
     return fig
 
 
-def _missing(trace: ScoredEpisode) -> list[tuple[int, int]]:
-    """The stretches of rows that lack a number."""
-    stream = None if trace.detail is None else trace.detail.stream
-    return [] if stream is None else spans(np.isnan(stream).any(axis=1))
-
-
 def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
-    for start, stop in _missing(trace):
+    for start, stop in spans(trace.missing):
         ax.axvspan(start * trace.dt, stop * trace.dt, color=GREY, alpha=0.5, linewidth=0)
     ax.plot(_times(trace), np.clip(trace.surprise, *_limits([trace])), color=BLUE, linewidth=1.5)
     ax.axhline(trace.threshold, color=BLACK, linewidth=1, linestyle=DASHED)
