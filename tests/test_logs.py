@@ -324,6 +324,16 @@ def test_a_last_row_that_was_cut_off_is_left_out_and_that_is_said(end, tmp_path)
     assert len(read_text(whole)["time"]) == 3
 
 
+def test_mixed_encodings_notes_between_rows_and_marks_for_nothing_are_read(tmp_path):
+    head, rows = "time,temperature [°C],q\n".encode(), b"0,20,1\n0.1,-,2\n# at 21 \xb0C\n0.2,22,4\n0.3,23,3\n"
+    (tmp_path / "x.csv").write_bytes(head + rows)
+    with noted() as notes:
+        episode = read(tmp_path / "x.csv")
+    assert [c.unit for c in episode.spec.channels] == ["°C", "1"]
+    np.testing.assert_array_equal(episode.stream[:, 0], [20, np.nan, 22, 23])
+    assert len(notes) == 2
+
+
 def test_json_lines_are_rows(tmp_path):
     rows = [{"t": 0.1 * k, "q": [k, -k], "tool": {"force": None if k == 3 else 2.0 * k}} for k in range(8)]
     path = written(tmp_path / "x.jsonl", "".join(json.dumps(row) + "\n" for row in rows) + '{"t": 0.8, "q"')

@@ -109,6 +109,10 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     if again:
         note(f"{path}: its header stands there {again + 1} times, and is left out")
         rows = [(n, line) for n, line in rows if line.strip() != first.strip()]
+    comments = sum(line.lstrip().startswith("#") for _, line in rows)
+    if comments:
+        note(f"{path}: {comments} lines behind a # are left out")
+        rows = [(n, line) for n, line in rows if not line.lstrip().startswith("#")]
     if not complete and len(rows) > 1 and _cut_off(dialect, rows[-2][1], rows[-1][1], len(names)):
         note(f"{path}: its last line was cut off, and is left out")
         rows = rows[:-1]
@@ -125,6 +129,7 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
             sep=r"\s+" if dialect.separator == " " else dialect.separator,
             header=None,
             names=list(range(widest)),
+            na_values=["-", "--"],
             float_precision="round_trip",
             low_memory=False,
         )
