@@ -159,7 +159,9 @@ def _header_at(lines: Sequence[str]) -> int:
         dialect = Dialect.of(line)
         with suppress(ValueError):
             size = len(_cells_of_header(dialect, line))
-            below = [dialect.cells(other) for other in lines[at + 1 : at + 1 + AGREE]]
+            if at and any(dialect.is_number(cell) for cell in dialect.cells(line) if cell.strip()):
+                continue  # it is a row
+            below = [dialect.cells(other) for other in lines[at + 1 :] if not other.lstrip().startswith("#")][:AGREE]
             agree = [len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below]
             numbers = [sum(dialect.is_number(c) for c in cells[:size] if c.strip()) for cells in below]
             if below and all(agree) and max(numbers) > 0 and numbers[-1] > 0:
