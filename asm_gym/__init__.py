@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+if not hasattr(gymnasium.vector, "AutoresetMode"):  # since 1.1
+    raise ImportError(
+        f"asm-gym needs Gymnasium 1.1 or newer, got {gymnasium.__version__}: pip install --upgrade gymnasium"
+    )
+
 from asm_gym.extras import needed_for
 from asm_gym.tasks import TASKS
 from asm_gym.version import __version__  # noqa: F401

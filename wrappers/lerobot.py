@@ -28,7 +28,7 @@ from asm_gym.data.gaps import blamed, reason
 from asm_gym.data.rows import ClockWentBack, Pace
 from asm_gym.guard.checks import check_monitor
 from asm_gym.guard.engine import Engine
-from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
 from asm_gym.monitors import Monitor, load_monitor
@@ -164,7 +164,7 @@ class LeRobotGuard:
         grip = np.flatnonzero([bool(_GRIPPER.fullmatch(name.lower())) for name in self._names])
         robots = Robots(1, low, high, rest=unknown, grip=grip, dt=dt, meaning=self._meaning())
         quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
-        reaction = "hold" if self.on_alarm != "monitor" else "monitor"
+        reaction: OnAlarmName = "hold" if self.on_alarm != "monitor" else "monitor"
         return Engine(robots, self.monitor, GuardOptions(reaction, quiet_rows, 1.0, contact_limits=None))
 
     def _meaning(self) -> ActionMeaning:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection.adaptive import AdaptiveThreshold
@@ -16,8 +16,10 @@ from asm_gym.policies.base import Policy
 from asm_gym.validation import check_flag, check_number, short_repr
 
 ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")  # names that ``on_alarm`` takes
+OnAlarmName = Literal["monitor", "hold", "retract", "comply", "recall", "graded", "terminate"]
+"""The same for a type checker, which finds a name that is misspelt."""
 
-OnAlarm = str | Policy | Callable[[Any], Policy]
+OnAlarm = OnAlarmName | Policy | Callable[[Any], Policy]
 """What ``on_alarm`` takes: a name, a policy, or what makes a policy for an environment."""
 
 TRY_AFTER_S, GIVE_UP_AFTER_S, GO_ON_S = 0.5, 3.0, 5.0
@@ -90,7 +92,8 @@ class GuardOptions:
         Raises:
             ValueError: there are responses, and nobody asks for them.
         """
-        chosen: OnAlarm = (GRADED if names_causes else "hold") if self.on_alarm is None else self.on_alarm
+        usual: OnAlarmName = "graded" if names_causes else "hold"
+        chosen: OnAlarm = usual if self.on_alarm is None else self.on_alarm
         if self.responses is not None and not (isinstance(chosen, str) and chosen == GRADED):
             raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={short_repr(chosen)}")
         return chosen
