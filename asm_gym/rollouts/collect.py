@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +22,7 @@ from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, Interventio
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
+from asm_gym.guard.options import OnAlarmName
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
 from asm_gym.policies.scripted.base import Style
@@ -255,7 +256,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     monitor = _memory(memory, memory.stat().st_mtime_ns)
     infos: list[dict[str, Any]] = []
     with staged(trial, config) as env:
-        guarded = NeuralASMSafety(env, monitor, on_alarm=trial.on_alarm)
+        guarded = NeuralASMSafety(env, monitor, on_alarm=cast(OnAlarmName, trial.on_alarm))
         success = play(trial, config, guarded, infos.append)
     asm = [info["asm"] for info in infos]
     rows = len(asm[0]["surprises"])  # of each control step
