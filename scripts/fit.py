@@ -198,7 +198,7 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         return
     left = f"it leaves {model.left_by_body:.2f} of what is left of unseen torques without it"
     if model.links is None:
-        yield f"{args.urdf} is not used, for {left}: does it hold this arm's masses, and name joints as the log?"
+        yield f"{args.urdf} is not used, for {left}: see that it holds this arm's masses, and names joints as the log"
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
     how = (
