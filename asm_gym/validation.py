@@ -11,6 +11,7 @@ import difflib
 import inspect
 import math
 import operator
+import sys
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -63,7 +64,7 @@ def check_number(
     # NaN alone differs from itself.
     if number != number or not _within(number, **bounds):
         raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
-    if not infinite and abs(number) > np.finfo(np.float64).max:
+    if not infinite and abs(number) > sys.float_info.max:  # NumPy would convert a long integer
         raise ValueError(f"{name} must be finite, got {short_repr(value)}")
     return number
 

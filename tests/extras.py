@@ -138,7 +138,7 @@ def matrix(asked: str = "") -> int:
             Path(folder, "pins.txt").write_text("".join(pins))
             steps = (
                 f"git clone -q --depth 1 file://{ROOT} tree",
-                f"uv venv -q --python {python} tree/.venv",
+                f"uv venv -q --seed --python {python} tree/.venv",
                 f"uv pip install -q --python tree/.venv -c pins.txt -e 'tree[dev]' '{numpy}'",
                 f"uv pip install -q --python tree/.venv --no-deps {ROBOSUITE}",
                 "touch tree/.venv/.installed",

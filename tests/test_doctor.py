@@ -84,7 +84,7 @@ def test_the_first_backend_that_draws_is_taken_and_looked_for_once(
     assert dict(os.environ) == before
 
 
-@pytest.mark.parametrize(("name", "version"), [("mujoco", "3.3.7"), ("robosuite", "1.4.1")])
+@pytest.mark.parametrize(("name", "version"), [("mujoco", "3.12.0"), ("mujoco", "3.3.7"), ("robosuite", "1.4.1")])
 def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name: str, version: str) -> None:
     machine(**{name: version})
     check = failed().pop(name)
@@ -93,7 +93,7 @@ def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name
     assert ("--no-deps" in check.remedy) == (name == "robosuite")  # which brings NumPy below 2
 
 
-@pytest.mark.parametrize(("name", "fits", "fails"), [("mujoco", "3.9.0", "3.3.7"), ("robosuite", "1.5.2", "1.5.1")])
+@pytest.mark.parametrize(("name", "fits", "fails"), [("mujoco", "3.11.0", "3.12.0"), ("robosuite", "1.5.2", "1.5.1")])
 def test_a_simulator_out_of_range_is_refused_before_it_is_imported(
     name: str, fits: str, fails: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

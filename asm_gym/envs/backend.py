@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
 from types import ModuleType, SimpleNamespace
@@ -56,30 +55,15 @@ def _required() -> Any:
 
 
 def _fit_to_mujoco() -> None:
-    """Mend what robosuite 1.5.2 asks of MuJoCo and newer ones answer otherwise.
-
-    From 3.10 on ``mj_fullM`` takes other arguments, from 3.11 on ``data.qM`` is gone, and from 3.12 on a type of joint
-    equals no NumPy integer on its right.
-    """
+    """Mend robosuite 1.5.2's mass matrix: MuJoCo 3.10 changed the arguments of ``mj_fullM``, 3.11 removed ``qM``."""
     from robosuite.controllers.parts import controller
-    from robosuite.utils.binding_utils import MjData, MjModel
+    from robosuite.utils.binding_utils import MjData
 
     def whole_mass_matrix(model: mujoco.MjModel, whole: Floats, triangle: Floats) -> None:
         rows, columns = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
         whole[:] = 0.0
         whole[rows, columns] = whole[columns, rows] = triangle
 
-    def address(first: str, wide: dict[int, int]) -> Callable[[Any, str], Any]:
-        def of(model: Any, name: str) -> Any:
-            joint = model.joint_name2id(name)
-            at, count = getattr(model, first)[joint], wide.get(int(model.jnt_type[joint]), 1)
-            return at if count == 1 else (at, at + count)
-
-        return of
-
-    free, ball = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
-    MjModel.get_joint_qpos_addr = address("jnt_qposadr", {free: 7, ball: 4})
-    MjModel.get_joint_qvel_addr = address("jnt_dofadr", {free: 6, ball: 3})
     MjData.qM = property(lambda data: data._data.M)
     controller.mujoco = SimpleNamespace(mj_fullM=whole_mass_matrix)
 
