@@ -329,7 +329,7 @@ class Foreseeing(CueMonitor):
 
 @pytest.mark.parametrize("name", [*REFLEXES, GRADED])
 def test_every_reflex_acts_in_the_step_after_an_alarm_by_an_action_of_its_own(name, lift):
-    env = NeuralASMSafety(lift, Foreseeing([3], lift.unwrapped.stream_spec), on_alarm=name)
+    env = NeuralASMSafety(lift, Foreseeing([3], lift.unwrapped.stream_spec), on_alarm=name, contact_limits=None)
     env.reset(seed=0)
     wanted = np.full(7, 0.75, np.float32)
     said = [env.step(wanted)[4]["asm"] for _ in range(5)]

@@ -110,7 +110,8 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
                     f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
                 )
             spaces = env.single_observation_space, env.single_action_space
-            return StreamSpec.from_spaces(*spaces, control_period(env)), False  # type: ignore[arg-type]
+            dt = float(Members(env).first("dt") or control_period(env))  # type: ignore[arg-type]
+            return StreamSpec.from_spaces(*spaces, dt), False
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:
             first.require(other, "the first environment")
