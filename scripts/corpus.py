@@ -46,9 +46,9 @@ def make(args: Args, console: Console) -> None:
             for number in range(min(args.rounds, total)):
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
                     record_corpus(args.out, sources[part], number, total, args.workers, progress)
-    entries = Corpus.open(args.out).entries
-    hours = sum(e.seconds for e in entries if e.label.role != "faulty") / 3600
-    console.print(f"Corpus {VERSION} in {args.out}: {len(entries)} episodes, {hours:.2f} healthy hours")
+    files = Corpus.open(args.out).files
+    hours = files.seconds[files.role != "faulty"].sum() / 3600
+    console.print(f"Corpus {VERSION} in {args.out}: {len(files)} episodes, {hours:.2f} healthy hours")
 
 
 main = partial(run, "corpus", Args, make)

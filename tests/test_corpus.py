@@ -51,7 +51,7 @@ def test_what_is_there_is_not_recorded_again(recorded, monkeypatch):
     folder, made = recorded
     monkeypatch.setattr("time.localtime", lambda *_: (2031, 5, 17, 12, 0, 0, 0, 1, 0))  # another day, the same bytes
     assert len(made) == len(set(made)) == 9
-    (folder / Corpus.open(folder).entries[0].path).unlink()
+    (folder / Corpus.open(folder).files.index[0]).unlink()
     with pytest.raises(ValueError, match=r"cut off: 1 of 9 files are missing, such as scripted/episodes/Lift"):
         Corpus.open(folder)
     record_round(folder, 0)
@@ -64,13 +64,13 @@ def test_episodes_are_chosen_by_role_policy_and_task_and_checked(recorded):
     assert len(corpus.episodes("nominal")) == 6
     assert [e.label.task for e in corpus.episodes(policies=("stack_sac",))] == ["Stack"] * 2
     assert {e.label.role for e in corpus.episodes("fit", "calibration", tasks=("Lift",))} == {"fit", "calibration"}
-    seconds = sum(e.seconds for e in corpus.entries)
+    seconds = corpus.files.seconds.sum()
     assert seconds == pytest.approx(sum(len(e) * e.spec.dt for e in corpus.episodes()))
 
 
 def test_one_changed_bit_is_refused(recorded):
     corpus = Corpus.open(recorded[0])
-    path = corpus.folder / corpus.entries[3].path
+    path = corpus.folder / corpus.files.index[3]
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)

@@ -48,7 +48,7 @@ from asm_gym.evaluation.resampling import Calibration, Windows, by_episode, inte
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.scoring import fitted
 from asm_gym.evaluation.statistics import Rate, Share, auroc
-from asm_gym.evaluation.tables import Column, Table, tabulate
+from asm_gym.evaluation.tables import Table, tabulate
 from tests.streams import sine_episodes
 
 
@@ -374,7 +374,7 @@ def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
 
 
 def test_a_new_column_is_a_heading_and_a_function():
-    table = tabulate("numbers", (Column("n", str), Column("squared", lambda n: f"{n * n:d}")), [2, 3])
+    table = tabulate("numbers", {"n": str, "squared": lambda n: f"{n * n:d}"}, [2, 3])
     assert (table.headings, table.rows) == (["n", "squared"], [("2", "4"), ("3", "9")])
     with pytest.raises(ValueError, match="2 columns, but a row of 1"):
         Table("t", ("a", "b"), [("x",)])

@@ -16,7 +16,7 @@ from asm_gym.data.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.scoring import NOMINAL_ROLES, Recordings
 from asm_gym.rollouts import collect, progress
 from asm_gym.rollouts.collect import environment
-from asm_gym.rollouts.run_folder import claimed, locked, make_missing
+from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.scripts.cli import main
 from tests.fakes import FakeEnv
 from tests.streams import sine_episodes
@@ -100,9 +100,9 @@ def test_arguments_of_the_environment_may_be_lists_dictionaries_and_arrays():
 HOLD = """
 import sys, time
 from pathlib import Path
-from asm_gym.rollouts.run_folder import locked
+from asm_gym.rollouts.run_folder import claimed
 
-with locked(Path(sys.argv[1])):
+with claimed(Path(sys.argv[1]), "run.json", {}):
     print("held", flush=True)
     time.sleep(600)
 """
@@ -119,17 +119,17 @@ def holder(tmp_path):
 
 
 def test_a_second_command_is_refused_until_the_first_ends_even_if_it_is_killed(holder, tmp_path, capsys):
-    with pytest.raises(BlockingIOError, match="in use"), locked(tmp_path):
+    with pytest.raises(BlockingIOError, match="in use"), claimed(tmp_path, "run.json", {}):
         pass
-    assert main(["collect", PENDULUM, "--policy", "hold", "--out", str(tmp_path)]) == 2
+    assert main(["collect", PENDULUM, "--policy", "sway", "--out", str(tmp_path)]) == 2
     assert "in use" in capsys.readouterr().err
     holder.kill()
     holder.wait()
-    with pytest.raises(ZeroDivisionError), locked(tmp_path):
+    with pytest.raises(ZeroDivisionError), claimed(tmp_path, "run.json", {}):
         raise ZeroDivisionError
-    with locked(tmp_path):
+    with claimed(tmp_path, "run.json", {}):
         pass
-    assert not list(tmp_path.iterdir())
+    assert [p.name for p in tmp_path.iterdir()] == ["run.json"]
 
 
 def test_a_run_continues_with_its_settings_and_is_refused_with_others(tmp_path):

@@ -136,7 +136,6 @@ def visible_kinds(detectability: Sequence[Detectability]) -> dict[tuple[str, str
 class Bound(NamedTuple):
     """The results of an ideal observer, which no monitor can surpass."""
 
-    name: str
     auroc: float
     found: Mapping[AlarmRate, Share]
     delays: Delays | None
@@ -146,7 +145,6 @@ class Bound(NamedTuple):
         """Return the bound on these faults, at ``RATES`` and at a false-alarm ``rate``."""
         n = len(faults)
         return cls(
-            IDEAL,
             auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults])))) if n else math.nan,
             found={by_episode(r): Share(round(n * mean_power(faults, r)), n) for r in {*RATES, rate} if n},
             delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in faults]),

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from scipy import stats
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import HOUR
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult, Bound
+from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Outcomes, in_words
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour, interval, rate_text
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Estimate, Rate, Share
-from asm_gym.evaluation.tables import Column, Table, count, percent, tabulate
+from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors.calibration import AlarmRate
-
-Compared = DetectionMetrics | Bound
-"""A monitor, or the ideal observer, whose row has fewer cells."""
 
 UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely than this
 
@@ -40,15 +38,15 @@ def _before_and_after(measure: Callable[[Outcomes], str]) -> Callable[[Detection
     return lambda m: " → ".join(measure(outcome) for outcome in m.outcomes)
 
 
-CONDITION_COLUMNS: Sequence[Column[DetectionMetrics]] = (
-    Column("", lambda m: m.name),
-    Column("\nepisodes", lambda m: str(len(m.watched))),
-    Column("\ndetected", lambda m: str(m.detected.k) if m.detected.n else ""),
-    Column("delay [ms]\nmedian, 95 %", _delays),
-    Column("false\nalarms", lambda m: str(metrics.false_alarms(m.watched).k)),
-    Column("tasks\nsolved", _before_and_after(lambda o: str(o.success.k))),
-    Column("peak\nforce [N]", _before_and_after(lambda o: f"{o.peak_force:.1f}")),
-)
+CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
+    "": lambda m: m.name,
+    "\nepisodes": lambda m: str(len(m.watched)),
+    "\ndetected": lambda m: str(m.detected.k) if m.detected.n else "",
+    "delay [ms]\nmedian, 95 %": _delays,
+    "false\nalarms": lambda m: str(metrics.false_alarms(m.watched).k),
+    "tasks\nsolved": _before_and_after(lambda o: str(o.success.k)),
+    "peak\nforce [N]": _before_and_after(lambda o: f"{o.peak_force:.1f}"),
+}
 """One monitor by condition: detection with the policy alone; solved and force: alone → with the response."""
 
 
@@ -59,18 +57,17 @@ def headline(rows: Sequence[DetectionMetrics]) -> str:
     return f"{count(found)} faults detected; {count(false)} nominal episodes with a false alarm."
 
 
-def monitor_columns(result: BenchmarkResult) -> Sequence[Column[Compared]]:
+def monitor_columns(promises: Sequence[AlarmRate]) -> dict[str, Callable[[DetectionMetrics], str]]:
     """Return the columns of monitors side by side."""
-    promises = [by_episode(rate) for rate in sorted({*RATES, result.rate})] + [by_hour(rate) for rate in PER_HOUR]
-    return (
-        Column("Monitor", lambda m: m.name),
-        Column("AUROC, same steps", _auroc),
-        *(Column(f"Found at {rate_text(promise)}", _found(promise)) for promise in promises),
-        Column("Median delay [ms]", lambda m: milliseconds(m.delays)),
-        Column("False alarms", _of_monitor(_false_alarms)),
-        Column("Alarms/h", _of_monitor(lambda m: metrics.hourly_alarms(m.nominal).text)),
-        Column("Right channel", _of_monitor(lambda m: percent(metrics.attribution_accuracy(m.faulty)))),
-    )
+    return {
+        "Monitor": lambda m: m.name,
+        "AUROC, same steps": lambda m: "{:.3f} ({:.3f}–{:.3f})".format(*interval(m.auroc, m.draws.auroc)),
+        **{f"Found at {rate_text(promise)}": partial(_found, promise=promise) for promise in promises},
+        "Median delay [ms]": lambda m: milliseconds(m.delays),
+        "False alarms": _false_alarms,
+        "Alarms/h": lambda m: metrics.hourly_alarms(m.nominal).text,
+        "Right channel": lambda m: percent(metrics.attribution_accuracy(m.faulty)),
+    }
 
 
 BRIEF = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right channel")
@@ -90,26 +87,28 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"crashed ({crashed}), and faults in such scenes."
         + (f" Kinds that cannot be detected: {', '.join(hidden)}." if hidden else "")
     )
-    return tabulate(caption, monitor_columns(result), _compared(result))
+    promises = [by_episode(rate) for rate in sorted({*RATES, result.rate})] + [by_hour(rate) for rate in PER_HOUR]
+    monitors = tabulate(caption, monitor_columns(promises), result.on_visible)
+    ideal = result.bound([kind for kind, seen in result.visible.items() if seen])
+    found = [percent(ideal.found.get(promise)) for promise in promises]
+    first = (IDEAL, f"{ideal.auroc:.3f}", *found, milliseconds(ideal.delays), "", "", "")
+    return Table(caption, monitors.headings, [first, *monitors.rows])
 
 
 def brief_monitors_table(result: BenchmarkResult) -> Table:
     """Return the chief columns without their intervals, narrow enough for a terminal."""
-    wanted = {*BRIEF, f"Found at {rate_text(result.promise)}"}
-    columns = [column for column in monitor_columns(result) if column.heading in wanted]
-    rows = [tuple(column.cell(m).partition(" (")[0] for column in columns) for m in _compared(result)]
-    return Table(f"found within {result.window_s:g} s of the onset", [column.heading for column in columns], rows)
-
-
-def _compared(result: BenchmarkResult) -> list[Compared]:
-    return [result.bound([kind for kind, seen in result.visible.items() if seen]), *result.on_visible]
+    table = monitors_table(result)
+    headings = [h for h in table.headings if h in BRIEF or h == f"Found at {rate_text(result.promise)}"]
+    columns = [table.headings.index(heading) for heading in headings]
+    rows = [[str(row[n]).partition(" (")[0] for n in columns] for row in table.rows]
+    return Table(f"found within {result.window_s:g} s of the onset", headings, rows)
 
 
 def kinds_table(result: BenchmarkResult) -> Table:
     """Return AUROC and faults found of every kind."""
     rows = []
     for kind, seen in result.visible.items():
-        own: list[Compared] = [result.bound([kind]), *(m.only([kind]) for m in result.monitors.values())]
+        own = [result.bound([kind]), *(m.only([kind]) for m in result.monitors.values())]
         found = (f"{m.auroc:.2f} / {percent(m.found.get(result.promise))}" for m in own)
         rows.append((in_words(kind) if seen else f"({in_words(kind)})", *found))
     return Table(
@@ -207,34 +206,17 @@ def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str
     return f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})" + ", broken" * broken
 
 
-def _of_monitor(cell: Callable[[DetectionMetrics], str]) -> Callable[[Compared], str]:
-    """Return a cell that is empty for the ideal observer, who raises no alarms."""
-    return lambda m: cell(m) if isinstance(m, DetectionMetrics) else ""
-
-
 def _false_alarms(m: DetectionMetrics) -> str:
     share = metrics.false_alarms(m.nominal)
     low, high = share.interval
     return f"{count(share)} ({100 * low:.0f}–{100 * high:.0f} %)" if share.n else ""
 
 
-def _auroc(m: Compared) -> str:
-    if not isinstance(m, DetectionMetrics):
-        return f"{m.auroc:.3f}"
-    found = interval(m.auroc, m.draws.auroc)
-    return f"{found.value:.3f} ({found.low:.3f}–{found.high:.3f})"
-
-
-def _found(promise: AlarmRate) -> Callable[[Compared], str]:
-    def cell(m: Compared) -> str:
-        share = m.found.get(promise)
-        if not isinstance(m, DetectionMetrics):
-            return percent(share)
-        if share is None:
-            return "" if promise.per == HOUR else f"needs {conformal_episodes(promise.rate)}"
-        if promise not in m.draws.found:
-            return percent(share)
-        found = interval(share.value, m.draws.found[promise])
-        return f"{100 * found.value:.0f} % ({100 * found.low:.0f}–{100 * found.high:.0f})"
-
-    return cell
+def _found(m: DetectionMetrics, promise: AlarmRate) -> str:
+    share = m.found.get(promise)
+    if share is None:
+        return "" if promise.per == HOUR else f"needs {conformal_episodes(promise.rate)}"
+    if promise not in m.draws.found:
+        return percent(share)
+    found = interval(share.value, m.draws.found[promise])
+    return f"{100 * found.value:.0f} % ({100 * found.low:.0f}–{100 * found.high:.0f})"

@@ -1,10 +1,10 @@
-"""Tables: their columns, each a heading and a function of a row's subject, and how they are written as text."""
+"""Tables, and how they are written as text."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import TypeVar
 
 from rich.markup import escape
 from rich.table import Table as RichTable
@@ -37,17 +37,10 @@ class Table:
         return made
 
 
-class Column(NamedTuple, Generic[Subject]):
-    """A heading, and the function that gives its cell."""
-
-    heading: str
-    cell: Callable[[Subject], str]
-
-
-def tabulate(caption: str, columns: Sequence[Column[Subject]], subjects: Iterable[Subject]) -> Table:
-    """Make a row for each subject."""
-    rows = [tuple(column.cell(subject) for column in columns) for subject in subjects]
-    return Table(caption, [column.heading for column in columns], rows)
+def tabulate(caption: str, columns: Mapping[str, Callable[[Subject], str]], subjects: Iterable[Subject]) -> Table:
+    """Make a row for each subject; ``columns`` hold the function of a cell by heading."""
+    rows = [tuple(cell(subject) for cell in columns.values()) for subject in subjects]
+    return Table(caption, list(columns), rows)
 
 
 def markdown(table: Table) -> str:

@@ -6,6 +6,7 @@ The joint, axis, direction or reading that a fault acts on is drawn from the epi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,10 +53,6 @@ class Drawn(NamedTuple):
     def encoder(self) -> dict[str, Any]:
         return {"channel": f"{self.prefix}joint_position", "element": self.joint}
 
-    @property
-    def when(self) -> dict[str, Any]:
-        return {"onset": self.onset, "seed": self.seed}
-
 
 Kind = Callable[[Drawn, int], Fault]
 
@@ -63,54 +60,48 @@ KINDS: Registry[Kind] = Registry(
     "kind of fault",
     "asm_gym.faults.suite:KINDS",
     {
-        "push": lambda d, s: body.Push(
-            body=d.link, newtons=(8.0, 20.0, 40.0)[s], direction=d.direction, duration=10, **d.when
-        ),
-        "payload": lambda d, s: body.Payload(body=d.hand, kilograms=(0.25, 0.75, 2.0)[s], **d.when),
-        "collision": lambda d, s: body.Collision(body=d.hand, stiffness=(500, 2000, 8000)[s], duration=20, **d.when),
-        "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=(50, 150, 400)[s], **d.when),
-        "held_by_person": lambda d, s: body.HeldByPerson(
-            body=d.link, stiffness=(100, 300, 800)[s], duration=30, **d.when
-        ),
-        "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=(0.9, 0.7, 0.4)[s], **d.when),
-        "stuck_joint": lambda d, s: actuator.StuckJoint(joint=d.joint, duration=(4, 12, None)[s], **d.when),
+        "push": lambda d, s: body.Push(body=d.link, newtons=(8.0, 20.0, 40.0)[s], direction=d.direction, duration=10),
+        "payload": lambda d, s: body.Payload(body=d.hand, kilograms=(0.25, 0.75, 2.0)[s]),
+        "collision": lambda d, s: body.Collision(body=d.hand, stiffness=(500, 2000, 8000)[s], duration=20),
+        "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=(50, 150, 400)[s]),
+        "held_by_person": lambda d, s: body.HeldByPerson(body=d.link, stiffness=(100, 300, 800)[s], duration=30),
+        "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=(0.9, 0.7, 0.4)[s]),
+        "stuck_joint": lambda d, s: actuator.StuckJoint(joint=d.joint, duration=(4, 12, None)[s]),
         "joint_friction": lambda d, s: actuator.JointFriction(
-            joint=d.joint, newton_metres=(0.5, 2, 6)[s], viscous=(0.5, 2, 6)[s], **d.when
+            joint=d.joint, newton_metres=(0.5, 2, 6)[s], viscous=(0.5, 2, 6)[s]
         ),
-        "backlash": lambda d, s: actuator.Backlash(joint=d.joint, gap=(0.003, 0.01, 0.03)[s], **d.when),
-        "gripper_opens": lambda d, s: actuator.GripperOpens(duration=(2, 8, None)[s], **d.when),
-        "weak_gripper": lambda d, s: actuator.WeakGripper(strength=(0.5, 0.2, 0.05)[s], **d.when),
-        "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=(0.01, 0.03, 0.1)[s], **d.when),
-        "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=(5e-4, 2e-3, 8e-3)[s], **d.when),
-        "frozen_encoder": lambda d, s: sensor.FrozenEncoder(joint=d.joint, duration=(5, 15, None)[s], **d.when),
-        "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=(2e-3, 1e-2, 5e-2)[s], **d.when),
-        "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=(0.02, 0.1, 0.5)[s], **d.when),
-        "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s], **d.when),
-        "encoder_dropout": lambda d, s: sensor.Dropout(**d.encoder, probability=(0.05, 0.2, 0.5)[s], **d.when),
+        "backlash": lambda d, s: actuator.Backlash(joint=d.joint, gap=(0.003, 0.01, 0.03)[s]),
+        "gripper_opens": lambda d, s: actuator.GripperOpens(duration=(2, 8, None)[s]),
+        "weak_gripper": lambda d, s: actuator.WeakGripper(strength=(0.5, 0.2, 0.05)[s]),
+        "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=(0.01, 0.03, 0.1)[s]),
+        "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=(5e-4, 2e-3, 8e-3)[s]),
+        "frozen_encoder": lambda d, s: sensor.FrozenEncoder(joint=d.joint, duration=(5, 15, None)[s]),
+        "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=(2e-3, 1e-2, 5e-2)[s]),
+        "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=(0.02, 0.1, 0.5)[s]),
+        "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s]),
+        "encoder_dropout": lambda d, s: sensor.Dropout(**d.encoder, probability=(0.05, 0.2, 0.5)[s]),
         "torque_scale": lambda d, s: sensor.Scale(
-            channel=d.prefix + "measured_torque", element=d.joint, factor=(1.05, 1.15, 1.5)[s], **d.when
+            channel=d.prefix + "measured_torque", element=d.joint, factor=(1.05, 1.15, 1.5)[s]
         ),
         "wrist_bias": lambda d, s: sensor.Bias(
-            channel=d.prefix + "wrist_force", element=d.translation, amount=(0.5, 2.0, 8.0)[s], **d.when
+            channel=d.prefix + "wrist_force", element=d.translation, amount=(0.5, 2.0, 8.0)[s]
         ),
-        "frozen_wrist": lambda d, s: sensor.Freeze(
-            channel="wrist_force", element=None, duration=(5, 15, None)[s], **d.when
-        ),
-        "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s], **d.when),
-        "action_drop": lambda d, s: action.ActionDrop(probability=(0.1, 0.3, 0.7)[s], **d.when),
-        "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s], **d.when),
-        "action_repeat": lambda d, s: action.ActionRepeat(steps=(2, 4, 8)[s], **d.when),
-        "sign_flip": lambda d, s: action.SignFlip(axis=d.translation, duration=(3, 10, None)[s], **d.when),
-        "action_noise": lambda d, s: action.ActionNoise(share=(0.15, 0.4, 1.0)[s], **d.when),
-        "adversary": lambda d, s: action.Adversary(size=(0.05, 0.15, 0.4)[s], **d.when),
-        "slip": lambda d, s: object.Slip(friction=(0.4, 0.15, 0.03)[s], **d.when),
-        "snatch": lambda d, s: object.Snatch(newtons=(3, 10, 30)[s], direction=d.direction, duration=10, **d.when),
-        "teleport": lambda d, s: object.Teleport(offset=((0.01, 0.03, 0.08)[s], (0.01, 0.03, 0.08)[s], 0.0), **d.when),
-        "heavy_object": lambda d, s: object.Heavy(kilograms=(0.1, 0.4, 1.5)[s], **d.when),
-        "missing_object": lambda d, _: object.Missing(**d.when),
+        "frozen_wrist": lambda d, s: sensor.Freeze(channel="wrist_force", element=None, duration=(5, 15, None)[s]),
+        "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s]),
+        "action_drop": lambda d, s: action.ActionDrop(probability=(0.1, 0.3, 0.7)[s]),
+        "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s]),
+        "action_repeat": lambda d, s: action.ActionRepeat(steps=(2, 4, 8)[s]),
+        "sign_flip": lambda d, s: action.SignFlip(axis=d.translation, duration=(3, 10, None)[s]),
+        "action_noise": lambda d, s: action.ActionNoise(share=(0.15, 0.4, 1.0)[s]),
+        "adversary": lambda d, s: action.Adversary(size=(0.05, 0.15, 0.4)[s]),
+        "slip": lambda d, s: object.Slip(friction=(0.4, 0.15, 0.03)[s]),
+        "snatch": lambda d, s: object.Snatch(newtons=(3, 10, 30)[s], direction=d.direction, duration=10),
+        "teleport": lambda d, s: object.Teleport(offset=((0.01, 0.03, 0.08)[s], (0.01, 0.03, 0.08)[s], 0.0)),
+        "heavy_object": lambda d, s: object.Heavy(kilograms=(0.1, 0.4, 1.5)[s]),
+        "missing_object": lambda d, _: object.Missing(),
     },
 )
-"""The fault of each kind for an episode, at severity 0 to 2."""
+"""The fault of each kind for an episode, at severity 0 to 2; ``suite_fault`` sets when it begins."""
 
 
 def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
@@ -122,30 +113,27 @@ def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
 
 
 HARMLESS: dict[str, Callable[[Drawn], Fault]] = {
-    "lighter_object": lambda d: object.ObjectMass(factor=0.9, **_always(d)),
-    "heavier_object": lambda d: object.ObjectMass(factor=1.1, **_always(d)),
-    "smoother_object": lambda d: object.ObjectFriction(factor=0.9, **_always(d)),
-    "rougher_object": lambda d: object.ObjectFriction(factor=1.1, **_always(d)),
-    "touch": lambda d: body.Touch(body=d.link, direction=d.direction, duration=10, **d.when),
-    "noisy_sensors": lambda d: sensor.NoisySensors(**_always(d)),
+    "lighter_object": lambda d: object.ObjectMass(factor=0.9),
+    "heavier_object": lambda d: object.ObjectMass(factor=1.1),
+    "smoother_object": lambda d: object.ObjectFriction(factor=0.9),
+    "rougher_object": lambda d: object.ObjectFriction(factor=1.1),
+    "touch": lambda d: body.Touch(body=d.link, direction=d.direction, duration=10),
+    "noisy_sensors": lambda d: sensor.NoisySensors(),
 }
 """Each harmless variation for an episode; what is a property of the world holds from its beginning."""
-
-
-def _always(drawn: Drawn) -> dict[str, Any]:
-    return {"onset": 0, "seed": drawn.seed}
 
 
 def register_fault(name: str, make: Kind | str) -> None:
     """Register a kind of fault, in this process and in its workers; raise ValueError where the name is taken.
 
     Args:
-        make: is called with a ``Drawn`` and a severity, 0 to 2; or ``module:name`` of it.
+        make: is called with a ``Drawn`` and a severity, 0 to 2; or ``module:name`` of it. The fault that it returns
+            gets the onset and the seed of the episode.
 
     Example:
         >>> from asm_gym import register_fault
         >>> from asm_gym.faults import Push
-        >>> register_fault("nudge", lambda drawn, severity: Push(newtons=2.0 + severity, onset=drawn.onset))
+        >>> register_fault("nudge", lambda drawn, severity: Push(newtons=2.0 + severity))
     """
     KINDS.register(name, target(make))
 
@@ -167,13 +155,14 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
 def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:
     """Return the fault of one kind and severity for the episode with this seed."""
     check_choice("severity", severity, SEVERITIES)
-    return KINDS.find(kind)(draw(env, onset, seed), SEVERITIES.index(severity))
+    fault = KINDS.find(kind)(draw(env, onset, seed), SEVERITIES.index(severity))
+    return replace(fault, onset=onset, seed=seed)
 
 
 def harmless_variation(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> Fault:
     """Return one harmless variation for the episode with this seed."""
     check_choice("harmless variation", kind, HARMLESS)
-    return HARMLESS[kind](draw(env, onset, seed))
+    return replace(HARMLESS[kind](draw(env, onset, seed)), onset=onset if kind == "touch" else 0, seed=seed)
 
 
 def possible(kind: str, env: RobosuiteEnv) -> bool:

@@ -18,6 +18,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
+
 from asm_gym.data.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
 from asm_gym.files import written_whole
@@ -34,6 +36,8 @@ SKILLS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblyRound", "PickPlac
 """Tasks with episodes to learn from, to calibrate on and to test on."""
 MANIFEST = "manifest.json"
 _LABEL = ("task", "role", "kind", "severity", "seed", "onset")
+COLUMNS = ("policy", *_LABEL, "sha256", "seconds")
+"""Of the manifest: the policy, the episode's label, the file's checksum, and its length [s]."""
 
 
 class Source(NamedTuple):
@@ -64,26 +68,12 @@ ROUNDS = 5
 QUICK = {"skills": (Source("Lift", "scripted", 2, 2, 2, faults=True),), "hours": (Source("Lift", "lift_sac", 0, 0, 2),)}
 
 
-class Entry(NamedTuple):
-    """A file of the corpus: the policy, the episode's label, the file's checksum, and its length [s]."""
-
-    policy: str
-    label: EpisodeLabel
-    sha256: str
-    seconds: float
-
-    @property
-    def path(self) -> Path:
-        """Path in the corpus."""
-        return self.policy / self.label.path
-
-
 @dataclass(frozen=True)
 class Corpus:
-    """A recorded corpus."""
+    """A recorded corpus: its folder, and a row for each file, whose index is the file's path in the folder."""
 
     folder: Path
-    entries: tuple[Entry, ...]
+    files: pd.DataFrame
 
     @classmethod
     def open(cls, folder: str | Path) -> Corpus:
@@ -94,45 +84,41 @@ class Corpus:
             ValueError: it is of another version, damaged, or lacks files.
         """
         folder = Path(folder)
-        entries = read_manifest(folder)
-        missing = [entry.path for entry in entries if not (folder / entry.path).is_file()]
+        files = read_manifest(folder)
+        missing = [path for path in files.index if not (folder / path).is_file()]
         if missing:
             raise ValueError(
-                f"{folder} is cut off: {len(missing)} of {len(entries)} files are missing, such as {missing[0]}; "
+                f"{folder} is cut off: {len(missing)} of {len(files)} files are missing, such as {missing[0]}; "
                 "asm-gym corpus records what is missing"
             )
-        return cls(folder, tuple(entries))
+        return cls(folder, files)
 
-    def select(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Entry]:
-        """Select by role, policy and task; all where none is named."""
-        return [
-            entry
-            for entry in self.entries
-            if (not roles or entry.label.role in roles)
-            and (not policies or entry.policy in policies)
-            and (not tasks or entry.label.task in tasks)
-        ]
+    def select(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> pd.DataFrame:
+        """Select files by role, policy and task; all where none is named."""
+        chosen = self.files
+        for name, values in (("role", roles), ("policy", policies), ("task", tasks)):
+            chosen = chosen[chosen[name].isin(values)] if values else chosen
+        return chosen
 
-    def verified(self, entry: Entry) -> Path:
-        """Return the path of a file. Raises ValueError where it is damaged."""
-        path = self.folder / entry.path
-        if digest(path) != entry.sha256:
-            raise ValueError(f"{path} is damaged: its checksum is not the manifest's; delete it, and record it anew")
-        return path
+    def verified(self, path: str) -> Path:
+        """Return where a file is. Raises ValueError where it is damaged."""
+        where = self.folder / path
+        if digest(where) != self.files.sha256[path]:
+            raise ValueError(f"{where} is damaged: its checksum is not the manifest's; delete it, and record it anew")
+        return where
 
     def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
         """Load episodes by role, policy and task, and compare each with its checksum; all where none is named."""
-        return [load_episode(self.verified(entry)) for entry in self.select(*roles, policies=policies, tasks=tasks)]
+        return [load_episode(self.verified(path)) for path in self.select(*roles, policies=policies, tasks=tasks).index]
 
 
 def skill_files(folder: Path, tasks: Sequence[str] = SKILLS) -> list[Path]:
     """Return the files of the experts' skills, verified, and sorted by kind and severity."""
     corpus = Corpus.open(folder)
-    kinds = [(kind, severity) for kind in ("", *KINDS) for severity in ("", *SEVERITIES)]
+    order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
     chosen = corpus.select(policies=("scripted",), tasks=tasks)
-    return [
-        corpus.verified(entry) for entry in sorted(chosen, key=lambda e: kinds.index((e.label.kind, e.label.severity)))
-    ]
+    chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
+    return [corpus.verified(path) for path in chosen.index]
 
 
 def digest(path: Path) -> str:
@@ -140,20 +126,21 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def write_manifest(folder: Path, entries: Sequence[Entry]) -> None:
+def place(policy: str, label: EpisodeLabel) -> str:
+    """Return the path of a file in the corpus."""
+    return (policy / label.path).as_posix()
+
+
+def write_manifest(folder: Path, files: dict[str, dict[str, Any]]) -> None:
     """Write the manifest of these files, and the versions that recorded them."""
     about = {"format": "asm-gym corpus", "version": VERSION, "made_with": versions()}
-    lines = []
-    for entry in sorted(entries, key=lambda entry: entry.path):
-        label = {name: getattr(entry.label, name) for name in _LABEL}
-        lines.append(json.dumps({"policy": entry.policy, **label, "sha256": entry.sha256, "seconds": entry.seconds}))
-    files = ",\n".join(lines)
-    with written_whole(folder / MANIFEST) as file:
-        file.write(f'{json.dumps(about)[:-1]}, "files": [\n{files}\n]}}\n'.encode())
+    lines = ",\n".join(json.dumps(files[path]) for path in sorted(files))
+    with written_whole(folder / MANIFEST) as manifest:
+        manifest.write(f'{json.dumps(about)[:-1]}, "files": [\n{lines}\n]}}\n'.encode())
 
 
-def read_manifest(folder: Path) -> list[Entry]:
-    """Return the files of a corpus.
+def read_manifest(folder: Path) -> pd.DataFrame:
+    """Return the files of a corpus: a row each, by path.
 
     Raises:
         FileNotFoundError: no corpus is there.
@@ -164,10 +151,11 @@ def read_manifest(folder: Path) -> list[Entry]:
         raise FileNotFoundError(2, "no corpus is there; asm-gym corpus records one", str(path))
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
-        version, lines = about["version"], about["files"]
+        version, files = about["version"], about["files"]
         if version != VERSION:
             raise ValueError(f"it holds version {version!r} of the corpus, and this asm-gym reads {VERSION}")
-        return [Entry(e["policy"], EpisodeLabel(**{n: e[n] for n in _LABEL}), e["sha256"], e["seconds"]) for e in lines]
+        paths = [place(f["policy"], EpisodeLabel(**{name: f[name] for name in _LABEL})) for f in files]
+        return pd.DataFrame(files, paths, COLUMNS, dtype=object)
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} cannot be read: {error}; asm-gym corpus makes it anew") from error
 
@@ -193,17 +181,17 @@ def record_corpus(
     folder: Path, sources: Sequence[Source], number: int, rounds: int, workers: int | str, progress: Progress
 ) -> None:
     """Record what is missing of a round, source by source, and add it to the manifest."""
-    known = {entry.path: entry for entry in read_manifest(folder)} if (folder / MANIFEST).is_file() else {}
+    there = (folder / MANIFEST).is_file()
+    known: dict[str, dict[str, Any]] = read_manifest(folder).to_dict("index") if there else {}
     for source in sources:
         wanted = trials(source, number, rounds)
-        paths = [Path(source.policy) / trial.label.path for trial in wanted]
-        new = {path for path in paths if not (folder / path).is_file()}
-        known = {path: entry for path, entry in known.items() if path not in new}
+        paths = [place(source.policy, trial.label) for trial in wanted]
+        new = {path for path in paths if path not in known or not (folder / path).is_file()}
         files = record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress)
         for trial, path, file in zip(wanted, paths, files, strict=True):
-            if path not in known:
+            if path in new:
                 episode = load_episode(file)
                 seconds = round(len(episode) * episode.spec.dt, 6)
-                entry = Entry(source.policy, trial.label, digest(file), seconds)
-                known[entry.path] = entry
-        write_manifest(folder, list(known.values()))
+                label = {name: getattr(trial.label, name) for name in _LABEL}
+                known[path] = {"policy": source.policy, **label, "sha256": digest(file), "seconds": seconds}
+        write_manifest(folder, known)

@@ -46,7 +46,13 @@ def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]
         BlockingIOError: another command works in it.
     """
     ours = json.loads(json.dumps(settings, default=str)) | versions()
-    with locked(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK, blocking=False, is_singleton=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BlockingIOError(f"{folder} is in use by another process: wait for it, or name another --out") from None
+    try:
         path = folder / name
         if path.is_file():
             theirs = json.loads(path.read_text(encoding="utf-8"))
@@ -58,27 +64,10 @@ def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]
         with written_whole(path) as file:
             file.write((json.dumps(ours, indent=2) + "\n").encode())
         yield
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep other commands out of ``folder`` while the block runs; the system frees the lock of a dead process.
-
-    Raises:
-        BlockingIOError: another command works in it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK, blocking=False, is_singleton=False)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise BlockingIOError(f"{folder} is in use by another process: wait for it, or name another --out") from None
-    try:
-        yield
     finally:
         with suppress(OSError):  # Windows removes no open file
             (folder / LOCK).unlink()
-        lock.release()
+        lock.release()  # the system frees that of a dead process
 
 
 def make_missing(

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
@@ -32,7 +32,6 @@ ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
 ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
 BATCH, LOG_STD, CLONING_RATE = 256, -3.5, 1e-3
 """Of cloning: batch size; the actor's log standard deviation before tanh; learning rate."""
-BEST = "best.npz"  # file of the best agent of the evaluations
 
 Floats = NDArray[np.float32]
 
@@ -93,36 +92,6 @@ class GuardedSAC(SAC):
         super()._store_transition(buffer, kept, seen, reward, dones, infos)
 
 
-class Evaluation(EvalCallback):
-    """stable-baselines3's evaluation, which reports progress, and exports the best agent."""
-
-    def __init__(self, plan: Plan, out: Path, env: Standardised, progress: Progress) -> None:
-        super().__init__(
-            Monitor(env),
-            callback_on_new_best=_Export(out / BEST, env),
-            n_eval_episodes=plan.evaluation_episodes,
-            eval_freq=plan.evaluate_every,
-            log_path=str(out / "log"),
-            verbose=0,
-        )
-        self._steps, self._progress = plan.steps, progress
-        self.eval_env.seed(plan.seed + 1)
-
-    def _on_step(self) -> bool:
-        self._progress(min(self.num_timesteps, self._steps), self._steps)
-        return super()._on_step()
-
-
-class _Export(BaseCallback):
-    def __init__(self, path: Path, env: Standardised) -> None:
-        super().__init__()
-        self._path, self._env = path, env
-
-    def _on_step(self) -> bool:
-        export(self.model, self._env).save(self._path, steps=self.num_timesteps)
-        return True
-
-
 def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:
     """Return a learner whose actor is going to be cloned."""
     return GuardedSAC(
@@ -158,8 +127,24 @@ def train(plan: Plan, out: Path, demonstrations: Sequence[Episode], progress: Pr
         fill_buffer(learner, demonstrations, view)
         clone(learner, plan.cloning_updates, plan.seed, progress)
         if plan.steps:
-            learner.learn(plan.steps, Evaluation(plan, out, Standardised(other, *standard), progress))
-        return NetworkPolicy.load(out / BEST) if plan.steps >= plan.evaluate_every else export(learner, view)
+            judge = EvalCallback(
+                Monitor(Standardised(other, *standard)),
+                n_eval_episodes=plan.evaluation_episodes,
+                eval_freq=plan.evaluate_every,
+                log_path=str(out / "log"),
+                best_model_save_path=str(out),
+                verbose=0,
+            )
+            judge.eval_env.seed(plan.seed + 1)
+
+            def show(own: dict[str, Any], _: Any) -> bool:
+                progress(min(own["self"].num_timesteps, plan.steps), plan.steps)
+                return True
+
+            learner.learn(plan.steps, [judge, ConvertCallback(show)])
+        if plan.steps >= plan.evaluate_every:
+            learner.set_parameters(out / "best_model.zip")
+        return export(learner, view)
 
 
 def check_sizes(env: gym.Env[Any, Any], demonstrations: Sequence[Episode]) -> None:

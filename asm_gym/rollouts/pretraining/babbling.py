@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from asm_gym.data.episode import save_episode
 from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
+from asm_gym.policies.base import StatefulPolicy
 from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style
 from asm_gym.policies.scripted.geometry import Vector, move
 from asm_gym.rollouts.collect import environment, record_stream
@@ -129,7 +130,7 @@ def _lesson(task: str, number: int, seed: int, lead: str) -> Lesson:
     )
 
 
-class Babbler:
+class Babbler(StatefulPolicy):
     """The policy of a lesson."""
 
     def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
@@ -140,20 +141,17 @@ class Babbler:
         self._noisy_grip = bool(self._rng.random() < 0.5)
         self._left, self._course, self._grasp, self._held = 0, np.zeros_like(self._noise), 1.0, 0
 
-    def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Any]:
+    def begin(self, observation: Any) -> Any:
+        return None
+
+    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the next action (A,)."""
         lesson, rng = self._lesson, self._rng
         fresh = rng.standard_normal(self._noise.shape)
         self._noise = lesson.smoothness * self._noise + np.sqrt(1.0 - lesson.smoothness**2) * fresh
         action = lesson.noise * self._noise  # (A,)
         if self._guide is not None:
-            guided, state = self._guide.predict(observation, state, episode_start)
+            guided, state = self._guide.predict(observation, state)
             # Without a guide's grip, however loose, the memory would never learn what holding feels like.
             if lesson.noise and rng.random() < LOOSENED:
                 self._grasp = rng.uniform(LOOSE, 1.0)
@@ -203,24 +201,20 @@ class Aim(NamedTuple):
     left: int  # steps until it gives up
 
 
-class Reaching:
+class Reaching(StatefulPolicy):
     """A policy of one arm under OSC_POSE that reaches for one place after another."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float = 1.0) -> None:
         self._read, self._rng, self._speed = ObservationReader(env), np.random.default_rng([seed, 2]), PACE * speed
 
-    def predict(
-        self,
-        observation: Any,
-        state: Aim | None = None,
-        episode_start: NDArray[np.bool_] | None = None,
-        deterministic: bool = False,
-    ) -> tuple[NDArray[np.float32], Aim]:
+    def begin(self, observation: Any) -> Aim:
+        hand = self._read.hand(observation)
+        return self._next(hand.at, hand.turned)
+
+    def act(self, observation: Any, state: Aim, deterministic: bool) -> tuple[NDArray[np.float32], Aim]:
         """Return the next action (7,)."""
         hand = self._read.hand(observation)
-        if state is None:
-            state = self._next(hand.at, hand.turned)
-        elif not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
+        if not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
             state = self._next(state.began, state.upright)
         action = move(hand, state.place, state.turned, self._speed)
         return np.append(action, state.grip).astype(np.float32), state._replace(left=state.left - 1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_al
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.scoring import traces_of
 from asm_gym.evaluation.statistics import Rate, Share
-from asm_gym.evaluation.tables import Column, Table, count, percent, tabulate
+from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors import CalibratedMonitor
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import Trial, faulty_trial, nominal_trials
@@ -106,17 +106,17 @@ class Alarms(NamedTuple):
         return cls(*(hourly_alarms(traces, event) for event in ("", KNOCK, STOP)))
 
 
-COLUMNS: Sequence[Column[Marks]] = (
-    Column("", lambda m: m.name),
-    Column("hours", lambda m: f"{hourly_alarms(m.solved).hours:.2f}"),
-    Column("faults/h", lambda m: Alarms.of(m.solved).fault.text),
-    Column("knocks/h", lambda m: f"{Alarms.of(m.solved).knock.value:.0f}" if m.solved else ""),
-    Column("stops/h", lambda m: f"{Alarms.of(m.solved).stop.value:.0f}" if m.solved else ""),
-    Column("failed, alarm", lambda m: count(false_alarms(m.failed)) if m.failed else ""),
-    Column("AUROC", lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else ""),
-    Column("found", lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""),
-    Column("median [ms]", lambda m: milliseconds(m.metrics.delays) if m.metrics.faulty else ""),
-)
+COLUMNS: dict[str, Callable[[Marks], str]] = {
+    "": lambda m: m.name,
+    "hours": lambda m: f"{hourly_alarms(m.solved).hours:.2f}",
+    "faults/h": lambda m: Alarms.of(m.solved).fault.text,
+    "knocks/h": lambda m: f"{Alarms.of(m.solved).knock.value:.0f}" if m.solved else "",
+    "stops/h": lambda m: f"{Alarms.of(m.solved).stop.value:.0f}" if m.solved else "",
+    "failed, alarm": lambda m: count(false_alarms(m.failed)) if m.failed else "",
+    "AUROC": lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else "",
+    "found": lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else "",
+    "median [ms]": lambda m: milliseconds(m.metrics.delays) if m.metrics.faulty else "",
+}
 
 
 def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Table:
