@@ -133,9 +133,6 @@ def demonstrate(args: Args, console: Console) -> None:
         "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
         "Time until faults were noticed": figures.delay_figure(rows),
         "Faults against nominal episodes at the same time": figures.roc_figure(rows),
-        "Source of the surprise when an encoder froze": figures.attribution_figure(
-            next(e for e in examples if e.kind == "frozen encoder")
-        ),
     }
     intro = (
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "

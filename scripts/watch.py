@@ -143,7 +143,6 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
             f"Surprise over time in the {len(worst)} most surprising episodes (--figures)",
             figures.surprise_figure(worst),
         ),
-        "attribution": ("Where surprise came from in the most surprising one", figures.attribution_figure(worst[0])),
         "stream": ("What its most surprising channels sensed", figures.stream_figure(worst[0])),
     }
     for name, (_, figure) in drawn.items():

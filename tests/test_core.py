@@ -60,7 +60,6 @@ import json
 print(json.dumps([
     said(lambda: gymnasium.make("asm_gym/Lift-v0")),
     said(lambda: asm_gym.wrappers.FaultInjection),
-    said(lambda: asm_gym.wrappers.SurpriseOverlay),
     said(lambda: asm_gym.monitors.make_monitor("gru", spec)),
     said(lambda: __import__("asm_gym.data.datasets").data.datasets.require_minari()),
     said(lambda: __import__("asm_gym.tasks").tasks.env_id("gymnasium_robotics:FetchReach-v4")),
@@ -71,7 +70,6 @@ print(json.dumps([
 SAID = [
     "a robosuite environment or a fault in one needs mujoco: pip install 'asm-gym[robosuite]'",
     "a robosuite environment or a fault in one needs mujoco: pip install 'asm-gym[robosuite]'",
-    "SurpriseOverlay needs matplotlib: pip install 'asm-gym[report]'",
     "GRU needs torch: pip install 'asm-gym[agents]'",
     "a dataset needs h5py: pip install 'asm-gym[data]'",
     "gymnasium_robotics:FetchReach-v4 needs gymnasium_robotics: pip install 'asm-gym[environments]'",

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from asm_gym import faults
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, SurpriseOverlay, VectorNeuralASMSafety
+from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 
 FAULTS = {name: kind for name, kind in vars(faults).items() if isinstance(kind, type) and name != "Fault"}
@@ -65,10 +65,6 @@ WRAPPERS = {
     "many": (lambda **more: VectorNeuralASMSafety(
         gym.vector.SyncVectorEnv([FakeEnv]), **({"monitor": FadingMonitor()} | more)
     ), ("monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate")),
-    "overlay": (
-        lambda **more: SurpriseOverlay(NeuralASMSafety(FakeEnv(), CueMonitor()), **more),
-        ("caption",),
-    ),
 }  # fmt: skip
 
 

@@ -183,7 +183,7 @@ def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, t
     stream[40:, 0] += 3
     out = tmp_path / "out"
     out.mkdir()
-    names = ("alarms.csv", "report.html", "surprise.png", "attribution.png", "stream.png")
+    names = ("alarms.csv", "report.html", "surprise.png", "stream.png")
     for name in names:
         (tmp_path / f"own {name}").write_text("precious")
         (out / name).symlink_to(tmp_path / f"own {name}")

@@ -15,7 +15,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -26,7 +25,6 @@ from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection, is_constant
 from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.evaluation.statistics import Share
 from asm_gym.files import written_whole
 
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
@@ -45,7 +43,6 @@ _STYLE: dict[Any, Any] = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
 }
-MOST_BANDS = 4  # more curves than these have no bands of uncertainty: they could not be told apart
 
 
 @contextmanager
@@ -84,42 +81,33 @@ def roc_figure(groups: Sequence[DetectionMetrics]) -> Figure:
         raise ValueError("a ROC curve needs nominal traces")
     with figure(height=4.6, width=8.4) as fig:
         ax = fig.subplots()
-        ax.plot([0, 100], [0, 100], color=GREY, linewidth=1)
+        ax.plot([0, 1], [0, 1], color=GREY, linewidth=1)
         for i, group in enumerate(faulty):
-            u = np.sort(placements(group.faulty, group.nominal, group.window_s))
-            if not u.size:
-                continue
-            colour, line, _ = look(i)
-            x, y = 100 * np.concatenate([[0], u, [1]]), 100 * np.concatenate([np.arange(u.size + 1), [u.size]]) / u.size
-            label = f"{group.name}: {1 - u.mean():.3f}"
-            ax.step(x, y, where="post", color=colour, linestyle=line, linewidth=2, label=label, clip_on=False)
-        ax.set(xlim=(0, 100), ylim=(0, 100), box_aspect=1)
-        ax.set(xlabel="nominal episodes above [%]", ylabel="faulty episodes above [%]")
+            u = placements(group.faulty, group.nominal, group.window_s)
+            if u.size:
+                colour, line, _ = look(i)
+                ax.ecdf(u, color=colour, linestyle=line, linewidth=2, label=f"{group.name}: {1 - u.mean():.3f}")
+        ax.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
+        ax.set(xlabel="share of nominal episodes above", ylabel="share of faulty episodes above")
         ax.grid()
         fig.legend(loc="outside right upper", handlelength=3.5, title="AUROC")
     return fig
 
 
 def delay_figure(groups: Sequence[DetectionMetrics]) -> Figure:
-    """Draw the share of faults detected within so many ms of the onset; with 95 % Wilson bands for few curves."""
+    """Draw the share of faults detected within so many ms of the onset."""
     faulty = [g for g in groups if g.faulty]
     _require_some(faulty)
     window_ms = 1e3 * max(g.window_s for g in faulty)
     with figure(height=4.4) as fig:
         ax = fig.subplots()
         for i, group in enumerate(faulty):
-            delays = delays_ms(group.faulty, group.window_s)
-            found = delays[np.isfinite(delays)]
-            counts = np.append(np.arange(len(found) + 1), len(found))  # at 0, at each alarm, at the end
-            x = np.concatenate([[0.0], found, [window_ms]])
+            delays = np.minimum(delays_ms(group.faulty, group.window_s), 2 * window_ms)  # a miss is out of the picture
             colour, line, _ = look(i)
-            if len(faulty) <= MOST_BANDS:
-                low, high = np.array([Share(int(k), len(delays)).interval for k in counts]).T
-                ax.fill_between(x, 100 * low, 100 * high, step="post", color=colour, alpha=0.12, linewidth=0)
-            label = f"{group.name} ({len(found)} of {len(delays)})"
-            ax.step(x, 100 * counts / len(delays), where="post", color=colour, linestyle=line, linewidth=2, label=label)
-        ax.set(xlim=(0, window_ms), ylim=(0, 102), xlabel="time since the onset of the fault [ms]")
-        ax.set_ylabel("faults detected [%]")
+            label = f"{group.name} ({group.detected.k} of {group.detected.n})"
+            ax.ecdf(delays, color=colour, linestyle=line, linewidth=2, label=label)
+        ax.set(xlim=(0, window_ms), ylim=(0, 1.02), xlabel="time since the onset of the fault [ms]")
+        ax.set_ylabel("share of faults detected")
         ax.grid()
         fig.legend(loc="outside right upper", handlelength=3.5)
     return fig
@@ -167,40 +155,15 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
     ax.grid(axis="y")
 
 
-def attribution_figure(trace: ScoredEpisode, top: int = 12) -> Figure:
-    """Draw the shares of the ``top`` channels in the surprise over time, in units of the threshold."""
-    share = _attribution(trace) / trace.threshold  # (T, D)
-    # An infinite share takes the brightest finite colour, or it would leave all others dark.
-    share = np.nan_to_num(share, nan=0.0, posinf=float(share[np.isfinite(share)].max(initial=1.0)), neginf=0.0)
-    rows = np.argsort(-share[trace.onset or 0 :].max(axis=0), kind="stable")[:top]
-    high = max(float(share[:, rows].max()), 1.0)
-    with figure(height=1.5 + 0.24 * len(rows)) as fig:
-        ax = fig.subplots()
-        ends = (0.0, len(trace) * trace.dt, len(rows) - 0.5, -0.5)
-        norm = LogNorm(min(0.01, high / 100), high)
-        drawn = np.clip(share[:, rows].T, norm.vmin, None)
-        image = ax.imshow(drawn, norm=norm, cmap="cividis", aspect="auto", extent=ends, interpolation="nearest")
-        ax.set_yticks(range(len(rows)), [trace.channels[r] for r in rows])
-        ax.set_xlabel("time [s]")
-        ax.spines[:].set_visible(False)
-        if trace.onset is not None:
-            ax.axvline(trace.onset * trace.dt, color="white", linewidth=1.5)
-            if trace.delay is not None:
-                ax.axvline(trace.onset * trace.dt + trace.delay, color="white", linewidth=1.5, linestyle=DASHED)
-        ax.set_title(f"{trace.title} (white: fault, alarm)")
-        fig.colorbar(image, ax=ax, label="share of surprise / threshold", pad=0.02)
-    return fig
-
-
 def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
     """Draw the ``top`` channels that surprised most; faults and alarms are shaded.
 
     Raises:
         ValueError: the episode has no stream.
     """
-    if trace.stream is None:
+    if trace.stream is None or trace.attribution is None:
         raise ValueError("this trace was kept without its stream")
-    share = np.nan_to_num(_attribution(trace)[trace.onset or 0 :], posinf=1e30)
+    share = np.nan_to_num(trace.attribution[trace.onset or 0 :], posinf=1e30)
     rows = np.argsort(-share.max(axis=0), kind="stable")[:top]
     with figure(height=1.0 + 1.15 * len(rows)) as fig:
         axes = fig.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
@@ -239,12 +202,6 @@ def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
     finite = np.concatenate([t.surprise[np.isfinite(t.surprise)] for t in traces])
     ceiling = max(float(finite.max(initial=0.0)), 10 * max(thresholds))
     return min(max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling / 10), ceiling
-
-
-def _attribution(trace: ScoredEpisode) -> Any:
-    if trace.attribution is None:
-        raise ValueError("this trace was kept without the attribution that the figure needs")
-    return trace.attribution
 
 
 ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000  # panels side by side; channels drawn; points of a curve

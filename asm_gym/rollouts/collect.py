@@ -277,8 +277,6 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
             ended_by_alarm=bool(asm[-1]["gave_up"] or (trial.acting == "terminate" and asm[-1]["alarm"])),
             contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
         ),
-        attribution=attribution,
-        channels=monitor.spec.labels,
         fault=fault,
     )
     return trace.attributed(attribution, monitor.spec.labels)
