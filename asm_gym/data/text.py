@@ -254,10 +254,9 @@ def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[s
         return header_of(columns, "it"), not any(numbers)
     if numbers and sum(numbers) > len(numbers) / 2:
         said = f"is of {len(numbers)} numbers" if all(numbers) else f"holds {sum(numbers)} numbers"
-        example = " ".join(f"x{k}" for k in range(len(cells)))
-        raise ValueError(
-            f"its first line {said} and no header: name its {len(cells)} columns, --columns {example[:60]}"
-        )
+        size = len(cells) - (not cells[0].strip())
+        example = " ".join(f"x{k}" for k in range(size))
+        raise ValueError(f"its first line {said} and no header: name its {size} columns, --columns {example[:60]}")
     return header_of(cells, "it"), True
 
 
