@@ -109,7 +109,8 @@ def _pivoted(table: Columns) -> Columns:
     import pandas as pd
 
     key = next((name for name in table if _is_key(name, table[name])), None)
-    if key is None:
+    values = [name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)]
+    if key is None or not values:
         return table
     clock = next((name for name in table if is_clock(name) and len(table[name]) > 1), None)
     frame = pd.DataFrame(table)
@@ -117,7 +118,6 @@ def _pivoted(table: Columns) -> Columns:
     new = frame[clock] != frame[clock].shift() if clock is not None else None
     if new is not None and not new.all():  # joints of a moment share a stamp
         round_of = new.cumsum()
-    values = [name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)]
     wide = frame.assign(_round=round_of).pivot_table(values, "_round", key, aggfunc="last", sort=False)
     made: Columns = {} if clock is None else {clock: frame.groupby(round_of.to_numpy())[clock].first().to_numpy()}
     made |= {f"{name}[{word}]": wide[name, word].to_numpy() for name, word in wide.columns}

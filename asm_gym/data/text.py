@@ -155,18 +155,19 @@ def _blocks(numbered: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int,
 
 def _header_at(lines: Sequence[str]) -> int:
     """The number of the line that is the header: those below it have as many cells, and numbers among them."""
+    first_row = 0
     for at, line in enumerate(lines[:MOST_PREAMBLE]):
         dialect = Dialect.of(line)
         with suppress(ValueError):
             size = len(_cells_of_header(dialect, line))
-            if at and any(dialect.is_number(cell) for cell in dialect.cells(line) if cell.strip()):
-                continue  # it is a row
             below = [dialect.cells(other) for other in lines[at + 1 :] if not other.lstrip().startswith("#")][:AGREE]
             agree = [len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below]
             numbers = [sum(dialect.is_number(c) for c in cells[:size] if c.strip()) for cells in below]
             if below and all(agree) and max(numbers) > 0 and numbers[-1] > 0:
-                return at
-    return 0
+                if not at or not any(dialect.is_number(cell) for cell in dialect.cells(line) if cell.strip()):
+                    return at
+                first_row = first_row or at
+    return first_row
 
 
 def _are_units(dialect: Dialect, line: str, below: str) -> bool:
