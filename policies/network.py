@@ -10,11 +10,8 @@ plain text of the JSON, without unpickling anything; a policy that its tensors d
 
 from __future__ import annotations
 
+import itertools
 import json
-import pickle
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -52,9 +49,6 @@ POLICIES = {
 }
 """The first of the algorithms that use a module's policies, and their activation by default."""
 
-DAMAGE = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, LookupError, TypeError, AttributeError)
-"""Errors of an archive whose members are not what they should be, besides ValueError and those of unpickling."""
-
 
 class NetworkPolicy(StatefulPolicy):
     """Acts by a network, without noise; it keeps nothing between steps.
@@ -90,18 +84,15 @@ class NetworkPolicy(StatefulPolicy):
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
                 raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
-            if not (np.isfinite(W).all() and np.isfinite(b).all()):
-                raise ValueError(f"layer {n} must be finite")
             size = len(W)
         self.action_size = size
         self.activation, self.squash = activation, squash
         self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
         self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
-        for what, array in {"mean": self.mean, "scale": self.scale}.items():
-            if array.shape != (inputs,) or not np.isfinite(array).all():
-                raise ValueError(f"{what} must be {inputs} finite numbers, got {array.shape}")
-        if not (self.scale > 0).all():
-            raise ValueError(f"scale must be positive, got {self.scale.min()}")
+        if self.mean.shape != (inputs,) or self.scale.shape != (inputs,) or not (self.scale > 0).all():
+            raise ValueError(f"mean and scale must be {inputs} numbers, and scale positive")
+        if not all(np.isfinite(a).all() for a in (self.mean, self.scale, *itertools.chain(*self.layers))):
+            raise ValueError("weights, biases, mean and scale must be finite")
         self.trained_in = dict(trained_in or {})
         self._low, self._high = np.full(size, -1.0, np.float32), np.ones(size, np.float32)
 
@@ -190,7 +181,7 @@ def read_archive(path: Path) -> NetworkPolicy:
         if "activation_fn" in options:
             activation = str(options["activation_fn"]).rstrip("'>").rsplit(".", 1)[-1].lower()
         return network(algorithm, tensors, activation)
-    except (*DAMAGE, ValueError, pickle.UnpicklingError) as error:
+    except Exception as error:  # whatever members that are not what they should be raise
         why = str(error) or type(error).__name__
         raise ValueError(f"{path} is not an agent that can be read: {why}") from error
 

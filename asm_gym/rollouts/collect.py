@@ -229,12 +229,12 @@ def collect_to(
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the episodes that are not in ``folder`` yet; return the files of all."""
-    make = partial(_record_to, folder=folder.resolve(), spec=env_spec(env_id), config=config)
-    return make_missing(make, seeds, lambda seed: folder.resolve() / f"{seed}.npz", workers, progress)
+    folder, spec = folder.resolve(), env_spec(env_id)
 
+    def make(seed: int) -> Path:
+        return save_episode(folder / f"{seed}.npz", record_episode(seed, spec, config))
 
-def _record_to(seed: int, folder: Path, spec: EnvSpec, config: RolloutConfig) -> Path:
-    return save_episode(folder / f"{seed}.npz", record_episode(seed, spec, config))
+    return make_missing(make, seeds, lambda seed: folder / f"{seed}.npz", workers, progress)
 
 
 def check(env_id: str, config: RolloutConfig) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +25,6 @@ Rows = NDArray[np.float64]
 
 PEN = slice(0, 2)  # columns of the pen's position
 FREE = 0.6  # ``free_running_probability`` of ``NeuralASM`` for recall
-
-
-class Expresser(Protocol):
-    """A model that knows skills."""
-
-    def express(self, streams: Rows, cue: int) -> Rows:
-        """Return the prediction (T, B, D) of each row of B streams (T, B, D), from rows before it up to ``cue``."""
-        ...
 
 
 def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Trajectory]:
@@ -85,6 +76,7 @@ class ExpressionMemory:
         return cls(reader, trained.network)
 
     def express(self, streams: Rows, cue: int) -> Rows:
+        """Return the prediction (T, B, D) of each row of B streams (T, B, D), from rows before it up to ``cue``."""
         cued = follow(self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams[:cue]))
         rows = to_rows(self.reader, cued)
         if cue == len(streams):
@@ -116,6 +108,9 @@ class Backpropagated:
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
         return to_rows(self.reader, Recalled(senses, commands, commands[-1]))
+
+
+Expresser = ExpressionMemory | Backpropagated
 
 
 def mean_demonstrations(train: Sequence[Episode], hand: slice = PEN) -> Rows:

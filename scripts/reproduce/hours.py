@@ -9,13 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.detection_tables import kept_rate
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.pretraining.exam import SEVERITIES, Alarms, Exam, Marks, examine, usual_force
+from asm_gym.rollouts.pretraining.exam import SEVERITIES, Exam, Marks, examine, usual_force
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings
@@ -63,12 +64,12 @@ def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Tab
     for promised, threshold in thresholds.items():
         at = [m.at(threshold) for m in marks]
         healthy, faulty = [t for m in at for t in m.solved], [t for m in at for t in m.metrics.faulty]
-        alarms = Alarms.of(healthy)
         shares = [
             DetectionMetrics("", [t for t in faulty if t.severity in severities], [], WINDOW_S).detected
             for severities in (SEVERITIES, ("mild",))
         ]
-        cells = kept_rate(alarms.fault, promised), f"{alarms.knock.value:.1f}", f"{alarms.stop.value:.1f}"
+        excused = (f"{hourly_alarms(healthy, event).value:.1f}" for event in (KNOCK, STOP))
+        cells = kept_rate(hourly_alarms(healthy), promised), *excused
         rows.append((f"{promised:g}", f"{threshold:.3g}", *cells, *(f"{percent(s)} of {s.n}" for s in shares)))
     hours = sum(len(t) * t.dt for m in marks for t in m.solved) / 3600
     caption = (

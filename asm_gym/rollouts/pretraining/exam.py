@@ -15,7 +15,7 @@ from asm_gym.evaluation.detection_tables import milliseconds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.scoring import traces_of
-from asm_gym.evaluation.statistics import Rate, Share
+from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors import CalibratedMonitor
 from asm_gym.rollouts.seeds import role_seeds
@@ -93,25 +93,12 @@ def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode],
     return Marks(name, solved, failed, DetectionMetrics(name, visible, solved, window))
 
 
-class Alarms(NamedTuple):
-    """Alarms of healthy episodes per hour, by event."""
-
-    fault: Rate
-    knock: Rate
-    stop: Rate
-
-    @classmethod
-    def of(cls, traces: Sequence[ScoredEpisode]) -> Alarms:
-        """Count at the threshold of the episodes."""
-        return cls(*(hourly_alarms(traces, event) for event in ("", KNOCK, STOP)))
-
-
 COLUMNS: dict[str, Callable[[Marks], str]] = {
     "": lambda m: m.name,
     "hours": lambda m: f"{hourly_alarms(m.solved).hours:.2f}",
-    "faults/h": lambda m: Alarms.of(m.solved).fault.text,
-    "knocks/h": lambda m: f"{Alarms.of(m.solved).knock.value:.0f}" if m.solved else "",
-    "stops/h": lambda m: f"{Alarms.of(m.solved).stop.value:.0f}" if m.solved else "",
+    "faults/h": lambda m: hourly_alarms(m.solved).text,
+    "knocks/h": lambda m: f"{hourly_alarms(m.solved, KNOCK).value:.0f}" if m.solved else "",
+    "stops/h": lambda m: f"{hourly_alarms(m.solved, STOP).value:.0f}" if m.solved else "",
     "failed, alarm": lambda m: count(false_alarms(m.failed)) if m.failed else "",
     "AUROC": lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else "",
     "found": lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else "",
@@ -134,7 +121,8 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
 
 def summary(marks: Sequence[Marks]) -> str:
     """Return one line: alarms, and faults found, in all exams together."""
-    fault, knock, stop = Alarms.of([t for m in marks for t in m.solved])
+    solved = [t for m in marks for t in m.solved]
+    fault, knock, stop = (hourly_alarms(solved, event) for event in ("", KNOCK, STOP))
     found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
     return (
         f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops an hour in {fault.hours:.2f} healthy "
