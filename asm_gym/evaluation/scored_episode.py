@@ -74,10 +74,6 @@ class ScoredEpisode:
             raise ValueError(f"surprise must have the shape (T,) with T > 0, got {self.surprise.shape}")
         if np.isnan(self.surprise).any():
             raise ValueError("surprise must not be NaN: a row that cannot be judged has the surprise inf")
-        if not self.dt > 0:
-            raise ValueError(f"dt must be > 0, got {self.dt}")
-        if self.onset is not None and (self.kind == NOMINAL or self.onset < 0):
-            raise ValueError(f"onset must be >= 0, and None of a nominal episode, got {self.onset} of {self.kind}")
 
     def __len__(self) -> int:
         return len(self.surprise)

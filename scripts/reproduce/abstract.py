@@ -72,7 +72,7 @@ AROUND = slice(EVENT, EVENT + WINDOW)
 class Config(kit.Config):
     """One network, six skills."""
 
-    skills: int = option(6, quick=2, check=partial(check_letters, least=2))
+    skills: int = option(6, quick=2, check=partial(check_letters, low=2))
     """Letters."""
     writings: int = option(20, quick=6, least=2)
     """Writings of each letter to learn from."""

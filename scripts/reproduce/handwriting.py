@@ -14,6 +14,7 @@ import math
 import string
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from scipy.special import erf
 
 from asm_gym.data.episode import Episode
 from asm_gym.spec import MOTOR, Channel, StreamSpec
+from asm_gym.validation import check_number
 
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 """Names of the letters, which look like none of the alphabet."""
@@ -59,17 +61,7 @@ class Letter:
     strokes: tuple[Stroke, ...]
 
 
-def check_letters(*counts: int, least: int = 1) -> None:
-    """Raise ValueError for fewer letters than ``least``, or more than there are names."""
-    for count in counts:
-        if not least <= count <= len(NAMES):
-            raise ValueError(f"a repertoire has {least} to {len(NAMES)} skills, got {count}")
-
-
-def wide_enough(hidden: int, channels: int) -> None:
-    """Raise ValueError where a network has fewer hidden units than numbers to predict."""
-    if hidden < channels:
-        raise ValueError(f"hidden must be at least the number of channels, {channels}, got {hidden}")
+check_letters = partial(check_number, "letters", low=1, high=len(NAMES), whole=True)
 
 
 def repertoire(count: int, rng: np.random.Generator) -> list[Letter]:

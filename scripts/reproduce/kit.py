@@ -63,7 +63,6 @@ class Findings(NamedTuple):
     records: Sequence[Record]
     tables: Sequence[Table]
     figure: Figure | None = None
-    facts: Mapping[str, Any] = {}  # further JSON-serialisable results
 
 
 def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
@@ -100,7 +99,6 @@ def write(path: Path, found: Findings, config: Any, seconds: float) -> list[str]
         "python": platform.python_version(),
         "machine": platform.machine(),
         "seconds": round(seconds, 1),
-        **found.facts,
     }
     write_text(path.with_suffix(".json"), json.dumps(details, indent=2) + "\n")
     return written

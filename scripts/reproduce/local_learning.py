@@ -44,7 +44,7 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import trajectories
-from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire, wide_enough
+from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 
@@ -66,7 +66,7 @@ class Config(kit.Config):
 
     skills: int = option(8, quick=2, check=check_letters)
     """Letters."""
-    hidden: int = option(64, quick=16, check=partial(wide_enough, channels=4))
+    hidden: int = option(64, quick=16, least=4)
     """Hidden units."""
     writings: int = option(8, quick=4, least=1)
     """Writings of each letter."""
@@ -254,4 +254,4 @@ def run(config: Config) -> Findings:
         right.set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
         for ax in (left, right):
             ax.legend(fontsize=7)
-    return Findings(records, tables, fig, {"rates": RATES})
+    return Findings(records, tables, fig)

@@ -29,8 +29,9 @@ from asm_gym.scripts.reproduce.expression import (
     mean_demonstrations,
     recalled,
 )
-from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire, wide_enough
+from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
+from asm_gym.validation import check_number
 
 MODELS = {
     "memory": "traces, local",
@@ -48,19 +49,15 @@ CHOSEN: dict[str, dict[str, Any]] = {
 }
 
 
-def check_cue(cue: int) -> None:
-    """Raise ValueError for a cue that leaves nothing to recall."""
-    if not 1 <= cue < STEPS:
-        raise ValueError(f"a cue must be shorter than the letter, 1 to {STEPS - 1} steps, got {cue}")
-
-
 @dataclass(frozen=True)
 class Config(kit.Config):
     """Recall from a cue."""
 
     repertoires: tuple[int, ...] = option((1, 2, 4, 8, 16, 32), quick=(1, 4), least=1, check=check_letters)
     """Letters that one network learns."""
-    cues: tuple[int, ...] = option((1, 2, 5, 10, 20, 30), least=1, check=check_cue)
+    cues: tuple[int, ...] = option(
+        (1, 2, 5, 10, 20, 30), least=1, check=partial(check_number, "cue", low=1, high=STEPS - 1, whole=True)
+    )
     """Rows that are read before recall begins."""
     models: tuple[str, ...] = option(tuple(MODELS), least=1, known=MODELS)
     """Models to compare."""
@@ -68,7 +65,7 @@ class Config(kit.Config):
     """Batches of 64 rows for the networks of the memory."""
     updates: int = option(1200, quick=40, least=1)
     """Batches of 16 letters for the networks trained by backpropagation through time."""
-    hidden: int = option(64, quick=32, check=partial(wide_enough, channels=4))
+    hidden: int = option(64, quick=32, least=4)
     """Hidden units of a GRU."""
     writings: int = option(8, quick=4, least=1)
     """Writings of each letter to learn from."""

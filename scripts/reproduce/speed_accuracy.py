@@ -29,7 +29,7 @@ from asm_gym.memory.energy import iterations_within
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import ExpressionMemory, Rows
-from asm_gym.scripts.reproduce.handwriting import DT, Letter, check_letters, copybook, repertoire, wide_enough, written
+from asm_gym.scripts.reproduce.handwriting import DT, Letter, check_letters, copybook, repertoire, written
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.validation import check_number
 
@@ -56,7 +56,7 @@ class Config(kit.Config):
     """Short steps of inference a second, at every speed."""
     skills: int = option(4, quick=2, check=check_letters)
     """Letters."""
-    hidden: int = option(64, quick=32, check=partial(wide_enough, channels=4))
+    hidden: int = option(64, quick=32, least=4)
     """Hidden units."""
     writings: int = option(12, quick=4, least=1)
     """Writings of each letter."""
