@@ -23,7 +23,6 @@ class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
     dt = 0.05
-    dt = 0.05
 
     def __init__(self, length: int = 20, own_stream: bool = True, first: int = 0) -> None:
         self.observation_space = spaces.Box(-100.0, 100.0, (2,), np.float32)

@@ -123,10 +123,10 @@ class Guard(RuleBasedStateMachine):
         self.running = not (terminated or truncated)
         asm = info["asm"]
         assert info["cost"] == float(asm["alarm"]) == float(info["asm_alarm"])
-        assert asm["alarm"] == (asm["surprise"] > asm["threshold"])
+        assert asm["alarm"] == (asm["surprise"] > asm["threshold"] or asm["reason"] == "missing")
         assert not asm["failure"] or asm["alarm"]
         lost = isinstance(self.robot.next, str) or not np.isfinite(as_float32(action)).all()
-        assert asm["alarm"] or not lost
+        assert asm["alarm"] or asm["intervened"] or not lost
         if asm["intervened"]:
             assert self.acts or not np.isfinite(as_float32(action)).all()
 

@@ -138,6 +138,8 @@ def test_robots_on_threads_move_as_each_alone():
 
 @pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
 def test_members_are_filmed_each_on_its_thread(tmp_path):
+    pytest.importorskip("moviepy")  # which wants another Pillow than everything else
+
     def filmed(i):
         return RecordVideo(gym.make("asm_gym/Lift-v0", horizon=2, render_mode="rgb_array"), str(tmp_path / str(i)))
 
