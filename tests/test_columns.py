@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from asm_gym.data.behaviour import code_of, counts, follows, stands_still, turn_of
+from asm_gym.data.behaviour import code_of, counts, follows, turn_of
 from asm_gym.data.channels import ColumnPlan, read_recorded
 from asm_gym.data.clock import find_clock, seconds_a_row
 from asm_gym.data.columns import LogLayout, decide
@@ -75,13 +75,6 @@ def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat()
     assert np.isnan(code_of(Q))
     assert np.isnan(code_of(np.where(T > 3.5, 2.0, Q)))  # a stop
     assert np.isnan(code_of(np.where(np.arange(ROWS) == 9, 500.0, Q)))  # once: a glitch
-
-
-def test_a_frozen_sense_is_told_from_an_arm_at_rest():
-    frozen = np.where((T > 1) & (T < 3), Q[50], Q)
-    assert stands_still(frozen, np.cos(2 * T)[:, None]) > 90
-    assert stands_still(frozen, frozen[:, None]) == 0  # the arm rests
-    assert stands_still(np.round(np.clip(Q, -0.2, 0.2), 1), np.cos(2 * T)[:, None]) == 0  # a coarse encoder
 
 
 HEALTHY = {"time": T, "q0": Q, "q1": np.cos(2 * T) + 1e-3 * RNG.normal(size=ROWS)}
@@ -214,16 +207,12 @@ def test_every_refusal_names_what_gets_the_file_read_and_that_works_when_typed(
     )
 
 
-def test_a_logger_that_was_started_twice_makes_two_logs_and_headings_make_one_each(tmp_path):
+def test_a_logger_that_was_started_twice_makes_two_logs(tmp_path):
     frame = pd.DataFrame(HEALTHY).to_csv(index=False)
     (tmp_path / "x.csv").write_text(frame + frame)
     with noted() as notes:
         assert [len(log.episode) for log in read_logs(tmp_path / "x.csv")] == [ROWS, ROWS]
     assert any("cut there" in line for line in notes)
-    block = "\n".join(f"\t{k}\t{k % 3}" for k in range(15))
-    (tmp_path / "y.dat").write_text(f"normal\n{block}\n\n\ncollision\n{block}\n\n")
-    logs = list(read_logs(tmp_path / "y.dat", LogLayout(columns=["fx", "fy"], rate=3.0)))
-    assert [bool(log.episode.faults.any()) for log in logs] == [False, True]
 
 
 def test_alarms_of_one_cause_are_one_and_missing_data_are_apart():

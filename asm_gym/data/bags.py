@@ -15,8 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import HELD, Columns
 from asm_gym.extras import require
@@ -67,35 +65,33 @@ def read_bag(path: Path) -> Columns:
 
 
 def _columns(bag: Any) -> Columns:
+    import pandas as pd
+
     chosen = [c for c in bag.connections if c.msgtype in MESSAGES]
     states = [c for c in chosen if c.msgtype == JOINT_STATE]
     if not any(c.msgcount for c in states):
         topics = ", ".join(f"{c.topic} ({c.msgtype})" for c in bag.connections) or "none"
         raise ValueError(f"it holds no sensor_msgs/JointState; its topics: {topics}")
-    order: list[tuple[tuple[str, ...], float, float, Numbers]] = []
-    heard: dict[tuple[str, ...], list[float]] = {}  # when messages of the same joints came on a topic [s]
+    said: dict[tuple[str, ...], list[Numbers]] = {}  # on a topic, of the same joints
     for connection, written, raw in bag.messages(connections=chosen):
         message = bag.deserialize(raw, connection.msgtype)
         numbers = MESSAGES[connection.msgtype](message)
         key = (connection.topic, *sorted(getattr(message, "name", ())))
         named = {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
-        order.append((key, stamp_of(message) or 1e-9 * written, 1e-9 * written, named))
-        heard.setdefault(key, []).append(1e-9 * written)
+        came = 1e-9 * written
+        said.setdefault(key, []).append({"came": came, "time": stamp_of(message) or came} | named)
     of_states = {c.topic for c in states}
-    clock = max((key for key in heard if key[0] in of_states), key=lambda key: len(heard[key]))
-    if len(heard) > 1:
+    clock = max((key for key in said if key[0] in of_states), key=lambda key: len(said[key]))
+    if len(said) > 1:
         note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
-    old = {key: HELD * (came[-1] - came[0]) / max(len(came) - 1, 1) for key, came in heard.items()}
-    latest: dict[tuple[str, ...], tuple[float, Numbers]] = {}
-    rows: list[Numbers] = []
-    for key, time, came, numbers in order:
-        latest[key] = came, numbers
-        if key == clock:
-            fresh = [said for other, (at, said) in latest.items() if came - at <= old[other] or other == clock]
-            rows.append({"time": time} | {name: value for said in fresh for name, value in said.items()})
-    names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
-    return columns | {"time": columns["time"] - columns["time"][0]}  # seconds since 1970 would cost digits
+    rows = pd.DataFrame(said.pop(clock))
+    for messages in said.values():
+        other = pd.DataFrame(messages)
+        old = HELD * (other["came"].iloc[-1] - other["came"].iloc[0]) / max(len(other) - 1, 1)
+        new = other[["came", *other.columns.difference(rows.columns, sort=False)]]
+        rows = pd.merge_asof(rows, new, on="came", tolerance=old)
+    rows["time"] -= rows["time"].iloc[0]  # seconds since 1970 would cost digits
+    return {name: rows[name].to_numpy() for name in rows if name != "came"}
 
 
 def stamp_of(message: Any) -> float:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.names import TAU, TURN
-from asm_gym.readings import spans
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +24,6 @@ PACE = 2e-3  # how far a second clock is off a straight line, as a share of its 
 CODE_APART = 5.0  # how many ranges of all others a code for missing data is away from them
 CODES_AT_MOST = 0.5  # share of rows that may hold one
 LEAST_CODE = 99.0  # a code is at least so large
-STANDS, SELDOM = 20, 0.2  # equal readings in a row that make a sense frozen; share of others that repeat themselves
 
 
 def known(values: NDArray[Any]) -> Floats:
@@ -95,13 +93,3 @@ def code_of(values: NDArray[Any]) -> float:
         if float(np.abs(others - code).min()) > CODE_APART * float(np.ptp(others)) > 0:
             return float(code)
     return math.nan
-
-
-def stands_still(values: NDArray[Any], others: Floats) -> int:
-    """Return for how many rows in a row a column (T,) that seldom repeats itself does, while ``others`` (T, n) move."""
-    again = np.diff(values) == 0
-    moving = others.std(axis=0)
-    runs = [(start, stop) for start, stop in spans(again) if stop - start >= STANDS]
-    seldom = again.sum() - sum(b - a for a, b in runs) < SELDOM * (len(again) - sum(b - a for a, b in runs))
-    frozen = [b - a + 1 for a, b in runs if seldom and (others[a : b + 1].std(axis=0) > 0.2 * moving).any()]
-    return max(frozen, default=0)

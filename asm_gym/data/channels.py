@@ -135,7 +135,7 @@ def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ())
     if layout.spec is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
         raise ValueError(f"the memory reads {1 / spec.dt:.4g} rows a second, these come at {1 / dt:.4g}")
     if layout.spec is None:
-        spec = replace(spec, dt=dt, channels=tuple(_with_noise(spec, rows)))
+        spec = with_noise(replace(spec, dt=dt), np.array([noise_of(x) for x in rows.T]))
         _note_columns(columns)
     return Recorded(rows.astype(np.float32), spec, faults)
 
@@ -254,11 +254,13 @@ def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Chann
     return Channel(name, len(columns), next(iter(units), "1"), 0.0, group, elements if any(elements) else ())
 
 
-def _with_noise(spec: StreamSpec, rows: NDArray[np.float64]) -> Iterable[Channel]:
-    """The channels with the white noise that their rows (T, D) show."""
-    for channel, place in zip(spec.channels, spec.slices.values(), strict=True):
-        noise = 0.0 if channel.group == MOTOR else float(np.median([noise_of(x) for x in rows[:, place].T]))
-        yield replace(channel, noise=noise)
+def with_noise(spec: StreamSpec, noise: NDArray[np.float64]) -> StreamSpec:
+    """Return a spec whose sensed channels have the median of the white noise (..., D) of their numbers."""
+    channels = [
+        channel if channel.group == MOTOR else replace(channel, noise=float(np.median(noise[..., place])))
+        for channel, place in zip(spec.channels, spec.slices.values(), strict=True)
+    ]
+    return replace(spec, channels=tuple(channels))
 
 
 def _note_columns(columns: Sequence[Column]) -> None:

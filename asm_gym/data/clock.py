@@ -12,7 +12,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,9 +65,7 @@ class Clock(NamedTuple):
 
 
 def _seconds(column: str, unit: float | None, values: NDArray[Any], paired: bool) -> Floats:
-    if values.dtype.kind == "M":
-        return np.asarray((values - values[:1]) / np.timedelta64(1, "ns"), np.float64) * 1e-9
-    values = values if values.dtype.kind in "biuf" else _seconds_of_text(column, values)
+    values, unit = _numbers(column, unit, values)
     if values.ndim != 1 or not len(values):
         raise ValueError(f"the clock {column!r} must hold a number a row, got the shape {values.shape}")
     known = values[np.isfinite(values)]
@@ -76,7 +73,7 @@ def _seconds(column: str, unit: float | None, values: NDArray[Any], paired: bool
     unit = _epoch(first) if unit is None else unit
     if first < EPOCHS[-1][0] or (paired and unit < 1.0):
         return values.astype(np.float64) * unit
-    since = values.astype(np.int64) - int(first) if values.dtype.kind in "biu" else values - first
+    since = values.astype(np.int64) - int(known[0]) if values.dtype.kind in "biu" else values - first
     return np.asarray(since, np.float64) * unit
 
 
@@ -85,25 +82,26 @@ def _epoch(number: float) -> float:
     return next((unit for least, unit in EPOCHS if number >= least), 1.0)
 
 
-_TIME_OF_DAY = re.compile(r"\d{1,2}:\d\d:\d\d(\.\d+)?")
-
-
-def _seconds_of_text(column: str, values: NDArray[Any]) -> Floats:
-    """(T,) numbers of a column of text; times and dates in seconds from its first row."""
+def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDArray[Any], float | None]:
+    """The numbers (T,) of a column of times, and their unit: nanoseconds since 1970 of dates, seconds of a day."""
     import pandas as pd
 
+    if values.dtype.kind in "biuf":
+        return values, unit
+    if values.dtype.kind == "M":
+        return values.astype("M8[ns]").astype(np.int64), 1e-9
     text = pd.Series(values).astype("string").str.strip().replace("", pd.NA)
     numbers = pd.to_numeric(text, errors="coerce")
     if (numbers.notna() | text.isna()).all():
-        return np.asarray(numbers.to_numpy(np.float64, na_value=np.nan))
-    if text.str.fullmatch(_TIME_OF_DAY.pattern).fillna(True).all():
+        return numbers.to_numpy(np.float64, na_value=np.nan), unit
+    if text.str.fullmatch(r"\d{1,2}:\d\d:\d\d(\.\d+)?").fillna(True).all():
         day = (pd.to_timedelta(text) / pd.Timedelta(seconds=1)).to_numpy(np.float64)
-        return np.asarray(day + 86400.0 * np.concatenate([[0], np.cumsum(np.diff(day) < -43200)]))
+        return day + 86400.0 * np.concatenate([[0], np.cumsum(np.diff(day) < -43200)]), 1.0
     for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": True}):
         with suppress(ValueError, TypeError):
-            moments = pd.to_datetime(text, utc=True, **how)
-            since = (moments - moments.min()) / pd.Timedelta(seconds=1)
-            return np.asarray(since.to_numpy(np.float64, na_value=np.nan))
+            moments = pd.to_datetime(text, utc=True, **how).dt.as_unit("ns")
+            since = moments.astype(np.int64)
+            return (since if moments.notna().all() else since.where(moments.notna())).to_numpy(), 1e-9
     odd = next(str(cell) for cell in text[numbers.isna() & text.notna()])
     raise ValueError(f"the clock {column!r} must hold a time, got {odd[:40]!r}: --rate HZ reads the rows without it")
 
@@ -113,18 +111,9 @@ def _moment(column: str, unit: float | None, cell: str) -> float:
     try:
         number = float(cell or "nan")
     except ValueError:
-        try:
-            moment = datetime.fromisoformat(cell.strip())
-        except ValueError:
-            return float(_text_moment(column, cell))
-        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)  # all rows are of the same zone
-        return (moment - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
+        numbers, unit = _numbers(column, unit, np.array([cell], object))
+        number = float(numbers[0])
     return number * (_epoch(number) if unit is None else unit)
-
-
-def _text_moment(column: str, cell: str) -> float:
-    start = "00:00:00" if _TIME_OF_DAY.fullmatch(cell.strip()) else "01/01/1970 00:00:00"
-    return float(_seconds_of_text(column, np.array([start, cell.strip()], object))[1])
 
 
 def clocks_among(names: Iterable[str]) -> list[Clock]:
@@ -248,7 +237,7 @@ def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock
         unnamed = name.strip().lower() in COUNTERS
         if unnamed and values.dtype.kind == "O" and len(values):
             with suppress(ValueError):
-                if (np.diff(_seconds_of_text(name, values)) > 0).all():
+                if (np.diff(Clock((name,)).seconds(table)) > 0).all():
                     return Clock((name,))
         if values.dtype.kind not in "biuf" or values.ndim != 1 or len(values) < 3 or not np.isfinite(values).all():
             continue

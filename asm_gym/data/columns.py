@@ -127,24 +127,24 @@ def _named(table: Mapping[str, NDArray[Any]]) -> dict[str, Column]:
 
 def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None, is_stamp: bool) -> tuple[str, str]:
     """The role of a column by its name, by the options, and by the kind of its cells; else a sense."""
-    if any(column.matches(pattern) or header == pattern for pattern in layout.ignore):
-        return "ignored", "by --ignore"
-    if clock is not None and header in clock.columns:
-        return "clock", "tells the rate"
-    if is_label(column.name, layout.labels):
-        return "label", "rows it marks are not learned from"
-    if layout.channels and not any(column.matches(pattern) for pattern in layout.channels):
-        return "ignored", "not among --channels"
-    if is_stamp and not layout.channels:
-        return "clock", f"another clock{BACK}"
-    if DOUBLED in header:
-        other = header.partition(DOUBLED)[0]
-        return "double", f"differs from another column of the name {other!r}; --ignore '{header}' leaves it out"
-    if not is_numeric(column.values):
-        return _words(column)
-    if not np.isfinite(column.values).any():
-        return "empty", "holds no number"
-    return "sense", ""
+    asked_for = any(column.matches(pattern) for pattern in layout.channels)
+    left_out = any(column.matches(pattern) or header == pattern for pattern in layout.ignore)
+    other = header.partition(DOUBLED)[0]
+    rules = (
+        (left_out, "ignored", "by --ignore"),
+        (clock is not None and header in clock.columns, "clock", "tells the rate"),
+        (is_label(column.name, layout.labels), "label", "rows it marks are not learned from"),
+        (bool(layout.channels) and not asked_for, "ignored", "not among --channels"),
+        (is_stamp and not layout.channels, "clock", f"another clock{BACK}"),
+        (
+            DOUBLED in header,
+            "double",
+            f"differs from another column of the name {other!r}; --ignore '{header}' leaves it out",
+        ),
+        (is_numeric(column.values) and not np.isfinite(column.values).any(), "empty", "holds no number"),
+    )
+    role, why = next(((role, why) for holds, role, why in rules if holds), ("sense", ""))
+    return _words(column) if role == "sense" and not is_numeric(column.values) else (role, why)
 
 
 def _words(column: Column) -> tuple[str, str]:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.behaviour import stands_still
 from asm_gym.data.channels import clock_of
 from asm_gym.data.clock import Clock
 from asm_gym.data.columns import Column, LogLayout, decide
@@ -80,7 +79,7 @@ def inspected(
     columns = decide([table, *others], layout, clock)
     trouble = [f"{c.name} {c.why}" for c in columns if c.role in ("mixed", "double")]
     found = found._replace(trouble=found.trouble or "; ".join(trouble))
-    return Inspection(name, found, columns, [_facts(c, columns, found) for c in columns])
+    return Inspection(name, found, columns, [_facts(c) for c in columns])
 
 
 def is_constant(column: Column) -> bool:
@@ -109,19 +108,15 @@ def _clock(table: Columns, layout: LogLayout) -> tuple[ClockFound, Clock | None]
     return ClockFound(clock.seconds(table), 1 / dt, jitter, gaps, name=clock.name), clock
 
 
-def _facts(column: Column, columns: Sequence[Column], clock: ClockFound) -> dict[str, Any]:
+def _facts(column: Column) -> dict[str, Any]:
     """What the values of a column are like."""
     values = column.values if is_numeric(column.values) else np.zeros(0)
     known = values[np.isfinite(values) & (values != column.code)]
     different, missing, step = len(np.unique(known)), len(values) - len(known), resolution(values)
     repeats = float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0
-    others = [c.values for c in columns if c.role == "sense" and c is not column]
-    still = stands_still(values, np.column_stack(others)) if column.role == "sense" and others else 0
     treatment = {
         f"hardly moves: {different} values; its spread has a floor": 1 < different < FEW_VALUES,
         "missing numbers: bridged, or cut there": missing > 0,
-        f"stands still for {still / (clock.rate or 1):.3g} s while others move: frozen?": still > 0,
-        "repeats itself at rest: healthy": not still and bool(step) and repeats > 0.02 and different > 1,
         "a memory of radians reads it too": "deg" in column.unit or "°" in column.unit,
     }
     remarks = ["commanded, by its name"] if column.role == "command" else []

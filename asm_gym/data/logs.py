@@ -9,11 +9,9 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 from asm_gym.checkpoint import read_arrays
 from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
@@ -24,7 +22,7 @@ from asm_gym.data.datasets import METADATA, read_dataset
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot import INFO, read_lerobot
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import HEADING, Columns, laid_out, table_of
+from asm_gym.data.tables import Columns, laid_out, table_of
 from asm_gym.data.text import read_json_lines, read_text
 from asm_gym.data.timing import recordings
 from asm_gym.validation import typed
@@ -45,10 +43,8 @@ FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
 HDF5 = (".hdf5", ".h5")  # files of several demonstrations, as robomimic writes them
 ASKED_FOR = (".txt", ".dat", ".data", ".log")  # read where they are named, and not in a folder: most are no logs
 POINTER = b"version https://git-lfs.github.com"
-FIRST_TABLES, FIRST_NUMBERS = (
-    20,
-    20_000_000,
-)  # by how many of a folder's tables, or numbers, it is decided what columns are
+FIRST_TABLES = 20  # by how many of a folder's tables it is decided what columns are,
+FIRST_NUMBERS = 20_000_000  # or by how many numbers of these
 
 
 class Log(NamedTuple):
@@ -149,14 +145,6 @@ def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
         raise ValueError(f"it holds no row of numbers, got {', '.join(table)[:200] or 'no column'}")
     if len({len(values) for values in table.values()}) > 1:
         yield source._replace(columns=table)  # refused, with the lengths
-        return
-    headings = table.pop(HEADING, None)
-    if headings is not None:
-        edges = [0, *(np.flatnonzero(headings[1:] != headings[:-1]) + 1).tolist(), len(headings)]
-        for start, stop in pairwise(edges):
-            part = {name: values[start:stop] for name, values in table.items()}
-            part["label"] = np.array([str(headings[start]).partition(" ")[0]] * (stop - start), object)
-            yield source._replace(name=f"{source.name} {headings[start]}", columns=part)
         return
     try:
         clock = clock_of(table, layout)

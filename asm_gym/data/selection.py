@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.channels import with_noise
 from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
 from asm_gym.readings import noise_of, spans
-from asm_gym.spec import MOTOR
 
 SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
 AROUND_S = 5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is no normal motion
@@ -78,11 +78,7 @@ def with_shared_noise(episodes: list[Episode]) -> list[Episode]:
     if spec.source != "table" or len(episodes) == 1:
         return episodes
     noise = np.array([[noise_of(column) for column in e.stream.T] for e in episodes])  # (N, D)
-    channels = [
-        channel if channel.group == MOTOR else replace(channel, noise=float(np.median(noise[:, place])))
-        for channel, place in zip(spec.channels, spec.slices.values(), strict=True)
-    ]
-    whole = replace(spec, channels=tuple(channels))
+    whole = with_noise(spec, noise)
     return [replace(episode, spec=whole) for episode in episodes]
 
 

@@ -25,8 +25,8 @@ Columns = dict[str, NDArray[Any]]
 Named = dict[str, dict[str, str]]  # values by their kind, by the column that names them
 
 _NAMES = re.compile(r"(?P<of>.*?)(?:joint_?)?names?[_.]?\[?(?P<place>\d+)\]?", re.I)
-_KEY = re.compile(r"(.*[^a-z])?(joint|motor|axis|servo|actuator|name)s?([^a-z].*)?", re.I)
-HEADING = "heading label"  # the column of the words above blocks of a table
+_KEYS = "joint|motor|axis|servo|actuator|name|channel|signal|sensor|topic|field|variable"  # whose row it is
+_KEY = re.compile(rf"(.*[^a-z])?({_KEYS})s?([^a-z].*)?", re.I)
 MOST_KEYS = 64  # joints of a long table
 MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
 SPARSE = 0.55  # share of filled rows up to which a column comes at a lower rate: at most at every other row
@@ -126,14 +126,14 @@ def _pivoted(table: Columns) -> Columns:
 
 
 def _is_key(name: str, values: NDArray[Any]) -> bool:
-    """Whether a column says whose row it is: it goes round and round the same few words, or numbers if called so."""
-    if len(values) < 4 or (is_numeric(values) and (values.dtype.kind not in "iu" or not _KEY.fullmatch(name))):
+    """Whether a column says whose row it is: it is called so, and goes round the same few words or numbers."""
+    import pandas as pd
+
+    if len(values) < 4 or values.dtype.kind == "f" or not _KEY.fullmatch(name) or _NAMES.fullmatch(name):
         return False
-    words = values if is_numeric(values) else np.array([str(cell) for cell in values])
-    if is_clock(name) or _NAMES.fullmatch(name):
-        return False
-    size = len(np.unique(words[: 4 * MOST_KEYS]))
-    if not 2 <= size <= min(MOST_KEYS, len(words) // 2) or len(np.unique(words[:size])) < size:
+    words = pd.factorize(values)[0]
+    size = int(words.max()) + 1
+    if not 2 <= size <= min(MOST_KEYS, len(words) // 2) or (words[:size] != np.arange(size)).any():
         return False
     changes, again = np.mean(words[1:] != words[:-1]), np.mean(words[size:] == words[:-size])
     return bool(changes >= MOSTLY and again >= MOSTLY)
@@ -141,6 +141,8 @@ def _is_key(name: str, values: NDArray[Any]) -> bool:
 
 def _joined(table: Columns) -> Columns:
     """A table whose columns come at several rates, at the rate of the fastest ones."""
+    import pandas as pd
+
     filled = {n: np.isfinite(v) for n, v in table.items() if is_numeric(v) and v.dtype.kind == "f" and not is_clock(n)}
     filled = {name: mask for name, mask in filled.items() if mask.any()}
     groups = defaultdict[bytes, list[str]](list)
@@ -159,9 +161,9 @@ def _joined(table: Columns) -> Columns:
         return table
     rate = f"of {fastest!r}" if fastest else "of the table"
     note(f"columns come at several rates: rows are those {rate}, {', '.join(slower)[:120]} keep their newest value")
-    made = {name: _held(values, slower.get(name))[rows] for name, values in table.items()}
-    start = max(int(np.argmax(np.isfinite(made[name]))) for name in slower)  # before that the slower ones said nothing
-    return {name: values[start:] for name, values in made.items()}
+    held = pd.DataFrame({n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()})[rows]
+    start = int(held.notna().to_numpy().argmax(axis=0).max())  # before that the slower ones said nothing
+    return {n: (held[n].to_numpy() if n in slower else values[rows])[start:] for n, values in table.items()}
 
 
 def _regular(mask: NDArray[np.bool_]) -> bool:
@@ -171,15 +173,6 @@ def _regular(mask: NDArray[np.bool_]) -> bool:
         return False
     steps = np.diff(filled)
     return bool(np.quantile(steps, 0.9) <= 2.5 * max(float(np.median(steps)), 1 / mask.mean()))
-
-
-def _held(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[Any]:
-    """(T,) the newest value of a slower column, as long as it is not old."""
-    if mask is None:
-        return values
-    newest = np.maximum.accumulate(np.where(mask, np.arange(len(mask)), -1))
-    old = (newest < 0) | (np.arange(len(mask)) - newest > HELD / mask.mean())
-    return np.where(old, np.nan, values[newest])
 
 
 def laid_out(table: Columns) -> Columns:

@@ -10,11 +10,12 @@ last line   cut off in the middle: left out, with a note
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.names import split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import HEADING, Columns
+from asm_gym.data.tables import Columns
 from asm_gym.files import regular_file
 
 if TYPE_CHECKING:
@@ -36,10 +37,10 @@ MOST_COLUMNS = 8192  # every number is weighed against every other later on: see
 LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
 SEPARATORS = ";\t,|"
 FLAGS = {"true": 1.0, "false": 0.0}
+WINDOWS = "asm_gym.windows"  # how bytes that are no UTF-8 are read
 DOUBLED = " #"  # stands, with a number, behind the name of a column that another has
 MOST_PREAMBLE, AGREE = 50, 5  # lines above a header; lines below it that must have as many cells
 LONGEST_UNIT = 12  # characters of a unit
-_HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
 
 
 class Dialect(NamedTuple):
@@ -90,42 +91,41 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     """
     import pandas as pd
 
-    numbered, complete = _lines(path)
-    if not numbered:
+    lines, complete = _lines(path)
+    if lines.empty:
         raise ValueError("it needs a header and at least one row, got 0 lines")
-    blocks, numbered = _blocks(numbered) if columns else ([], numbered)
-    at = 0 if columns else _header_at([line for _, line in numbered[: MOST_PREAMBLE + AGREE]])
+    at = 0 if columns else _header_at(lines.iloc[: MOST_PREAMBLE + AGREE].tolist())
     if at:
         note(f"{path}: its first {at} lines are no part of the table, and are left out")
-    first, rows = numbered[at][1], numbered[at + 1 :]
-    dialect = Dialect.of(first)
-    names, has_header = _header(dialect, first, columns)
-    rows = rows if has_header else numbered
-    below = [line for _, line in rows[:2]] if has_header else []
-    if len(below) == 2 and below[0].strip() != first.strip() and _are_units(dialect, *below):
-        units = [cell.strip() for cell in dialect.cells(rows.pop(0)[1])]
+    first, rows = lines.iloc[at].strip(), lines.iloc[at + 1 :]
+    dialect = Dialect.of(lines.iloc[at])
+    names, has_header = _header(dialect, lines.iloc[at], columns)
+    if not has_header:
+        rows = lines
+    elif len(rows) > 1 and rows.iloc[0].strip() != first and _are_units(dialect, *rows.iloc[:2]):
+        units = [cell.strip() for cell in dialect.cells(rows.iloc[0])]
         names = [f"{n} [{u.strip('[]()')}]" if u and n else n for n, u in zip(names, units, strict=False)]
-    again = sum(line.strip() == first.strip() for _, line in rows) if has_header else 0
-    if again:
-        note(f"{path}: its header stands there {again + 1} times, and is left out")
-        rows = [(n, line) for n, line in rows if line.strip() != first.strip()]
-    comments = sum(line.lstrip().startswith("#") for _, line in rows)
-    if comments:
-        note(f"{path}: {comments} lines behind a # are left out")
-        rows = [(n, line) for n, line in rows if not line.lstrip().startswith("#")]
-    if not complete and len(rows) > 1 and _cut_off(dialect, rows[-2][1], rows[-1][1], len(names)):
+        rows = rows.iloc[1:]
+    for what, left_out in (
+        ("its header once more", (rows.str.strip() == first) & has_header),
+        ("behind a #", rows.str.lstrip().str.startswith("#")),
+    ):
+        if left_out.any():
+            note(f"{path}: {left_out.sum()} lines are left out, {what}")
+            rows = rows[~left_out]
+    if not complete and len(rows) > 1 and _cut_off(dialect, *rows.iloc[-2:], len(names)):
         note(f"{path}: its last line was cut off, and is left out")
-        rows = rows[:-1]
-    if not rows:
-        raise ValueError(f"it needs a header and at least one row, got {len(numbered)} lines")
+        rows = rows.iloc[:-1]
+    if rows.empty:
+        raise ValueError(f"it needs a header and at least one row, got {len(lines)} lines")
     widest = len(names)
-    for n, line in rows:
+    for n, line in rows.items():
         cells = dialect.cells(line)
         widest = max(widest, len(cells))
         check_cells(cells, len(names), f"line {n} has")
     try:
         frame = pd.read_csv(
-            io.StringIO("\n".join(line for _, line in rows)),
+            io.StringIO("\n".join(rows)),
             sep=r"\s+" if dialect.separator == " " else dialect.separator,
             header=None,
             names=list(range(widest)),
@@ -135,22 +135,7 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
         )
     except ValueError as error:
         raise ValueError(f"it is no table of text: {' '.join(str(error).split())}") from error
-    made = [(name, _column(frame[k], dialect.comma)) for k, name in enumerate(names)]
-    made += [(HEADING, np.array(blocks, object))] if blocks else []
-    return _merged([(n, c) for n, c in made if n or c.dtype.kind == "O" or np.isfinite(c).any()])
-
-
-def _blocks(numbered: list[tuple[int, str]]) -> tuple[list[str], list[tuple[int, str]]]:
-    """The heading of each row where words stand above blocks of a table, and its rows; else no headings."""
-    headings, rows, heading = list[str](), list[tuple[int, str]](), ""
-    for n, line in numbered:
-        if len(line.split()) == 1 and re.fullmatch(r"[^\W\d]\w*", line.strip()):
-            heading = f"{line.strip()} {n}"
-        else:
-            headings.append(heading)
-            rows.append((n, line))
-    found = len(set(headings)) > 1 and all(headings)
-    return (headings, rows) if found else ([], numbered)
+    return _merged((name, _column(frame[k], dialect.comma)) for k, name in enumerate(names))
 
 
 def _header_at(lines: Sequence[str]) -> int:
@@ -159,7 +144,7 @@ def _header_at(lines: Sequence[str]) -> int:
     for at, line in enumerate(lines[:MOST_PREAMBLE]):
         dialect = Dialect.of(line)
         with suppress(ValueError):
-            size = len(_cells_of_header(dialect, line))
+            size = len(dialect.cells(_uncommented(line)))
             below = [dialect.cells(other) for other in lines[at + 1 :] if not other.lstrip().startswith("#")][:AGREE]
             agree = [len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below]
             numbers = [sum(dialect.is_number(c) for c in cells[:size] if c.strip()) for cells in below]
@@ -178,29 +163,29 @@ def _are_units(dialect: Dialect, line: str, below: str) -> bool:
     return bool(words) and any(dialect.is_number(c) for c in dialect.cells(below) if c.strip())
 
 
-def _merged(columns: Sequence[tuple[str, NDArray[Any]]]) -> Columns:
-    """The columns by name; of one name, equal ones are one, and others get a number."""
-    by_name: dict[str, list[NDArray[Any]]] = {}
+def _merged(columns: Iterable[tuple[str, NDArray[Any]]]) -> Columns:
+    """The columns by name, but for empty ones without a name; of one name, equal ones are one, others get a number."""
+    import pandas as pd
+
+    made: Columns = {}
     for name, values in columns:
-        same = by_name.setdefault(name, [])
-        if any(_equal(kept, values) for kept in same):
+        if not name and values.dtype.kind != "O" and not np.isfinite(values).any():
+            continue
+        others = [other for other in made if other.partition(DOUBLED)[0] == name]
+        if any(pd.Series(made[other]).equals(pd.Series(values)) for other in others):
             note(f"columns of the same name are equal, and read as one: {name}")
         else:
-            same.append(values)
-    return {f"{n}{DOUBLED}{k}" if k > 1 else n: v for n, same in by_name.items() for k, v in enumerate(same, 1)}
+            made[f"{name}{DOUBLED}{len(others) + 1}" if others else name] = values
+    return made
 
 
-def _equal(one: NDArray[Any], other: NDArray[Any]) -> bool:
-    return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+def _lines(path: Path) -> tuple[pd.Series[str], bool]:
+    """The lines that are not empty by their numbers, from 1, and whether the last one has an end."""
+    import pandas as pd
 
-
-def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
-    """The lines that are not empty, numbered from 1, and whether the last one has an end."""
     regular_file(path)
     raw = path.read_bytes()
-    wide = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
-    if not wide and raw[1:200:2].count(0) > 80:  # UTF-16 of Windows, without its mark
-        raw, wide = b"\xff\xfe" + raw, True
+    wide = raw[:2] in (b"\xff\xfe", b"\xfe\xff") or raw[1:200:2].count(0) > 80  # UTF-16 of Windows
     if b"\x00" in raw[:LONGEST_LINE] and not wide:
         raise ValueError("it is no text")
     try:
@@ -208,27 +193,31 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], bool]:
     except UnicodeDecodeError:
         if wide:
             raise ValueError("it is no text") from None
-        text = "".join(map(_decoded, raw.removeprefix(b"\xef\xbb\xbf").splitlines(keepends=True)))
-        note(f"{path} is not in UTF-8 throughout: other lines are read as Windows-1252")
-    lines = re.split(r"\r\n?|\n", text)
-    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip(" ")]
-    n, longest = max(numbered, key=lambda each: len(each[1]), default=(0, ""))
-    if len(longest) > LONGEST_LINE:
-        raise ValueError(f"line {n} has {len(longest)} characters: at most {MOST_COLUMNS} columns can be watched")
-    return numbered, text.endswith(("\n", "\r"))
+        text = raw.decode("utf-8-sig", WINDOWS)
+        note(f"{path} is not in UTF-8 throughout: other characters are read as Windows-1252")
+    lines = pd.Series(re.split(r"\r\n?|\n", text), dtype=object)
+    lines.index += 1
+    lines = lines[lines.str.strip(" ") != ""]
+    sizes = lines.str.len()
+    if sizes.max() > LONGEST_LINE:
+        n, size = sizes.idxmax(), sizes.max()
+        raise ValueError(f"line {n} has {size} characters: at most {MOST_COLUMNS} columns can be watched")
+    return lines, text.endswith(("\n", "\r"))
 
 
-def _decoded(line: bytes) -> str:
-    try:
-        return line.decode("utf-8")
-    except UnicodeDecodeError:
-        return line.decode("cp1252", errors="replace")
+def _as_windows(error: UnicodeError) -> tuple[str, int]:
+    """The characters that are no UTF-8, as Windows-1252."""
+    assert isinstance(error, UnicodeDecodeError)
+    return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
+
+
+codecs.register_error(WINDOWS, _as_windows)
 
 
 def check_cells(cells: Sequence[str], size: int, where: str) -> None:
     """Raise ValueError where a row has fewer cells than its header, or more that hold something."""
     if len(cells) < size or any(cell.strip() for cell in cells[size:]):
-        raise ValueError(f"{where} {len(cells)} cells, its header {size}")
+        raise ValueError(f"{where} {len(cells)} cells, its header {size}: mend it, or cut the file there")
 
 
 def _cut_off(dialect: Dialect, before: str, last: str, size: int) -> bool:
@@ -237,16 +226,14 @@ def _cut_off(dialect: Dialect, before: str, last: str, size: int) -> bool:
     return len(cells) < size or any(dialect.is_number(was) and not dialect.is_number(now) for was, now in cells)
 
 
-def _cells_of_header(dialect: Dialect, line: str) -> list[str]:
-    cells = dialect.cells(line)
-    if len(cells) > 1 and cells[0] in ("#", "%"):  # in front of a header whose names are separated by blanks
-        return cells[1:]
-    return cells
+def _uncommented(line: str) -> str:
+    """The line of a header that stands behind a # or a %."""
+    return line.lstrip(" ").lstrip("#%").lstrip(" ")
 
 
 def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
     """Names of the columns, and whether the first line holds them."""
-    cells = _cells_of_header(dialect, line)
+    cells = dialect.cells(_uncommented(line))
     numbers = [dialect.is_number(cell) for cell in cells if cell.strip()]
     if columns:
         columns = ["", *columns] if cells and not cells[0].strip() and len(columns) == len(cells) - 1 else columns
@@ -263,7 +250,7 @@ def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[s
 
 def header_of(cells: Sequence[str], where: str) -> list[str]:
     """Return the names of columns. Raises ValueError where there are none or too many."""
-    names = [cell.strip().lstrip("#%-").strip() if cell.strip() not in ("%", "#") else "" for cell in cells]
+    names = [cell.strip().lstrip("#%-").strip() for cell in cells]
     while names and not names[-1]:  # ;;; at the end of every line
         names.pop()
     if not names:
@@ -278,15 +265,13 @@ def _check_width(size: int) -> None:
 
 
 def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
-    """Return the numbers (T,) of cells of text: decimals, true and false, 0x1f; NaN of empty cells and of words."""
+    """Return the numbers (T,) of cells of text: decimals, true and false; NaN of empty cells and of words."""
     import pandas as pd
 
     text = pd.Series(cells).astype("string").str.strip()
     plain = text.str.replace(",", ".", regex=False) if comma else text
     found = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
     values: NDArray[np.float64] = found.to_numpy(np.float64, na_value=np.nan)
-    hexadecimal = text.str.fullmatch(_HEX).fillna(False).to_numpy(bool)
-    values[hexadecimal] = [float(int(cell, 16)) for cell in text[hexadecimal]]
     return values
 
 
@@ -306,19 +291,19 @@ def read_json_lines(path: Path, columns: Sequence[str] = ()) -> Columns:
     import pandas as pd
 
     rows: list[dict[str, Any]] = []
-    numbered, complete = _lines(path)
-    for n, line in numbered:
+    lines, complete = _lines(path)
+    for n, line in lines.items():
         try:
             rows.append(flat_row(json.loads(line), columns))
             _check_width(len(rows[-1]))
         except (ValueError, RecursionError) as error:
-            if rows and isinstance(error, json.JSONDecodeError) and n == numbered[-1][0] and not complete:
+            if rows and isinstance(error, json.JSONDecodeError) and n == lines.index[-1] and not complete:
                 note(f"{path}: its last line was cut off, and is left out")
                 continue
             raise ValueError(f"line {n} is no row: {error}") from error
     if not rows:
         raise ValueError("it needs at least one row, got none")
-    within = json.loads(numbered[0][1])
+    within = json.loads(lines.iloc[0])
     within = within if isinstance(within, dict) else {}
     lost = [k for k, v in within.items() if isinstance(v, list) and v and isinstance(v[0], dict | list)]
     if lost:
