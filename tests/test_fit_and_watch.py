@@ -113,7 +113,6 @@ def test_an_inspection_says_what_is_known_of_a_log():
     assert facts["current_1"]["noise"] == pytest.approx(0.05, rel=0.1)
     assert (facts["current_1"]["resolution"], facts["current_1"]["missing"]) == (0.0, 10)
     assert "never moves" in facts["fan"]["what is done"]
-    assert "healthy" in facts["q_1"]["what is done"]
     assert any("1 gaps in the clock, the longest 2.0" in line for line in found.remarks())
     assert any("no clock: say --rate" in line for line in inspected("x", {"q": np.arange(9.0)}).remarks())
 

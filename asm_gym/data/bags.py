@@ -84,14 +84,15 @@ def _columns(bag: Any) -> Columns:
     clock = max((key for key in said if key[0] in of_states), key=lambda key: len(said[key]))
     if len(said) > 1:
         note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
-    rows = pd.DataFrame(said.pop(clock))
-    for messages in said.values():
-        other = pd.DataFrame(messages)
+    tables = {key: pd.DataFrame(messages) for key, messages in said.items()}
+    rows = tables[clock]
+    for other in (table for key, table in tables.items() if key != clock):
         old = HELD * (other["came"].iloc[-1] - other["came"].iloc[0]) / max(len(other) - 1, 1)
-        new = other[["came", *other.columns.difference(rows.columns, sort=False)]]
+        new = other[["came", *other.columns.difference(rows.columns)]]
         rows = pd.merge_asof(rows, new, on="came", tolerance=old)
     rows["time"] -= rows["time"].iloc[0]  # seconds since 1970 would cost digits
-    return {name: rows[name].to_numpy() for name in rows if name != "came"}
+    names = dict.fromkeys(name for table in tables.values() for name in table if name != "came")
+    return {name: rows[name].to_numpy() for name in names}
 
 
 def stamp_of(message: Any) -> float:
