@@ -37,8 +37,8 @@ SECONDS = {
 """Seconds in one, by the unit behind the name of a clock."""
 
 # Names of columns that count rows.
-COUNTERS = ("", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0")
-COUNTERS += ("__index_level_0__",)  # of pandas in Parquet
+COUNTERS = {"", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0"}
+COUNTERS |= {"__index_level_0__"}  # of pandas in Parquet
 
 TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fromkeys(("rad", "radian", "radians"), TAU)
 """A whole turn, by the unit of an angle."""

@@ -113,7 +113,7 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
         if left_out.any():
             note(f"{path}: {left_out.sum()} lines are left out, {what}")
             rows = rows[~left_out]
-    if not complete and len(rows) > 1 and _cut_off(dialect, *rows.iloc[-2:], len(names)):
+    if not complete and len(rows) > 1 and _cut_off(dialect, rows.iloc[-2], rows.iloc[-1], len(names)):
         note(f"{path}: its last line was cut off, and is left out")
         rows = rows.iloc[:-1]
     if rows.empty:
