@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.envs.commands import clip, in_units
+from asm_gym.envs.commands import clip
 from asm_gym.envs.robots import gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
@@ -28,10 +28,10 @@ class Actions:
 
     def __init__(self, env: Any, task: str, controller: str) -> None:
         self._task, self._controller = task, controller
-        self._low, high = env.action_spec
-        self._half = 0.5 * (high - self._low)
-        self.space = spaces.Box(-1.0, 1.0, self._low.shape, np.float32)
-        self.size = int(self._low.size)
+        low, high = env.action_spec
+        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
+        self.space = spaces.Box(-1.0, 1.0, low.shape, np.float32)
+        self.size = int(low.size)
         self.grippers = gripper_actions(env.robots)  # indices of the numbers that command grippers
 
     def checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -50,7 +50,7 @@ class Actions:
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""
-        return in_units(action, self._low, self._half)
+        return self._middle + self._half * action
 
     def slowed(self, simulation: Simulation, action: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
         """Return the action (A,) scaled so that no hand is commanded to go faster than ``limit`` [m/s].

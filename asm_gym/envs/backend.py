@@ -44,6 +44,7 @@ def import_robosuite() -> Any:
         if no_viewer:
             del sys.modules["cv2"]
     _fit_to_mujoco()
+    _compile_less()
     return robosuite
 
 
@@ -66,6 +67,15 @@ def _fit_to_mujoco() -> None:
 
     MjData.qM = property(lambda data: data._data.M)
     controller.mujoco = SimpleNamespace(mj_fullM=whole_mass_matrix)
+
+
+def _compile_less() -> None:
+    """Leave uncompiled what takes seconds to compile, for an observable of robosuite's robots that nothing reads."""
+    from robosuite.robots import robot
+    from robosuite.utils import transform_utils
+
+    mat2quat = getattr(transform_utils.mat2quat, "py_func", transform_utils.mat2quat)
+    robot.T = SimpleNamespace(**{**vars(transform_utils), "mat2quat": mat2quat})
 
 
 def row_substeps(rate: int, control_freq: int) -> int:

@@ -36,15 +36,6 @@ def clip(action: NDArray[np.float32], clipped: NDArray[np.float32]) -> bool:
 
 
 @compiled
-def in_units(action: NDArray[np.float32], low: Floats, half: Floats) -> Floats:
-    """Return an action (A,) in [-1, 1] within bounds whose least and half range are ``low`` and ``half`` (A,)."""
-    found = np.empty(len(action))
-    for i in range(len(action)):
-        found[i] = low[i] + half[i] * (np.float64(action[i]) + 1.0)
-    return found
-
-
-@compiled
 def within(value: float, least: float, most: float) -> float:
     """Return a number within bounds; NaN stays."""
     if value < least:
@@ -53,50 +44,33 @@ def within(value: float, least: float, most: float) -> float:
 
 
 @compiled
-def scaled(action: float, scaling: Floats, i: int) -> float:
-    """Return input ``i`` of a controller in its own units."""
-    x = within(action, scaling[LEAST, i], scaling[MOST, i])
-    found: float = (x - scaling[MIDDLE, i]) * scaling[SCALE, i] + scaling[OFFSET, i]
+def scaled(action: float, scaling: Floats, a: int, i: int) -> float:
+    """Return input ``i`` of controller ``a`` in its own units; scaling is (A, 5, N)."""
+    x = within(action, scaling[a, LEAST, i], scaling[a, MOST, i])
+    found: float = (x - scaling[a, MIDDLE, i]) * scaling[a, SCALE, i] + scaling[a, OFFSET, i]
     return found
 
 
 @compiled
-def rotation(turn: Floats, matrix: Floats) -> None:
-    """Write the rotation (3, 3) by ``turn`` (3,), an axis times an angle [rad], into ``matrix``."""
-    angle = np.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
-    q = np.zeros(4, np.float32)
-    q[0] = 1.0
+def rotation(turn: Floats, at: int, matrix: Floats) -> None:
+    """Write the rotation (3, 3) by three numbers of ``turn`` at ``at``, axis times angle [rad], into ``matrix``."""
+    rx, ry, rz = turn[at], turn[at + 1], turn[at + 2]
+    angle = np.sqrt(rx * rx + ry * ry + rz * rz)
+    w, x, y, z = np.float32(1.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
     if angle != 0.0:
-        q[0] = np.cos(angle / 2.0)
-        for i in range(3):
-            q[1 + i] = turn[i] / angle * np.sin(angle / 2.0)
-    norm = np.float64(0.0)
-    for i in range(4):
-        norm += np.float64(q[i] * q[i])
+        sine = np.sin(angle / 2.0)
+        w, x = np.float32(np.cos(angle / 2.0)), np.float32(rx / angle * sine)
+        y, z = np.float32(ry / angle * sine), np.float32(rz / angle * sine)
+    norm = np.float64(w * w) + np.float64(x * x) + np.float64(y * y) + np.float64(z * z)
     scale = np.sqrt(2.0 / np.float64(np.float32(norm)))
-    for i in range(4):
-        q[i] = np.float64(q[i]) * scale
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        a, b, c, w = q[1 + i], q[1 + j], q[1 + k], q[0]
-        first, second = q[1 + min(j, k)], q[1 + max(j, k)]
-        matrix[i, i] = 1.0 - np.float64(first * first) - np.float64(second * second)
-        matrix[i, j] = np.float64(a * b - c * w)
-        matrix[j, i] = np.float64(a * b + c * w)
-
-
-@compiled
-def move_arms(action: Floats, first: Ints, count: Ints, scalings: Floats, deltas: Floats, turns: Floats) -> None:
-    """Write what an action asks of each arm into deltas (A, JOINTS), and its rotation into turns (A, 3, 3).
-
-    Args:
-        first, count: (A,) each arm's part of the action.
-        scalings: (A, 5, JOINTS).
-    """
-    for a in range(len(first)):
-        for i in range(count[a]):
-            deltas[a, i] = scaled(action[first[a] + i], scalings[a], i)
-        rotation(deltas[a, 3:6], turns[a])
+    w, x = np.float32(np.float64(w) * scale), np.float32(np.float64(x) * scale)
+    y, z = np.float32(np.float64(y) * scale), np.float32(np.float64(z) * scale)
+    matrix[0, 0] = 1.0 - np.float64(y * y) - np.float64(z * z)
+    matrix[1, 1] = 1.0 - np.float64(x * x) - np.float64(z * z)
+    matrix[2, 2] = 1.0 - np.float64(x * x) - np.float64(y * y)
+    matrix[0, 1], matrix[1, 0] = x * y - z * w, x * y + z * w
+    matrix[1, 2], matrix[2, 1] = y * z - x * w, y * z + x * w
+    matrix[2, 0], matrix[0, 2] = z * x - y * w, z * x + y * w
 
 
 @compiled
@@ -105,9 +79,9 @@ def move_gripper(asked: Floats, scaling: Floats, ranges: Floats, motors: Ints, c
 
     Args:
         asked: (G,) in [-1, 1].
-        scaling: (5, G) of robosuite's controller.
+        scaling: (1, 5, G) of robosuite's controller.
         ranges: (4, G) the middle and half of what it commands, and the motors' own bounds.
     """
     for i in range(len(motors)):
-        command = ranges[0, i] + ranges[1, i] * scaled(asked[i], scaling, i)
+        command = ranges[0, i] + ranges[1, i] * scaled(asked[i], scaling, 0, i)
         ctrl[motors[i]] = within(command, ranges[2, i], ranges[3, i])

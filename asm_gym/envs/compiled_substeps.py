@@ -20,7 +20,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
-from asm_gym.envs.control import brake, control, hand_velocity, hold_at, set_goal
+from asm_gym.envs.control import HELD, control, set_goal
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
@@ -37,6 +37,7 @@ from asm_gym.envs.mujoco_views import (
     NominalViews,
     SubstepLimits,
     Views,
+    Work,
 )
 
 # Parts of one arm's sample in a substep.
@@ -46,6 +47,7 @@ WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
 CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
 VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
 SAMPLE = VELOCITY.stop
+_WRENCH, _CONTACT, _VELOCITY = WRENCH.start, CONTACT.start, VELOCITY.start
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
@@ -62,26 +64,23 @@ _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, 
 @compiled
 def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
     """Evaluate the nominal model's dynamics at the live joint positions and velocities."""
-    nominal.qpos[:] = views.qpos
-    nominal.qvel[:] = views.qvel
+    for i in range(len(nominal.qpos)):
+        nominal.qpos[i] = views.qpos[i]
+    for i in range(len(nominal.qvel)):
+        nominal.qvel[i] = views.qvel[i]
     _kinematics(nominal.model, nominal.data)
     _com_pos(nominal.model, nominal.data)
     _mass(nominal.model, nominal.data)
     _com_vel(nominal.model, nominal.data)
-    _rne(nominal.model, nominal.data, 0, nominal.bias.ctypes.data)
+    _rne(nominal.model, nominal.data, 0, nominal.bias_at)
 
 
 @compiled
 def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
     """Write the sensor values of every arm after substep ``k`` into samples (A, K, SAMPLE)."""
-    edited = nominal.model != 0
-    mass = nominal.mass if edited else views.M
-    bias = nominal.bias if edited else views.qfrc_bias
-    needed = np.empty(JOINTS)
     for a in range(len(arms.joints)):
-        row = samples[a, k]
-        n = arms.joints[a]
-        needed[:] = 0.0
+        for i in range(SAMPLE):
+            samples[a, k, i] = 0.0
         for t in range(arms.tree.shape[1]):
             i = arms.tree[a, t]
             if i < 0:
@@ -89,67 +88,74 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
             first = views.M_rowadr[i]
             for at in range(first + views.M_rownnz[i] - 1, first - 1, -1):
                 j = views.M_colind[at]
-                for r in range(n):
+                for r in range(arms.joints[a]):
                     if arms.dofs[a, r] == i:
-                        needed[r] += mass[at] * views.qacc[j]
+                        samples[a, k, r] += nominal.mass[at] * views.qacc[j]
                     elif arms.dofs[a, r] == j:
-                        needed[r] += mass[at] * views.qacc[i]
-        for i in range(n):
+                        samples[a, k, r] += nominal.mass[at] * views.qacc[i]
+        for i in range(arms.joints[a]):
             dof = arms.dofs[a, i]
             damped = views.qfrc_passive[dof] + (views.dof_damping[dof] - nominal.damping[dof]) * views.qvel[dof]
-            row[i] = needed[i] + bias[dof] - damped - views.qfrc_actuator[dof]
-            row[JOINTS + i] = views.qfrc_actuator[dof]
-        at = arms.wrench[a]
+            samples[a, k, i] += nominal.bias[dof] - damped - views.qfrc_actuator[dof]
+            samples[a, k, JOINTS + i] = views.qfrc_actuator[dof]
         for i in range(6):
-            row[2 * JOINTS + i] = views.sensordata[at + i]
-        for i in range(3):
-            row[2 * JOINTS + 6 + i] = 0.0
+            samples[a, k, _WRENCH + i] = views.sensordata[arms.wrench[a] + i]
         for t in range(arms.bodies.shape[1]):
             body = arms.bodies[a, t]
             if body < 0:
                 break
             for i in range(3):
-                row[2 * JOINTS + 6 + i] += views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
-        hand_velocity(views, arms, a, views.subtree_com[arms.root[a]], row[2 * JOINTS + 9 :])
+                samples[a, k, _CONTACT + i] += views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
+        site, body, root = arms.site[a], arms.site_body[a], arms.root[a]
+        for i in range(3):
+            j, m = (i + 1) % 3, (i + 2) % 3
+            y = views.site_xpos[site, j] - views.subtree_com[root, j]
+            z = views.site_xpos[site, m] - views.subtree_com[root, m]
+            turning = views.cvel[body, j] * z - views.cvel[body, m] * y
+            samples[a, k, _VELOCITY + i] = views.cvel[body, 3 + i] + turning
+            samples[a, k, _VELOCITY + 3 + i] = views.cvel[body, i]
 
 
 @compiled
-def feel(arms: Arms, limits: SubstepLimits, k: int, samples: Floats) -> None:
-    """Compare the arms' load in substep ``k`` with the limits; NaN passes a limit."""
+def feel(joints: Ints, limits: SubstepLimits, k: int, samples: Floats) -> bool:
+    """Compare the load of arms of so many ``joints`` (A,) in substep ``k`` with the limits; NaN passes a limit.
+
+    Returns:
+        Whether the arms must stop now; true once in a control step.
+    """
     state = limits.state
-    if state[ARMED]:
-        for a in range(len(arms.joints)):
-            for i in range(FELT):
-                if i < JOINTS and i >= arms.joints[a]:
-                    continue
-                value = samples[a, k, i if i < JOINTS else i - JOINTS + WRENCH.start]
-                load = abs(value) / limits.most[a, i]
-                if not load <= limits.load[0]:
-                    limits.load[0] = load if load == load else np.inf
-                if state[PASSED_IN] < 0 and not load <= 1.0:
-                    state[PASSED_IN] = state[SUBSTEPS]
+    for a in range(len(joints) if state[ARMED] else 0):
+        for i in range(FELT):
+            if i < JOINTS and i >= joints[a]:
+                continue
+            load = abs(samples[a, k, i if i < JOINTS else i - JOINTS + _WRENCH]) / limits.most[a, i]
+            if not load <= limits.load[0]:
+                limits.load[0] = load if load == load else np.inf
+            if state[PASSED_IN] < 0 and not load <= 1.0:
+                state[PASSED_IN] = state[SUBSTEPS]
     state[SUBSTEPS] += 1
+    if state[ACTS] == 0 or state[PASSED_IN] < 0 or state[STAYED] != 0:
+        return False
+    state[STAYED] = 1
+    return True
 
 
 @compiled
-def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals) -> None:
+def hold(held: Ints) -> None:
+    """Hold the arms from the next substep on where they then are; those that are held already, where they were."""
+    for a in range(len(held)):
+        if held[a] == 0:
+            held[a] = HELD
+
+
+@compiled
+def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work) -> None:
     """Brake the arms that are held, where their controllers are not compiled."""
-    if goals.held.any():
-        if nominal.model != 0:
-            _evaluate_nominal(views, nominal)
-        for a in range(len(arms.joints)):
-            if goals.held[a]:
-                brake(views, nominal, arms, goals, a)
-
-
-@compiled
-def must_stay(limits: SubstepLimits) -> bool:
-    """Whether the arms must stop now; true once in a control step."""
-    state = limits.state
-    now = state[ACTS] and state[PASSED_IN] >= 0 and not state[STAYED]
-    if now:
-        state[STAYED] = 1
-    return bool(now)
+    if nominal.model != 0:
+        _evaluate_nominal(views, nominal)
+    for a in range(len(arms.joints)):
+        if goals.held[a] != 0:
+            control(views, nominal, arms, goals, work, a)
 
 
 @compiled
@@ -157,8 +163,7 @@ def bind(*parts: Any) -> Bound:
     """Return what ``run`` works on.
 
     Args:
-        parts: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``SubstepLimits``, and three arrays: the action in
-            metres and radians (A, JOINTS), the rotation that it asks for (A, 3, 3), and samples (A, K, SAMPLE).
+        parts: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``Work``, ``SubstepLimits``; samples (A, K, SAMPLE).
     """
     return Bound(parts)  # type: ignore[no-untyped-call]
 
@@ -174,21 +179,19 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
 
     From the substep after a limit is passed, the arms stay where they are, where the limits ask for that.
     """
-    views, nominal, arms, goals, limits, deltas, turns, samples = bound.parts
+    views, nominal, arms, goals, work, limits, samples = bound.parts
     for k in range(first, first + count):
         _step1(views.model, views.data)
         if nominal.model != 0:
             _evaluate_nominal(views, nominal)
-        stay = must_stay(limits)
         for a in range(len(arms.joints)):
-            if stay:
-                hold_at(views, arms, goals, a)
-            elif fresh and k == first:
-                set_goal(views, arms, goals, a, deltas[a], turns[a])
-            control(views, nominal, arms, goals, a)
+            if fresh and k == first and goals.held[a] == 0:
+                set_goal(views, arms, goals, work, a)
+            control(views, nominal, arms, goals, work, a)
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)  # the place for all that is measured in every substep
-        feel(arms, limits, k, samples)
+        if feel(arms.joints, limits, k, samples):
+            hold(goals.held)
 
 
 @compiled
@@ -246,17 +249,18 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
     """
     largest = 0.0
     for a in range(len(samples)):
-        mean[a] = 0.0
-        peak[a] = 0.0
-        last[a] = samples[a, count - 1]
-        for k in range(count):
-            row = samples[a, k]
-            for i in range(SAMPLE):
-                mean[a, i] += row[i] / count
+        for i in range(SAMPLE):
+            mean[a, i] = peak[a, i] = 0.0
+            last[a, i] = samples[a, count - 1, i]
+            for k in range(count):
+                value = samples[a, k, i]
+                mean[a, i] += value / count
                 # NaN compares false: it is taken when it comes, and stays.
-                if not abs(row[i]) <= abs(peak[a, i]) and peak[a, i] == peak[a, i]:
-                    peak[a, i] = row[i]
-            force = np.sqrt(np.sum(row[2 * JOINTS + 6 : 2 * JOINTS + 9] ** 2))
+                if not abs(value) <= abs(peak[a, i]) and peak[a, i] == peak[a, i]:
+                    peak[a, i] = value
+        for k in range(count):
+            x, y, z = samples[a, k, _CONTACT], samples[a, k, _CONTACT + 1], samples[a, k, _CONTACT + 2]
+            force = np.sqrt(x * x + y * y + z * z)
             if not force <= largest and largest == largest:
                 largest = force
     return largest

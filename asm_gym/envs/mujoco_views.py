@@ -60,6 +60,7 @@ class NominalViews(NamedTuple):
     qvel: Floats
     mass: Floats
     bias: Floats
+    bias_at: int  # its address
     damping: Floats
 
 
@@ -83,16 +84,46 @@ class Arms(NamedTuple):
     compensate: NDArray[np.bool_]  # (A,) joint control that knows the arm's dynamics
     rest: Floats  # (A, JOINTS) the posture that spare joints tend to [rad]
     limits: Floats  # (A, JOINTS, 2) of the joint set-point [rad]
+    first: Ints  # (A,) where the arm's part of the action begins
+    inputs: Ints  # (A,) how many numbers it has
+    scaling: Floats  # (A, 5, JOINTS) of them; see ``commands``
 
 
 class Goals(NamedTuple):
     """The controllers' set-points, changed in place."""
 
-    position: Floats  # (A, 3) relative to the base
-    orientation: Floats  # (A, 3, 3) relative to the base
+    action: Floats  # that moves them, in robosuite's units
+    position: Floats  # (A, 3)
+    orientation: Floats  # (A, 3, 3)
     joints: Floats  # (A, JOINTS)
     anchor: Floats  # (A, JOINTS) where an arm that is held is to stay [rad]
-    held: Ints  # (A,) whether it is: 0, ``control.BRAKING`` or ``control.YIELDING``
+    held: Ints  # (A,) whether it is: 0, ``control.HELD``, ``control.BRAKING`` or ``control.YIELDING``
+
+    @classmethod
+    def of(cls, arms: int, inputs: int) -> Goals:
+        """Return set-points of 0, which no arm is held at."""
+        joints, held = np.zeros((2, arms, JOINTS)), np.zeros(arms, np.int64)
+        return cls(np.zeros(inputs), np.zeros((arms, 3)), np.zeros((arms, 3, 3)), *joints, held)
+
+
+class Work(NamedTuple):
+    """What control computes of one arm, overwritten for the next."""
+
+    M: Floats  # (JOINTS, JOINTS) mass matrix
+    L: Floats  # (JOINTS, JOINTS) a Cholesky factor
+    A: Floats  # (JOINTS, JOINTS)
+    G: Floats  # (JOINTS, JOINTS)
+    J: Floats  # (6, JOINTS) Jacobian of the hand: linear, then angular velocity
+    F: Floats  # (2, 6)
+    h: Floats  # (JOINTS,) bias
+    v: Floats  # (JOINTS,) velocities
+    p: Floats  # (JOINTS,)
+    tau: Floats  # (JOINTS,) torques
+
+    @classmethod
+    def empty(cls) -> Work:
+        """Return arrays to write into."""
+        return cls(*np.zeros((4, JOINTS, JOINTS)), np.zeros((6, JOINTS)), np.zeros((2, 6)), *np.zeros((4, JOINTS)))
 
 
 class SubstepLimits(NamedTuple):

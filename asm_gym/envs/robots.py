@@ -66,7 +66,7 @@ def is_compilable(robot: Any, arm: str) -> bool:
 def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
     """Return one row for each arm; the settings of controllers that do not run compiled stay 0."""
     n = len(parts)
-    indices = ("joints", "site", "site_body", "root", "base", "wrench", "kind")
+    indices = ("joints", "site", "site_body", "root", "base", "wrench", "kind", "first", "inputs")
     fields: dict[str, Any] = {name: np.zeros(n, np.int64) for name in indices}
     fields |= {name: np.zeros((n, JOINTS), np.int64) for name in ("qpos", "dofs", "motors")}
     fields |= {name: np.zeros((n, JOINTS)) for name in ("kp", "kd", "rest")}
@@ -75,6 +75,7 @@ def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
         tree=_padded([_carried_dofs(model, robot) for robot, _ in parts]),
         compensate=np.zeros(n, bool),
         limits=np.tile([-np.inf, np.inf], (n, JOINTS, 1)),
+        scaling=np.zeros((n, 5, JOINTS)),
         **fields,
     )
     for a, (robot, arm) in enumerate(parts):
@@ -190,7 +191,7 @@ class NominalDynamics:
         self._live = tuple(getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA)
         self._frozen = tuple(live.copy() for live in self._live)
         v = views
-        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.M, v.qfrc_bias, v.dof_damping.copy())
+        self.unedited = NominalViews(0, 0, v.qpos, v.qvel, v.M, v.qfrc_bias, 0, v.dof_damping.copy())
         """Views of the live model, valid while the robots' masses are as they were loaded."""
         self._copy: tuple[mujoco.MjModel, mujoco.MjData, NominalViews] | None = None
 
@@ -204,6 +205,7 @@ class NominalDynamics:
                 getattr(model, name)[:] = frozen.reshape(getattr(model, name).shape)
             data = mujoco.MjData(model)
             addresses, motion = (model._address, data._address), (data.qpos, data.qvel, data.M)
-            nominal = NominalViews(*addresses, *motion, np.zeros(model.nv), self.unedited.damping)
+            bias = np.zeros(model.nv)
+            nominal = NominalViews(*addresses, *motion, bias, bias.ctypes.data, self.unedited.damping)
             self._copy = model, data, nominal
         return self._copy[2]

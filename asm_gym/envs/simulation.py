@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
-from asm_gym.envs.commands import move_arms, move_gripper, scaling_of
-from asm_gym.envs.control import hold_at
+from asm_gym.envs.commands import move_gripper, scaling_of
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
@@ -27,6 +26,7 @@ from asm_gym.envs.mujoco_views import (
     NominalViews,
     SubstepLimits,
     Views,
+    Work,
 )
 from asm_gym.envs.robots import NominalDynamics, bodies, describe, is_compilable
 from asm_gym.envs.sensors import Proprioception
@@ -67,11 +67,9 @@ class Simulation:
 
     def begin_episode(self) -> None:
         """Take up the controllers, which robosuite makes anew in every reset."""
-        robots = self.env.robots
         self._done = self._row_began = 0
         self._force_before = 0.0
         self._fresh = False
-        self._action = np.zeros(sum(robot.action_dim for robot in robots))
         self.controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self.parts]
         """Robosuite's, of each arm."""
         # Asked once an episode: robosuite puts these together anew at every look.
@@ -83,13 +81,11 @@ class Simulation:
         self._grips = [grip for grip in grips if grip is not None]
         self.compiled = all(is_compilable(robot, arm) for robot, arm in self.parts)  # whether control runs compiled
         self.arms = describe(self.parts, self.model)
-        n = len(self.parts)
-        first, count = (np.array([getattr(part, end) for part in self.moves]) for end in ("start", "stop"))
-        scalings = np.zeros((n, 5, JOINTS))
-        for scaling, controller, size in zip(scalings, self.controllers, count - first, strict=True):
+        for a, (controller, part) in enumerate(zip(self.controllers, self.moves, strict=True)):
             if self.compiled:
-                scaling[:, :size] = scaling_of(controller, size)
-        self._moving = first, count - first, scalings
+                size = part.stop - part.start
+                self.arms.first[a], self.arms.inputs[a] = part.start, size
+                self.arms.scaling[a, :, :size] = scaling_of(controller, size)
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
         self._limits.state[:] = 0, 0, 0, -1, 0
@@ -99,10 +95,8 @@ class Simulation:
         self._columns = np.where(
             self._limited[1] < JOINTS, self._limited[1], self._limited[1] - JOINTS + kernels.WRENCH.start
         )
-        joints = np.zeros((n, JOINTS))
-        self._goals = Goals(np.zeros((n, 3)), np.zeros((n, 3, 3)), joints, joints.copy(), np.zeros(n, np.int64))
-        self._deltas = np.zeros((n, JOINTS))
-        self._turns = np.tile(np.eye(3), (n, 1, 1))
+        size = sum(robot.action_dim for robot in self.env.robots)
+        self._goals, self._work = Goals.of(len(self.parts), size), Work.empty()
         self._bound: tuple[NominalViews, Bound] | None = None
         self._samples[:] = 0.0
         if must_compile(kernels.run):
@@ -130,13 +124,12 @@ class Simulation:
                 nothing. So they are braked beneath their controllers (``control.brake``).
         """
         if hold:
-            self._hold_arms()
+            kernels.hold(self._goals.held)
         else:
             self._goals.held[:] = 0
-        self._action = action
+        self._goals.action[:] = action
         self._fresh = True
         if self.compiled:
-            move_arms(action, *self._moving, self._deltas, self._turns)
             for grip in self._grips:
                 grip(action)
 
@@ -157,25 +150,22 @@ class Simulation:
         """Run substeps under robosuite's own controllers."""
         first = self._done - self._row_began
         for k in range(first, first + count):
+            nominal = self.nominal.now()
             self.env.sim.step1()
-            self.env._pre_action(self._action, self._fresh)
-            kernels.brake_held(self.views, self.nominal.now(), self.arms, self._goals)
+            self.env._pre_action(self._goals.action.copy(), self._fresh)
+            if self._goals.held.any():
+                kernels.brake_held(self.views, nominal, self.arms, self._goals, self._work)
             self.env.sim.step2()
-            kernels.sample(self.views, self.nominal.now(), self.arms, k, self._samples)
-            kernels.feel(self.arms, self._limits, k, self._samples)
-            if kernels.must_stay(self._limits):
-                self._hold_arms()
+            kernels.sample(self.views, nominal, self.arms, k, self._samples)
+            if kernels.feel(self.arms.joints, self._limits, k, self._samples):
+                kernels.hold(self._goals.held)
             self._fresh = False
-
-    def _hold_arms(self) -> None:
-        for a in range(len(self.parts)):
-            hold_at(self.views, self.arms, self._goals, a)
 
     def _run(self, count: int) -> None:
         nominal = self.nominal.now()
         if self._bound is None or self._bound[0] is not nominal:
-            state = self.views, nominal, self.arms, self._goals, self._limits
-            self._bound = nominal, kernels.bind(*state, self._deltas, self._turns, self._samples)
+            state = self.views, nominal, self.arms, self._goals, self._work, self._limits, self._samples
+            self._bound = nominal, kernels.bind(*state)
         kernels.run(self._bound[1], self._fresh, self._done - self._row_began, count)
 
     def begin_row(self) -> None:
@@ -247,7 +237,7 @@ class Simulation:
             return None
         controller, motors = robot.composite_controller.part_controllers[name], robot._ref_actuators_indexes_dict[name]
         c, gripper, ctrl, motors = controller, robot.gripper[arm], self.views.ctrl, np.asarray(motors, np.int64)
-        scaling = scaling_of(c, c.control_dim)
+        scaling = scaling_of(c, c.control_dim)[None]
         middle, half = 0.5 * (c.actuator_max + c.actuator_min), 0.5 * (c.actuator_max - c.actuator_min)
         ranges = np.array([middle, half, *self.views.actuator_ctrlrange[motors].T])
 
