@@ -50,7 +50,8 @@ class Actions:
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""
-        return self._middle + self._half * action
+        units: NDArray[np.float64] = self._middle + self._half * action
+        return units
 
     def slowed(self, simulation: Simulation, action: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
         """Return the action (A,) scaled so that no hand is commanded to go faster than ``limit`` [m/s].

@@ -102,8 +102,8 @@ class Goals(NamedTuple):
     @classmethod
     def of(cls, arms: int, inputs: int) -> Goals:
         """Return set-points of 0, which no arm is held at."""
-        joints, held = np.zeros((2, arms, JOINTS)), np.zeros(arms, np.int64)
-        return cls(np.zeros(inputs), np.zeros((arms, 3)), np.zeros((arms, 3, 3)), *joints, held)
+        shapes = (inputs,), (arms, 3), (arms, 3, 3), (arms, JOINTS), (arms, JOINTS)
+        return cls._make([*map(np.zeros, shapes), np.zeros(arms, np.int64)])
 
 
 class Work(NamedTuple):
@@ -123,7 +123,8 @@ class Work(NamedTuple):
     @classmethod
     def empty(cls) -> Work:
         """Return arrays to write into."""
-        return cls(*np.zeros((4, JOINTS, JOINTS)), np.zeros((6, JOINTS)), np.zeros((2, 6)), *np.zeros((4, JOINTS)))
+        shapes = *[(JOINTS, JOINTS)] * 4, (6, JOINTS), (2, 6), *[(JOINTS,)] * 4
+        return cls._make(map(np.zeros, shapes))
 
 
 class SubstepLimits(NamedTuple):
