@@ -11,7 +11,7 @@ from scipy import stats
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import HOUR
 from asm_gym.evaluation import metrics
-from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult
+from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult, Bound
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Outcomes, in_words
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour, interval, rate_text
@@ -108,7 +108,10 @@ def kinds_table(result: BenchmarkResult) -> Table:
     """Return AUROC and faults found of every kind."""
     rows = []
     for kind, seen in result.visible.items():
-        own = [result.bound([kind]), *(m.only([kind]) for m in result.monitors.values())]
+        own: list[Bound | DetectionMetrics] = [
+            result.bound([kind]),
+            *(m.only([kind]) for m in result.monitors.values()),
+        ]
         found = (f"{m.auroc:.2f} / {percent(m.found.get(result.promise))}" for m in own)
         rows.append((in_words(kind) if seen else f"({in_words(kind)})", *found))
     return Table(

@@ -143,7 +143,7 @@ def train(plan: Plan, out: Path, demonstrations: Sequence[Episode], progress: Pr
 
             learner.learn(plan.steps, [judge, ConvertCallback(show)])
         if plan.steps >= plan.evaluate_every:
-            learner.set_parameters(out / "best_model.zip")
+            learner.set_parameters(str(out / "best_model.zip"))
         return export(learner, view)
 
 
