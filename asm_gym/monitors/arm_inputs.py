@@ -35,8 +35,8 @@ class Derived(NamedTuple):
     """Inputs that are derived from speeds and angles."""
 
     speeds: NDArray[np.intp]  # (S,) senses that are speeds, or whose changes are
-    from_steps: bool  # speeds are changes of positions
     angles: NDArray[np.intp]  # (J,) senses that are angles, along the chain
+    from_steps: bool  # speeds are changes of positions
     radians: Floats  # (J,) in one of their units
     pairs: NDArray[np.intp]  # (2, P) of sines and cosines of single angles, that are multiplied
     sources: NDArray[np.bool_]  # (M, X) which senses each derived input is made of
@@ -45,34 +45,23 @@ class Derived(NamedTuple):
     @classmethod
     def of(cls, spec: StreamSpec, urdf: str = "") -> Self:
         """Return what a stream has by its channels' names. Raises ValueError where the body model ``urdf`` misfits."""
-        place = {int(column): k for k, column in enumerate(spec.sensory)}
-        moving, from_steps = speeds(spec)
-        columns = _named(spec, POSITION)
-        columns = columns if len(columns) <= MOST_ANGLES else columns[:0]
-        units = {
-            i: c.unit for c, s in zip(spec.channels, spec.slices.values(), strict=True) for i in range(s.start, s.stop)
-        }
-        radians = np.array([ratio(units[int(i)], "rad") or 1.0 for i in columns])
-        links = _links(spec, columns, urdf)
-        S, J = len(moving), len(columns)
-        at = np.array([place[int(i)] for i in moving], np.intp)
-        angles = np.array([place[int(i)] for i in columns], np.intp)
-        pairs = np.array(np.triu_indices(2 * J), np.intp) if J and links is None else np.zeros((2, 0), np.intp)
+        (moving, from_steps), angles = speeds(spec), _named(spec, POSITION)
+        angles = angles if len(angles) <= MOST_ANGLES else angles[:0]
+        units = [c.unit for c in spec.channels for _ in c.labels]
+        radians = np.array([ratio(units[i], "rad") or 1.0 for i in angles])
+        links, J = _links(spec, angles, urdf), len(angles)
+        of_speed, of_angle = (spec.sensory == moving[:, None]), (spec.sensory == angles[:, None])  # (S, X), (J, X)
         if links is None:
-            own = np.eye(J, dtype=np.bool_)
-            ends = range(2, min(J, CHAIN + 1))
-            sums = np.array([[1 <= k <= n for k in range(J)] for n in ends], np.bool_).reshape(len(ends), J)
-            single = np.vstack([own, own])
-            of_angles = np.vstack([single, sums, sums, single[pairs[0]] | single[pairs[1]]])
+            pairs = np.array(np.triu_indices(2 * J), np.intp)
+            single = np.vstack([of_angle, of_angle])
+            sums = [of_angle[1 : n + 1].any(axis=0) for n in range(2, min(J, CHAIN + 1))]
+            derived = [single, *sums, *sums, single[pairs[0]] | single[pairs[1]]]
         else:
-            of_angles = np.ones((2 * J, J), np.bool_)
-        sources = np.zeros((S * len(WIDTHS) + len(of_angles), len(spec.sensory)), np.bool_)
-        for w in range(len(WIDTHS)):
-            sources[w * S + np.arange(S), at] = True
-        sources[S * len(WIDTHS) :, angles] = of_angles
-        if links is not None:
-            sources[S * len(WIDTHS) + J :, at] = True
-        return cls(at, from_steps, angles, radians, pairs, sources, links)
+            pairs, every = np.zeros((2, 0), np.intp), of_angle.any(axis=0)
+            derived = [*[every] * J, *[every | of_speed.any(axis=0)] * J]
+        sources = np.vstack([of_speed] * len(WIDTHS) + derived)
+        places = (np.searchsorted(spec.sensory, part) for part in (moving, angles))
+        return cls(*places, from_steps, radians, pairs, sources, links)
 
     def __call__(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> Floats:
         """Return the derived inputs (N, M) of ``values`` (N, X) with their ``spread`` (X,).

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Container, Sequence
-from copy import deepcopy
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -31,7 +30,6 @@ LARGEST = 10_000_000  # characters of a file: no arm has more
 
 SHOWN = 300  # rows by which orders of joints are compared
 TINY = 1e-12
-GROUND = "ground_of_all_roots"
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -42,7 +40,7 @@ KEPT = {
 }
 """Parts of a body model that weight and inertia need."""
 
-COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-12", "boundinertia": "1e-12"}
+COMPILER = {"fusestatic": False, "balanceinertia": True, "boundmass": 1e-12, "boundinertia": 1e-12}
 """MuJoCo takes links without a mass as nearly massless, and mends a tensor that no body can have."""
 
 
@@ -65,8 +63,7 @@ class BodyModel:
             ValueError: it is no URDF, MuJoCo cannot read it, or it has fewer joints than there are labels.
         """
         root = _parsed(urdf)
-        every = _compiled(root, None)
-        names = _joints(every)
+        every, names = _compiled(root, None)
         place = _matched(names, labels)
         by_name = 2 * len(place) > len(labels)
         if not by_name:
@@ -76,8 +73,7 @@ class BodyModel:
                     f"{len(labels)} joints are sensed, and the body's longest chain has {len(place)} that move: name "
                     f"the columns as its joints are named ({', '.join(names) or 'it has none'})"
                 )
-        model = _compiled(root, place)
-        order = _joints(model)
+        model, order = _compiled(root, place)
         return cls(tuple(order), np.array([place[name] for name in order], np.intp), by_name, model)
 
     def in_best_order(self, q: Floats, speed: Floats, acceleration: Floats, torque: Floats) -> Self:
@@ -98,17 +94,27 @@ class BodyModel:
                 total += float(np.var(torque[:, j] - inputs @ solved) / max(np.var(torque[:, j]), TINY))
             return total
 
-        by_alphabet = tuple(int(k) for k in np.argsort(np.argsort(self.names)))
-        tried = {order: unexplained(order) for order in (tuple(self.columns.tolist()), by_alphabet)}
-        found = [_swapped(order, unexplained, tried) for order in tuple(tried)]
-        return replace(self, columns=np.array(min(found, key=tried.__getitem__), np.intp))
+        columns, by_alphabet = tuple(self.columns.tolist()), tuple(np.argsort(np.argsort(self.names)).tolist())
+        tried = {order: unexplained(order) for order in (columns, by_alphabet)}
+        for order in tuple(tried):
+            better: tuple[int, ...] | None = order
+            while better is not None:
+                order, near = better, []
+                for a, b in combinations(range(len(order)), 2):
+                    swapped = np.array(order)
+                    swapped[[a, b]] = swapped[[b, a]]
+                    near.append(tuple(swapped.tolist()))
+                tried |= {other: unexplained(other) for other in near if other not in tried}
+                best = min(near, key=tried.__getitem__, default=order)
+                better = best if tried[best] < tried[order] else None
+        return replace(self, columns=np.array(min(tried, key=tried.__getitem__), np.intp))
 
     def torques(self, q: Floats, speed: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
         """Return the torques (N, J) of weight and of motion [N m; N where a joint slides].
 
         They are those of angles ``q`` (N, J) [rad or m], speeds [1/s of that] and accelerations [1/s² of that].
         """
-        mujoco = _mujoco()
+        mujoco: Any = require("mujoco", what="a body model")
         data, at = mujoco.MjData(self.model), self.columns
         weight, total = np.zeros(q.shape), np.zeros(q.shape)
         for n in range(len(q)):
@@ -129,25 +135,6 @@ def read_urdf(path: str | Path) -> str:
         return ElementTree.tostring(_parsed(text), encoding="unicode")
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-def _swapped(
-    order: tuple[int, ...], cost: Callable[[tuple[int, ...]], float], tried: dict[tuple[int, ...], float]
-) -> tuple[int, ...]:
-    """Return the order that no swap of two betters, from one on; what was tried is added to ``tried``."""
-    while True:
-        near = []
-        for a, b in combinations(range(len(order)), 2):
-            swapped = list(order)
-            swapped[a], swapped[b] = order[b], order[a]
-            near.append(tuple(swapped))
-        for other in near:
-            if other not in tried:
-                tried[other] = cost(other)
-        best = min(near, key=tried.__getitem__, default=order)
-        if not tried[best] < tried[order]:
-            return order
-        order = best
 
 
 def _matched(names: Sequence[str], labels: Sequence[str]) -> dict[str, int]:
@@ -173,10 +160,6 @@ def _words(name: str) -> set[str]:
     return set(re.findall(r"[a-z]+\d*|\d+", name.lower()))
 
 
-def _mujoco() -> Any:
-    return require("mujoco", what="a body model")
-
-
 def _parsed(urdf: str) -> Element:
     """The pared tree; entities, which could grow without end, are refused."""
     if "<!DOCTYPE" in urdf:
@@ -189,6 +172,8 @@ def _parsed(urdf: str) -> Element:
         raise ValueError(f"the body is no URDF: its root is <{root.tag}>, not <robot>")
     pared = Element("robot", name=root.get("name", ""))
     pared.extend(_pared(element) for element in root if element.tag in ("link", "joint"))
+    for inertial in pared.iter("inertial"):
+        _align(inertial)
     return pared
 
 
@@ -198,38 +183,29 @@ def _pared(element: Element) -> Element:
     return made
 
 
-def _compiled(root: Element, asked: Container[str] | None) -> Any:
-    """MuJoCo's model, in which the joints that are asked for move, or all that can."""
-    body = deepcopy(root)
-    for joint in body.findall("joint"):
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            joint.remove(mimic)
-        moves = joint.get("type") in MOVING and mimic is None
-        if not moves or (asked is not None and joint.get("name") not in asked):
-            joint.set("type", "fixed")
-    for inertial in body.iter("inertial"):
-        _align(inertial)
-    if len(roots := _roots(body)) > 1:
-        ElementTree.SubElement(body, "link", name=GROUND)
-        for name in roots:
-            fixed = ElementTree.SubElement(body, "joint", name=f"{GROUND}_{name}", type="fixed")
-            ElementTree.SubElement(fixed, "parent", link=GROUND)
-            ElementTree.SubElement(fixed, "child", link=name)
-    ElementTree.SubElement(ElementTree.SubElement(body, "mujoco"), "compiler", COMPILER)
+def _compiled(root: Element, asked: Container[str] | None) -> tuple[Any, list[str]]:
+    """Return MuJoCo's model, in which the joints that are asked for move, or all that can; and their names."""
+    mujoco: Any = require("mujoco", what="a body model")
+    fixed = {
+        joint.get("name")
+        for joint in root.findall("joint")
+        if joint.get("type") not in MOVING
+        or joint.find("mimic") is not None
+        or (asked is not None and joint.get("name") not in asked)
+    }
     try:
-        model = _mujoco().MjModel.from_xml_string(ElementTree.tostring(body, encoding="unicode"))
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        for name, value in COMPILER.items():
+            setattr(spec.compiler, name, value)
+        for joint in list(spec.joints):
+            if joint.name in fixed:
+                spec.delete(joint)
+        model = spec.compile()
     except ValueError as error:
         raise ValueError(f"the body cannot be read: {' '.join(str(error).split())}") from None
     if not all(np.isfinite(part).all() for part in (model.body_mass, model.body_inertia, model.body_pos)):
         raise ValueError("the body cannot be read: masses, inertias and positions must be finite")
-    return model
-
-
-def _roots(body: Element) -> list[str]:
-    """Return the links that are no joint's child."""
-    children = {child.get("link") for child in body.iterfind("joint/child")}
-    return [name for link in body.iterfind("link") if (name := link.get("name", "")) not in children]
+    return model, [model.joint(j).name for j in range(model.njnt)]
 
 
 def _align(inertial: Element) -> None:
@@ -247,10 +223,6 @@ def _align(inertial: Element) -> None:
     inertia = turn @ inertia @ turn.T
     for i, j, name in pairs:
         tensor.set(name, repr(float(inertia[i, j])))
-
-
-def _joints(model: Any) -> list[str]:
-    return [model.joint(j).name for j in range(model.njnt)]
 
 
 def _longest_chain(model: Any) -> list[int]:

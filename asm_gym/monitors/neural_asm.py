@@ -198,9 +198,6 @@ class NeuralASM(CalibratedMonitor):
             surprise = surprise._replace(skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)])
         return now, surprise
 
-    def reset_evidence(self, state: MonitorState) -> MonitorState:
-        return super().reset_evidence(state)._replace(values=self.values_.reset(state.values))
-
     def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), in the units of the action, after this state."""
         return self.model.expected_action(state.model)

@@ -18,7 +18,7 @@ Sources: Hoerl and Kennard 1970; for h, the leverage: Hoaglin and Welsch 1978 (T
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -49,44 +49,14 @@ MOST_INPUTS = 1024  # with more inputs no leverage is computed: the matrices wou
 
 
 class _Fitted(NamedTuple):
+    inputs: Floats  # (N, I)
+    scale: tuple[Floats, Floats]  # mean and spread of the derived ones
+    grams: Floats  # (FOLDS + 1, I, I) see ``_equations``
+    own: list[NDArray[np.intp]]  # of each group the inputs that it is not predicted from
     weights: Floats  # (X, I)
     left: Floats  # (N, X) cross-fitted errors
     R2: Floats  # (X,) cross-fitted
     alone: Floats  # (X,) 1 where a value is predicted from its joint alone
-
-
-class _Normal(NamedTuple):
-    """Normal equations of each fold of rows, and of all."""
-
-    fold: NDArray[np.intp]  # (N,)
-    grams: Floats  # (FOLDS, I, I)
-    crosses: Floats  # (FOLDS, I, X)
-
-    @classmethod
-    def of(cls, inputs: Floats, targets: Floats, fold: NDArray[np.intp]) -> Self:
-        parts = [(inputs[fold == f], targets[fold == f]) for f in range(FOLDS)]
-        return cls(fold, np.array([z.T @ z for z, _ in parts]), np.array([z.T @ x for z, x in parts]))
-
-    def weights(self, used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
-        """Return the weights (U, M) of the used inputs for some targets."""
-        N = len(self.fold)
-        gram, cross = self.grams.sum(axis=0)[np.ix_(used, used)], self.crosses.sum(axis=0)[np.ix_(used, mine)]
-        found: Floats = np.linalg.solve(gram / N + penalty * np.eye(len(used)), cross / N)
-        return found
-
-    def left(self, inputs: Floats, targets: Floats, used: NDArray[np.intp], mine: NDArray[np.intp]) -> Iterator[Floats]:
-        """Yield the cross-fitted errors (N, M) of some targets, predicted from the used inputs, by each penalty."""
-        spectra = []
-        for f in range(FOLDS):
-            rows = max(int((self.fold != f).sum()), 1)
-            gram, cross = (a.sum(axis=0) - a[f] for a in (self.grams, self.crosses))
-            values, vectors = np.linalg.eigh(gram[np.ix_(used, used)] / rows)
-            spectra.append((np.maximum(values, 0.0)[:, None], vectors, vectors.T @ cross[np.ix_(used, mine)] / rows))
-        for penalty in PENALTIES:
-            errors = targets[:, mine].copy()
-            for f, (values, vectors, projected) in enumerate(spectra):
-                errors[self.fold == f] -= inputs[self.fold == f][:, used] @ (vectors @ (projected / (values + penalty)))
-            yield errors
 
 
 class _Read(NamedTuple):
@@ -128,6 +98,7 @@ class ValueAssociation(ScaledModel):
         self.window = max(1, round(ALIKE_S / spec.dt))
         self.left_by_body = math.nan
         self._derived = self._told = Derived.of(spec, urdf)
+        self._loads = np.searchsorted(spec.sensory, forces(spec))
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -153,44 +124,41 @@ class ValueAssociation(ScaledModel):
     def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
         streams = [e.stream for e in episodes]
         senses = self.senses_ = StreamScaler.fit(self.spec, streams, self.lag)
-        lengths = [len(stream) - self.lag for stream in streams]
         parts = [[a[self.lag :] for a in self._read(senses.read_episode(stream))] for stream in streams]
-        read = _Read(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-        fold = _folds(lengths)
+        lengths = [len(part[0]) for part in parts]
+        read, fold = _Read(*(np.concatenate(part) for part in zip(*parts, strict=True))), _folds(lengths)
         self._derived = Derived.of(self.spec)
-        inputs, scale, own, given = self._predicted(read, fold)
+        given = self._fitted(read, fold)
         if self.urdf:
             alone, self._derived = self._derived, self._ordered(read)
-            by_body = self._predicted(read, fold)
-            loads = self._places(forces(self.spec))
-            self.left_by_body = float(
-                (1.0 - by_body[-1].R2[loads]).sum() / max((1.0 - given.R2[loads]).sum(), FAINTEST)
-            )
+            by_body = self._fitted(read, fold)
+            left, before = ((1.0 - found.R2[self._loads]).sum() for found in (by_body, given))
+            self.left_by_body = float(left / max(before, FAINTEST))
             if self.left_by_body < 1.0:
-                inputs, scale, own, given = by_body
+                given = by_body
             else:
                 self._derived = alone
         judged = self.judged(given.R2)
         judged = judged if len(judged) else np.arange(len(given.R2))
-        judging = np.unique(senses.groups[judged]) if inputs.shape[1] <= MOST_INPUTS else ()
-        far, left = [], given.left[:, judged]
+        judging = np.unique(senses.groups[judged]) if given.inputs.shape[1] <= MOST_INPUTS else ()
+        far, errors = [], given.left[:, judged]
         for g in judging:
-            matrix, factor = _far(inputs, fold, own[g])
+            matrix, factor = _far(given, fold, given.own[g])
             far.append(matrix)
-            left[:, (senses.groups[judged] == g) & (given.alone[judged] == 0)] /= factor[:, None]
+            errors[:, (senses.groups[judged] == g) & (given.alone[judged] == 0)] /= factor[:, None]
         ends = np.cumsum(lengths)[:-1]
-        largest = [np.abs(averaged(part, self.window)).max(axis=0) for part in np.split(left, ends)]
+        largest = [np.abs(averaged(part, self.window)).max(axis=0) for part in np.split(errors, ends)]
         progress(1, 1)
         learned = {
-            "derived_mean": scale[0],
-            "derived_spread": scale[1],
+            "derived_mean": given.scale[0],
+            "derived_spread": given.scale[1],
             "body": np.zeros(0) if self._derived.links is None else self._derived.links.columns * 1.0,
             "judged_values": judged * 1.0,
             "R2_values": given.R2,
             "D": given.weights[judged],
             "joint_alone": given.alone[judged],
             "largest": np.maximum(np.max(largest, axis=0), FAINTEST),
-            "far": np.array(far).reshape(len(far), *inputs.shape[1:] * 2),
+            "far": np.array(far).reshape(len(far), *given.inputs.shape[1:] * 2),
         }
         return self.restore({**senses.arrays, **learned})
 
@@ -206,7 +174,7 @@ class ValueAssociation(ScaledModel):
     def predict(self, state: Averaged, rows: NDArray[np.float64]) -> tuple[Averaged, ModelOutput]:
         history, read, known = read_next(self.senses_, state.history, rows)
         scaled, found = self._read(read), self.learned_
-        derived = (self._of(scaled, self._derived) - found["derived_mean"]) / found["derived_spread"]
+        derived = (self._derived(*self._physical(scaled)) - found["derived_mean"]) / found["derived_spread"]
         inputs = np.hstack([*scaled[:3], derived, scaled.commands])
         now = known * (scaled.values[:, self._values] - inputs @ found["D"].T) / self._farther(inputs)
         left = np.concatenate([state.left[:, 1:], now[:, None]], axis=1)
@@ -217,10 +185,6 @@ class ValueAssociation(ScaledModel):
         found = read.senses[:, :X], read.inputs[:, self.senses_.changes], read.inputs[:, self.spec.sensory]
         return _Read(*(np.asarray(a, np.float64) for a in (*found, read.commands)))
 
-    def _of(self, read: _Read, derived: Derived) -> Floats:
-        """Return the derived inputs (N, M)."""
-        return derived(*self._physical(read))
-
     def _physical(self, read: _Read) -> tuple[Floats, Floats, Floats, Floats]:
         """Return values (N, X) and standardised changes (N, X), and the spread and rate (X,) that these are of."""
         senses, sensory = self.senses_, self.spec.sensory
@@ -229,55 +193,72 @@ class ValueAssociation(ScaledModel):
 
     def _ordered(self, read: _Read) -> Derived:
         """Return what the body model derives, with its joints in the order that explains the torques best."""
-        told, loads = self._told, self._places(forces(self.spec))
+        told, physical = self._told, self._physical(read)
         assert told.links is not None
-        if told.links.by_name or len(loads) != len(told.angles):
+        if told.links.by_name or len(self._loads) != len(told.angles):
             return told
-        physical = self._physical(read)
-        moved = told.motion(*physical)
-        return told.with_joints(told.links.in_best_order(*moved, physical[0][:, loads]).columns)
+        best = told.links.in_best_order(*told.motion(*physical), physical[0][:, self._loads])
+        return told.with_joints(best.columns)
 
-    def _predicted(
-        self, read: _Read, fold: NDArray[np.intp]
-    ) -> tuple[Floats, tuple[Floats, Floats], list[NDArray[np.intp]], _Fitted]:
-        """Return inputs (N, I), mean and spread of the derived ones, each group's own inputs, and what they predict."""
-        derived = self._of(read, self._derived)
+    def _fitted(self, read: _Read, fold: NDArray[np.intp]) -> _Fitted:
+        """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there.
+
+        A torque is predicted from the inputs of its own joint alone, where that leaves less.
+        """
+        derived = self._derived(*self._physical(read))
         middle, width = derived.mean(axis=0), np.maximum(derived.std(axis=0), FAINTEST)
-        inputs = np.hstack([*read[:3], (derived - middle) / width, read.commands])
-        check_inputs(inputs.shape[1])
-        own = self._own()
-        return (
-            inputs,
-            (middle, width),
-            own,
-            _crossfitted(inputs, read.values, fold, self.senses_.groups, own, self._joint_inputs(inputs.shape[1])),
-        )
+        z, x, every = np.hstack([*read[:3], (derived - middle) / width, read.commands]), read.values, self._own()
+        check_inputs(z.shape[1])
+        (N, size), X = z.shape, x.shape[1]
+        grams, crosses = _equations(z, x, fold)
+
+        def solved(f: int, used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
+            gram = grams[f][np.ix_(used, used)] + penalty * np.eye(len(used))
+            found: Floats = np.linalg.solve(gram, crosses[f][np.ix_(used, mine)])  # (U, M)
+            return found
+
+        def unseen(used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
+            errors = x[:, mine].copy()  # (N, M)
+            for f in range(FOLDS):
+                errors[fold == f] -= z[fold == f][:, used] @ solved(f, used, mine, penalty)
+            return errors
+
+        weights, left, alone = np.zeros((X, size)), np.zeros((N, X)), np.zeros(X)
+        for k, used in self._joint_inputs(size).items():
+            one = np.array([k])
+            left[:, one], alone[k] = unseen(used, one, PENALTIES[0]), 1.0
+            weights[k, used] = solved(FOLDS, used, one, PENALTIES[0])[:, 0]
+        for g, own in enumerate(every):
+            mine, used = np.flatnonzero(self.senses_.groups == g), np.setdiff1d(np.arange(size), own)
+            errors = np.array([unseen(used, mine, penalty) for penalty in PENALTIES])  # (P, N, M)
+            squares = (errors**2).sum(axis=1)
+            better = squares.min(axis=0) < np.where(alone[mine] > 0, (left[:, mine] ** 2).sum(axis=0), np.inf)
+            for n, penalty in enumerate(PENALTIES):
+                taken = np.flatnonzero(better & (squares.argmin(axis=0) == n))
+                if len(taken):
+                    left[:, mine[taken]], alone[mine[taken]], weights[mine[taken]] = errors[n][:, taken], 0.0, 0.0
+                    weights[np.ix_(mine[taken], used)] = solved(FOLDS, used, mine[taken], penalty).T
+        R2 = 1.0 - (left**2).mean(axis=0) / np.maximum(x.var(axis=0), FAINTEST**2)
+        return _Fitted(z, (middle, width), grams, every, weights, left, R2, alone)
 
     def _joint_inputs(self, size: int) -> dict[int, NDArray[np.intp]]:
         """Return the inputs, of ``size``, of each torque's own joint: its speed, friction and body, and commands."""
-        X, derived, loads = len(self.spec.sensory), self._derived, self._places(forces(self.spec))
+        X, derived = len(self.spec.sensory), self._derived
         S, J = len(derived.speeds), len(derived.angles)
-        if len(loads) != S or (derived.links is not None and J != S):
+        if len(self._loads) != S or (derived.links is not None and J != S):
             return {}
-        speed = derived.speeds + (X if derived.from_steps else 0)
-        parts = [speed, *(3 * X + w * S + np.arange(S) for w in range(len(WIDTHS)))]
-        if derived.links is not None:
-            parts += [3 * X + len(WIDTHS) * S + n * J + np.arange(J) for n in range(2)]
+        bodies = 0 if derived.links is None else 2  # weight and motion
+        first = 3 * X + S * np.arange(len(WIDTHS) + bodies)  # of each kind of input
         commands = np.arange(size - len(self.spec.motor) - 1, size)
-        return {k: np.append([part[n] for part in parts], commands).astype(np.intp) for n, k in enumerate(loads)}
-
-    def _places(self, columns: NDArray[np.intp]) -> list[int]:
-        """Return the places of columns among the senses."""
-        place = {int(column): k for k, column in enumerate(self.spec.sensory)}
-        return [place[int(i)] for i in columns]
+        speed = derived.speeds + (X if derived.from_steps else 0)
+        return {int(k): np.concatenate([[speed[n]], first + n, commands]) for n, k in enumerate(self._loads)}
 
     def judged(self, R2: Floats) -> NDArray[np.intp]:
         """Return which values are judged, by their cross-fitted R² (X,)."""
-        judged = R2 > PREDICTED
-        loads, moves = (self._places(found) for found in (forces(self.spec), motion(self.spec)))
-        if loads and moves:
+        judged, moves = R2 > PREDICTED, np.searchsorted(self.spec.sensory, motion(self.spec))
+        if len(self._loads) and len(moves):
             judged[moves] = False
-            judged[loads] = True
+            judged[self._loads] = True
         return np.flatnonzero(judged)
 
     def _farther(self, inputs: Floats) -> Floats:
@@ -285,7 +266,7 @@ class ValueAssociation(ScaledModel):
         found, learned = np.ones((len(inputs), len(self._values))), self.learned_
         groups = np.where(learned["joint_alone"] > 0, -1, self.senses_.groups[self._values])
         for group, far in zip(np.unique(self.senses_.groups[self._values]), learned["far"], strict=False):
-            found[:, groups == group] = np.sqrt(np.maximum(1.0, ((inputs @ far) * inputs).sum(axis=1)))[:, None]
+            found[:, groups == group] = np.sqrt(np.maximum(1.0, squares(inputs, far)))[:, None]
         return found
 
     def _own(self) -> list[NDArray[np.intp]]:
@@ -308,46 +289,14 @@ def _folds(lengths: Sequence[int]) -> NDArray[np.intp]:
     return blocks
 
 
-def _crossfitted(
-    inputs: Floats,
-    targets: Floats,
-    fold: NDArray[np.intp],
-    groups: NDArray[np.intp],
-    own: list[NDArray[np.intp]],
-    joints: Mapping[int, NDArray[np.intp]],
-) -> _Fitted:
-    """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there.
-
-    ``own`` are the inputs that each group is not predicted from, ``joints`` those of the joint of a value: a value is
-    predicted from these alone where that leaves less.
-    """
-    (N, size), X = inputs.shape, targets.shape[1]
-    fitted = _Fitted(np.zeros((X, size)), np.zeros((N, X)), np.zeros(X), np.zeros(X))
-    normal = _Normal.of(inputs, targets, fold)
-    for k, used in joints.items():
-        errors = next(normal.left(inputs, targets, used, np.array([k])))[:, 0]
-        fitted.left[:, k], fitted.alone[k] = errors, 1.0
-        fitted.weights[k, used] = normal.weights(used, np.array([k]), PENALTIES[0])[:, 0]
-    for g, withheld in enumerate(own):
-        mine, used = np.flatnonzero(groups == g), np.setdiff1d(np.arange(size), withheld)
-        errors = np.array(list(normal.left(inputs, targets, used, mine)))  # (P, N, X of the group)
-        squares = (errors**2).sum(axis=1)
-        best, better = (
-            squares.argmin(axis=0),
-            squares.min(axis=0) < np.where(fitted.alone[mine] > 0, (fitted.left[:, mine] ** 2).sum(axis=0), np.inf),
-        )
-        for n in np.unique(best[better]):
-            taken = np.flatnonzero(better & (best == n))
-            fitted.left[:, mine[taken]], fitted.alone[mine[taken]] = errors[n][:, taken], 0.0
-            fitted.weights[mine[taken]] = 0.0
-            fitted.weights[np.ix_(mine[taken], used)] = normal.weights(used, mine[taken], PENALTIES[n]).T
-    return fitted._replace(R2=_explained(fitted.left, targets))
-
-
-def _explained(left: Floats, targets: Floats) -> Floats:
-    """Return R² (X,) of targets (N, X) with errors (N, X)."""
-    R2: Floats = 1.0 - (left**2).mean(axis=0) / np.maximum(targets.var(axis=0), FAINTEST**2)
-    return R2
+def _equations(z: Floats, x: Floats, fold: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return ZᵀZ/N and ZᵀX/N without the rows of each fold, and of all rows at last (FOLDS + 1, I, …)."""
+    found, rows = [], np.append(len(z) - np.bincount(fold, minlength=FOLDS), len(z))
+    for of in (z, x):
+        each = np.array([z[fold == f].T @ of[fold == f] for f in range(FOLDS)])
+        total = each.sum(axis=0)
+        found.append(np.array([*(total - each), total]) / np.maximum(rows, 1)[:, None, None])
+    return found[0], found[1]
 
 
 def averaged(left: Floats, window: int) -> Floats:
@@ -357,20 +306,24 @@ def averaged(left: Floats, window: int) -> Floats:
     return mean
 
 
-def _far(inputs: Floats, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _far(given: _Fitted, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Return the matrix (I, I) with which zᵀ far z is h/h̃ for inputs z, and the cross-fitted √max(1, h/h̃) (N,)."""
-    size = inputs.shape[1]
-    found = np.zeros((size, size))
+    size, found, h = given.inputs.shape[1], np.zeros_like(given.grams[0]), np.zeros(len(fold))
     used = np.setdiff1d(np.arange(size), withheld)
-    h = np.zeros(len(inputs))
-    for f in np.unique(fold):
-        tested = inputs[fold == f][:, used]
-        h[fold == f] = ((tested @ _inverse(inputs[fold != f][:, used])) * tested).sum(axis=1)
-    found[np.ix_(used, used)] = _inverse(inputs[:, used]) / np.median(h)
+    *unseen, of_all = (inverse(gram[np.ix_(used, used)]) for gram in given.grams)
+    for f, matrix in enumerate(unseen):
+        h[fold == f] = squares(given.inputs[fold == f][:, used], matrix)
+    found[np.ix_(used, used)] = of_all / np.median(h)
     return found, np.sqrt(np.maximum(1.0, h / np.median(h)))
 
 
-def _inverse(inputs: Floats) -> Floats:
-    """Return (ZᵀZ/N + λ)⁻¹ of inputs Z (N, I)."""
-    found: Floats = np.linalg.inv(inputs.T @ inputs / max(len(inputs), 1) + STIFFNESS * np.eye(inputs.shape[1]))
+def inverse(gram: Floats) -> Floats:
+    """Return (ZᵀZ/N + λ)⁻¹ of ZᵀZ/N (I, I)."""
+    found: Floats = np.linalg.inv(gram + STIFFNESS * np.eye(len(gram)))
+    return found
+
+
+def squares(z: Floats, matrix: Floats) -> Floats:
+    """Return zᵀ M z of each row (N,)."""
+    found: Floats = ((z @ matrix) * z).sum(axis=1)
     return found

@@ -25,7 +25,7 @@ from asm_gym.detection.scores import Largest
 from asm_gym.monitors.base import State, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next
-from asm_gym.monitors.value_association import ALIKE_S, MOST_INPUTS, STIFFNESS, ValueAssociation
+from asm_gym.monitors.value_association import ALIKE_S, MOST_INPUTS, ValueAssociation, inverse, squares
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -64,8 +64,8 @@ class Values(NamedTuple):
             return cls(monitor)
         z = np.concatenate([_with_one(senses.read_episode(e.stream).inputs) for e in episodes])
         alike = ALIKE_S / episodes[0].spec.dt / len(z)
-        leverage = alike * np.linalg.inv(z.T @ z / len(z) + STIFFNESS * np.eye(z.shape[1]))
-        usual = 1.0 / (1.0 + float(np.median(_squares(z, leverage))))
+        leverage = alike * inverse(z.T @ z / len(z))
+        usual = 1.0 / (1.0 + float(np.median(squares(z, leverage))))
         return cls(monitor, usual * leverage, usual)
 
     @classmethod
@@ -107,10 +107,6 @@ class Values(NamedTuple):
         """Return the state before the first row."""
         return () if self.monitor is None else self.monitor.initial_state(batch)
 
-    def reset(self, state: State) -> State:
-        """Return the state without the evidence so far."""
-        return () if self.monitor is None else self.monitor.reset_evidence(state)
-
     def join(
         self, state: State, rows: NDArray[np.float64], changes: Surprise, divisor: NDArray[np.float64]
     ) -> tuple[State, Surprise]:
@@ -136,7 +132,7 @@ class Values(NamedTuple):
         if not len(self.leverage) or self.monitor is None:
             return np.ones(len(rows))
         _, read, known = read_next(_senses(self.monitor), state.model.history, rows)
-        f = self.usual + _squares(_with_one(read.inputs), self.leverage)
+        f = self.usual + squares(_with_one(read.inputs), self.leverage)
         root: NDArray[np.float64] = np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
         return root
 
@@ -152,9 +148,3 @@ def _senses(monitor: CalibratedMonitor) -> StreamScaler:
 
 def _with_one(inputs: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.hstack([inputs, np.ones((len(inputs), 1))])
-
-
-def _squares(z: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return zᵀ M z of each row (N,)."""
-    found: NDArray[np.float64] = ((z @ matrix) * z).sum(axis=1)
-    return found
