@@ -7,7 +7,6 @@ import pytest
 
 from asm_gym import Channel, Episode, NeuralASM, StreamSpec
 from asm_gym.memory.free_energy import FreeEnergy
-from asm_gym.monitors.skills import learn_to_act
 
 SPEC = StreamSpec(
     (
@@ -34,7 +33,6 @@ def known(request):
     rng = np.random.default_rng(0)
     healthy = [episode(rng) for _ in range(30)]
     asm = NeuralASM(SPEC, hidden_size=24, association_size=16, epochs=10, dynamics=request.param).fit(healthy[:20])
-    learn_to_act(asm, healthy[:20], units=16)
     return asm.model.free_energy(healthy[20:24]), healthy[24:]
 
 
@@ -97,4 +95,4 @@ def test_the_command_that_lets_it_be_lowest_is_one_that_is_commanded_here(known)
 def test_spreads_of_no_row_are_refused(known):
     energy, fresh = known
     with pytest.raises(ValueError, match="no healthy row"):
-        FreeEnergy.of(energy.network, energy.senses, energy.motor, [fresh[0].stream[:2]])
+        FreeEnergy.of(energy.network, energy.senses, [fresh[0].stream[:2]])

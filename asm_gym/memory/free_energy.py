@@ -2,16 +2,15 @@
 
     F(x, u, z) = [½ Π_z ‖z - μ‖² + ½ Π_x ‖ε‖²]/τ² + N log τ           time: the state, and its prediction of the row
                + Σ_i ½ (e_i/σ_i)² + log σ_i                           association: each group of senses from the rest
-               + Σ_j ½ ((u_j - û_j)/τ_j)² + log τ_j                   motor association: the command that belongs here
 
     surprise      F rises where x is not what was expected
-    inference     z ← argmin F at given x and u; the other two sums do not depend on z
+    inference     z ← argmin F at given x and u; the second sum does not depend on z
     completion    x_M ← argmin F over missing senses M, and z with it
     reaction      (x, u) ← argmin F over the command and the row that it will lead to
     learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
 
-ε and μ are those of ``traces`` or ``settling``, e and σ of ``association``, û of ``motor``. τ and τ_j are the spreads
-left in healthy rows, so that all sums are in nats.
+ε and μ are those of ``traces`` or ``settling``, e and σ of ``association``. τ is the spread left in healthy rows, so
+that both sums are in nats.
 
 Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
 time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of their outcome.
@@ -28,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.association import Association
-from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.settling import SettlingWeights
 from asm_gym.memory.temporal import Step, TemporalNetwork
 from asm_gym.memory.traces import Weights
@@ -37,7 +35,7 @@ from asm_gym.scaling import FARTHEST, StreamScaler
 Floats = NDArray[np.float64]
 
 STEPS = 200  # largest number of L-BFGS steps for a row
-SMALLEST_SPREAD = 1e-3  # of τ
+SMALLEST_SPREAD = 1e-3  # τ
 
 
 class Terms(NamedTuple):
@@ -45,12 +43,11 @@ class Terms(NamedTuple):
 
     time: float
     association: float
-    motor: float
 
     @property
     def total(self) -> float:
         """F."""
-        return self.time + self.association + self.motor
+        return self.time + self.association
 
 
 class Before(NamedTuple):
@@ -67,7 +64,6 @@ class _Given(NamedTuple):
 
     moment: Before
     carried: tuple[Floats, ...]  # by traces μ and W_D's part of c; by settling W_H f(c)
-    command: Floats  # (A,) û, in spreads of the stream
 
 
 Through = tuple[float, Floats, Floats, Floats]  # the sum through time, and its gradients by x, u (A,) and z
@@ -79,26 +75,17 @@ class FreeEnergy:
 
     network: TemporalNetwork  # its synapses
     senses: StreamScaler  # how it reads a row
-    motor: Motor | None  # without a motor association the third sum is 0
-    tau: float  # τ of the temporal network
-    tau_motor: Floats  # τ_j (A,) in spreads of a command
+    tau: float = 1.0  # τ of the temporal network
 
     @classmethod
-    def of(
-        cls, network: TemporalNetwork, senses: StreamScaler, motor: Motor | None, streams: Sequence[NDArray[Any]]
-    ) -> Self:
-        """Return F with τ and τ_j from healthy ``streams`` (T, D). Raises ValueError where they are too short."""
-        raw = cls(network, senses, motor, 1.0, np.ones(len(senses.spec.motor)))
-        time, commands, rows = 0.0, np.zeros(len(senses.spec.motor)), 0
-        for stream in streams:
-            for moment, row in raw.moments(stream):
-                time += raw.terms(moment, row, raw.inferred(moment, row)).time
-                commands += raw._unexpected(raw._given(moment), raw._read(moment, row)[1][:-1]) ** 2
-                rows += 1
-        if not rows:
+    def of(cls, network: TemporalNetwork, senses: StreamScaler, streams: Sequence[NDArray[Any]]) -> Self:
+        """Return F with τ from healthy ``streams`` (T, D). Raises ValueError where they are too short."""
+        raw, numbers = cls(network, senses), senses.size + len(senses.spec.motor)
+        read = [(moment, row) for stream in streams for moment, row in raw.moments(stream)]
+        time = sum(raw.terms(moment, row, raw.inferred(moment, row)).time for moment, row in read)
+        if not read:
             raise ValueError("no healthy row is long enough to learn the spreads of")
-        tau = max(SMALLEST_SPREAD, float(np.sqrt(2.0 * time / (rows * (senses.size + len(commands))))))
-        return replace(raw, tau=tau, tau_motor=np.maximum(np.sqrt(commands / rows), SMALLEST_SPREAD))
+        return replace(raw, tau=max(SMALLEST_SPREAD, float(np.sqrt(2.0 * time / (len(read) * numbers)))))
 
     def moments(self, stream: NDArray[np.floating[Any]]) -> list[tuple[Before, Floats]]:
         """Return each row (D,) of an episode (T, D) from the ``2 lag``-th on, with its ``Before``."""
@@ -144,16 +131,8 @@ class FreeEnergy:
 
     def reaction(self, moment: Before) -> Floats:
         """Return the command (A,) of lowest F over itself and the row that it leads to."""
-        guess = moment.last[0].copy()
-        guess[self.senses.spec.motor] = self.expected(moment)
-        settled, _ = self.settled(moment, guess, np.ones(len(guess), np.bool_))
+        settled, _ = self.settled(moment, moment.last[0], np.ones(self.senses.spec.size, np.bool_))
         return settled[self.senses.spec.motor]
-
-    def expected(self, moment: Before) -> Floats:
-        """Return the command (A,) of the motor association; without one that of the last row."""
-        if self.motor is None:
-            return np.asarray(moment.last[0, self.senses.spec.motor], np.float64)
-        return np.asarray(self.motor.command(situation(self.senses, moment.last))[0], np.float64)
 
     @cached_property
     def _weights(self) -> tuple[Any, Association]:
@@ -172,15 +151,9 @@ class FreeEnergy:
         return x, u, np.where(np.abs(inputs) < FARTHEST, inputs, 0.0), changes
 
     def _given(self, moment: Before) -> _Given:
-        senses, motor, (w, _) = self.senses, self.senses.spec.motor, self._weights
-        c = moment.c[0].astype(np.float64)
+        (w, _), c = self._weights, moment.c[0].astype(np.float64)
         settling = isinstance(w, SettlingWeights)
-        carried = (w.W_H @ np.tanh(c),) if settling else (w.W_C @ c, w.W_D[:, : len(c)] @ c)
-        return _Given(moment, carried, (self.expected(moment) - senses.mean[motor]) / senses.spread[motor])
-
-    def _unexpected(self, given: _Given, u: Floats) -> Floats:
-        """Return u - û (A,) in spreads of the stream; 0 without a motor association."""
-        return np.zeros(len(u)) if self.motor is None else u - given.command
+        return _Given(moment, (w.W_H @ np.tanh(c),) if settling else (w.W_C @ c, w.W_D[:, : len(c)] @ c))
 
     def _of(self, given: _Given, row: Floats, z: Floats) -> tuple[Terms, Floats, Floats]:
         """Return F, and its gradients by (x, u) (D,), for each spread of a number, and by z (H,)."""
@@ -192,8 +165,6 @@ class FreeEnergy:
         numbers, scale = senses.size + len(spec.motor), 1.0 / self.tau**2
         time = raw / self.tau**2 + numbers * np.log(self.tau)
         between, of_a, of_changes = _between(association, a, changes)
-        off = self._unexpected(given, u[:-1])
-        motor = float(np.sum(0.5 * (off / self.tau_motor) ** 2 + np.log(self.tau_motor))) if self.motor else 0.0
         D, X, L, A = len(row), len(spec.sensory), len(senses.slow), len(spec.motor)
         slope = np.zeros(D)
         by_change = senses.spread / senses.change  # spreads of a change for each spread of the number
@@ -202,9 +173,7 @@ class FreeEnergy:
         slope[spec.sensory] += by_change[spec.sensory] * (of_changes + within * of_a[D : D + X])
         slope[senses.slow] += scale * by_change[senses.slow] * of_x[X:]
         slope[spec.motor] += scale * of_u + of_a[D + X + L : D + X + L + A]
-        if self.motor is not None:
-            slope[spec.motor] += off / self.tau_motor**2
-        return Terms(time, between, motor), slope, scale * of_z
+        return Terms(time, between), slope, scale * of_z
 
 
 def _between(association: Association, a: Floats, changes: Floats) -> tuple[float, Floats, Floats]:

@@ -154,7 +154,7 @@ class MemoryModel(ScaledModel):
 
     def free_energy(self, healthy: Sequence[Episode]) -> FreeEnergy:
         """Return F of all that it predicts, in the spreads that fresh ``healthy`` episodes leave."""
-        return FreeEnergy.of(self.network, self.senses_, self.motor_, [e.stream for e in healthy])
+        return FreeEnergy.of(self.network, self.senses_, [e.stream for e in healthy])
 
     def _units_each(self, senses: StreamScaler) -> int:
         """Return the hidden units of association for each group."""
