@@ -15,8 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from asm_gym.data.episode import load_episode
-from asm_gym.detection import check_per_hour
-from asm_gym.detection.conformal import check_hours
+from asm_gym.detection.conformal import check_hours, check_per_hour
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import NOMINAL_ROLES
 from asm_gym.evaluation.tables import markdown

@@ -16,10 +16,8 @@ from asm_gym.detection import (
     alarms_in,
     conformal_episodes,
     conformal_threshold,
-    hourly_promise,
-    hourly_threshold,
 )
-from asm_gym.detection.conformal import MINUTE
+from asm_gym.detection.conformal import MINUTE, hourly_promise, hourly_threshold
 from asm_gym.detection.detector import USUAL, habituate, usual_levels
 from asm_gym.detection.evidence import (
     CONTEXT_GAIN,

@@ -117,8 +117,8 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     score = asm.score(faulty[0])
     np.testing.assert_allclose(score.attribution.sum(axis=1), score.value)
     assert np.argmax(score.attribution[-1]) == 4
-    assert asm.values_.monitor is not None
     values = asm.values_
+    assert values is not None
     body = values.balance * values.monitor.score(faulty[0]).value ** values.power
     assert (score.value >= body - 1e-9).all()
 
@@ -126,7 +126,7 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
 def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_says():
     cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
     values = Values.learned(cut[:20], seed=0)
-    assert values.monitor is not None
+    assert values is not None
     senses = values.monitor.model.senses_
     z = [np.hstack([senses.read_episode(e.stream).inputs, np.ones((len(e), 1))]) for e in (*cut[:20], cut[25])]
     shown, asked = np.concatenate(z[:-1]).astype(np.float64), z[-1].astype(np.float64)
@@ -134,7 +134,7 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     h, usual = (np.einsum("ni,ij,nj->n", rows, inverse, rows) for rows in (asked, shown))
     root = np.sqrt(np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual))))  # a tenth of a second is 10 rows
     one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))
-    state, found = values.start(1), []
+    state, found = values.monitor.initial_state(1), []
     for row in cut[25].stream.astype(np.float64):
         found.append(values.spread(state, row[None])[0])
         state, judged = values.join(state, row[None], one, np.ones(1))

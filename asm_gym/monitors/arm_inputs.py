@@ -60,8 +60,8 @@ class Derived(NamedTuple):
             pairs, every = np.zeros((2, 0), np.intp), of_angle.any(axis=0)
             derived = [*[every] * J, *[every | of_speed.any(axis=0)] * J]
         sources = np.vstack([of_speed] * len(WIDTHS) + derived)
-        places = (np.searchsorted(spec.sensory, part) for part in (moving, angles))
-        return cls(*places, from_steps, radians, pairs, sources, links)
+        speed, angle = (np.searchsorted(spec.sensory, part) for part in (moving, angles))
+        return cls(speed, angle, from_steps, radians, pairs, sources, links)
 
     def __call__(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> Floats:
         """Return the derived inputs (N, M) of ``values`` (N, X) with their ``spread`` (X,).

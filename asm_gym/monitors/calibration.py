@@ -12,19 +12,17 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection import (
-    Blocks,
-    Detection,
-    EvidenceDetection,
+from asm_gym.detection import Blocks, Detection, EvidenceDetection, conformal_episodes, conformal_threshold
+from asm_gym.detection.base import Array
+from asm_gym.detection.conformal import (
+    EPISODE,
+    HOUR,
     Promise,
+    check_hours,
     check_per_hour,
-    conformal_episodes,
-    conformal_threshold,
     hourly_promise,
     hourly_threshold,
 )
-from asm_gym.detection.base import Array
-from asm_gym.detection.conformal import EPISODE, HOUR, check_hours
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES

@@ -100,11 +100,3 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> A
         return make(StreamSpec.from_json(saved.header["spec"]), **how).restore(saved)
     except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-
-
-def split_off(saved: Checkpoint, prefix: str) -> tuple[Checkpoint, Arrays]:
-    """Return a checkpoint without the arrays whose names have a prefix, and those arrays by the rest of their names."""
-    beside = {n.removeprefix(prefix): a for n, a in saved.arrays.items() if n.startswith(prefix)}
-    shapes = {n: s for n, s in saved.header["shapes"].items() if not n.startswith(prefix)}
-    arrays = {n: a for n, a in saved.arrays.items() if not n.startswith(prefix)}
-    return Checkpoint({**saved.header, "shapes": shapes}, arrays), beside

@@ -15,9 +15,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.checkpoint import Checkpoint, read_checkpoint
+from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
+from asm_gym.detection.base import Arrays
 from asm_gym.detection.events import Excuses
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
@@ -25,7 +26,7 @@ from asm_gym.monitors.arm_inputs import Derived
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.files import restored, split_off
+from asm_gym.monitors.files import restored
 from asm_gym.monitors.memory_config import MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.packing import rounded
@@ -65,7 +66,7 @@ class NeuralASM(CalibratedMonitor):
         config: all other hyperparameters.
 
     Attributes:
-        values_: judges values; empty before ``fit``, with ``values=False``, and where nothing predicts any.
+        values_: judges values; None before ``fit``, with ``values=False``, and where nothing predicts any.
         excuses_: tells knocks and stops from faults; None with ``excuses=False``.
 
     Example:
@@ -125,7 +126,7 @@ class NeuralASM(CalibratedMonitor):
         self.config, self.habituates = replace(config, **checked), evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = Excuses(spec) if excuses else None
-        self.values_ = Values()
+        self.values_: Values | None = None
         self._diagnosis: Diagnosis | None = None
         self._kernel: RowKernel | None = None
         self._kernel_of: tuple[Any, ...] = ()
@@ -171,12 +172,13 @@ class NeuralASM(CalibratedMonitor):
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
-        return super().learned_ | self.values_.arrays
+        return super().learned_ | ({} if self.values_ is None else self.values_.arrays)
 
     def initial_state(self, batch: int = 1) -> MonitorState:
         state = super().initial_state(batch)
         excuses = np.zeros((batch, 0), np.int64) if self.excuses_ is None else self.excuses_.start(batch)
-        return state._replace(excuses=excuses, values=self.values_.start(batch))
+        values = () if self.values_ is None else self.values_.monitor.initial_state(batch)
+        return state._replace(excuses=excuses, values=values)
 
     def observe(
         self, state: MonitorState, stream: NDArray[np.floating[Any]], out: MonitorState | None = None
@@ -191,7 +193,7 @@ class NeuralASM(CalibratedMonitor):
             now, divisor = now._replace(excuses=state.excuses), np.ones(len(rows))
         else:
             now, surprise, divisor = kernel(state, rows, out)
-        if self.values_.monitor is not None:
+        if self.values_ is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
             now = now._replace(values=values)
         if self.model.skills_:
@@ -234,10 +236,10 @@ class NeuralASM(CalibratedMonitor):
         other._uncalibrate()
         return other
 
-    def restore(self, saved: Checkpoint) -> Self:
-        own, values = split_off(saved, VALUES)
-        super().restore(own)
-        self.values_ = Values.found(self.spec, values, self.seed, self.urdf)
+    def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        super().with_learned({n: a for n, a in arrays.items() if not n.startswith(VALUES)}, skills)
+        values = {n.removeprefix(VALUES): a for n, a in arrays.items() if n.startswith(VALUES)}
+        self.values_ = Values.found(self.spec, values, self.seed, self.urdf) if values else None
         return self
 
     def _row_kernel(self) -> RowKernel | None:
@@ -251,7 +253,7 @@ class NeuralASM(CalibratedMonitor):
         return self._kernel
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
-        if self.values_.monitor is None:
+        if self.values_ is None:
             return self
         other = self._copy()
         other.values_ = self.values_._replace(balance=0.0)  # changes alone
@@ -260,4 +262,4 @@ class NeuralASM(CalibratedMonitor):
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         super()._learn(episodes, progress, warm_start)
-        self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else Values()
+        self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else None

@@ -87,8 +87,8 @@ class MonitorKind:
 
 
 _RIVALS = {
-    "logpzo": ("baselines.logpzo:LogpZO", "moving_mean"),
-    "gru": ("baselines.recurrent:GRU", "mahalanobis"),
+    "logpzo": ("baselines.networks:LogpZO", "moving_mean"),
+    "gru": ("baselines.networks:GRU", "mahalanobis"),
     "kalman": ("baselines.linear:Kalman", "mahalanobis"),
     "association_linear": ("baselines.linear:LinearAssociation", "mahalanobis"),
     "association_values": ("value_association:ValueAssociation", "largest"),

@@ -36,7 +36,7 @@ PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
 
 
 class Values(NamedTuple):
-    """The monitor of values; empty where it is not asked for, and where no value can be predicted.
+    """The monitor of values, and how it counts beside that of changes.
 
     Attributes:
         monitor: of values alone.
@@ -46,19 +46,22 @@ class Values(NamedTuple):
         power: p, 2 before ``calibrate``: changes are judged by squares.
     """
 
-    monitor: CalibratedMonitor | None = None
+    monitor: CalibratedMonitor
     leverage: NDArray[np.float64] = np.zeros((0, 0))
     usual: float = 1.0
     balance: float = 1.0
     power: float = 2.0
 
     @classmethod
-    def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self:
-        """Fit it to nominal episodes; ``urdf`` is the text of a body model, or empty."""
+    def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self | None:
+        """Fit it to nominal episodes; None where no value can be predicted.
+
+        ``urdf`` is the text of a body model, or empty.
+        """
         monitor = _monitor(episodes[0].spec, seed, urdf).fit(episodes)
         assert isinstance(monitor.model, ValueAssociation)
         if not len(monitor.model.judged(monitor.learned_["R2_values"])):
-            return cls()
+            return None
         senses = _senses(monitor)
         if senses.inputs > MOST_INPUTS:
             return cls(monitor)
@@ -71,8 +74,6 @@ class Values(NamedTuple):
     @classmethod
     def found(cls, spec: StreamSpec, arrays: Arrays, seed: int, urdf: str = "") -> Self:
         """Restore it from arrays by their names without the prefix. Raises where they do not fit."""
-        if not arrays:
-            return cls()
         own = {n: a for n, a in arrays.items() if n not in ("leverage", *SCALARS)}
         monitor, leverage = _monitor(spec, seed, urdf).with_learned(own), arrays["leverage"]
         size = _senses(monitor).inputs + 1
@@ -82,7 +83,6 @@ class Values(NamedTuple):
 
     def balanced(self, changes: Sequence[Surprise], episodes: Sequence[Episode]) -> Self:
         """Return it with b and p from nominal episodes, of whose changes ``join`` made this with b of 0."""
-        assert self.monitor is not None
         both = changes, self.monitor.score_episodes(episodes)
         dt = self.monitor.spec.dt
         logs = [np.log(np.maximum(Blocks.of([s.value for s in scores], dt).maxima, TINY)) for scores in both]
@@ -97,15 +97,9 @@ class Values(NamedTuple):
     @property
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """Arrays to keep in a checkpoint, by name."""
-        if self.monitor is None:
-            return {}
         scalars = {name: np.array(getattr(self, name)) for name in SCALARS}
         kept = {**self.monitor.learned_, "leverage": self.leverage, **scalars}
         return {PREFIX + name: array for name, array in kept.items()}
-
-    def start(self, batch: int) -> State:
-        """Return the state before the first row."""
-        return () if self.monitor is None else self.monitor.initial_state(batch)
 
     def join(
         self, state: State, rows: NDArray[np.float64], changes: Surprise, divisor: NDArray[np.float64]
@@ -114,7 +108,6 @@ class Values(NamedTuple):
 
         ``changes`` is the surprise that changes make; knocks and stops excuse a surprise by ``divisor`` (B,).
         """
-        assert self.monitor is not None
         root = self.spread(state, rows)
         new, values = self.monitor.observe(state, rows)
         weighted = self.balance * values.value**self.power
@@ -129,7 +122,7 @@ class Values(NamedTuple):
 
     def spread(self, state: State, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return √f (B,) of the next rows (B, D)."""
-        if not len(self.leverage) or self.monitor is None:
+        if not len(self.leverage):
             return np.ones(len(rows))
         _, read, known = read_next(_senses(self.monitor), state.model.history, rows)
         f = self.usual + squares(_with_one(read.inputs), self.leverage)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from asm_gym.memory.learning import Trajectory
-from asm_gym.monitors.baselines.torch_model import adam, descend
+from asm_gym.monitors.baselines.networks import adam, descend
 
 Array = NDArray[np.float32]
 BATCH = 16  # episodes of a batch

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, solve_discrete_are
 
@@ -61,7 +62,8 @@ class Kalman(StreamModel):
         check_inputs(self.spec.size + 1)
         streams = [e.stream for e in episodes]
         sensed = [s[:, self.spec.sensory].astype(np.float64) for s in streams]
-        mean, spread = _scale(np.concatenate(sensed))
+        rows = np.concatenate(sensed)
+        mean, spread = rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_SPREAD)
         xs = [(x - mean) / spread for x in sensed]
         before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
         u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
@@ -71,7 +73,9 @@ class Kalman(StreamModel):
         A, residual = weights[:X].T, after - Z @ weights
         R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / spread) ** 2, FAINTEST))
         # A residual holds the new measurement's noise and, through A, that of the last.
-        Q = _positive(residual.T @ residual / len(residual) - R - A @ R @ A.T)
+        excess = residual.T @ residual / len(residual) - R - A @ R @ A.T
+        values, vectors = np.linalg.eigh((excess + excess.T) / 2)
+        Q = (vectors * np.maximum(values, FAINTEST)) @ vectors.T  # the nearest that is positive
         try:
             P = solve_discrete_are(A.T, np.eye(X), Q, R)
         except (LinAlgError, ValueError):  # an unstable A: trust the measurements
@@ -165,11 +169,9 @@ class FrictionRule(StreamModel):
         parts = [(rows[:, self._torques], self._inputs(rows, before, width)) for rows, before in pairs]
         torque, inputs = (np.concatenate([p[k] for p in parts]) for k in range(2))
         solved = [np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in range(torque.shape[1])]
-        weights, smoothed = np.array(solved), []
-        for tau, told in parts:
-            left = tau - np.einsum("njk,jk->nj", told, weights)
-            means = [left[max(0, n - self.window + 1) : n + 1].mean(axis=0) for n in range(len(left))]
-            smoothed.append(np.array(means))
+        weights = np.array(solved)
+        left = [pd.DataFrame(tau - np.einsum("njk,jk->nj", told, weights)) for tau, told in parts]
+        smoothed = [of.rolling(self.window, min_periods=1).mean() for of in left]
         spread = np.maximum(np.concatenate(smoothed).std(axis=0), 1e-9)
         return self.restore({"width": width, "weights": weights, "rule_spread": spread})
 
@@ -200,15 +202,3 @@ class FrictionRule(StreamModel):
             pace = now - (now if self._from_positions else before[:, self._speeds] * body.radians)
             parts += body.links.torques(q, now, pace / (self.lag * self.spec.dt))
         return np.stack(parts, axis=2)
-
-
-def _scale(rows: Floats) -> tuple[Floats, Floats]:
-    """Return the mean and the spread (D,) of rows (N, D)."""
-    return rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_SPREAD)
-
-
-def _positive(matrix: Floats) -> Floats:
-    """Return the nearest symmetric matrix whose eigenvalues are at least ``FAINTEST``."""
-    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    nearest: Floats = (vectors * np.maximum(values, FAINTEST)) @ vectors.T
-    return nearest

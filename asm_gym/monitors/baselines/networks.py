@@ -1,0 +1,281 @@
+"""Baselines by torch, trained by backpropagation and kept as arrays: a GRU, and FAIL-Detect's best score.
+
+    GRU      h_t = GRU(h_{t-1}, [v_{t-1}, Δ_{t-1}, u_t])    Δ̂_t, log σ²_t = linear(h_t)    Gaussian log likelihood
+    logpZO   ‖z(x)‖²        z where the flow dx/ds = v(x, s), s from 0 to 1, carries x; N(0, I) if nominal
+
+logpZO is averaged there over the last five rows, and calibrated by a band in time; here it has one threshold on that
+mean (``moving_mean``). There an embedding of images and the action is scored; here the sensorimotor row. The network
+here is smaller: three layers of 512, where the authors train a one-dimensional U-Net of 59 million weights, which takes
+longer for a row on a core than the row lasts at 20 Hz.
+
+Sources: Cho et al. 2014 (EMNLP); Malhotra et al. 2015 (ESANN) for the Mahalanobis distance of a recurrent network's
+prediction errors; Xu et al. 2025 (RSS), “Can we detect failures without failure data? Uncertainty-aware runtime failure
+detection for imitation learning policies”; Lipman et al. 2023 (ICLR) for the flow.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from asm_gym.data.episode import Episode
+from asm_gym.detection import ModelOutput
+from asm_gym.detection.base import Arrays
+from asm_gym.memory.learning import shuffled
+from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.base import Progress
+from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
+from asm_gym.scaling import ScaledRows, StreamScaler
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_number, typed
+
+EPOCHS, BATCH = 200, 16  # passes at most over whole episodes, and episodes side by side
+FRESH = 5  # one in so many episodes is not trained on, but says when to stop
+
+PATIENCE, SLOWER, SLOWEST = 5, 0.3, 3e-5
+"""Epochs without a gain after which the step size is cut to a share; below the smallest, training has converged."""
+
+LARGEST_ERROR = 20.0
+"""Largest error in training, in standard deviations, that has its full weight; contacts would drown all else."""
+
+ROWS = 256  # of a batch of the flow
+STAGES = 10  # steps of the flow
+FARTHEST = 30.0  # where standardised numbers are cut off: networks of this kind diverge far from what they have seen
+
+
+class TorchModel(ScaledModel):
+    """A model that is a torch module.
+
+    Attributes:
+        module_: the network, once it is fitted.
+    """
+
+    module_: nn.Module
+
+    @abstractmethod
+    def module(self, senses: StreamScaler) -> nn.Module:
+        """Return a fresh network."""
+
+    @abstractmethod
+    def train(
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+    ) -> None:
+        """Train it on whole nominal episodes."""
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        streams = [e.stream for e in episodes]
+        senses = StreamScaler.fit(self.spec, streams)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # as for every other monitor, so that times compare
+        try:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(int(rng.integers(2**31)))
+                module = self.module(senses)
+                self.train(module, [senses.read_episode(s) for s in streams], rng, progress)
+        finally:
+            torch.set_num_threads(threads)
+        return self.restore({**senses.arrays, **{name: t.numpy() for name, t in module.state_dict().items()}})
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        senses = StreamScaler.of(self.spec, learned)
+        with torch.random.fork_rng(devices=[]):
+            module = self.module(senses)
+        state = {name: torch.from_numpy(np.array(learned[name], np.float32)) for name in module.state_dict()}
+        try:
+            module.load_state_dict(state)
+        except RuntimeError as error:
+            raise ValueError(f"the weights of this {self.kind} do not fit: {error}") from error
+        self.module_ = module.eval().requires_grad_(False)
+        return super().restore(learned, skills)
+
+
+def train_on_episodes(
+    module: nn.Module,
+    loss: Callable[[NDArray[np.intp], bool], Tensor],
+    episodes: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> None:
+    """Train by Adam, slowed down at every plateau of the fresh loss, until no gain is left; keep the best weights.
+
+    Args:
+        module: the network.
+        loss: of some episodes, by their numbers, while training or not.
+        episodes: how many there are. A fifth is not trained on; with fewer than five all are trained on.
+        rng: of the order of episodes.
+        progress: called with the epochs done, and the most there can be.
+    """
+    order = rng.permutation(episodes).astype(np.intp)
+    kept = episodes // FRESH
+    trained, fresh = order[kept:], order[:kept] if kept else order
+    optimiser = torch.optim.Adam(module.parameters(), 1e-3)
+    plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=SLOWER, patience=PATIENCE)
+    least, best = math.inf, copy.deepcopy(module.state_dict())
+    for epoch in range(EPOCHS):
+        progress(epoch, EPOCHS)
+        order = rng.permutation(trained)
+        for start in range(0, len(order), BATCH):
+            descend(loss(order[start : start + BATCH], True), optimiser)
+        with torch.no_grad():
+            now = float(loss(fresh, False))
+        if now < least:
+            least, best = now, copy.deepcopy(module.state_dict())
+        plateaus.step(now)
+        if optimiser.param_groups[0]["lr"] < SLOWEST:
+            break
+    module.load_state_dict(best)
+
+
+def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.optim.Optimizer, Any]:
+    """Return Adam and its cosine decay, the default of those who publish such models."""
+    optimiser = torch.optim.Adam(module.parameters(), rate)
+    return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
+
+
+def descend(loss: Tensor, optimiser: torch.optim.Optimizer, schedule: Any = None, clip: float = 1.0) -> None:
+    """Update once, with the gradient cut off at ``clip``."""
+    optimiser.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
+    optimiser.step()
+    if schedule is not None:
+        schedule.step()
+
+
+def padded(episodes: Sequence[NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+    """Return episodes (T, N) side by side (B, longest, N), and 1 where there is a step (B, longest)."""
+    rows = nn.utils.rnn.pad_sequence([torch.as_tensor(e) for e in episodes], batch_first=True)
+    real = nn.utils.rnn.pad_sequence([torch.ones(len(e)) for e in episodes], batch_first=True)
+    return rows, real
+
+
+class _GRUState(NamedTuple):
+    hidden: NDArray[np.float32]  # (B, H)
+    last: NDArray[np.float32]  # (B, S) what was sensed last
+    history: RowHistory
+
+
+class _GRUModule(nn.Module):
+    def __init__(self, senses: int, commands: int, changes: int, hidden: int) -> None:
+        super().__init__()
+        self.cell = nn.GRU(senses + commands, hidden, batch_first=True)
+        self.out = nn.Linear(hidden, 2 * changes)
+
+    def forward(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        states, _ = self.cell(inputs, hidden)
+        mean, log_variance = self.out(states).chunk(2, dim=-1)
+        return mean, log_variance.clamp(-12.0, 8.0), states
+
+
+class GRU(TorchModel):
+    """A gated recurrent network; its context is its hidden state.
+
+    Args:
+        spec: the stream it is to expect.
+        hidden_size: H, hidden units.
+    """
+
+    kind = "gru"
+
+    @typed
+    def __init__(self, spec: StreamSpec, hidden_size: int = 128) -> None:
+        super().__init__(spec)
+        self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
+
+    def module(self, senses: StreamScaler) -> nn.Module:
+        return _GRUModule(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size)
+
+    def train(
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+    ) -> None:
+        inputs = [np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings]
+
+        def loss(chosen: NDArray[np.intp], training: bool) -> Tensor:
+            x, real = padded([inputs[i] for i in chosen])
+            mean, log_variance, _ = module(x)
+            off = (padded([readings[i].changes for i in chosen])[0] - mean) * torch.exp(-0.5 * log_variance)
+            huber = nn.functional.huber_loss(off, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR)
+            likely: Tensor = ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
+            return likely
+
+        train_on_episodes(module, loss, len(readings), rng, progress)
+
+    def start(self, batch: int) -> _GRUState:
+        hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
+        last = self.senses_.read(rows, rows, rows).senses
+        return _GRUState(hidden, last, super().start(batch))
+
+    def predict(self, state: _GRUState, rows: NDArray[np.float64]) -> tuple[_GRUState, ModelOutput]:
+        history, r, _ = read_next(self.senses_, state.history, rows)
+        last = np.where(state.history.steps[:, None] > 0, state.last, r.senses)
+        inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
+        found = self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
+        mean, log_variance, hidden = (y.numpy()[:, 0] for y in found)
+        error = r.whole * (r.changes - mean) * np.exp(-0.5 * log_variance)
+        return _GRUState(hidden, r.senses, history), ModelOutput(error, hidden)
+
+
+class LogpZO(TorchModel):
+    """A flow from rows to noise: values, changes and the command.
+
+    Args:
+        spec: the stream it is to expect.
+        width: of each hidden layer.
+        updates: of the weights.
+    """
+
+    kind = "logpzo"
+
+    @typed
+    def __init__(self, spec: StreamSpec, width: int = 512, updates: int = 8000) -> None:
+        super().__init__(spec)
+        self.width = check_number("width", width, low=1, whole=True)
+        self.updates = check_number("updates", updates, low=1, whole=True)
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        return np.concatenate([self.spec.sensory, self.senses_.slow, self.spec.motor])
+
+    def module(self, senses: StreamScaler) -> nn.Module:
+        size = senses.size + len(self.spec.motor)
+        widths = [size + 1, *[self.width] * 3]
+        layers = [part for n, m in pairwise(widths) for part in (nn.Linear(n, m), nn.SiLU())]
+        return nn.Sequential(*layers, nn.Linear(self.width, size))
+
+    def train(
+        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+    ) -> None:
+        optimiser, schedule = adam(module, self.updates)
+        rows = np.concatenate([_features(r) for r in readings])
+        for n, chosen in zip(range(self.updates), shuffled(len(rows), ROWS, rng), strict=False):
+            progress(n, self.updates)
+            x = torch.as_tensor(rows[chosen])
+            noise, s = torch.randn_like(x), torch.rand(len(x), 1)
+            flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
+            descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
+
+    def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+        state, reading, _ = read_next(self.senses_, state, rows)
+        error = self._noise(torch.as_tensor(_features(reading))).numpy().astype(np.float64)
+        return state, ModelOutput(error, no_context(rows))
+
+    def _noise(self, x: Tensor) -> Tensor:
+        """Return z (B, N) of rows (B, N)."""
+        for stage in range(STAGES):
+            s = torch.full((len(x), 1), stage / STAGES)
+            x = x + self.module_(torch.cat([x, s], dim=1)) / STAGES
+        return x
+
+
+def _features(reading: ScaledRows) -> NDArray[np.float32]:
+    """Return values, changes of slow channels, and the action (B, N)."""
+    return np.clip(np.hstack([reading.senses, reading.commands[:, :-1]]), -FARTHEST, FARTHEST)
