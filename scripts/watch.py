@@ -15,7 +15,7 @@ import io
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -28,7 +28,6 @@ from asm_gym.data.gaps import SURPRISING, bridge_of, bridged
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.ros2_dds import text_topic
 from asm_gym.evaluation.alarms import (
     HEADINGS,
     Alarm,
@@ -43,8 +42,7 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
 from asm_gym.files import writable, write_text
-from asm_gym.guard.alarm_outputs import AlarmCommand, as_json
-from asm_gym.guard.live import ALARM, LiveEvent, follow
+from asm_gym.guard.live import ALARM, LiveEvent, follow, run_hook
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, origin, run
@@ -52,7 +50,7 @@ from asm_gym.scripts.log_options import LogOptions
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
-LIVE_ONLY = ("until_alarm", "json", "hook", "publish")  # options
+LIVE_ONLY = ("until_alarm", "json", "hook")  # options
 SHOWN_ROWS = 20  # alarms printed; the file holds them all
 
 
@@ -75,9 +73,7 @@ class Args(LogOptions):
     json: bool = False
     """Print what a live source gives as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
     hook: str | None = option(None, metavar="COMMAND")
-    """Run at every alarm of a live source, with the alarm as a line of JSON on its standard input."""
-    publish: str | None = option(None, metavar="/TOPIC")
-    """Topic of ROS 2 on which every alarm of a live source is published, as std_msgs/String of JSON."""
+    """Shell command, run at every alarm of a live source, with the alarm as a line of JSON on its standard input."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
@@ -158,18 +154,6 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
     return f"Wrote {args.out / 'report.html'} and alarms.csv"
 
 
-def alarm_outputs(args: Args, console: Console) -> list[Callable[[LiveEvent], None]]:
-    """Return what takes the events of a live source."""
-    shown = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    outputs: list[Callable[[LiveEvent], None]] = [lambda event: shown(as_json(event) if args.json else str(event))]
-    if args.hook is not None:
-        outputs.append(AlarmCommand(args.hook))
-    if args.publish is not None:
-        publish_text = text_topic(args.publish)
-        outputs.append(lambda event: publish_text(as_json(event)) if event.kind == ALARM else None)
-    return outputs
-
-
 def watch(args: Args, console: Console) -> int:
     """Watch a recording or a live source."""
     live = live_source(args.source)
@@ -184,11 +168,12 @@ def watch(args: Args, console: Console) -> int:
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if live is not None:
         opened = partial(lines_from, args.source, sys.stdin, args.silence)
-        outputs = alarm_outputs(args, console)
 
         def say(event: LiveEvent) -> None:
-            for output in outputs:
-                output(event)
+            text = event.to_json() if args.json else str(event)
+            console.print(text, soft_wrap=True, highlight=False, markup=False)
+            if args.hook and event.kind == ALARM:
+                run_hook(args.hook, event)
 
         bridge = bridge_of(args.bridge, monitor.spec.dt)
         lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from asm_gym.data.live import SourceDied, lines_from
-from asm_gym.data.ros2_dds import text_topic
 from asm_gym.data.rows import RowReader
 from asm_gym.spec import Channel, StreamSpec
 from tests.needs import needs
@@ -156,18 +155,3 @@ def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_r
     steps = np.diff([row.numbers[0] for row in read])
     assert (steps == 1 + np.array([row.lost for row in read[1:]])).all()
     assert sum(not row.read for row in rows) in (1, 2)  # late, and sent twice
-
-
-def test_an_alarm_is_published_for_who_is_there_and_who_comes_later():
-    participant = domain.DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
-    sub, core = needs("cyclonedds.sub"), needs("cyclonedds.core")
-    text_topic("/asm_gym/alarm")('{"kind": "alarm"}')
-    kept = text_topic("/asm_gym/alarm")
-    kept('{"kind": "alarm"}')
-    quality = core.Qos(core.Policy.Reliability.Reliable(0), core.Policy.Durability.TransientLocal)
-    reader = sub.DataReader(participant, topic.Topic(participant, "rt/asm_gym/alarm", Text), qos=quality)
-    until, found = time.monotonic() + 10, []
-    while not found and time.monotonic() < until:
-        found = [sample.data for sample in reader.take(N=5)]
-        time.sleep(0.05)
-    assert found[:1] == ['{"kind": "alarm"}']

@@ -22,7 +22,6 @@ from asm_gym.data.rows import SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.guard.alarm_outputs import as_json
 from asm_gym.guard.live import LiveEvent, follow
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
@@ -225,21 +224,10 @@ def test_alarms_leave_a_watch_as_json_and_by_a_command(monitor, tmp_path, monkey
 
 def test_an_infinite_surprise_is_json_too():
     event = LiveEvent("alarm", 1.0, "q[0]  inf thresholds", "missing data", "q[0]", float("inf"), 0.1)
-    assert json.loads(as_json(event))["thresholds"] == "inf"
+    assert json.loads(event.to_json())["thresholds"] == "inf"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--hook", ""], "must not be empty"),
-        (["--hook", "no-such-program-here --now"], "there is no program no-such-program-here"),
-        (["--publish", "/"], "a topic has a name"),
-    ],
-)
-def test_an_output_that_makes_no_sense_is_refused(options, message, monitor, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stdin", io.StringIO("[1, 2, 3, 4]\n"))
-    assert live(monitor, tmp_path, "-", *options) == 2
-    assert message in capsys.readouterr().err
+def test_what_is_for_a_live_source_is_refused_with_a_recording(monitor, tmp_path, capsys):
     assert live(monitor, tmp_path, str(tmp_path), "--json") == 2
     assert "--json is for a live source" in capsys.readouterr().err
 

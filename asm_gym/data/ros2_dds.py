@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -35,7 +35,6 @@ FIELDS: dict[str, dict[str, str]] = {
     "geometry_msgs/msg/Vector3": dict.fromkeys("xyz", "float64"),
     "geometry_msgs/msg/Wrench": dict.fromkeys(("force", "torque"), "geometry_msgs/msg/Vector3"),
     "geometry_msgs/msg/WrenchStamped": {"header": "std_msgs/msg/Header", "wrench": "geometry_msgs/msg/Wrench"},
-    "std_msgs/msg/String": {"data": "str"},
     "std_msgs/msg/MultiArrayDimension": {"label": "str", "size": "uint32", "stride": "uint32"},
     "std_msgs/msg/MultiArrayLayout": {"dim": "[std_msgs/msg/MultiArrayDimension]", "data_offset": "uint32"},
     "std_msgs/msg/Float64MultiArray": {"layout": "std_msgs/msg/MultiArrayLayout", "data": "[float64]"},
@@ -119,22 +118,6 @@ def _participant() -> Any:
     if not domain.isdigit():
         raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
     return _dds("domain").DomainParticipant(int(domain))
-
-
-def text_topic(name: str) -> Callable[[str], None]:
-    """Return what publishes a text on a topic, as std_msgs/msg/String, reliably; who comes later has the last one.
-
-    Raises:
-        ValueError: no such name, or ROS_DOMAIN_ID is no number.
-    """
-    if not name.strip("/"):
-        raise ValueError(f"a topic has a name, such as /asm_gym/alarm, got {name!r}")
-    participant, core, kind = _participant(), _dds("core"), message("std_msgs/msg/String")
-    reliable = core.Policy.Reliability.Reliable(_dds("util").duration(seconds=1))
-    quality = core.Qos(reliable, core.Policy.Durability.TransientLocal, core.Policy.History.KeepLast(1))
-    topic = _dds("topic").Topic(participant, f"rt/{name.strip('/')}", kind)
-    writer = _dds("pub").DataWriter(participant, topic, qos=quality)
-    return lambda text: writer.write(kind(data=text))
 
 
 def _kind(participant: Any, name: str) -> str:

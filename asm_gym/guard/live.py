@@ -5,11 +5,16 @@ Nothing that a line holds ends a watch: a line that cannot be read is an alarm.
 
 from __future__ import annotations
 
+import json
+import math
+import subprocess
 import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from itertools import chain
+from threading import Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,6 +53,22 @@ class LiveEvent(NamedTuple):
 
     def __str__(self) -> str:
         return self.text if self.kind == SUMMARY else f"{self.time:.3f} s  {self.text}"
+
+    def to_json(self) -> str:
+        """Return it as one line for machines; a number that is not finite is text: ``"inf"``, ``"nan"``."""
+        fields: dict[str, Any] = self._asdict()
+        return json.dumps(
+            {k: str(v) if isinstance(v, float) and not math.isfinite(v) else v for k, v in fields.items()}
+        )
+
+
+def run_hook(command: str, event: LiveEvent) -> None:
+    """Run a shell command with an event as a line of JSON on its standard input; nothing waits for it."""
+    process = subprocess.Popen(command, shell=True, stdin=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stdin is not None
+    with suppress(BrokenPipeError), process.stdin as file:  # it need not read
+        file.write(event.to_json() + "\n")
+    Thread(target=process.wait, daemon=True).start()
 
 
 def follow(
