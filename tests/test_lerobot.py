@@ -56,12 +56,6 @@ def monitor():
     return made.calibrate([recorded(100 + n) for n in range(39)], 0.025)
 
 
-def ticks():
-    """A clock of 30 rows a second."""
-    now = iter(np.arange(1, 100_000) / RATE)
-    return lambda: float(next(now))
-
-
 def run(guard, arm, rows=200, jam=100, begin=0, step=None):
     """The rows of alarm and of intervention."""
     step = step or (lambda o, a: guard({"observation": o, "action": a})["action"])
@@ -76,13 +70,13 @@ def run(guard, arm, rows=200, jam=100, begin=0, step=None):
 
 
 def test_a_healthy_policy_is_let_go_on(monitor):
-    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(200)
+    guard, arm = LeRobotGuard(monitor), Arm(200)
     assert run(guard, arm, jam=-1) == ([], [])
     np.testing.assert_array_equal(arm.sent[-1], list(arm.policy(199).values()))
 
 
 def test_a_jammed_joint_is_an_alarm_and_the_arm_stays_where_it_stood(monitor):
-    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(201)
+    guard, arm = LeRobotGuard(monitor), Arm(201)
     alarms, others = run(guard, arm, rows=120)
     assert 100 < alarms[0] <= 115
     assert others[0] == alarms[0]
@@ -96,7 +90,7 @@ def test_a_jammed_joint_is_an_alarm_and_the_arm_stays_where_it_stood(monitor):
 
 @pytest.mark.parametrize(("hot", "fault"), [(25.0, "stalled"), (71.0, "overheated"), (None, "stalled")])
 def test_a_servo_that_stalls_or_overheats_is_named(monitor, hot, fault):
-    guard, arm = LeRobotGuard(monitor, "monitor", clock=ticks()), Arm(201)
+    guard, arm = LeRobotGuard(monitor, "monitor"), Arm(201)
 
     def step(observation, action):
         if hot is not None:
@@ -109,7 +103,7 @@ def test_a_servo_that_stalls_or_overheats_is_named(monitor, hot, fault):
 
 def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):
     for response, over in (("hold", True), ("stop", False)):
-        guard, arm = LeRobotGuard(monitor, response, quiet_s=0.5, clock=ticks()), Arm(202)
+        guard, arm = LeRobotGuard(monitor, response, quiet_s=0.5), Arm(202)
         run(guard, arm, rows=115)
         assert guard.intervened
         arm.jammed[:] = False
@@ -123,7 +117,7 @@ def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):
 
 
 def test_monitor_only_says_so(monitor):
-    guard, arm = LeRobotGuard(monitor, "monitor", clock=ticks()), Arm(203)
+    guard, arm = LeRobotGuard(monitor, "monitor"), Arm(203)
     alarms, others = run(guard, arm, rows=120)
     assert alarms
     assert not others
@@ -139,7 +133,7 @@ def test_monitor_only_says_so(monitor):
     ],
 )
 def test_what_is_missing_or_not_finite_is_held_at_once_at_finite_numbers(monitor, spoil):
-    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(204)
+    guard, arm = LeRobotGuard(monitor), Arm(204)
     run(guard, arm, rows=60, jam=-1)
     observation, action = arm.get_observation(), arm.policy(60)
     spoil(observation, action)
@@ -155,7 +149,7 @@ def test_what_is_missing_or_not_finite_is_held_at_once_at_finite_numbers(monitor
 @pytest.mark.parametrize("what", ["observation", "action"])
 @pytest.mark.parametrize("value", [None, "?", float("nan"), float("inf"), "missing"])
 def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hold(monitor, on_alarm, rows, what, value):
-    guard, arm = LeRobotGuard(monitor, on_alarm, clock=ticks()), Arm(208)
+    guard, arm = LeRobotGuard(monitor, on_alarm), Arm(208)
     for k in range(60):
         given = {"observation": arm.get_observation(), "action": arm.policy(k)}
         if k < rows:
@@ -183,16 +177,16 @@ def test_a_velocity_is_held_by_zero_and_what_no_name_tells_must_be_told(monitor)
     rolls = rolls.with_learned(monitor.learned_)
     rolls.threshold_ = monitor.threshold
     observation = dict(zip((m.replace(".pos", ".vel") for m in MOTORS), np.arange(6.0), strict=True))
-    guard = LeRobotGuard(rolls, clock=ticks())
+    guard = LeRobotGuard(rolls)
     sent = guard({"observation": observation, "action": dict.fromkeys(observation, float("nan"))})["action"]
     assert list(sent.values())[:5] == [0.0] * 5
-    guard = LeRobotGuard(monitor, action_means="torque", clock=ticks())
+    guard = LeRobotGuard(monitor, action_means="torque")
     with pytest.raises(ValueError, match="action_means"):
         guard({"observation": Arm(0).get_observation(), "action": Arm(0).policy(0)})
 
 
 def test_a_monitor_that_fails_ends_in_the_hold(monitor, monkeypatch):
-    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(205)
+    guard, arm = LeRobotGuard(monitor), Arm(205)
     run(guard, arm, rows=60, jam=-1)
     monkeypatch.setattr(type(monitor), "observe", lambda *args: 1 / 0)
     with pytest.warns(UserWarning, match="monitor: ZeroDivisionError"):
@@ -214,7 +208,7 @@ def test_what_it_cannot_guard_is_refused(monitor):
 def test_lerobots_own_pipeline_takes_it(monitor):
     processor = needs("lerobot.processor")
     converters = needs("lerobot.processor.converters")
-    guard, arm = LeRobotGuard(monitor, clock=ticks()), Arm(206)
+    guard, arm = LeRobotGuard(monitor), Arm(206)
     pipeline = processor.RobotProcessorPipeline(
         steps=[guard],
         to_transition=converters.robot_action_observation_to_transition,

@@ -16,18 +16,18 @@ import re
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import MEANINGS, TARGET, TORQUE, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
+from asm_gym.data.action_meaning import TARGET, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
 from asm_gym.data.gaps import blamed, reason
 from asm_gym.data.rows import ClockWentBack, Pace
-from asm_gym.guard.checks import check_monitor
 from asm_gym.guard.engine import Engine
+from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
@@ -58,7 +58,6 @@ class LeRobotGuard:
         quiet_s: how long without an alarm until the policy acts again [s].
         action_means: as in ``NeuralASMSafety``, by the order of the memory's actions. By default ``.pos`` is a target
             and ``.vel`` a velocity.
-        clock: a clock in seconds, for the rate.
 
     Attributes:
         alarm, intervened: whether there was an alarm at the newest row, and whether a hold was sent.
@@ -76,7 +75,6 @@ class LeRobotGuard:
         on_alarm: str = "hold",
         quiet_s: float = 1.0,
         action_means: ActionMeans | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         check_choice("on_alarm", on_alarm, ON_ALARM)
         self.on_alarm = on_alarm
@@ -88,7 +86,6 @@ class LeRobotGuard:
         self._motors = [_motor_of(label) for label in self._spec.labels]
         self._told = action_means
         self._rows_lately = max(2, round(STALL_S / self._spec.dt))
-        self._clock = clock
         try:
             from lerobot.processor import ProcessorStep
         except ImportError:
@@ -150,7 +147,7 @@ class LeRobotGuard:
     def _follow_clock(self) -> None:
         """Say where rows come at another rate than the memory reads."""
         try:
-            self._pace.lost(self._clock())
+            self._pace.lost(time.monotonic())
         except ClockWentBack as error:
             self._pace = Pace(self._spec.dt)
             _log.warning("%s", error)
@@ -171,20 +168,18 @@ class LeRobotGuard:
         """Return what the actions mean: what is told, or what LeRobot's names say.
 
         Raises:
-            ValueError: some are torques, or neither a position nor a velocity by their names.
+            ValueError: they are to be held, and some are torques, or neither a position nor a velocity by their names.
         """
         state = {name: column for column, (is_command, name) in enumerate(self._motors) if not is_command}
         means = [VELOCITY if n.endswith(".vel") else TARGET if n.endswith(".pos") else UNKNOWN for n in self._names]
         if self._told is not None:
             means = list(ActionMeaning.told(self._told, len(means)).means)
-        if wrong := [n for n, m in zip(self._names, means, strict=True) if m in (UNKNOWN, TORQUE)]:
-            raise ValueError(
-                f"nothing makes {', '.join(wrong)} stay: say what they mean by action_means, a name of "
-                f'{", ".join(MEANINGS[:3])} for all or for each, or watch with on_alarm="monitor"'
-            )
         senses = [state.get(n, -1) if m == TARGET else -1 for n, m in zip(self._names, means, strict=True)]
         slopes = [float(sense >= 0) for sense in senses]
-        return ActionMeaning(tuple(means), tuple(senses), tuple(slopes), (0.0,) * len(means))
+        meaning = ActionMeaning(tuple(means), tuple(senses), tuple(slopes), (0.0,) * len(means))
+        if self.on_alarm != "monitor":
+            meaning.check_stays("this robot", self._names)
+        return meaning
 
     def _described(self, row: Floats32, report: RowReport, observation: Mapping[str, Any]) -> dict[str, Any]:
         """Return what there is to say of an alarm."""

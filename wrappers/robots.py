@@ -10,16 +10,17 @@ import numpy as np
 from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import ACTIONS, DELTA, TARGET, TORQUE, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
-from asm_gym.guard.checks import LOG
+from asm_gym.data.action_meaning import ACTIONS, MEANINGS, TARGET, ActionMeaning, ActionMeans
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.observer import LOG, Fitted, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.severity import nothing_felt
-from asm_gym.monitors import NeuralASM, pretrained_for
+from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.validation import check_number, short_repr
-from asm_gym.wrappers.observation_map import ObservationMap
 
 DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
 
@@ -62,6 +63,66 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     return inner
 
 
+class ObservationMap:
+    """Where the numbers of a stream stand in an observation of this space.
+
+    ``layout`` are the parts of the observation in order, by the names of channels, and their sizes; ``own`` is the
+    space of that layout. Without a stream of its own, observation and action are the stream. Raises ValueError where
+    the environment does not say where they stand, or a wrapper inside has changed the observation.
+    """
+
+    def __init__(
+        self,
+        space: gym.spaces.Space[Any],
+        spec: StreamSpec,
+        has_stream: bool,
+        layout: dict[str, int] | None = None,
+        own: gym.spaces.Space[Any] | None = None,
+    ) -> None:
+        self._space, senses = space, len(spec.sensory)
+        if not has_stream and isinstance(space, gym.spaces.Box):
+            self._places = [("", spec.sensory, np.arange(senses))]
+        elif not has_stream or layout is None:
+            raise ValueError("the environment does not say where its stream stands in its observation")
+        elif own is not None and space != own:
+            raise ValueError(f"a wrapper inside has changed the observation, which was {own}")
+        else:
+            self._places = _laid_out(layout, spec, space)
+        self.shown = np.zeros(spec.size, bool)
+        """(D,) which columns stand in the observation; a policy that sees nothing else cannot read the others."""
+        for _, columns, _ in self._places:
+            self.shown[columns] = True
+
+    def repaired(self, observation: Any, row: NDArray[np.float32], missing: NDArray[np.bool_]) -> Any:
+        """Return the observation with the numbers of ``row`` (D,) where they are ``missing`` (D,)."""
+        for part, columns, entries in self._places:
+            wrong = missing[columns]
+            if not wrong.any():
+                continue
+            array = np.array(observation[part] if part else observation)
+            array.reshape(-1)[entries[wrong]] = row[columns[wrong]]
+            box = self._space[part] if isinstance(self._space, gym.spaces.Dict) else self._space
+            if isinstance(box, gym.spaces.Box):
+                array = np.clip(array, box.low, box.high).astype(box.dtype)
+            observation = {**observation, part: array} if part else array
+        return observation
+
+
+def _laid_out(
+    layout: dict[str, int], spec: StreamSpec, space: gym.spaces.Space[Any]
+) -> list[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
+    """Return part, columns and entries of each channel in a flat observation, its ``state``, or a dict of arrays."""
+    named = isinstance(space, gym.spaces.Dict) and "state" not in space.spaces
+    flat = "state" if isinstance(space, gym.spaces.Dict) else ""
+    found, start = [], 0
+    for name, size in layout.items():
+        if name in spec.slices:
+            columns = np.arange(spec.size)[spec.slices[name]]
+            found.append((name if named else flat, columns, np.arange(size) + (0 if named else start)))
+        start += size
+    return found
+
+
 def robots_of(
     env: AnyEnv, spec: StreamSpec, found: ActionMeaning | None = None, told: ActionMeans | None = None
 ) -> tuple[Robots, ObservationMap | None]:
@@ -91,11 +152,9 @@ def robots_of(
     given = None if told is None else ActionMeaning.told(told, rest.size, found)
     try:
         if not holds_itself:
-            meaning = _meaning(env, given, found)
-            if meaning is None or given is not None:
-                rest = _resting_action(env, actions, changed, meaning)
-    except ValueError as error:  # no action is known to rest
-        refused["hold"], meaning = str(error), None
+            rest, meaning = _staying(env, actions, changed, given, found)
+    except ValueError as error:
+        refused["hold"] = str(error)
     grip = np.asarray(first("gripper_actions", ()), np.intp)
     if grip.size and grip.max() >= rest.size:  # a wrapper inside takes other numbers
         grip = grip[:0]
@@ -153,64 +212,30 @@ def _changed(env: AnyEnv) -> str:
     return changed
 
 
-def _meaning(env: AnyEnv, told: ActionMeaning | None, found: ActionMeaning | None) -> ActionMeaning | None:
-    """Return what the actions mean by which a robot stays; None where a zero action makes it stay.
+def _staying(
+    env: AnyEnv, actions: gym.spaces.Box, changed: str, told: ActionMeaning | None, found: ActionMeaning | None
+) -> tuple[NDArray[np.float32], ActionMeaning | None]:
+    """Return (A,) the action for which robots that do not hold by themselves stay, and what their actions mean.
+
+    The meaning is None where that action makes them stay everywhere; else its targets do not count.
 
     Raises:
-        ValueError: nothing tells what some of them mean, or they are torques.
+        ValueError: nothing tells what some of them mean, or they are torques, or a wrapper changes them.
     """
-    meaning = found if told is None else told
-    if meaning is None or UNKNOWN in meaning.means:
-        unknown = (
-            "" if meaning is None else f"numbers {', '.join(map(str, np.flatnonzero(_are(meaning, UNKNOWN))))} of "
-        )
-        raise ValueError(
-            f"nothing tells what {unknown}the actions of {env.unwrapped} mean, so that no hold is known: say it by "
-            'action_means="delta", "target" or "velocity", or one of them for each number; or use Hold(env, '
-            'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
-        )
-    if TORQUE in meaning.means:
-        raise ValueError(
-            f"actions of {env.unwrapped} are torques, and none of them makes an arm stay: use Hold(env, "
-            'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
-        )
-    if told is not None and found is not None and (wrong := _contradicted(told, found)):
-        warnings.warn(f"action_means contradicts the recorded episodes: {wrong}", stacklevel=6)
-    return None if told is not None and set(told.means) <= {DELTA, VELOCITY} else meaning
-
-
-def _are(meaning: ActionMeaning, name: str) -> NDArray[np.bool_]:
-    return np.array([own == name for own in meaning.means])
-
-
-def _contradicted(told: ActionMeaning, found: ActionMeaning) -> str:
-    """Return in which numbers of the action (A,) recorded episodes contradict what was told."""
-    pairs = enumerate(zip(told.means, found.means, strict=True))
-    both = ((k, own, was) for k, (own, was) in pairs if was in (TARGET, DELTA, VELOCITY) and TARGET in (own, was))
-    return "; ".join(f"number {k} is told to be a {own}, and moves as a {was}" for k, own, was in both if own != was)
-
-
-def found_in(monitor: Any) -> ActionMeaning | None:
-    """Return what a monitor has found in the episodes that it was fitted on."""
-    found = getattr(monitor, "about", {}).get(ACTIONS)
-    return None if found is None else ActionMeaning.from_json(found)
-
-
-def _resting_action(
-    env: AnyEnv, actions: gym.spaces.Box, changed: str, meaning: ActionMeaning | None
-) -> NDArray[np.float32]:
-    """Return the action (A,) for which robots that do not hold by themselves stay; of targets it does not count.
-
-    Raises:
-        ValueError: there is none.
-    """
-    if not isinstance(env, VectorEnv) and meaning is None:
-        return resting_action(env)
-    rest = nearest_to_rest(actions)
-    moved = rest.ravel() if meaning is None else rest.ravel()[~_are(meaning, TARGET)]
-    if changed or np.any(moved):
+    rest, meaning = nearest_to_rest(actions), told or found or ActionMeaning.unknown(actions.shape)
+    meaning.check_stays(env.unwrapped)
+    if told is None:
+        return rest, meaning
+    pairs = [] if found is None else enumerate(zip(told.means, found.means, strict=True))
+    wrong = [(k, was) for k, (own, was) in pairs if own != was and TARGET in (own, was) and was in MEANINGS[:3]]
+    if wrong:
+        said = "; ".join(f"number {k} moves as a {was}" for k, was in wrong)
+        warnings.warn(f"action_means contradicts the recorded episodes: {said}", stacklevel=6)
+    if TARGET not in told.means and not isinstance(env, VectorEnv):
+        return resting_action(env), None
+    if changed or np.any(rest.ravel()[np.array(told.means) != TARGET]):
         raise ValueError(changed or no_rest(actions))
-    return rest
+    return rest, told if TARGET in told.means else None
 
 
 def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
@@ -279,3 +304,40 @@ def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> Any:
             )
         wrapper = wrapper.env
     return inner
+
+
+class Guarding:
+    """What a guard of one environment has in common with a guard of many."""
+
+    env: Any
+    _options: GuardOptions
+    _spec: StreamSpec  # of the streams that are watched
+    _rows_per_step = 1
+
+    def _watch_with(self, monitor: Monitor) -> None:
+        """Take up a monitor, and all that depends on it."""
+        check_answer(monitor)
+        check_monitor(monitor, self._spec)
+        found = getattr(monitor, "about", {}).get(ACTIONS)
+        meaning = None if found is None else ActionMeaning.from_json(found)
+        self._robots, self._places = robots_of(self.env, monitor.spec, meaning, self._options.action_means)
+        chosen = self._options.reaction(diagnosis_of(monitor) is not None)
+        policies = [] if isinstance(chosen, str) else [policy_for(chosen, self.env)] * self._robots.count
+        self._engine = Engine(self._robots, monitor, self._options, policies, self._rows_per_step)
+        self._next = monitor
+
+    def _watch_with_next(self) -> None:
+        """Take over the monitor that was assigned, or was fitted or calibrated since."""
+        if Fitted.of(self._next, self._spec).differs(self._engine.fitted):
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            self._watch_with(self._next)
+
+    @property
+    def monitor(self) -> Monitor:
+        """The monitor in use; one that is assigned, or was fitted or calibrated since, takes over at the next reset."""
+        return self._engine.fitted.monitor
+
+    @monitor.setter
+    def monitor(self, monitor: Monitor) -> None:
+        check_monitor(monitor, self._spec)
+        self._next = monitor

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import RecordEpisodeStatistics
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
-from asm_gym.guard.engine import Engine
 from asm_gym.guard.motion import Command
 from asm_gym.guard.observer import joined
 from asm_gym.guard.options import GuardOptions, OnAlarm
@@ -25,11 +25,12 @@ from asm_gym.policies.reflexes import HoldsItself
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, check_choice, short_repr
-from asm_gym.wrappers.episode_counts import relay_beneath_counts
-from asm_gym.wrappers.robots import body_memory, felt_by, found_in, policy_for, robots_of, sensing_within_steps
+from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensing_within_steps
+
+COUNTS = "stable_baselines3.common.monitor"  # module of a wrapper that counts episodes
 
 
-class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Guard an environment with a Box action space under any policy; other environments can be watched.
 
     From the step after an alarm on, a reflex acts in the policy's place, until surprise has stayed under
@@ -155,17 +156,6 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         self._holds = isinstance(self._inner, HoldsItself)
         self._ended = True
 
-    def _watch_with(self, monitor: Monitor) -> None:
-        """Take up a monitor, and all that depends on it."""
-        check_answer(monitor)
-        check_monitor(monitor, self._spec)
-        chosen = self._options.reaction(diagnosis_of(monitor) is not None)
-        policies = () if isinstance(chosen, str) else (policy_for(chosen, self.env),)
-        robots, self._places = robots_of(self.env, monitor.spec, found_in(monitor), self._options.action_means)
-        self._engine = Engine(robots, monitor, self._options, policies, self._rows_per_step)
-        self._robots, self._monitor = robots, monitor
-        self._next, self._taken_up = monitor, Fitted.of(monitor, self._spec)
-
     @property
     def threshold(self) -> float:
         """What surprise must exceed for an alarm in this episode."""
@@ -179,10 +169,8 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
         info = dict(info)
+        self._watch_with_next()
         nothing = self._engine.begin()
-        if self._changed():
-            self._watch_with(self._next)
-            nothing = self._engine.begin()
         self._limit_contact(anew=True)
         self._observation, self._alarms, self._failed, self._solved = observation, 0, "", False
         if self._robots.meaning is not None:
@@ -308,3 +296,52 @@ class NeuralASMSafety(ExchangesMonitor, gym.Wrapper[Any, Any, Any, Any], RecordC
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
         info["asm_intervened"] = np.bool_(True in [bool(row.intervened[0]) for row in rows])
         info["cost_sum"] = np.float64(self._alarms)
+
+
+class Relay(gym.Wrapper[Any, Any, Any, Any]):
+    """Pass on ``outcome`` in place of one step, where there is one.
+
+    It stands beneath a wrapper that counts episodes inside a guard, as ``make_vec_env(wrapper_class=NeuralASMSafety)``
+    of Stable-Baselines3 puts its Monitor there. The guard steps the environment beneath the counting wrapper, and then
+    steps the wrapper once, which is handed the guard's outcome.
+    """
+
+    outcome: tuple[Any, ...] | None = None
+
+    def step(self, action: Any) -> Any:
+        outcome, self.outcome = self.outcome, None
+        return self.env.step(action) if outcome is None else outcome
+
+
+def relay_beneath_counts(env: gym.Env[Any, Any], ends: bool) -> Relay | None:
+    """Put a relay beneath the counting wrappers that stand outermost in ``env``, and return it; None without any.
+
+    Args:
+        ends: the guard may end episodes, which a counting wrapper further inside would not see.
+
+    Raises:
+        ValueError: there is such a wrapper.
+    """
+    layers: list[gym.Wrapper[Any, Any, Any, Any]] = []
+    while isinstance(env, gym.Wrapper):
+        layers.append(env)
+        env = env.env
+    outermost = list(takewhile(_counts, layers))
+    hidden = next(filter(_counts, layers[len(outermost) :]), None)
+    if ends and hidden is not None:
+        name = type(hidden).__name__
+        raise ValueError(
+            f"{name} counts episodes inside, and would not see those that the guard ends: put it outside, as in "
+            f"{name}(NeuralASMSafety(env, monitor)), or directly beneath the guard"
+        )
+    if not outermost:
+        return None
+    inner = outermost[-1].env
+    relay = inner if isinstance(inner, Relay) else Relay(inner)
+    outermost[-1].env = relay
+    return relay
+
+
+def _counts(layer: Any) -> bool:
+    known = isinstance(layer, RecordEpisodeStatistics)
+    return known or any(kind.__module__ == COUNTS for kind in type(layer).__mro__)

@@ -14,20 +14,18 @@ from numpy.typing import NDArray
 from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.guard.checks import ExchangesMonitor, Fitted, check_answer, check_monitor, diagnosis_of
-from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32, check_choice
-from asm_gym.wrappers.robots import Members, askable, body_memory, felt_by, found_in, policy_for, robots_of
+from asm_gym.wrappers.robots import Guarding, Members, askable, body_memory, felt_by
 
 Mask = NDArray[np.bool_]
 
 
-class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
+class VectorNeuralASMSafety(Guarding, VectorWrapper):
     """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
 
     Other arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` has arrays whose first axis is n, and
@@ -119,17 +117,6 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
             raise ValueError("many environments are watched at their control rate: make them without stream_freq")
         return first, True
 
-    def _watch_with(self, monitor: Monitor) -> None:
-        """Take up a monitor, and all that depends on it."""
-        check_answer(monitor)
-        check_monitor(monitor, self._spec)
-        chosen = self._options.reaction(diagnosis_of(monitor) is not None)
-        self._robots, self._places = robots_of(self.env, monitor.spec, found_in(monitor), self._options.action_means)
-        policies = () if isinstance(chosen, str) else [policy_for(chosen, self.env)] * self.num_envs
-        self._engine = Engine(self._robots, monitor, self._options, policies)
-        self._monitor = self._next = monitor
-        self._taken_up = Fitted.of(monitor, self._spec)
-
     @property
     def threshold(self) -> NDArray[np.float64]:
         """(n,) what surprise must exceed for an alarm in the episodes that run."""
@@ -149,10 +136,9 @@ class VectorNeuralASMSafety(ExchangesMonitor, VectorWrapper):
         if ended is None and not begun.all():
             raise gym.error.ResetNeeded("the first reset() must be of all environments")
         self._ended = np.zeros(n, bool) if ended is None else ended
+        if begun.all():
+            self._watch_with_next()
         nothing = self._begin(begun)
-        if begun.all() and self._changed():
-            self._watch_with(self._next)
-            nothing = self._begin(begun)
         self._report(infos, nothing, np.full(self.env.action_space.shape or (), np.nan, np.float32), begun)
         return self._observations, infos
 

@@ -78,6 +78,23 @@ class ActionMeaning:
             known = [part if own == was == TARGET else (-1, 0.0, 0.0) for own, was, *part in parts]
         return cls(each, *(tuple(values) for values in zip(*known, strict=True)))
 
+    @classmethod
+    def unknown(cls, shape: tuple[int, ...]) -> Self:
+        """Return that nothing is known of actions of this shape."""
+        size = int(np.prod(shape))
+        return cls((UNKNOWN,) * size, (-1,) * size, (0.0,) * size, (0.0,) * size)
+
+    def check_stays(self, robot: object, names: Sequence[str] = ()) -> None:
+        """Raise ValueError for numbers of the action, perhaps with ``names``, that nothing is known to make stay."""
+        wrong = [k for k, means in enumerate(self.means) if means in (UNKNOWN, TORQUE)]
+        if wrong:
+            which = ", ".join(names[k] if names else f"number {k}" for k in wrong)
+            raise ValueError(
+                f"no hold is known for actions of {robot}: {which} are torques, or nothing tells what they mean. Say "
+                f"it by action_means, {', '.join(MEANINGS[:3])} for all or for each; or use Hold(env, "
+                'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
+            )
+
     def staying(self, row: NDArray[np.floating[Any]], executed: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """Return the action (A,) for which a robot stays where it is sensed to be in ``row`` (D,).
 

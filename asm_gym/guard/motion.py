@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.guard.observer import joined
-from asm_gym.guard.places import Places
-from asm_gym.guard.reflexes import Motion, Reflexes
+from asm_gym.guard.reflexes import Motion, Places, Reflexes
 from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold
@@ -55,14 +54,13 @@ class Motions:
         self._take_over, self._warn, self._reacts = take_over, warn, reflexes is not None or bool(policies)
         self.places = Places(robots.count, robots.meaning, robots.rest) if reflexes is None else reflexes.places
         self._last = np.zeros((robots.count, robots.rest.size), np.float32)  # executed last
-        self._before = np.zeros_like(self._last)  # executed last before the override
         self.nobody: Mask = np.zeros(robots.count, bool)  # (n,) never written to
         self._memory: dict[int, Any] = {}  # the states of policies that are in an override
         self.begin(~self.nobody)
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        self._last[which] = self._before[which] = self._robots.rest
+        self._last[which] = self._robots.rest
         self.places.begin(which)
         if self._reflexes is not None:
             self._reflexes.begin(which)
@@ -70,7 +68,6 @@ class Motions:
 
     def start(self, robot: int, executed: Floats32) -> None:
         """The override of a robot has begun, after it has ``executed`` (A,)."""
-        self._before[robot] = executed
         self.places.start(robot, executed)
         self._memory.pop(robot, None)
 
@@ -131,7 +128,7 @@ class Motions:
             self._warn(robot, failed, "the robot holds instead")
             motion, action = stay, stay.action.copy()
         if motion.keeps_grip:
-            grip = self._before[robot, robots.grip]
+            grip = self.places.executed[robot, robots.grip]
             action[robots.grip] = np.where(np.isfinite(grip), grip, action[robots.grip])
         return np.clip(action, robots.low, robots.high), motion.brakes, failed
 
@@ -140,7 +137,7 @@ class Motions:
             return self._reflexes.move(robot, name)
         policy, fresh, state = self._policies[robot], robot not in self._memory, self._memory.get(robot)
         if fresh and isinstance(policy, Hold):  # any other policy starts as in a new episode
-            state = policy.begin(self._before[robot].copy())
+            state = policy.begin(self.places.executed[robot].copy())
         given: dict[str, Any] = {"state": state, "episode_start": np.array([fresh]), "deterministic": True}
         action, self._memory[robot] = policy.predict(seen(robot), **given)
         return Motion(action, keeps_grip=False)

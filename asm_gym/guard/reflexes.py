@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.guard.places import Places
+from asm_gym.data.action_meaning import ActionMeaning
 from asm_gym.guard.robots import Robots, named
 from asm_gym.spec import StreamSpec
 
@@ -21,10 +21,7 @@ Mask = NDArray[np.bool_]
 GRADED = "graded"  # not a reflex, but the one that severity and cause ask for
 PATH = 10  # how many actions a retreat undoes
 COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
-TOLERATED, TOLERATED_ALONE = (
-    4.0,
-    2.0,
-)  # external torque that none gives way to [N m]: under "graded", and "comply" alone
+TOLERATED, TOLERATED_ALONE = 4.0, 2.0  # external torque that none gives way to [N m]: under "graded"; "comply" alone
 
 NO_TORQUE = "comply needs the channel external_torque: make the environment with stream group torque"
 
@@ -35,6 +32,45 @@ class Motion(NamedTuple):
     action: NDArray[np.float32]  # (A,)
     brakes: bool = False  # the robot stays, whatever the action is
     keeps_grip: bool = True  # the grippers are told what they were told before the override
+
+
+class Places:
+    """The actions (n, A) for which n robots stay: each where it was when its override began.
+
+    Args:
+        meaning: of their actions; None where ``rest`` is known to make them stay.
+        rest: (A,) what is left to do where nothing else is known.
+    """
+
+    def __init__(self, count: int, meaning: ActionMeaning | None, rest: NDArray[np.float32]) -> None:
+        self._meaning, self._rest = meaning, rest
+        self.executed = np.tile(rest, (count, 1))  # (n, A) last before the override
+        self._actions = np.full((count, rest.size), np.nan, np.float32)
+        self._rows: NDArray[np.float32] = np.zeros((count, 0), np.float32)  # (n, D) newest that were finite
+
+    def begin(self, which: NDArray[np.bool_]) -> None:
+        """New episodes of the robots of ``which`` (n,)."""
+        self.executed[which], self._actions[which], self._rows[which] = self._rest, np.nan, np.nan
+
+    def sense(self, rows: NDArray[np.float32]) -> None:
+        """Take in the newest rows (n, D)."""
+        if self._meaning is not None:
+            self._rows = np.where(np.isfinite(rows), rows, self._rows if self._rows.size else np.float32(np.nan))
+
+    def start(self, robot: int, executed: NDArray[np.float32]) -> None:
+        """An override begins, after the robot has ``executed`` (A,)."""
+        self.executed[robot], self._actions[robot] = executed, np.nan
+
+    def stay(self, robot: int) -> NDArray[np.float32]:
+        """Return the action (A,) for which a robot stays; a number that is not known yet is that of ``rest``."""
+        if self._meaning is None:
+            return self._rest.copy()
+        action = self._actions[robot]
+        if not np.isfinite(action).all() and self._rows.size:
+            found = self._meaning.staying(self._rows[robot], self.executed[robot])
+            action[:] = np.where(np.isfinite(action), action, found)
+        stay: NDArray[np.float32] = np.where(np.isfinite(action), action, self._rest)
+        return stay
 
 
 class Reflexes:
