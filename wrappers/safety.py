@@ -16,15 +16,13 @@ from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.motion import Command
-from asm_gym.guard.observer import joined
 from asm_gym.guard.options import GuardOptions, OnAlarm
-from asm_gym.guard.report import INFO, LazyInfo, RowReport, report
+from asm_gym.guard.report import LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource, stepped
-from asm_gym.validation import as_float32, check_choice, short_repr
+from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensing_within_steps
 
 COUNTS = "stable_baselines3.common.monitor"  # module of a wrapper that counts episodes
@@ -80,7 +78,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             where an environment cannot hold by itself: a target arm is held by the target at which it is, others by
             zero. None for what its attribute ``action_means`` says, or else the episodes that the monitor was
             fitted on.
-        info: ``"full"``, or ``"flat"`` for the scalars without ``info["asm"]``.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response; a response that lets a pressing arm go on; a reflex
@@ -117,7 +114,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
         action_means: ActionMeans | None = None,
-        info: Literal["full", "flat"] = "full",
     ) -> None:
         self._options = GuardOptions(
             on_alarm=on_alarm,
@@ -132,15 +128,13 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             contact_limits=contact_limits,
             action_means=action_means,
         )
-        recorded = {"monitor": monitor, "monitor_freq": monitor_freq, "info": info, **vars(self._options)}
+        recorded = {"monitor": monitor, "monitor_freq": monitor_freq, **vars(self._options)}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
         if self._box is None and on_alarm not in ("monitor", "terminate"):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
-        check_choice("info", info, INFO)
-        self._full = info == "full"
         self._relay = relay_beneath_counts(env, ends=on_alarm != "monitor")
         self._stepped = self.env if self._relay is None else self._relay.env
         self._source = StreamSource(env)
@@ -172,7 +166,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._watch_with_next()
         nothing = self._engine.begin()
         self._limit_contact(anew=True)
-        self._observation, self._alarms, self._failed, self._solved = observation, 0, "", False
+        self._observation, self._alarms, self._solved = observation, 0, False
         if self._robots.meaning is not None:
             self._engine.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
@@ -188,10 +182,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             if action.shape != self._box.shape:
                 raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done
-        self._failed, overridden = "", False
         self._executed = action
-        if self._box is not None:
-            overridden = bool(self._command(action).overridden[0])
+        overridden = self._box is not None and self._command(action)
         self._rows: list[RowReport] = []
         observation, reward, terminated, truncated, info = self._run()
         info = dict(info)  # an environment may use its own again
@@ -220,17 +212,15 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if self._relay is None:
             return outcome
         self._relay.outcome = outcome
-        return self.env.step(action)  # the wrappers in between count what came of it
+        return stepped(self.env, action)  # the wrappers in between count what came of it
 
-    def _command(self, action: NDArray[np.float32]) -> Command:
+    def _command(self, action: NDArray[np.float32]) -> bool:
         """Choose what is to be done next: the policy's ``action`` (A,), or something else."""
         command = self._engine.act(action.reshape(1, -1), lambda _: self._observation)
         self._executed = command.actions[0].reshape(action.shape)
-        if command.failures:
-            self._failed = joined(self._failed, command.failures.get(0, ""))
         if command.brakes[0]:
             self._inner.holding = True
-        return command
+        return bool(command.overridden[0])
 
     def _run(self) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step the environment; rows within the step are judged meanwhile, and a hold lasts through all its parts."""
@@ -282,17 +272,16 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         surprise = max([float(row.surprise.value[0]) for row in rows])
         alarm = True in [bool(row.alarm[0]) for row in rows]
         self._alarms += alarm
-        if self._full:
-            failed, robots, asked = self._failed, self._robots, self._executed
-            more: dict[str, float] = {"alarms": self._alarms}
-            if (running := self._engine.running) is not None:
-                more = more | {"ceiling": running.ceiling, "level": running.level}
+        robots, asked = self._robots, self._executed
+        more: dict[str, float] = {"alarms": self._alarms}
+        if (running := self._engine.running) is not None:
+            more = more | {"ceiling": running.ceiling, "level": running.level}
 
-            def told() -> dict[str, Any]:
-                slowed = 0.0 if executed is None or self._box is None else robots.slowed(asked, executed)
-                return report(rows, 0, self._spec, executed, failed) | more | {"slowed": slowed}
+        def told() -> dict[str, Any]:
+            slowed = 0.0 if executed is None or self._box is None else robots.slowed(asked, executed)
+            return report(rows, 0, self._spec, executed) | more | {"slowed": slowed}
 
-            info["asm"] = LazyInfo(told)
+        info["asm"] = LazyInfo(told)
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
         info["asm_intervened"] = np.bool_(True in [bool(row.intervened[0]) for row in rows])
         info["cost_sum"] = np.float64(self._alarms)

@@ -15,11 +15,11 @@ from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.options import GuardOptions, OnAlarm
-from asm_gym.guard.report import INFO, LazyInfo, RowReport, side_by_side
+from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
-from asm_gym.validation import as_float32, check_choice
+from asm_gym.validation import as_float32
 from asm_gym.wrappers.robots import Guarding, Members, askable, body_memory, felt_by
 
 Mask = NDArray[np.bool_]
@@ -70,14 +70,11 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
         action_means: ActionMeans | None = None,
-        info: Literal["full", "flat"] = "full",
     ) -> None:
         super().__init__(env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
         refuse_running_statistics(env, "VectorNeuralASMSafety")
-        check_choice("info", info, INFO)
-        self._full = info == "full"
         options = on_alarm, release_after, release_below, max_override, try_after, truncate
         self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold, action_means=action_means)
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
@@ -108,7 +105,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                     f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
                 )
             spaces = env.single_observation_space, env.single_action_space
-            dt = float(Members(env).first("dt") or control_period(env))  # type: ignore[arg-type]
+            dt = float(Members(env).first("dt") or control_period(env))
             return StreamSpec.from_spaces(*spaces, dt), False
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:
@@ -149,7 +146,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if chosen.shape != self.env.action_space.shape:
             raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
         begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
-        executed, failed = self._command(chosen, begun)
+        executed = self._command(chosen, begun)
         observations, rewards, terminated, truncated, infos = self.env.step(executed.copy())
         infos = dict(infos)
         if self._forced.any():
@@ -159,7 +156,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             rewards, terminated, truncated = (np.where(forced, 0, x) for x in (rewards, terminated, truncated))
         rows, failures = self._sensed(observations, executed, infos)
         felt = felt_by(self._robots, infos, infos.get("_contact_load"))
-        report = self._engine.judge(rows, executed, felt, failures, active=~begun).with_failures(failed)
+        report = self._engine.judge(rows, executed, felt, failures, active=~begun)
         stopped = (report.gave_up | (report.ends & self._engine.ends_on_alarm)) & ~begun
         self._forced = stopped & ~np.asarray(terminated | truncated, bool)
         terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
@@ -175,8 +172,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._ended = terminated | truncated
         return self._observations, rewards, terminated, truncated, infos
 
-    def _command(self, chosen: NDArray[np.float32], begun: Mask) -> tuple[NDArray[np.float32], Mapping[int, str]]:
-        """Return (n, A) what is done, and what failed when it was chosen."""
+    def _command(self, chosen: NDArray[np.float32], begun: Mask) -> NDArray[np.float32]:
+        """Return (n, A) what is done."""
 
         def seen(robot: int) -> Any:
             return list(iterate(self.observation_space, self._observations))[robot]
@@ -187,7 +184,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if brakes or self._holding:
             self._members.set_attr("holding", command.brakes.tolist())
         self._holding = brakes
-        return command.actions.reshape(chosen.shape), command.failures
+        return command.actions.reshape(chosen.shape)
 
     def _sensed(
         self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any]
@@ -259,13 +256,12 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             "cost": report.alarm.astype(np.float64),
             "cost_sum": self._alarms.astype(np.float64),
         }
-        if self._full:
-            slowed = np.zeros(self.num_envs) if slowed is None else slowed
-            asm: dict[str, Any] = {"executed_action": executed.copy(), "alarms": self._alarms.copy(), "slowed": slowed}
-            if self._engine.running is not None:
-                n, running = self.num_envs, self._engine.running
-                asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}
-            found["asm"] = LazyInfo(lambda: side_by_side(report, self._spec) | asm)
+        slowed = np.zeros(self.num_envs) if slowed is None else slowed
+        asm: dict[str, Any] = {"executed_action": executed.copy(), "alarms": self._alarms.copy(), "slowed": slowed}
+        if self._engine.running is not None:
+            n, running = self.num_envs, self._engine.running
+            asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}
+        found["asm"] = LazyInfo(lambda: side_by_side(report, self._spec) | asm)
         infos.update(found | {f"_{key}": present for key in found})
 
 

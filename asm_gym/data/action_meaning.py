@@ -75,7 +75,7 @@ class ActionMeaning:
         known = [(-1, 0.0, 0.0)] * size
         if found is not None:
             parts = zip(each, found.means, found.senses, found.slopes, found.offsets, strict=True)
-            known = [part if own == was == TARGET else (-1, 0.0, 0.0) for own, was, *part in parts]
+            known = [(k, a, b) if own == was == TARGET else (-1, 0.0, 0.0) for own, was, k, a, b in parts]
         return cls(each, *(tuple(values) for values in zip(*known, strict=True)))
 
     @classmethod

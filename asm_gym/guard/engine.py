@@ -105,6 +105,7 @@ class Engine:
         self._held = self._nobody  # whose reflex acts next
         self._command = Command(np.zeros((n, robots.rest.size), np.float32), self._nobody, self._nobody, NOTHING)
         self._refused = self._nobody  # whose policy's action was none, in the step that runs
+        self._unsaid: Mapping[int, str] = NOTHING  # what failed when the command was chosen, by robot
         self._warned: set[tuple[int, str]] = set()
 
     @property
@@ -152,6 +153,7 @@ class Engine:
         names = self._arbiter.response if self._graded else [self._name] * self._count
         idle = self._nobody if idle is None else idle
         self._command, self._refused = self._motions.choose(actions, self._held, idle, names, seen)
+        self._unsaid = self._command.failures
         if self._refused is not self._nobody:
             self._held = self._arbiter.state == REFLEX
         return self._command
@@ -179,10 +181,9 @@ class Engine:
         held, refused, self._refused = self._held, self._refused, self._nobody
         refused = refused if refused is self._nobody else refused & active
         failed = self._failures(failures or NOTHING, refused, active)
+        unsaid, self._unsaid = self._unsaid, NOTHING
         believed = self._rows.next(rows, active)
-        for i, said in believed.failures.items():
-            failed[i] = joined(failed.get(i, ""), said)
-        observed = self._observer.observe(believed.rows, failed, held, active)
+        observed = self._observer.observe(believed.rows, _joined_in_each(failed, believed.failures), held, active)
         for i, said in observed.failures.items():
             self._warn(i, said, "which counts as an alarm")
         intervened = held if refused is self._nobody else held | refused
@@ -203,7 +204,7 @@ class Engine:
             self._arbiter.state.copy(),
             severity,
             NOTHING,
-            observed.failures,
+            _joined_in_each({i: said for i, said in unsaid.items() if not refused[i]}, observed.failures),
             NOTHING,
             believed.lost,
             observed.latency,
@@ -232,13 +233,13 @@ class Engine:
         """Tell the monitor that the last rows (n, D) were these: something else was commanded than it seemed."""
         self._observer.amend(rows)
 
-    def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> dict[int, str]:
+    def _failures(self, failures: Mapping[int, str], refused: Mask, active: Mask) -> Mapping[int, str]:
         """Return all that is known to have failed before the rows are looked at, by robot."""
         found = {i: said for i, said in failures.items() if active[i]} if failures else {}
         for i in np.flatnonzero(refused).tolist() if refused is not self._nobody else ():
             found[i] = joined(self._command.failures.get(i, ""), found.get(i, ""))
         if self.fitted.stale:
-            found |= {i: joined(found.get(i, ""), STALE) for i in map(int, np.flatnonzero(active))}
+            return _joined_in_each(found, dict.fromkeys(np.flatnonzero(active).tolist(), STALE))
         return found
 
     def _known_to_decide(self, believed: Believed, failures: Mapping[int, str], refused: Mask) -> Mask:
@@ -311,8 +312,7 @@ class Engine:
             if outcome.alarm:
                 report.alarm[i], report.event[i] = True, outcome.event
         repairs = {i: repair.names for i, repair in self._rows.repairs.items()}
-        failed = {**report.failure, **{i: joined(report.failure.get(i, ""), said) for i, said in failures.items()}}
-        state = self._arbiter.state.copy()
+        failed, state = _joined_in_each(report.failure, failures), self._arbiter.state.copy()
         return report._replace(state=state, outcomes=outcomes, failure=failed, repairs=repairs)
 
     def _warn(self, robot: int, failure: str, instead: str) -> None:
@@ -321,3 +321,10 @@ class Engine:
         if who not in self._warned:
             self._warned.add(who)
             warnings.warn(f"{failure}; {instead}", stacklevel=4)
+
+
+def _joined_in_each(failures: Mapping[int, str], more: Mapping[int, str]) -> Mapping[int, str]:
+    """Return what failed by robot, of two times or parts."""
+    if not (failures and more):
+        return failures or more
+    return {i: joined(failures.get(i, ""), more.get(i, "")) for i in (*failures, *more)}

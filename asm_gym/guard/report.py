@@ -22,8 +22,6 @@ REASONS = CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING
 """Reasons of an alarm: a contact limit was passed, something failed, surprise is over its threshold, a hand is not
 where its joints say, a number is not finite."""
 
-INFO = "full", "flat"  # how much stands in ``info``
-
 Mask = NDArray[np.bool_]
 
 
@@ -66,11 +64,6 @@ class RowReport(NamedTuple):
             found[i] = outcome.alarm and (outcome.event != KNOCKED or outcome.reason == CONTACT)
         return found
 
-    def with_failures(self, failures: Mapping[int, str]) -> RowReport:
-        """Return the same with what failed before the rows, by robot."""
-        both = {i: joined(said, self.failure.get(i, "")) for i, said in failures.items()}
-        return self._replace(failure={**self.failure, **both})
-
     def of(self, which: Mask) -> RowReport:
         """Return the same with nothing to say of all robots but those of ``which`` (n,)."""
         parts: dict[str, Any] = {}
@@ -92,14 +85,11 @@ class RowReport(NamedTuple):
 NO_OUTCOME = Outcome(False, "", 0, NO_RESPONSE, Decision())
 
 
-def report(
-    rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, failed: str = ""
-) -> dict[str, Any]:
+def report(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None) -> dict[str, Any]:
     """Return what to say of the rows of a step of one robot; the wrapper adds ``alarms``, steps in alarm so far.
 
     Args:
         executed: (A,) the action that was done last; None before the first step.
-        failed: what failed before the step; empty where nothing did.
     """
     surprises = np.array([row.surprise.value[robot] for row in rows])
     largest, last = int(surprises.argmax()), rows[-1]
@@ -119,7 +109,7 @@ def report(
         # What has led to the state, a name in ``TRANSITIONS``, or how the policy goes on in alarm; empty for no change
         "transition": next((t for o in reversed(outcomes) if (t := o.decision.transition)), ""),
         # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
-        "failure": joined(failed, *(row.failure.get(robot, "") for row in rows)),
+        "failure": joined(*(row.failure.get(robot, "") for row in rows)),
         "cause": caused.cause,  # of an alarm: family, part, probability of the family, probabilities of all
         "response": caused.name,  # what is done about it under "graded"
         "case": caused.case,  # the row of the table of responses that says so
