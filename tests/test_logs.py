@@ -279,18 +279,6 @@ def test_tables_with_and_without_a_header(text, columns, tmp_path):
     assert episode.spec.dt == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
-def test_text_is_read_in_the_encodings_of_loggers(encoding, tmp_path):
-    path = written(tmp_path / "x.csv", "time [s];Achse 1 [°]\n0;90,5\n1;180\n", encoding)
-    if encoding == "latin-1":
-        with pytest.warns(LogWarning, match="is not in UTF-8"):
-            episode = read(path)
-    else:
-        episode = read(path)
-    assert [(c.name, c.unit) for c in episode.spec.channels] == [("Achse 1", "°")]
-    np.testing.assert_array_equal(episode.stream[:, 0], [90.5, 180])
-
-
 @pytest.mark.parametrize(
     ("text", "columns", "message"),
     [
@@ -370,11 +358,7 @@ def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
     ("make", "error", "message"),
     [
         (lambda p: None, FileNotFoundError, "there is no"),
-        (
-            lambda p: p.mkdir(),
-            FileNotFoundError,
-            "no episodes: no .npz, .npy, .parquet.*no LeRobot or Minari",
-        ),
+        (lambda p: p.mkdir(), FileNotFoundError, "no episodes: no .npz, .npy, .parquet.*no LeRobot or Minari"),
         (lambda p: p.write_bytes(b"PK"), ValueError, "files that can be read end in .npz, .npy, .parquet"),
     ],
 )

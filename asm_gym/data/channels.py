@@ -16,12 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.behaviour import code_of
 from asm_gym.data.clock import Clock, find_clock, seconds_a_row
 from asm_gym.data.columns import Column, LogLayout, decide
 from asm_gym.data.names import TAU, TURN, TURNED, factor, is_command, is_label, label_of, split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns, laid_out, table_of
+from asm_gym.data.tables import Columns, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
 from asm_gym.readings import noise_of
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -110,19 +109,12 @@ def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ())
 
     ``others`` are tables of the same log or folder: what a column is, all of them tell.
     """
-    table = laid_out(table_of(frame))
-    lengths = {name: len(values) for name, values in table.items()}
-    if not lengths or not max(lengths.values()):
-        raise ValueError(f"a frame must hold columns of numbers, got {', '.join(table)[:200] or 'nothing'}")
-    if len(set(lengths.values())) > 1:
-        raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
+    table = laid_out(frame)
     clock = clock_of(table, layout)
     columns = [] if layout.spec else decide([table, *others], layout, clock)
     spec = layout.spec or described(columns, layout)
     plan = ColumnPlan(table, spec)
     rows = plan.rows(table)
-    if layout.spec is not None:
-        rows = _decoded(rows, table, plan)
     labels = [v for n, v in table.items() if n not in plan.columns and is_label(split_unit(n)[0], layout.labels)]
     faults = np.logical_or.reduce([_marked(values) for values in labels]) if labels else np.zeros(0, np.bool_)
     timing = _timing(table, clock, layout)
@@ -184,16 +176,6 @@ def _period(timing: Timing | None, table: Columns, layout: LogLayout) -> tuple[f
     if abs(spec.dt / own - 1) > RATE_TOLERANCE:
         note(f"rows that come at {1 / own:.4g} a second are read at {1 / spec.dt:.4g}, by their clock")
     return spec.dt, True
-
-
-def _decoded(rows: NDArray[np.float64], table: Columns, plan: ColumnPlan) -> NDArray[np.float64]:
-    """The rows (T, D) without the numbers that stand for missing data, such as this log alone has."""
-    codes = {name: code_of(table[name]) for name in dict.fromkeys(plan.columns)}
-    for name, code in codes.items():
-        if not math.isnan(code) and code not in plan.codes:
-            note(f"{name}: {code:g} is taken for missing data, in {int(np.sum(table[name] == code))} rows")
-            rows[np.ix_(table[name] == code, [c == name for c in plan.columns])] = np.nan
-    return rows
 
 
 def _marked(values: NDArray[Any]) -> NDArray[np.bool_]:

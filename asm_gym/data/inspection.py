@@ -12,7 +12,7 @@ from asm_gym.data.channels import clock_of
 from asm_gym.data.clock import Clock
 from asm_gym.data.columns import Column, LogLayout, decide
 from asm_gym.data.gaps import BRIDGED_ROWS
-from asm_gym.data.tables import Columns, is_numeric, laid_out, table_of
+from asm_gym.data.tables import Columns, is_numeric, laid_out
 from asm_gym.data.timing import FAR, evenly, timing_of
 from asm_gym.readings import noise_of, resolution, spans
 
@@ -74,7 +74,7 @@ def inspected(
     name: str, table: Mapping[str, NDArray[Any]], layout: LogLayout | None = None, others: Sequence[Columns] = ()
 ) -> Inspection:
     """Describe a table of columns (T,) or (T, k), as ``asm-gym fit`` reads it; ``others`` are of the same folder."""
-    table, layout = laid_out(table_of(table)), layout or LogLayout()
+    table, layout = laid_out(table), layout or LogLayout()
     found, clock = _clock(table, layout)
     columns = decide([table, *others], layout, clock)
     trouble = [f"{c.name} {c.why}" for c in columns if c.role in ("mixed", "double")]

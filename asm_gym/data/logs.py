@@ -22,7 +22,7 @@ from asm_gym.data.datasets import METADATA, read_dataset
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot import INFO, read_lerobot
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns, laid_out, table_of
+from asm_gym.data.tables import Columns, laid_out
 from asm_gym.data.text import read_json_lines, read_text
 from asm_gym.data.timing import recordings
 from asm_gym.validation import typed
@@ -140,12 +140,7 @@ def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
 
 def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
     """The recordings in a table: it is cut where its clock begins anew, or leaps."""
-    table = laid_out(table_of(source.columns))
-    if not table or not max(map(len, table.values())):
-        raise ValueError(f"it holds no row of numbers, got {', '.join(table)[:200] or 'no column'}")
-    if len({len(values) for values in table.values()}) > 1:
-        yield source._replace(columns=table)  # refused, with the lengths
-        return
+    table = laid_out(source.columns)
     try:
         clock = clock_of(table, layout)
         parts = recordings(clock.seconds(table)) if clock is not None else []

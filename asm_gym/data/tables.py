@@ -175,7 +175,15 @@ def _regular(mask: NDArray[np.bool_]) -> bool:
     return bool(np.quantile(steps, 0.9) <= 2.5 * max(float(np.median(steps)), 1 / mask.mean()))
 
 
-def laid_out(table: Columns) -> Columns:
-    """Return a table with a column a sense, and a row a moment."""
-    lengths = {len(values) for values in table.values()}
-    return table if len(lengths) != 1 else _joined(_pivoted(_with_names(table)))
+def laid_out(frame: Any) -> Columns:
+    """Return a table as ``table_of`` reads it, with a column a sense and a row a moment.
+
+    Raises ValueError where it has no row, or columns of several lengths.
+    """
+    table = table_of(frame)
+    lengths = {name: len(values) for name, values in table.items()}
+    if not any(lengths.values()):
+        raise ValueError(f"a table must hold columns of numbers, got {', '.join(table)[:200] or 'nothing'}")
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
+    return _joined(_pivoted(_with_names(table)))
