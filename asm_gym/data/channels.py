@@ -154,28 +154,27 @@ def _timing(table: Columns, clock: Clock | None, layout: LogLayout) -> Timing | 
 def _period(timing: Timing | None, table: Columns, layout: LogLayout) -> tuple[float, bool]:
     """How far apart rows are to be [s], and whether their clock tells where each belongs."""
     own = timing.dt if timing is not None else None
-    if layout.rate is not None:
-        dt = 1.0 / check_number("rate", layout.rate, low=SLOWEST)
-        if own is not None and timing is not None and not 1 / RESAMPLED <= own / dt <= RESAMPLED:
-            clock = timing.clock.name
-            note(f"the clock {clock!r} says {1 / own:.4g} rows a second: by --rate {layout.rate:g} it is not read")
-            return dt, False
-        return dt, own is not None
-    if own is None:
-        if layout.nominal is None:
-            moved = seconds_a_row(table)
-            hint = "" if moved is None else f"; positions and velocities say about {1 / moved:.4g}"
-            what = "Say the rate [Hz] of this layout (--rate), or name or add a column of times (--clock)"
-            raise ValueError(f"how many rows come a second? {what}{hint}")
-        return 1.0 / layout.nominal, False
-    if layout.nominal is not None and abs(own * layout.nominal - 1) <= RATE_TOLERANCE:
-        return 1.0 / layout.nominal, True
-    spec = layout.spec
-    if spec is None or not 1 / RESAMPLED <= own / spec.dt <= RESAMPLED:
-        return own, True
-    if abs(spec.dt / own - 1) > RATE_TOLERANCE:
-        note(f"rows that come at {1 / own:.4g} a second are read at {1 / spec.dt:.4g}, by their clock")
-    return spec.dt, True
+    said = 1.0 / check_number("rate", layout.rate, low=SLOWEST) if layout.rate is not None else None
+    meant = 1.0 / layout.nominal if layout.nominal is not None else None
+    if own is None or timing is None:
+        if (known := said or meant) is not None:
+            return known, False
+        moved = seconds_a_row(table)
+        hint = "" if moved is None else f"; positions and velocities say about {1 / moved:.4g}"
+        what = "Say the rate [Hz] of this layout (--rate), or name or add a column of times (--clock)"
+        raise ValueError(f"how many rows come a second? {what}{hint}")
+    if said is None and meant is not None and abs(own / meant - 1) <= RATE_TOLERANCE:
+        return meant, True
+    dt = said or (layout.spec.dt if layout.spec is not None else own)
+    if 1 / RESAMPLED <= own / dt <= RESAMPLED:
+        if abs(dt / own - 1) > RATE_TOLERANCE:
+            note(f"rows that come at {1 / own:.4g} a second are read at {1 / dt:.4g}, by their clock")
+        return dt, True
+    if said is not None:
+        clock = timing.clock.name
+        note(f"the clock {clock!r} says {1 / own:.4g} rows a second: by --rate {layout.rate:g} it is not read")
+        return said, False
+    return own, True
 
 
 def _marked(values: NDArray[Any]) -> NDArray[np.bool_]:

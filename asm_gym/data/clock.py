@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,12 +109,14 @@ def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDA
 
 def _moment(column: str, unit: float | None, cell: str) -> float:
     """The time of one cell [s]."""
-    try:
+    with suppress(ValueError):
         number = float(cell or "nan")
-    except ValueError:
-        numbers, unit = _numbers(column, unit, np.array([cell], object))
-        number = float(numbers[0])
-    return number * (_epoch(number) if unit is None else unit)
+        return number * (_epoch(number) if unit is None else unit)
+    with suppress(ValueError):
+        moment = datetime.fromisoformat(cell.strip())
+        return moment.replace(tzinfo=moment.tzinfo or UTC).timestamp()
+    numbers, found = _numbers(column, unit, np.array([cell], object))
+    return float(numbers[0]) * (found or 1.0)
 
 
 def clocks_among(names: Iterable[str]) -> list[Clock]:

@@ -155,7 +155,7 @@ def _words(column: Column) -> tuple[str, str]:
     numbers = np.isfinite(numbers_in(column.values)) | empty
     if empty.all():
         return "empty", "holds nothing"
-    if numbers.mean() < MIXED or numbers[~empty].mean() < MIXED:
+    if numbers[~empty].mean() < MIXED:
         return "words", "holds words"
     row = int(np.argmin(numbers))
     what = f"must hold numbers, got {str(column.values[row])[:40]!r} in row {row + 1}"

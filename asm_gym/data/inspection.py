@@ -82,11 +82,6 @@ def inspected(
     return Inspection(name, found, columns, [_facts(c) for c in columns])
 
 
-def is_constant(column: Column) -> bool:
-    """Tell whether a sense never moves."""
-    return column.role == "sense" and len(np.unique(column.values[np.isfinite(column.values)])) <= 1
-
-
 def _clock(table: Columns, layout: LogLayout) -> tuple[ClockFound, Clock | None]:
     count = np.arange(max(map(len, table.values()), default=0), dtype=np.float64)
     rate = layout.rate or layout.nominal or 0.0

@@ -89,8 +89,7 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
                 found = read_recorded(source.columns, replace(layout, nominal=source.rate), others)
             except ValueError as error:
                 raise ValueError(f"{source.file or source.name}: {error}") from error
-            fields = {"faults": found.faults, "success": source.success}
-            episode = Episode(found.stream, found.spec, **fields)  # type: ignore[arg-type]
+            episode = Episode(found.stream, found.spec, success=source.success, faults=found.faults)
         layout = replace(layout, spec=layout.spec or episode.spec)  # the others are read as the first one was
         yield Log(source.name, episode)
 
@@ -114,9 +113,7 @@ def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
         for n, (columns, rate, success) in enumerate(read_lerobot(path)):
             yield from _parts(Source(f"episode {n}", columns, None, rate, success), layout)
     elif files:
-        root = path / "episodes" if (path / "episodes").is_dir() else path
-        for file in files:
-            name = str(file.relative_to(root)) if file != path else file.name
+        for name, file in files.items():
             try:
                 with file.open("rb") as opened:
                     if opened.read(len(POINTER)) == POINTER:
@@ -155,17 +152,18 @@ def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
         yield source._replace(name=f"{source.name} part {n}", columns=part)
 
 
-def _files_at(path: Path) -> list[Path]:
-    """The file, or those in a folder that can be read and are not half-written."""
+def _files_at(path: Path) -> dict[str, Path]:
+    """The file, or those in a folder that can be read and are not half-written, by their names."""
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
+    known = (*FILES, *HDF5)
     if path.is_file():
-        if path.suffix not in (*FILES, *HDF5):
-            raise ValueError(f"{path}: files that can be read end in {', '.join((*FILES, *HDF5))}")
-        return [path]
+        if path.suffix not in known:
+            raise ValueError(f"{path}: files that can be read end in {', '.join(known)}")
+        return {path.name: path}
     root = path / "episodes" if (path / "episodes").is_dir() else path
-    found = (f for f in root.rglob("*") if f.suffix in (*FILES, *HDF5) and f.suffix not in ASKED_FOR)
-    return sorted(f for f in found if not any(part.startswith(".") for part in f.relative_to(root).parts))
+    found = {f.relative_to(root): f for f in sorted(root.rglob("*")) if f.suffix in known and f.suffix not in ASKED_FOR}
+    return {str(name): f for name, f in found.items() if not any(part.startswith(".") for part in name.parts)}
 
 
 def _is_episode(path: Path) -> bool:

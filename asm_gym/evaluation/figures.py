@@ -20,9 +20,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from asm_gym.data.behaviour import is_constant
 from asm_gym.data.columns import Column
 from asm_gym.data.episode import spans
-from asm_gym.data.inspection import Inspection, is_constant
+from asm_gym.data.inspection import Inspection
 from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.files import written_whole
@@ -235,7 +236,8 @@ def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:
     every = max(1, len(values) // MOST_POINTS)
     times, shown = clock.times[::every], values[::every].astype(np.float64)
     after_gap = np.searchsorted(times, clock.gaps[:, 1])  # no line is drawn across a gap
-    colour = GREY if is_constant(column) else LOG_COLOURS[column.role]
+    still = is_constant(values)
+    colour = GREY if still else LOG_COLOURS[column.role]
     ax.plot(np.insert(times, after_gap, np.nan), np.insert(shown, after_gap, np.nan), color=colour, linewidth=0.7)
     for start, stop in clock.gaps[:200]:
         ax.axvspan(start, stop, color=ORANGE, alpha=0.35, linewidth=0)
@@ -244,5 +246,5 @@ def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:
         ax.plot(clock.times[lost], np.full(lost.sum(), np.nanmin(shown, initial=0.0)), "|", color=ORANGE, markersize=4)
     name = column.name if len(column.name) < 30 else "…" + column.name[-29:]
     unit = f" [{column.unit}]" if column.unit else ""
-    ax.set_title(f"{name}{unit}, {column.role}{', never moves' * is_constant(column)}")
+    ax.set_title(f"{name}{unit}, {column.role}{', never moves' * still}")
     ax.margins(x=0)
