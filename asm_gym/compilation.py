@@ -98,6 +98,12 @@ def _cache_of(dispatcher: Any) -> Any:
     return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
 
 
+def inner(function: F) -> F:
+    """Compile ``function`` into compiled functions that call it: Python's own entry takes as long to compile again."""
+    how: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+    return cast(F, numba.njit(**how)(function))
+
+
 @lru_cache
 def _digest(folder: Path) -> str:
     """Return the digest of every source file in a folder, and of what compiles and links its code."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.envs.mujoco_views import Floats, Ints
 
 LEAST, MOST, MIDDLE, SCALE, OFFSET = range(5)
@@ -35,7 +35,7 @@ def clip(action: NDArray[np.float32], clipped: NDArray[np.float32]) -> bool:
     return True
 
 
-@compiled
+@inner
 def within(value: float, least: float, most: float) -> float:
     """Return a number within bounds; NaN stays."""
     if value < least:
@@ -43,7 +43,7 @@ def within(value: float, least: float, most: float) -> float:
     return most if value > most else value
 
 
-@compiled
+@inner
 def scaled(action: float, scaling: Floats, a: int, i: int) -> float:
     """Return input ``i`` of controller ``a`` in its own units; scaling is (A, 5, N)."""
     x = within(action, scaling[a, LEAST, i], scaling[a, MOST, i])
@@ -51,7 +51,7 @@ def scaled(action: float, scaling: Floats, a: int, i: int) -> float:
     return found
 
 
-@compiled
+@inner
 def rotation(turn: Floats, at: int, matrix: Floats) -> None:
     """Write the rotation (3, 3) by three numbers of ``turn`` at ``at``, axis times angle [rad], into ``matrix``."""
     rx, ry, rz = turn[at], turn[at + 1], turn[at + 2]

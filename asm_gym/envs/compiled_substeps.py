@@ -19,7 +19,7 @@ from llvmlite import binding
 from numba import types
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.envs.control import HELD, control, set_goal
 from asm_gym.envs.mujoco_views import (
     ACTS,
@@ -61,7 +61,7 @@ _mass: Any = types.ExternalFunction("mj_makeM", _on_data)
 _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, types.int32, types.intp))
 
 
-@compiled
+@inner
 def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
     """Evaluate the nominal model's dynamics at the live joint positions and velocities."""
     for i in range(len(nominal.qpos)):

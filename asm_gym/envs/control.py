@@ -21,12 +21,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import inner
 from asm_gym.envs.commands import rotation, scaled
 from asm_gym.envs.mujoco_views import JOINT_POSITION, Arms, Floats, Goals, NominalViews, Views, Work
 
 
-@compiled
+@inner
 def cholesky(M: Floats, n: int, L: Floats) -> None:
     """Write the lower factor of M (n, n) into L.
 
@@ -46,7 +46,7 @@ def cholesky(M: Floats, n: int, L: Floats) -> None:
                     L[i, k] = 0.0
 
 
-@compiled
+@inner
 def forward(L: Floats, n: int, B: Floats, r: int) -> None:
     """b ← L⁻¹ b, where b is row ``r`` of B; 0 where a row of L is."""
     for i in range(n):
@@ -56,7 +56,7 @@ def forward(L: Floats, n: int, B: Floats, r: int) -> None:
         B[r, i] = s / L[i, i] if L[i, i] > 0.0 else 0.0
 
 
-@compiled
+@inner
 def solve(M: Floats, n: int, L: Floats, B: Floats, r: int) -> None:
     """b ← M⁻¹ b, where b is row ``r`` of B, and L is scratch.
 
@@ -80,7 +80,7 @@ RESTING = 0.1  # an arm none of whose joints is faster than this has come to res
 YIELD_LEVER = 0.15  # r₀: what a joint has at least for a lever [m]
 
 
-@compiled
+@inner
 def set_goal(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Move the set-point of arm ``a`` as the action asks, from where the arm is now; M, L, A and G are scratch."""
     for i in range(arms.inputs[a]):
@@ -114,7 +114,7 @@ def set_goal(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None
                 goals.orientation[a, i, j] += work.L[i, k] * work.M[k, j]
 
 
-@compiled
+@inner
 def read_arm(views: Views, nominal: NominalViews, arms: Arms, work: Work, a: int) -> None:
     """Write mass matrix M and bias h of arm ``a``, as the robot knows itself, its Jacobian J and velocity v."""
     site, root = arms.site[a], arms.root[a]
@@ -138,7 +138,7 @@ def read_arm(views: Views, nominal: NominalViews, arms: Arms, work: Work, a: int
         work.J[2, i] = views.cdof[dof, 5] + work.J[3, i] * y - work.J[4, i] * x
 
 
-@compiled
+@inner
 def multiply(M: Floats, n: int, x: Floats, out: Floats) -> None:
     """Write M x of the first n rows and columns into out."""
     for i in range(n):
@@ -147,7 +147,7 @@ def multiply(M: Floats, n: int, x: Floats, out: Floats) -> None:
             out[i] += M[i, j] * x[j]
 
 
-@compiled
+@inner
 def osc_torques(work: Work, n: int) -> None:
     """Write the torques of operational space control into tau.
 
@@ -180,7 +180,7 @@ def osc_torques(work: Work, n: int) -> None:
             work.tau[i] += J[r, i] * (F[0, r] - F[1, r])
 
 
-@compiled
+@inner
 def brake(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Write the torques that hold arm ``a`` at its anchor, which follows what presses too hard, into tau."""
     n, fastest = arms.joints[a], 0.0
@@ -210,7 +210,7 @@ def brake(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
         work.tau[i] += work.h[i]
 
 
-@compiled
+@inner
 def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Write the torques of arm ``a``'s controller into tau."""
     n, site = arms.joints[a], arms.site[a]
@@ -243,7 +243,7 @@ def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     osc_torques(work, n)
 
 
-@compiled
+@inner
 def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Command the motors of arm ``a``, as far as they go."""
     read_arm(views, nominal, arms, work, a)

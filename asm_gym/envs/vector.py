@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from itertools import chain
 from typing import Any, TypeVar
@@ -76,23 +76,17 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         try:
             found = work(self._here)
         finally:
-            errors = [future.exception() for future in others]
-        for error in filter(None, errors):
-            raise error
+            wait(others)
         return list(chain(found, *(future.result() for future in others)))
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         n, options = self.num_envs, dict(options or {})
-        seeds = [seed if seed is None else seed + i for i in range(n)] if seed is None or np.ndim(seed) == 0 else seed
-        if len(seeds) != n:
-            raise ValueError(f"seed must be a number or one of each of {n} environments, got {len(seeds)}")
-        which = options.pop("reset_mask", None)
-        if which is not None:
-            if not (isinstance(which, np.ndarray) and which.dtype == bool and which.shape == (n,) and which.any()):
-                raise ValueError(f'options["reset_mask"] must be {n} booleans, one of them true, got {which}')
-            if not all(seen is not None or begun for seen, begun in zip(self._env_obs, which, strict=True)):
-                raise gym.error.ResetNeeded("the first reset() must be of all environments")
-        begun = np.ones(n, bool) if which is None else which.copy()
+        begun = np.asarray(options.pop("reset_mask", np.ones(n, bool)))
+        seeds = [None if seed is None else seed + i for i in range(n)] if np.ndim(seed) == 0 else list(seed)
+        if len(seeds) != n or begun.dtype != bool or begun.shape != (n,):
+            raise ValueError(f"seed and reset_mask must be one of each of {n} environments, got {seed} and {begun}")
+        if any(seen is None and not now for seen, now in zip(self._env_obs, begun, strict=True)):
+            raise gym.error.ResetNeeded("the first reset() must be of all environments")
 
         def start(i: int) -> tuple[int, Any, dict[str, Any]]:
             return (i, *self.envs[i].reset(seed=seeds[i], options=options or None))
@@ -140,15 +134,14 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
     def _merged(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
         """Return the infos of all members, as ``_add_info`` puts them together one by one."""
         merged: dict[str, Any] = {}
-        everyone = np.ones(self.num_envs, bool)
         for key, first in infos[0].items():
             form, values = _form(first), [info.get(key) for info in infos]
             if form is not None and key != "final_obs" and all(_form(value) == form for value in values):
-                merged[key], merged[f"_{key}"] = np.array(values), everyone
-        if any(key not in merged for info in infos for key in info):
-            rest = [{key: value for key, value in info.items() if key not in merged} for info in infos]
-            for i, info in enumerate(rest):
-                merged = self._add_info(merged, info, i)
+                merged[key], merged[f"_{key}"] = np.array(values), np.ones(self.num_envs, bool)
+        stacked = set(merged)
+        for i, info in enumerate(infos):
+            rest = {key: value for key, value in info.items() if key not in stacked}
+            merged = self._add_info(merged, rest, i)
         return merged
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
