@@ -51,7 +51,7 @@ from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
 LIVE_ONLY = ("until_alarm", "json", "hook")  # options
-SHOWN_ROWS = 20  # alarms printed; the file holds them all
+SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,18 +112,13 @@ def review(args: Args, monitor: Any, console: Console) -> int:
         say(f"Note: {line}.")
     if over:
         say(f"Bridged {over} rows that lack a number, for at most {bridge:.3g} s at once: they are not judged.")
-    shown = ranked(alarms)[:SHOWN_ROWS]
+    shown = sorted(alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))[:SHOWN_ROWS]
     say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
     for log, start, end, channel, why, excess in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(written)
     return BAD_NEWS if alarms else DONE
-
-
-def ranked(alarms: Sequence[Alarm]) -> list[Alarm]:
-    """Return alarms by their excess; missing data, which are infinite, behind what was sensed."""
-    return sorted(alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
 
 
 def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:

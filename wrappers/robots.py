@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
-from asm_gym.validation import check_number, short_repr
+from asm_gym.validation import as_float32, check_number, short_repr
 
 DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
 
@@ -238,6 +239,17 @@ def _staying(
     return rest, told if TARGET in told.means else None
 
 
+def sensed_row(row: Callable[[], Any], size: int) -> tuple[NDArray[np.float32], str]:
+    """Return the row (D,) that is read, or NaN and what failed."""
+    try:
+        found = as_float32(row())
+        if found.shape != (size,):
+            raise ValueError(f"a row has the shape {(size,)}, got {found.shape}")
+    except Exception as error:
+        return np.full(size, np.nan, np.float32), f"stream: {error!r}"
+    return found, ""
+
+
 def felt_by(robots: Robots, infos: dict[str, Any], there: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
     """Return what environments say in ``info`` of what their arms felt in a step, of those that are ``there`` (n,)."""
     numbers = nothing_felt(robots.count, robots.felt_size)
@@ -265,18 +277,14 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
     was made for another environment, whose arm it would move.
     """
     made, many = on_alarm, isinstance(env, VectorEnv)
-    takes = (
-        "a name or one policy with a predict() that all environments share"
-        if many
-        else ("a name, have a predict(), or make such a policy")
-    )
+    takes = "one policy with a predict() that all environments share" if many else "have a predict(), or make a policy"
     try:
         if not many and callable(on_alarm) and (isinstance(on_alarm, type) or not hasattr(on_alarm, "predict")):
             made = on_alarm(env)
+        if isinstance(made, type) or not callable(getattr(made, "predict", None)):
+            raise TypeError("it has no predict()")
     except TypeError as error:
-        raise ValueError(f"on_alarm must be {takes}, got {short_repr(on_alarm)}: {error}") from error
-    if isinstance(made, type) or not callable(getattr(made, "predict", None)):
-        raise ValueError(f"on_alarm must be {takes}, got {short_repr(made)}")
+        raise ValueError(f"on_alarm must be a name, or {takes}, got {short_repr(made)}: {error}") from error
     name = type(made).__name__
     bound = isinstance(made, Hold) and not made.explicit  # to one environment
     if many and bound:

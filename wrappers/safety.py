@@ -23,7 +23,7 @@ from asm_gym.policies.reflexes import HoldsItself
 from asm_gym.spec import control_period
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensing_within_steps
+from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensed_row, sensing_within_steps
 
 COUNTS = "stable_baselines3.common.monitor"  # module of a wrapper that counts episodes
 
@@ -190,7 +190,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if "success" in info:
             self._solved |= bool(info["success"])
             info.setdefault("is_success", self._solved)
-        row, failure = self._sensed(observation, info)
+        row, failure = sensed_row(lambda: self._source.row(observation, self._executed, info), self._spec.size)
         done = self._executed
         if self._box is not None:
             done = self._robots.executed_in(row[None], done.reshape(1, -1))[0].reshape(done.shape)
@@ -236,16 +236,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
                 self._inner.keeps_holding = self._inner.holding = False
             if hooks is not None:
                 hooks.remove(self._judge)
-
-    def _sensed(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], str]:
-        """Return the row (D,) that ends a step, or NaN and what failed."""
-        try:
-            row = as_float32(self._source.row(observation, self._executed, info))
-            if row.shape != (self._spec.size,):
-                raise ValueError(f"a row has the shape {(self._spec.size,)}, got {row.shape}")
-        except Exception as error:
-            return np.full(self._spec.size, np.nan, np.float32), f"stream: {error!r}"
-        return row, ""
 
     def _judge(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
         """Judge one row, with ``info`` of the step that it ends; in mid-step a reflex takes over at once."""

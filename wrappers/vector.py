@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
-from asm_gym.wrappers.robots import Guarding, Members, askable, body_memory, felt_by
+from asm_gym.wrappers.robots import Guarding, Members, askable, body_memory, felt_by, sensed_row
 
 Mask = NDArray[np.bool_]
 
@@ -195,19 +196,17 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         there = np.asarray(infos.get("_stream", np.ones(n, bool)))
         if self._own_stream and there.all() and np.shape(stream) == (n, size):
             return np.array(as_float32(stream)), {}
-        rows, failures = np.full((n, size), np.nan, np.float32), {}
-        for i in range(n):
-            try:
-                if self._own_stream and not (stream is not None and there[i]):
-                    raise KeyError('info has no "stream"')
-                parts = [stream[i]] if self._own_stream else [np.ravel(observations[i]), np.ravel(executed[i])]
-                row = as_float32(np.concatenate(parts))
-                if row.shape != (size,):
-                    raise ValueError(f"a row has the shape {(size,)}, got {row.shape}")
-                rows[i] = row
-            except Exception as error:
-                failures[i] = f"stream: {error!r}"
-        return rows, failures
+
+        def row(i: int) -> NDArray[np.float32]:
+            if not self._own_stream:
+                return np.concatenate([np.ravel(observations[i]), np.ravel(executed[i])])
+            if stream is None or not there[i]:
+                raise KeyError('info has no "stream"')
+            own: NDArray[np.float32] = stream[i]
+            return own
+
+        rows, said = zip(*(sensed_row(partial(row, i), size) for i in range(n)), strict=True)
+        return np.stack(rows), {i: failure for i, failure in enumerate(said) if failure}
 
     def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
         """Return the observations, and set the streams, with what is completed in the environments of ``where``."""

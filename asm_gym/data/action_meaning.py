@@ -173,14 +173,10 @@ def _meaning(spec: StreamSpec, windows: Floats, rates: set[int], column: int) ->
 
 def _likeliest(spec: StreamSpec, column: int, fits: Sequence[_Fit]) -> _Fit | None:
     """Return the fit of the sense that a number of the action moves; None where it moves none."""
-    best = max((fit.tells for fit in fits), default=0.0)
-    own = spec.labels[column].partition("[")[2]
-
-    def preferred(fit: _Fit) -> tuple[Any, ...]:
-        named = bool(own) and spec.labels[fit.sense].endswith(f"[{own}")
-        return fit.tells >= ALIKE * best, named, fit.slope in OWN and fit.offset == 0.0, fit.tells
-
-    return max(fits, key=preferred, default=None)
+    best, name = max((fit.tells for fit in fits), default=0.0), spec.labels[column].partition("[")[2]
+    alike = [fit for fit in fits if fit.tells >= ALIKE * best]
+    own = [fit for fit in alike if name and spec.labels[fit.sense].endswith(f"[{name}")]
+    return max(own or alike, key=lambda fit: (fit.slope in OWN and fit.offset == 0.0, fit.tells), default=None)
 
 
 def _fit(x: Floats, u: Floats, sense: int) -> _Fit | None:
