@@ -192,8 +192,8 @@ def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
 
 def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
     """Yield notes on what the body model is worth, and which columns it takes for which joints."""
-    judging: Any = monitor.values_ and monitor.values_.monitor if isinstance(monitor, NeuralASM) else monitor
-    model = judging and judging.model
+    values = monitor.values_ if isinstance(monitor, NeuralASM) else None
+    model = monitor.model if values is None else values.monitor.model
     if args.urdf is None or not isinstance(model, ValueAssociation):
         return
     left = f"it leaves {model.left_by_body:.2f} of what is left of unseen torques without it"

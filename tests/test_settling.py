@@ -17,7 +17,7 @@ from asm_gym.memory.settling import (
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import MemoryConfig, NeuralASM, load_monitor
-from asm_gym.monitors.skills import name_skills, named_skills, recall
+from asm_gym.monitors.skills import name_skills, recall
 from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
 
@@ -124,7 +124,7 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
     assert np.mean(alarms) > 0.9
     named = [Episode.from_stream(e.stream, e.spec, info={"skill": str(n % 2)}) for n, e in enumerate(sine_episodes(8))]
     copy = load_monitor(tmp_path / "settling.asm")
-    assert set(named_skills(name_skills(copy, named), episode.stream)) <= {"0", "1"}
+    assert set(name_skills(copy, named).score(episode).skill) <= {"0", "1"}
     state = asm.initial_state()
     for row in episode.stream:
         state, _ = asm.observe(state, row[None])

@@ -20,9 +20,9 @@ from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import Calibrated
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
 from asm_gym.monitors.stream_model import (
-    ErrorPlaces,
     StreamModel,
     batch_of,
+    error_places,
     model_outputs,
     parameter_names,
     side_by_side,
@@ -177,7 +177,7 @@ class CalibratedMonitor(Calibrated):
         self._require_fitted()
         rows = self._rows(state, stream)
         model, output = self.model.predict(state.model, rows)
-        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._places)
+        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._placed)
         finite = np.isfinite(rows)
         broken = ~finite.all(axis=1)
         if broken.any():
@@ -191,7 +191,7 @@ class CalibratedMonitor(Calibrated):
 
     @typed
     def score(self, episode: Episode) -> Surprise:
-        """Return the surprise of each step of an episode; no names of skills."""
+        """Return the surprise of each step of an episode."""
         return self.score_episodes([episode])[0]
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
@@ -202,7 +202,7 @@ class CalibratedMonitor(Calibrated):
         scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
         with threadpool_limits(1):
             for group, steps in side_by_side(episodes, self.initial_state, self.observe):
-                known = [f for f in Surprise._fields if f != "skill" and steps and getattr(steps[0], f) is not None]
+                known = [f for f in Surprise._fields if steps and getattr(steps[0], f) is not None]
                 for n, i in enumerate(group):
                     if own := steps[: len(episodes[i])]:
                         scores[i] = Surprise(**{name: np.array([getattr(s, name)[n] for s in own]) for name in known})
@@ -273,6 +273,11 @@ class CalibratedMonitor(Calibrated):
             raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
         return rows
 
+    def _placed(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the share of each number (B, D) from that of each error (B, X)."""
+        shares: NDArray[np.float64] = parts @ self._places
+        return shares
+
     def _place_errors(self) -> None:
         """Find the columns of errors, once the model knows them."""
-        self._places = ErrorPlaces(self.model.error_columns, self.spec)
+        self._places = error_places(self.model.error_columns, self.spec)

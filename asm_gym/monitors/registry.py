@@ -92,8 +92,8 @@ _RIVALS = {
     "kalman": ("baselines.linear:Kalman", "mahalanobis"),
     "association_linear": ("baselines.linear:LinearAssociation", "mahalanobis"),
     "association_values": ("value_association:ValueAssociation", "largest"),
-    "external_torque_limit": ("baselines.limits:ExternalTorqueLimit", "largest"),
-    "force_limit": ("baselines.limits:ForceLimit", "squares"),
+    "external_torque_limit": ("baselines.linear:ExternalTorqueLimit", "largest"),
+    "force_limit": ("baselines.linear:ForceLimit", "squares"),
 }
 """The model of each rival, and the detection that its authors judged it by."""
 

@@ -23,7 +23,7 @@ from asm_gym.scaling import StreamScaler
 def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
     """Learn to tell which skill is running, from episodes that name it, and return the memory.
 
-    ``info["skill"]`` is the skill of an episode. Only ``surprise.skill`` depends on it.
+    ``info["skill"]`` is the skill of an episode. Only ``Surprise.skill`` depends on it.
 
     Args:
         memory: fitted; it is changed.
@@ -54,22 +54,6 @@ def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
         W_K, b_K = learn_readout(units, skills, len(known), np.random.default_rng(memory.seed))
     model.restore({**model.learned_, "W_K": W_K, "b_K": b_K}, tuple(map(str, known)))
     return memory
-
-
-def named_skills(memory: NeuralASM, stream: NDArray[np.floating[Any]]) -> NDArray[np.str_]:
-    """Return the skill (T,) that seems to run in each step of a stream (T, D), by the rows before it.
-
-    Raises:
-        RuntimeError: no skill has a name: ``name_skills`` comes first.
-    """
-    if not memory.skills_:
-        raise RuntimeError("no skill has a name yet: call name_skills(memory, episodes) first")
-    model, named = memory.model, []
-    state = model.start(1)
-    for row in np.asarray(stream, np.float64):
-        state, _ = model.predict(state, row[None])
-        named.append(memory.skills_[int(state.skill.argmax())])
-    return np.array(named)
 
 
 def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 512) -> NeuralASM:

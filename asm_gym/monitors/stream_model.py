@@ -92,26 +92,15 @@ class ScaledModel(StreamModel):
         return RowHistory.empty(batch, self.lag, self.spec.size)
 
 
-class ErrorPlaces:
-    """The column of the stream that each error belongs to.
+def error_places(columns: NDArray[np.intp], spec: StreamSpec) -> NDArray[np.float64]:
+    """Return the share of each error (X,) that each number of the stream has (X, D).
 
-    Args:
-        columns: (X,) of the stream; -1 for an error that all senses share.
-        spec: of the stream.
+    ``columns`` (X,) are those of the errors; -1 for an error that all senses share.
     """
-
-    def __init__(self, columns: NDArray[np.intp], spec: StreamSpec) -> None:
-        self._nowhere, self._senses = columns < 0, spec.sensory
-        self._places = np.zeros((len(columns), spec.size))  # (X, D)
-        self._places[np.flatnonzero(~self._nowhere), columns[~self._nowhere]] = 1.0
-
-    def __call__(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of each number (B, D) from that of each error (B, X)."""
-        found: NDArray[np.float64] = parts @ self._places
-        if self._nowhere.any():
-            common = np.where(self._nowhere, parts, 0.0).sum(axis=1, keepdims=True)
-            found[:, self._senses] += common / len(self._senses)
-        return found
+    shares, own = np.zeros((len(columns), spec.size)), columns >= 0
+    shares[own, columns[own]] = 1.0
+    shares[np.ix_(~own, spec.sensory)] = 1.0 / len(spec.sensory)
+    return shares
 
 
 def read_next(

@@ -35,11 +35,7 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
             step, column = bad[0]
             label, value = spec.labels[column], episode.stream[step, column]
             raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
-    _check_range(episodes)
-
-
-def _check_range(episodes: Sequence[Episode]) -> None:
-    """Raise ValueError for a number out of all proportion, beside which its channel would look constant."""
+    # Beside a number out of all proportion its channel would look constant.
     if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
         return
     rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)

@@ -28,7 +28,7 @@ from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.statistics import auroc
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.skills import name_skills, named_skills
+from asm_gym.monitors.skills import name_skills
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import (
@@ -160,9 +160,10 @@ def one(job: tuple[str, int], config: Config) -> tuple[list[Record], dict[str, C
         courses[way] = closed_loop(driver, cues, way, seed, energy, asm.threshold)
         note(way, **written(courses[way], given))
     note("surprise", **noticed(courses, asm.threshold))
-    named = name_skills(asm, given.train)
+    name_skills(asm, given.train)
+    named = [asm.score(e).skill for e in given.tests]
     for row in (CUE, EVENT, STEPS - 1):
-        right = [named_skills(named, e.stream[: row + 1])[-1] == e.info["skill"] for e in given.tests]
+        right = [said is not None and said[row] == e.info["skill"] for said, e in zip(named, given.tests, strict=True)]
         note("named", row=row, right=float(np.mean(right)))
     return made, courses
 

@@ -1,14 +1,17 @@
-"""Linear baselines: a Kalman filter, ridge regression, and a rule of friction.
+"""Linear baselines: a Kalman filter, ridge regression, a rule of friction, and the limits in use today.
 
     Kalman      x_t = A x_{t-1} + B u_t + c + w, w ~ N(0, Q)      y_t = x_t + v, v ~ N(0, R)     ε: innovations
     ridge       ε_t = (Δ_t - D a_t)/s                             D, s, a_t: association without hidden units
     friction    r_j = mean over 0.1 s of τ_j - (c_0 + c_1 v_j + Σ_w c_w tanh(v_j/w s_j))    ε = r_j / spread_j
                 with a body model also less c_g g_j + c_m (M q̈ + c)_j, see ``body_model``
+    limits      ε = (x - centre) / scale    of channels: force of the wrist [N] less the hand's own weight, the mean
+                over nominal episodes; external torque of each joint, from a momentum observer, over its nominal spread
 
 R is the sensor noise that the stream's spec states; A, B, c by ridge regression; Q is what is left of the residuals.
 What the memory's hidden units, precision and temporal network are worth is what it finds beyond ``LinearAssociation``.
 
-Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in innovations; Hoerl and Kennard 1970.
+Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in innovations; Hoerl and Kennard 1970;
+Will and Grossman 1975 for the guarded move; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 15 (observer) and 31 (limits).
 """
 
 from __future__ import annotations
@@ -202,3 +205,58 @@ class FrictionRule(StreamModel):
             pace = now - (now if self._from_positions else before[:, self._speeds] * body.radians)
             parts += body.links.torques(q, now, pace / (self.lag * self.spec.dt))
         return np.stack(parts, axis=2)
+
+
+class _Limit(StreamModel):
+    """A constant prediction for some channels.
+
+    Args:
+        spec: of a stream that has them.
+
+    Raises:
+        ValueError: it has none of them.
+    """
+
+    shortest = 1
+    held_out = 0  # so few numbers are not learned by heart
+    channel = ""
+    """End of their names."""
+    scaled = False
+
+    def __init__(self, spec: StreamSpec) -> None:
+        super().__init__(spec)
+        named = [i for name, s in spec.slices.items() if name.endswith(self.channel) for i in range(spec.size)[s]]
+        self._columns = np.array(named, np.intp)
+        if not len(self._columns):
+            raise ValueError(f"this stream has no {self.channel}; it has: {', '.join(spec.slices)}")
+
+    @property
+    def error_columns(self) -> NDArray[np.intp]:
+        return self._columns
+
+    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+        rows = np.concatenate([e.stream for e in episodes])[:, self._columns].astype(float)
+        scale = np.maximum(rows.std(axis=0), 1e-6) if self.scaled else np.ones(rows.shape[1])
+        return self.restore({"limit_centre": rows.mean(axis=0), "limit_scale": scale})
+
+    def start(self, batch: int) -> RowHistory:
+        return RowHistory.empty(batch, 1, self.spec.size)  # it only says how many streams there are
+
+    def predict(self, state: RowHistory, rows: Floats) -> tuple[RowHistory, ModelOutput]:
+        error = (rows[:, self._columns] - self.learned_["limit_centre"]) / self.learned_["limit_scale"]
+        return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
+
+
+class ForceLimit(_Limit):
+    """A limit on the largest force of the wrist in a step."""
+
+    kind = "force_limit"
+    channel = "wrist_force_peak"
+
+
+class ExternalTorqueLimit(_Limit):
+    """A limit on each joint's external torque, in spreads of its nominal values."""
+
+    kind = "external_torque_limit"
+    channel = "external_torque_peak"
+    scaled = True
