@@ -11,7 +11,7 @@ R is the sensor noise that the stream's spec states; A, B, c by ridge regression
 What the memory's hidden units, precision and temporal network are worth is what it finds beyond ``LinearAssociation``.
 
 Sources: Kalman 1960; Mehra and Peschon 1971 (Automatica 7) for faults found in innovations; Hoerl and Kennard 1970;
-Will and Grossman 1975 for the guarded move; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 15 (observer) and 31 (limits).
+Will and Grossman 1975 for the guarded move; Haddadin, De Luca and Albu-Schäffer 2017, Eq. 15 and 31, for torques.
 """
 
 from __future__ import annotations

@@ -265,15 +265,11 @@ class LogpZO(TorchModel):
 
     def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
         state, reading, _ = read_next(self.senses_, state, rows)
-        error = self._noise(torch.as_tensor(_features(reading))).numpy().astype(np.float64)
-        return state, ModelOutput(error, no_context(rows))
-
-    def _noise(self, x: Tensor) -> Tensor:
-        """Return z (B, N) of rows (B, N)."""
+        x = torch.as_tensor(_features(reading))  # (B, N), which the flow makes z
         for stage in range(STAGES):
             s = torch.full((len(x), 1), stage / STAGES)
             x = x + self.module_(torch.cat([x, s], dim=1)) / STAGES
-        return x
+        return state, ModelOutput(x.numpy().astype(np.float64), no_context(rows))
 
 
 def _features(reading: ScaledRows) -> NDArray[np.float32]:
