@@ -238,7 +238,9 @@ def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[s
     if columns:
         columns = ["", *columns] if cells and not cells[0].strip() and len(columns) == len(cells) - 1 else columns
         if len(columns) != len(cells):
-            raise ValueError(f"{len(columns)} columns are named, and its first line has {len(cells)} cells")
+            raise ValueError(
+                f"{len(columns)} columns are named, and its first line has {len(cells)} cells: cut off what is no row"
+            )
         return header_of(columns, "it"), not any(numbers)
     if numbers and sum(numbers) > len(numbers) / 2:
         said = f"is of {len(numbers)} numbers" if all(numbers) else f"holds {sum(numbers)} numbers"
