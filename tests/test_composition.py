@@ -171,7 +171,7 @@ def episode(seed: int, fan: float = 0.0, rows: int = 120) -> Episode:
     still = np.zeros(rows)
     still[rows // 2 :] = fan
     columns = {"q": command + 0.01 * rng.normal(size=command.shape), "temperature": temperature, "fan": still}
-    return Episode.from_table(columns | {"action": command}, rate=50.0, success=True)
+    return Episode.from_table(columns | {"action": command}, channels=tuple(columns), rate=50.0, success=True)
 
 
 def test_a_rounded_channel_changes_by_no_less_than_its_rounding():

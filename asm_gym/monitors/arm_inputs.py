@@ -11,7 +11,6 @@ the chain: a linear model can say neither without. Source: Stribeck friction smo
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -49,7 +48,14 @@ class Derived(NamedTuple):
         angles = angles if len(angles) <= MOST_ANGLES else angles[:0]
         units = [c.unit for c in spec.channels for _ in c.labels]
         radians = np.array([ratio(units[i], "rad") or 1.0 for i in angles])
-        links, J = _links(spec, angles, urdf), len(angles)
+        links, J = None, len(angles)
+        if urdf and not len(moving) == J > 0:
+            raise ValueError(
+                f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; by their names "
+                f"{J} numbers are angles and {len(moving)} are speeds"
+            )
+        if urdf:
+            links = BodyModel.of(urdf, [spec.labels[i] for i in angles])
         of_speed, of_angle = (spec.sensory == moving[:, None]), (spec.sensory == angles[:, None])  # (S, X), (J, X)
         if links is None:
             pairs = np.array(np.triu_indices(2 * J), np.intp)
@@ -80,28 +86,10 @@ class Derived(NamedTuple):
             parts += [single, np.sin(sums), np.cos(sums), products]
         return np.hstack(parts)
 
-    def with_joints(self, columns: NDArray[np.intp]) -> Derived:
-        """Return it with the columns (M,) of angles that belong to the joints of the body model."""
-        assert self.links is not None
-        return self._replace(links=replace(self.links, columns=columns))
-
     def motion(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
         """Return angles, speeds and accelerations (N, J) of what ``__call__`` takes."""
         q, pace = values[:, self.angles] * self.radians, (steps * rate)[:, self.speeds] * self.radians
         return (q, pace, np.zeros_like(q)) if self.from_steps else (q, values[:, self.speeds] * self.radians, pace)
-
-
-def _links(spec: StreamSpec, columns: NDArray[np.intp], urdf: str) -> BodyModel | None:
-    """Return the body model for columns of angles. Raises ValueError where it does not fit them."""
-    if not urdf:
-        return None
-    moving = speeds(spec)[0]
-    if not len(columns) or len(moving) != len(columns):
-        raise ValueError(
-            f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; by their names "
-            f"{len(columns)} numbers are angles and {len(moving)} are speeds"
-        )
-    return BodyModel.of(urdf, [spec.labels[int(i)] for i in columns])
 
 
 def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:

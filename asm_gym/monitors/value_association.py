@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -164,8 +165,10 @@ class ValueAssociation(ScaledModel):
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self._values = learned["judged_values"].astype(np.intp)
-        columns = learned["body"].astype(np.intp)
-        self._derived = self._told.with_joints(columns) if len(columns) else Derived.of(self.spec)
+        self._derived = Derived.of(self.spec)
+        if len(learned["body"]) and self._told.links is not None:
+            links = replace(self._told.links, columns=learned["body"].astype(np.intp))
+            self._derived = self._told._replace(links=links)
         return super().restore(learned, skills)
 
     def start(self, batch: int) -> Averaged:
@@ -197,8 +200,7 @@ class ValueAssociation(ScaledModel):
         assert told.links is not None
         if told.links.by_name or len(self._loads) != len(told.angles):
             return told
-        best = told.links.in_best_order(*told.motion(*physical), physical[0][:, self._loads])
-        return told.with_joints(best.columns)
+        return told._replace(links=told.links.in_best_order(*told.motion(*physical), physical[0][:, self._loads]))
 
     def _fitted(self, read: _Read, fold: NDArray[np.intp]) -> _Fitted:
         """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there.

@@ -277,23 +277,15 @@ def table(records: Sequence[Record], arm: RealArm, monitors: Sequence[str]) -> T
     rows = []
     for name in monitors:
         own = where(records, monitor=name)
-        faulty = [r for r in own if r["kind"]]
-        found = {kind: [r["found"] for r in where(faulty, kind=kind)] for kind in kinds}
+        quiet, faulty = where(own, kind=""), [r for r in own if r["kind"]]
+        found = [[r["found"] for r in where(faulty, kind=kind)] for kind in kinds]
         delays = [r["delay"] for r in faulty if r["found"]]
-        level, pressed = healthy[name][fewest], [r for r in faulty if r["kind"] in ("push", "payload")]
-        seconds, alarms, alarm_s = (
-            sum(r[name] for r in where(own, kind="")) for name in ("seconds", "alarms", "alarm_s")
-        )
-        rows.append(
-            (
-                name,
-                *(f"{sum(f)} of {len(f)}" for f in found.values()),
-                f"{np.median(delays):.3g}" if delays else "",
-                f"{sum(r['excess'] > level for r in pressed)} of {len(pressed)}",
-                f"{3600 * alarms / seconds:.0f}",
-                f"{100 * alarm_s / seconds:.1f} %",
-            )
-        )
+        pressed = [r["excess"] > healthy[name][fewest] for r in faulty if r["kind"] in ("push", "payload")]
+        seconds, alarms, alarm_s = (sum(r[value] for r in quiet) for value in ("seconds", "alarms", "alarm_s"))
+        shares = [f"{sum(f)} of {len(f)}" for f in (*found, pressed)]
+        delay = f"{np.median(delays):.3g}" if delays else ""
+        healthily = f"{3600 * alarms / seconds:.0f}", f"{100 * alarm_s / seconds:.1f} %"
+        rows.append((name, *shares[:-1], delay, shares[-1], *healthily))
     caption = (
         f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. * added to the recording, found within half a piece. "
         f"At {fewest}: pushes and payloads found by the threshold that {fewest} healthy pieces pass."
