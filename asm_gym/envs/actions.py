@@ -9,12 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.envs.commands import clip
-from asm_gym.envs.robots import gripper_actions
+from asm_gym.envs.robots import CHANGES, gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
-
-_CHANGES = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes of the arm's pose
 
 
 class Actions:
@@ -43,10 +40,9 @@ class Actions:
         action = as_float32(action, "the action")
         if action.shape != self.space.shape:
             raise ValueError(f"{self._task} takes an action of shape {self.space.shape}, got {action.shape}")
-        clipped = np.empty_like(action)
-        if not clip(action, clipped):
+        if not np.isfinite(action).all():
             raise ValueError(f"the action must be finite, got {action}")
-        return clipped
+        return np.minimum(np.maximum(action, -1.0, dtype=np.float32), 1.0, dtype=np.float32)
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""
@@ -61,9 +57,10 @@ class Actions:
         """
         slow, rest, scaled = action, None, self.scaled(action)
         for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
-            if controller.name not in _CHANGES or controller.input_type != "delta":
+            if controller.name not in CHANGES or controller.input_type != "delta":
                 continue
-            delta = np.asarray(controller.scale_action(scaled[part]), np.float64)
+            least, most, middle, scale, offset = simulation.arms.scaling[a, :, : part.stop - part.start]
+            delta = (np.minimum(np.maximum(scaled[part], least), most) - middle) * scale + offset
             if controller.name == "JOINT_POSITION":
                 delta = simulation.hand_jacobian(a)[:3] @ delta
             (kp, kd), step = (controller.kp[:3].tolist(), controller.kd[:3].tolist()), delta[:3]
@@ -80,8 +77,8 @@ class Actions:
         Raises:
             ValueError: the controller takes no changes.
         """
-        if self._controller not in _CHANGES:
-            raise ValueError(f"actions of {' and '.join(_CHANGES)} are changes, those of {self._controller} are not")
+        if self._controller not in CHANGES:
+            raise ValueError(f"actions of {' and '.join(CHANGES)} are changes, those of {self._controller} are not")
         action, joint = np.zeros(self.size, np.float32), 0
         for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
             n = int(simulation.arms.joints[a])

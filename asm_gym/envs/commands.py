@@ -1,4 +1,4 @@
-"""Actions as the controllers take them: checked, scaled, and turned into rotations, compiled.
+"""Actions as the controllers take them: scaled, and turned into rotations, compiled.
 
 The same numbers as robosuite's, to the last bit, whose rotations are of single precision.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.envs.mujoco_views import Floats, Ints
@@ -23,16 +22,6 @@ def scaling_of(controller: Any, size: int) -> Floats:
     c = controller
     rows = c.input_min, c.input_max, c.action_input_transform, c.action_scale, c.action_output_transform
     return np.array([np.broadcast_to(np.asarray(row, np.float64), size) for row in rows])
-
-
-@compiled
-def clip(action: NDArray[np.float32], clipped: NDArray[np.float32]) -> bool:
-    """Write an action (A,) within [-1, 1] into ``clipped``; return whether it is finite."""
-    for i in range(len(action)):
-        if not np.isfinite(action[i]):
-            return False
-        clipped[i] = min(max(action[i], np.float32(-1.0)), np.float32(1.0))
-    return True
 
 
 @inner

@@ -16,6 +16,7 @@ from asm_gym.tasks import ROBOTS, TaskSpec
 from asm_gym.validation import check_choice, check_text, short_repr
 
 PHYSICS_FREQ = 500  # robosuite's physics rate [Hz]
+CHANGES = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes of the arm's pose
 Part = tuple[Any, str]  # one of robosuite's robots, and the name of one of its arms
 
 
@@ -59,7 +60,7 @@ def gripper_actions(robots: list[Any]) -> tuple[int, ...]:
 def is_compilable(robot: Any, arm: str) -> bool:
     """Whether the compiled loop implements the arm's controller, which has robosuite's own settings."""
     controller = robot.composite_controller.part_controllers[arm]
-    known = controller.name in ("OSC_POSE", "JOINT_POSITION") and controller.joint_dim <= JOINTS
+    known = controller.name in CHANGES and controller.joint_dim <= JOINTS
     return known and len(robot.arms) == 1 and not robot.is_mobile
 
 
