@@ -267,16 +267,6 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
 
 
 @compiled
-def average(samples: Floats, count: int, arms: Ints, columns: Ints, mean: Floats) -> None:
-    """Write the mean (N,) of the first ``count`` substeps of N columns, each of its arm."""
-    for n in range(len(columns)):
-        total = 0.0
-        for k in range(count):
-            total += samples[arms[n], k, columns[n]]
-        mean[n] = total / count
-
-
-@compiled
 def touching(pairs: Ints, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> bool:
     """Whether, among pairs (N, 2) of geoms in contact, one of the first group (G,) touches one of the other (G,)."""
     for n in range(len(pairs)):

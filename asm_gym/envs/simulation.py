@@ -191,13 +191,6 @@ class Simulation:
         return self._samples[self._limited[0], : self._done - self._row_began, self._columns].T
 
     @property
-    def mean_felt(self) -> NDArray[np.float64]:
-        """(N,) the mean of ``felt``."""
-        mean: NDArray[np.float64] = np.empty(len(self._columns))
-        kernels.average(self._samples, self._done - self._row_began, self._limited[0], self._columns, mean)
-        return mean
-
-    @property
     def contact_forces(self) -> NDArray[np.float64]:
         """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
         forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]

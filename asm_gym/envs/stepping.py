@@ -126,7 +126,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             passed = sim.passed_limit
             found["contact_load"] = np.inf if unstable else sim.load
             found["contact_left_s"] = np.nan if passed is None else (passed + 1) / PHYSICS_FREQ
-            found["contact_felt"] = sim.mean_felt
+            found["contact_felt"] = sim.felt.mean(axis=0)
         return found
 
     def _divergences(self) -> int:
