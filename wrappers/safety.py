@@ -132,10 +132,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
-        if self._box is None and on_alarm not in ("monitor", "terminate"):
+        if self._box is None and not (isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
-        self._relay = relay_beneath_counts(env, ends=on_alarm != "monitor")
+        self._relay = relay_beneath_counts(env, ends=not (isinstance(on_alarm, str) and on_alarm == "monitor"))
         self._stepped = self.env if self._relay is None else self._relay.env
         self._source = StreamSource(env)
         self._spec = self._source.spec
