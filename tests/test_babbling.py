@@ -10,7 +10,7 @@ import pytest
 
 from asm_gym.data.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.comparison import detectability_of
-from asm_gym.evaluation.metrics import DetectionMetrics
+from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.scripted.base import ObservationReader
@@ -33,7 +33,7 @@ from asm_gym.rollouts.pretraining.babbling import (
     curriculum,
     record_lesson,
 )
-from asm_gym.rollouts.pretraining.exam import Alarms, Exam, Marks, examine, summary, usual_force
+from asm_gym.rollouts.pretraining.exam import Exam, Marks, examine, summary, usual_force
 from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy, held_out
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.trial import RolloutConfig
@@ -274,9 +274,9 @@ def test_alarms_are_counted_by_event_and_faults_at_any_threshold():
         return ScoredEpisode(kind[0], 0, 1.0, 4.0, rows[0], onset, kind[1], excused=excused)
 
     solved = [trace(5.0, 150.0), *[trace(3.0, 90.0)] * 2, *[trace(2.0, stop=60.0)] * 3, *[trace(1.0)] * 94]
-    found = Alarms.of(solved)
+    found = [hourly_alarms(solved, *event) for event in ((), ("knock",), ("stop",))]
     assert [rate.k for rate in found] == [1, 2, 3]  # what is a fault is no knock beside it
-    assert found.fault.hours == pytest.approx(1.0)
+    assert found[0].hours == pytest.approx(1.0)
     marks = Marks("Lift", solved, [], DetectionMetrics("Lift", [trace(3.5, onset=1)], solved, 1.0))
     assert summary([marks]).endswith("in 1.00 healthy hours, 0 of 1 faults found.")
     assert summary([marks.at(3.2)]).endswith("1 of 1 faults found.")
