@@ -8,8 +8,10 @@ import pytest
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.memory.energy import infer
-from asm_gym.memory.learning import Schedule
+from asm_gym.memory.learning import Moment, Schedule
+from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.settling import (
+    SettlingLearner,
     SettlingNetwork,
     SettlingWeights,
     initial_settling_weights,
@@ -101,6 +103,118 @@ def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
         mu = state @ w.W_H.T + u @ w.W_U.T
         state = mu + (x - mu @ C.T) @ K.T
         np.testing.assert_allclose(z, state, atol=1e-3 * small)
+
+
+class Published:
+    """The papers' network, written from their equations, with the authors' inference: steps of 0.01 from the prediction.
+
+    μ = W_R f(z') + W_in u,  dz = -ε_z + f'(z) ⊙ W_outᵀ ε_x,  ΔW_R = ε_z f(z')ᵀ,  ΔW_in = ε_z uᵀ,  ΔW_out = ε_x f(z)ᵀ
+    (Tang, Barron and Bogacz 2023; Millidge et al. 2024), and the motor prediction â = W_A f(h), h = W_R f(z') + b.
+    """
+
+    def __init__(self, w: SettlingWeights, steps: int) -> None:
+        self.W = {name: np.array(W, np.float64) for name, W in w._asdict().items()}
+        self.adam = {name: (np.zeros_like(W), np.zeros_like(W)) for name, W in self.W.items()}
+        self.steps, self.count = steps, 0
+
+    def prediction(self, z, u):
+        return np.tanh(z) @ self.W["W_H"].T + u @ self.W["W_U"].T
+
+    def senses(self, z):
+        return np.tanh(z) @ self.W["W_F"].T + self.W["b_F"]
+
+    def hidden(self, z):
+        return np.tanh(z) @ self.W["W_H"].T + self.W["W_U"][:, -1]
+
+    def action(self, z):
+        return np.tanh(self.hidden(z)) @ self.W["W_A"].T
+
+    def inferred(self, before, u, x):
+        mu = z = self.prediction(before, u)
+        for _ in range(self.steps):
+            z = z + 0.01 * (mu - z + (1 - np.tanh(z) ** 2) * ((x - self.senses(z)) @ self.W["W_F"]))
+        return mu, z
+
+    def energy(self, before, u, x, z):
+        return 0.5 * np.sum((z - self.prediction(before, u)) ** 2) + 0.5 * np.sum((x - self.senses(z)) ** 2)
+
+    def learn(self, before, u, x, rate):
+        """Take a step of Adam along the Hebbian changes, and return the state."""
+        mu, z = self.inferred(before, u, x)
+        e_z, e_x, e_a = z - mu, x - self.senses(z), u[:, :-1] - self.action(before)
+        e_h = (1 - np.tanh(self.hidden(before)) ** 2) * (e_a @ self.W["W_A"])
+        constant = np.append(np.zeros(u.shape[1] - 1), 1.0)
+        changes = {
+            "W_H": (e_z + e_h).T @ np.tanh(before),
+            "W_U": e_z.T @ u + np.outer(e_h.sum(axis=0), constant),
+            "W_F": e_x.T @ np.tanh(z),
+            "b_F": e_x.sum(axis=0),
+            "W_A": e_a.T @ np.tanh(self.hidden(before)),
+        }
+        self.count += 1
+        for name, change in changes.items():
+            (m, s), g = self.adam[name], change / len(x)
+            m += 0.1 * (g - m)
+            s += 0.001 * (g**2 - s)
+            scaled = m / (1 - 0.9**self.count), s / (1 - 0.999**self.count)
+            self.W[name] += rate * scaled[0] / (np.sqrt(scaled[1]) + 1e-8)
+        return z
+
+
+def exact_problem(seed: int, steps: int = 6):
+    """Random weights, and random rows (T, B, ...), of double precision, in which kernels then compute too."""
+    rng = np.random.default_rng(seed)
+    w = SettlingWeights(*(np.asarray(W, np.float64) for W in initial_settling_weights(H, S, A, rng)))
+    w.b_F[:] = rng.normal(size=S)
+    return w, rng.normal(size=(steps, 3, S)), np.dstack([rng.normal(size=(steps, 3, A)), np.ones((steps, 3, 1))])
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_inference_and_both_recalls_are_those_of_the_published_equations(seed):
+    w, senses, commands = exact_problem(seed)
+    ours, theirs = SettlingNetwork(w, unassociated(), 1500, 1, 1), Published(w, 4000)
+    z, expected = np.zeros((3, H)), []
+    for x, u in zip(senses, commands, strict=True):
+        mu, after = theirs.inferred(z, u, x)
+        expected.append(np.hstack([theirs.senses(mu), theirs.action(z)]))
+        z = after
+    online = follow(ours, np.zeros((3, H)), senses, commands)
+    np.testing.assert_allclose(online.traces, z, atol=1e-6)
+    np.testing.assert_allclose(np.dstack([online.senses, online.commands]), expected, atol=1e-6)
+    expected = []
+    for _ in range(6):  # the network's own predictions stand in for senses and actions
+        u = np.hstack([theirs.action(z), np.ones((3, 1))])
+        mu, after = theirs.inferred(z, u, theirs.senses(theirs.prediction(z, u)))
+        np.testing.assert_allclose(after, mu, atol=1e-9)  # nothing is left to infer
+        expected.append(np.hstack([theirs.senses(mu), u[:, :-1]]))
+        z = after
+    offline = run_on(ours, online.traces, 6)
+    np.testing.assert_allclose(np.dstack([offline.senses, offline.commands]), expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_learning_is_that_of_the_published_equations(seed):
+    w, senses, commands = exact_problem(seed)
+    theirs = Published(w, 4000)
+    schedule = SCHEDULE._replace(iterations=1500)
+    learner = SettlingLearner(w, schedule, np.random.default_rng(0))
+    never = np.zeros((3, 1), np.bool_)
+    ours = z = np.zeros((3, H))
+    for x, u in zip(senses, commands, strict=True):
+        ours, _ = learner.practise(ours, Moment(x, u, never), never, never, 1e-3)
+        z = theirs.learn(z, u, x, 1e-3)
+    np.testing.assert_allclose(ours, z, atol=1e-6)
+    for name, W in theirs.W.items():
+        np.testing.assert_allclose(getattr(w, name), W, atol=1e-6, err_msg=name)
+
+
+def test_few_of_our_steps_of_inference_go_at_least_as_far_as_a_hundred_published_ones():
+    w, senses, commands = exact_problem(0)
+    theirs, before = Published(w, 100), np.zeros((3, H))
+    for x, u in zip(senses, commands, strict=True):
+        _, z = theirs.inferred(before, u, x)
+        ours = SettlingNetwork(w, unassociated(), 20, 1, 1).follow(before, u, x, np.ones_like(x)).z
+        assert theirs.energy(before, u, x, ours) <= theirs.energy(before, u, x, z) + 1e-6
 
 
 @pytest.fixture(scope="module")

@@ -127,7 +127,7 @@ class Learner(ABC):
     def __init__(self, weights: Any, names: Collection[str], schedule: Schedule, rng: np.random.Generator) -> None:
         self.weights, self.schedule = weights, schedule
         self.synapses = {name: Synapse(getattr(weights, name)) for name in names}
-        self._direction = rng.standard_normal(weights.W_F.shape[1]).astype(np.float32)
+        self._direction = rng.standard_normal(weights.W_F.shape[1]).astype(weights.W_F.dtype)
         for _ in range(20):
             self.norm, self._direction = power_iteration(weights.W_F, self._direction)
 

@@ -94,7 +94,7 @@ class SettlingNetwork(TemporalNetwork):
         return Step(mu, np.hstack([self._sense(mu), action]), z, z)
 
     def run_on(self, c: Array) -> Step:
-        u = np.zeros((len(c), self.motor + 1), np.float32)
+        u = np.zeros((len(c), self.motor + 1), c.dtype)
         u[:, -1] = 1.0
         _, u[:, :-1] = self._expected(c, u)
         mu, action = self._expected(c, u)
