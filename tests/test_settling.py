@@ -106,7 +106,7 @@ def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
 
 
 class Published:
-    """The papers' network, written from their equations, with the authors' inference: steps of 0.01 from the prediction.
+    """The papers' network, written from their equations; inference takes steps of 0.01 from the prediction.
 
     μ = W_R f(z') + W_in u,  dz = -ε_z + f'(z) ⊙ W_outᵀ ε_x,  ΔW_R = ε_z f(z')ᵀ,  ΔW_in = ε_z uᵀ,  ΔW_out = ε_x f(z)ᵀ
     (Tang, Barron and Bogacz 2023; Millidge et al. 2024), and the motor prediction â = W_A f(h), h = W_R f(z') + b.
@@ -172,7 +172,7 @@ def exact_problem(seed: int, steps: int = 6):
 @pytest.mark.parametrize("seed", range(2))
 def test_inference_and_both_recalls_are_those_of_the_published_equations(seed):
     w, senses, commands = exact_problem(seed)
-    ours, theirs = SettlingNetwork(w, unassociated(), 1500, 1, 1), Published(w, 4000)
+    ours, theirs = SettlingNetwork(w, unassociated(), 3000, 1, 1), Published(w, 8000)
     z, expected = np.zeros((3, H)), []
     for x, u in zip(senses, commands, strict=True):
         mu, after = theirs.inferred(z, u, x)
@@ -195,8 +195,8 @@ def test_inference_and_both_recalls_are_those_of_the_published_equations(seed):
 @pytest.mark.parametrize("seed", range(2))
 def test_learning_is_that_of_the_published_equations(seed):
     w, senses, commands = exact_problem(seed)
-    theirs = Published(w, 4000)
-    schedule = SCHEDULE._replace(iterations=1500)
+    theirs = Published(w, 8000)
+    schedule = SCHEDULE._replace(iterations=3000)
     learner = SettlingLearner(w, schedule, np.random.default_rng(0))
     never = np.zeros((3, 1), np.bool_)
     ours = z = np.zeros((3, H))
