@@ -39,6 +39,7 @@ from asm_gym.monitors.arm_inputs import judged_by_values
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.monitors.training_data import mute_channels
 from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import option, run
@@ -233,7 +234,7 @@ def fit(args: Args, console: Console) -> None:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
-    for line in [*notes, *notes_on_columns(args, spec), *notes_on_body(args, monitor)]:
+    for line in [*notes, *notes_on_columns(args, spec), *notes_on_body(args, monitor), *mute_channels(fitting)]:
         say(f"Note: {line}.")
     rows = sum(map(len, fitting))
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")

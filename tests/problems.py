@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.memory.association import Association, association_shapes, unbounded
+from asm_gym.memory.association import Association, association_shapes, no_doubt, unbounded
 from asm_gym.memory.learning import Schedule, Trajectory
 
 CHANGES = slice(5, 10)
@@ -32,7 +32,8 @@ def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale:
 def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
     shapes = association_shapes(inputs, units, changes).values()
     drawn = Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
-    return drawn._replace(remainder=np.exp(drawn.remainder), span_S=unbounded(changes))
+    known = {"remainder": np.exp(drawn.remainder), "span_S": unbounded(changes)}
+    return drawn._replace(**known, **no_doubt(inputs, changes))
 
 
 def some_rows(steps: int, batch: int, sensory: int, motor: int) -> tuple[np.ndarray, np.ndarray]:

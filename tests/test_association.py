@@ -13,7 +13,10 @@ from asm_gym.memory.association import (
     complete,
     follow_drift,
     hidden_units,
+    leverage,
     log_variance,
+    normalised_errors,
+    spans,
     synapses,
     unbounded,
 )
@@ -23,13 +26,11 @@ from asm_gym.memory.association_learning import (
     association_change,
     crossfit,
     learn_association,
+    learn_doubt,
     learn_precision,
     thirds,
 )
-from asm_gym.memory.linear import (
-    conditional,
-    moments,
-)
+from asm_gym.memory.linear import LEAST_VARIANCE, conditional, inverse_of, moments
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import NeuralASM, make_monitor
 from tests.problems import CHANGES, energy, some_association
@@ -101,9 +102,41 @@ def test_hidden_units_learn_what_is_not_linear():
     cause = rng.normal(size=(3000, 2))
     delta = np.hstack([cause, np.sin(2 * cause) + 0.05 * rng.normal(size=cause.shape)]).astype(np.float32)
     a = np.hstack([delta, np.ones((len(delta), 2))]).astype(np.float32)
-    w = learn_association(a, delta, np.array([0, 0, 1, 1]), slice(0, 4), 20, np.random.default_rng(1))
+    w, _ = learn_association(a, delta, np.array([0, 0, 1, 1]), slice(0, 4), 20, np.random.default_rng(1))
     left = (delta - complete(hidden_units(a, w.V), a, w.U, w.D))[:, 2:].std()
     assert left < 0.45  # 0.65 by a line, 0.05 by the noise alone
+
+
+def test_doubt_is_learned_from_how_errors_grow_with_leverage():
+    rng = np.random.default_rng(0)
+    far = np.exp(rng.normal(size=(20_000, 3)) + 3.0).astype(np.float32)
+    truth = np.array([0.0, 0.1, 1.0])
+    errors = rng.normal(size=far.shape) * np.sqrt((1 + truth * far / np.median(far, axis=0)) / (1 + truth))
+    steady, slope = learn_doubt(errors.astype(np.float32), far)
+    np.testing.assert_allclose(1 / steady - 1, truth, rtol=0.5, atol=0.02)
+    np.testing.assert_allclose(steady + slope * np.median(far, axis=0), 1.0, rtol=1e-4)
+
+
+def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
+    rng = np.random.default_rng(0)
+    a = np.hstack([rng.normal(size=(1500, 100)), np.ones((1500, 1))]).astype(np.float32)  # nothing predicts anything
+    delta, groups = np.ascontiguousarray(a[:, :4]), np.arange(4)
+    w, errors = learn_association(a, delta, groups, slice(0, 4), 1, np.random.default_rng(1))
+    shown = normalised_errors(a, delta, np.ones((1500, 1), np.float32), *w[:7], spans(w.U), *w[7:], groups, 0)[0]
+    assert np.mean(errors**2) > 1.05 * np.mean(shown**2)
+    assert 0.8 < np.mean(errors**2) < 1.2
+
+
+@pytest.mark.parametrize("batch", [1, 40])
+def test_leverage_is_the_distance_of_each_group_s_inputs_by_an_inverse_of_their_own(batch):
+    a = mixed_rows()
+    found = leverage(a[:batch], *inverse_of(a, GROUPS, CHANGES), GROUPS, CHANGES.start)
+    for g in range(3):
+        others = np.setdiff1d(np.arange(13), np.arange(5, 10)[g == GROUPS])
+        b = a[:, others].astype(np.float64)
+        C = b.T @ b / len(b) + LEAST_VARIANCE * np.eye(len(others))
+        by_hand = np.sum(b[:batch] @ np.linalg.inv(C) * b[:batch], axis=1)
+        np.testing.assert_allclose(found[:, g == GROUPS], np.repeat(by_hand[:, None], sum(g == GROUPS), 1), rtol=2e-3)
 
 
 def test_crossfit_predicts_every_row_without_it():

@@ -9,6 +9,7 @@ import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.monitors import make_monitor
+from asm_gym.monitors.training_data import mute_channels
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.streams import sine_episodes
 
@@ -49,6 +50,29 @@ def test_a_sense_that_never_moves_and_one_that_is_another_s_copy_are_watched_too
     score = monitor.score(Episode.from_stream(stream, sine_episodes(1)[0].spec))
     assert score.value[20:].max() > 2 * max(nominal)
     assert np.argmax(score.attribution[20:23].sum(axis=0)) in ({3} if change is constant else {4, 5})
+
+
+@pytest.mark.parametrize("change", [constant, copied])
+def test_senses_that_tell_nothing_are_named_and_no_precision_is_infinite(change):
+    episodes = changed(sine_episodes(12), change)
+    named = {constant: ["joint_position[3]"], copied: ["joint_position[5]", "joint_position[4]"]}[change]
+    (line,) = mute_channels(episodes)
+    assert all(name in line for name in named)
+    assert mute_channels(sine_episodes(12)) == []
+    monitor = fresh("neural_asm", episodes[0].spec).fit(episodes)
+    known = monitor.model.network.association
+    assert known.doubt[1].max() > 0
+    assert all(np.isfinite(array).all() for array in known)
+    stream = changed(sine_episodes(1, seed=2), change)[0].stream.astype(np.float64)
+    stream[10] = 1e9
+    stream[20, 3] = np.nan
+    stream[30:, 4] += 1e3
+    state, values = monitor.initial_state(1), []
+    for row in stream:
+        state, surprise = monitor.observe(state, row[None])
+        values.append(surprise.value[0])
+    assert np.flatnonzero(~np.isfinite(values)).tolist() == [20]
+    assert min(values[10], values[30]) > max(values[:10])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -40,11 +40,24 @@ def expected_by(asm, state, rows):
     left = (reading.changes - reading.inputs @ a.D.T - units @ a.U.T) / a.remainder
     sure = np.where(history.steps < lag, 0.0, np.where(history.steps < 2 * lag, UNSURE, 1.0))
     errors = reading.whole * left * np.exp(-0.5 * spread) * sure[:, None]
+    if len(a.P):
+        errors /= np.sqrt(a.doubt[0] + a.doubt[1] * leverages(a.P, reading.inputs, model.senses_))
     skill = state.skill
     if asm.skills_:
         p = certainty(np.hstack([units, expected]), model.learned_["W_K"], model.learned_["b_K"])
         skill = KEPT * skill + np.log(p + SMALLEST)
     return errors, MemoryState(traces, expected, history.followed_by(rows), skill)
+
+
+def leverages(P, inputs, senses):
+    """Each group's inputs without its own changes, by an inverse of their own (B, X)."""
+    C, places = np.linalg.inv(P.astype(np.float64)), np.arange(senses.inputs)[senses.changes]
+    found = np.zeros((len(inputs), len(places)))
+    for g in np.unique(senses.groups):
+        others = np.setdiff1d(np.arange(len(C)), places[senses.groups == g])
+        b = inputs[:, others].astype(np.float64)
+        found[:, senses.groups == g] = np.sum(b * np.linalg.solve(C[np.ix_(others, others)], b.T).T, axis=1)[:, None]
+    return found
 
 
 def observed_by(asm, state, rows):

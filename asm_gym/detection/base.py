@@ -30,7 +30,7 @@ class Nominal(NamedTuple):
 
     episodes: Sequence[Episode]  # all, in the order given
     learned: Sequence[Episode]  # those that the model has learned
-    held_out: Sequence[Episode]  # the others; without any, those that it has
+    held_out: Sequence[Episode]  # the others, if any
     outputs: Callable[[Sequence[Episode]], list[ModelOutput]]
 
 

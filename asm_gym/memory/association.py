@@ -4,15 +4,21 @@
     h_t = V a_t                                    hidden units; those of group g have no synapse from its own Δ_t
     Δ̂_t = D a_t + U f(h_t)                         group g is predicted by its own units only
     log σ²_t = W_S f(h_t) + b_S, within span_S     expected variance of the error
-    ε_t = (Δ_t - Δ̂_t) / (s σ_t)                    normalised error; s is the spread that D alone leaves
+    g²_t = (1 + τ l_t/l̃) / (1 + τ)                 l_t: leverage of the inputs of a group, l̃: its usual value
+    ε_t = (Δ_t - Δ̂_t) / (s σ_t g_t)                normalised error; s is the spread that D alone leaves
     ΔU = η ψ(ε_t) σ_t f(h_t)ᵀ / n_t                follows slow drift, as ΔD does; n_t = ‖f(h_t)‖² + ‖a_t‖²
 
 The linear part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``).
 span_S are the limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
 
+Leverage is the distance of the inputs from those learned from, for each group without its own changes, by one inverse:
+
+    P = (E[a aᵀ] + λ I)⁻¹     y = P a     l_g = aᵀ y - y_gᵀ P_gg⁻¹ y_g
+
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
 2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Nagumo and Noda 1967
-(IEEE Trans. Automatic Control 12(3)) for the normalised delta rule.
+(IEEE Trans. Automatic Control 12(3)) for the normalised delta rule; Bishop 2006, section 3.3.2, for the variance of a
+prediction far from the data.
 """
 
 from __future__ import annotations
@@ -38,13 +44,30 @@ class Association(NamedTuple):
     b_S: Array  # noqa: N815 (X,)
     span_S: Array  # noqa: N815 (2, X) limits of log σ²
     remainder: Array  # (X,) s
+    P: Array  # (I, I), or (0, I) where leverage is not known
+    own: Array  # (X, X) P_gg⁻¹ of each group, 0 between groups
+    doubt: Array  # (2, X) of g²: its value at leverage 0, and its slope
 
 
 def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of ``Association`` by name."""
     M, X = units, changes
-    precision = {"W_S": (X, M), "b_S": (X,), "span_S": (2, X)}
-    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), **precision, "remainder": (X,)}
+    precision = {"W_S": (X, M), "b_S": (X,), "span_S": (2, X), "remainder": (X,)}
+    return {
+        "V": (M, inputs),
+        "U": (X, M),
+        "D": (X, inputs),
+        **precision,
+        "P": (inputs, inputs),
+        "own": (X, X),
+        "doubt": (2, X),
+    }
+
+
+def no_doubt(inputs: int, changes: int) -> dict[str, Array]:
+    """Return P, ``own`` and ``doubt`` by which g is 1 everywhere."""
+    doubt = np.repeat(np.array([[1.0], [0.0]], np.float32), changes, axis=1)
+    return {"P": np.zeros((0, inputs), np.float32), "own": np.zeros((changes, changes), np.float32), "doubt": doubt}
 
 
 class Change(NamedTuple):
@@ -107,6 +130,27 @@ def unbounded(size: int) -> Array:
 
 
 @kernel
+def leverage(a: Array, P: Array, own: Array, groups: NDArray[np.intp], first: int) -> Array:
+    """Return l (B, X) of inputs (B, I), of which the X changes begin at ``first``; ``groups`` (X,) are numbered."""
+    y = outward(a, P)
+    out = np.empty((a.shape[0], len(groups)), a.dtype)
+    each = np.empty(len(groups), a.dtype)  # of a group, at its number
+    for n in range(a.shape[0]):
+        total = np.float32(0)
+        for i in range(a.shape[1]):
+            total += a[n, i] * y[n, i]
+        each[:] = total
+        for i in range(len(groups)):
+            left = np.float32(0)
+            for j in range(len(groups)):
+                left += own[i, j] * y[n, first + j]
+            each[groups[i]] -= left * y[n, first + i]
+        for i in range(len(groups)):
+            out[n, i] = max(each[groups[i]], np.float32(0))
+    return out
+
+
+@kernel
 def normalised_errors(
     inputs: Array,
     changes: Array,
@@ -119,6 +163,11 @@ def normalised_errors(
     span_S: Array,
     remainder: Array,
     spans: NDArray[np.intp],
+    P: Array,
+    own: Array,
+    doubt: Array,
+    groups: NDArray[np.intp],
+    first: int,
 ) -> tuple[Array, Array]:
     """Return ε (B, X), 0 where ``whole`` (B, 1) is 0, and f(h) (B, M) for inputs (B, I) and changes (B, X)."""
     f = hidden_units(inputs, V)
@@ -136,12 +185,17 @@ def normalised_errors(
         for i in range(out.shape[1]):
             error = (changes[n, i] - out[n, i]) / remainder[i]
             out[n, i] = whole[n, 0] * error * np.exp(np.float32(-0.5) * spread[n, i])
+    if P.shape[0]:
+        far = leverage(inputs, P, own, groups, first)
+        for n in range(out.shape[0]):
+            for i in range(out.shape[1]):
+                out[n, i] /= np.sqrt(doubt[0, i] + doubt[1, i] * far[n, i])
     return out, f
 
 
 def follow_drift(association: Association, a: Array, delta: Array, rate: float) -> Association:
     """Return the association after a batch of inputs (B, I) and changes (B, X), ``rate`` being η in (0, 1]."""
-    _, U, D, W_S, b_S, span_S, remainder = association
+    _, U, D, W_S, b_S, span_S, remainder = association[:7]
     f = hidden_units(a, association.V)
     spread = remainder * np.exp(np.float32(0.5) * log_variance(f, W_S, b_S, span_S))
     error = np.clip(delta - complete(f, a, U, D), -spread, spread)

@@ -5,27 +5,39 @@
     ΔU ∝ ε_t f(h_t)ᵀ     ΔV ∝ ε_h a_tᵀ,   ε_h = f'(h_t) ⊙ Bᵀ ε_t
     c = Σ_n ψ(r_n) Δ̂_n / Σ_n Δ̂_n², in [0, 1]       share of the hidden units' predictions Δ̂ to believe
     ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ                     gradient of the Gaussian log likelihood
+    τ = argmax Σ_n log t_4(ε_n/(σ_n g_n)) - log g_n   how much a prediction is doubted by its leverage
 
-Errors come back by weights B of their own, which approach U. c and the precision are learned on cross-fitted errors:
+Errors come back by weights B of their own, which approach U. c, the precision and τ are learned on cross-fitted errors:
 each row is predicted by what was learned from the two thirds of the episodes that it is not in. From very few rows
-D reads the past and the command only, and U and W_S are 0.
+D reads the past and the command only, and U, W_S and τ are 0.
 
 Sources: Huber 1964 for ψ; Kolen and Pollack 1994 and Akrout et al. 2019 (NeurIPS) for learned feedback; Stone 1974 and
 Chernozhukov et al. 2018 (Econometrics Journal) for cross-fitting; Friston 2005 (Phil. Trans. R. Soc. B) for the
-maximum-likelihood precision.
+maximum-likelihood precision; Lange et al. 1989 for the t distribution of 4 degrees of freedom.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association, Change, complete, hidden_units, log_variance, synapses, unbounded
+from asm_gym.memory.association import (
+    Association,
+    Change,
+    complete,
+    hidden_units,
+    leverage,
+    log_variance,
+    no_doubt,
+    synapses,
+    unbounded,
+)
 from asm_gym.memory.energy import Array, kernel, outward
 from asm_gym.memory.learning import Synapse, Tick, coincidence, cosine_decay, shuffled
-from asm_gym.memory.linear import learn_from_past, learn_linear
+from asm_gym.memory.linear import inverse_of, learn_from_past, learn_linear
 
 FEEDBACK_GAIN = 1e-3  # initial gain of B
 DECAY = 0.3  # share of its step size by which a synapse of U or B decays
@@ -42,6 +54,8 @@ EXTREME = 0.0005  # share of nominal rows below the limits of log σ², and abov
 LARGEST_RATIO = 30.0  # clips ε²/σ² (5.5 σ), so that one contact does not undo a thousand steps
 PRECISION_EPOCHS, PRECISION_RATE = 20, 1e-3
 PRECISION_BATCH, PRECISION_BATCHES = 64, 250  # rows of a batch, and most batches in an epoch; then they are larger
+DOUBTS = 0.0, *(10.0 ** np.arange(-2.0, 0.6, 0.25))  # τ to choose from
+FREEDOM, SCALINGS, MOST_DOUBTED = 4, 10, 30_000  # of the t distribution, steps to its spread, and rows to choose τ by
 ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS  # progress reports of ``learn_association``
 
 
@@ -70,6 +84,13 @@ def association_change(
     return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a) if D.size else D), error
 
 
+class Learned(NamedTuple):
+    """What was learned, and the normalised errors (N, X) of rows by what was learned without them."""
+
+    association: Association
+    errors: Array
+
+
 def learn_association(
     a: Array,
     delta: Array,
@@ -80,7 +101,7 @@ def learn_association(
     tick: Tick = lambda: None,
     lengths: Sequence[int] = (),
     independent: int | None = None,
-) -> Association:
+) -> Learned:
     """Learn the linear part, then the hidden units, then the precision.
 
     Args:
@@ -96,29 +117,52 @@ def learn_association(
     D = learn_from_past(a, changes) if few else learn_linear(a, groups, changes)
     left = delta - outward(a, D)
     remainder = np.maximum(np.sqrt(np.mean(left**2, axis=0)), SMALLEST_SPREAD)  # (X,)
+    left /= remainder
     if few:
         for _ in range(ALL_TICKS):
             tick()
-        none = np.zeros_like(exists.U)
-        precision = none.copy(), np.zeros_like(remainder), unbounded(len(D))
-        return Association(_random(exists.V, rng), none, D, *precision, remainder)
-    left /= remainder
-
-    def learned(rows: NDArray[np.bool_] | slice) -> tuple[Array, Array]:
-        return _learn_hidden(a[rows], left[rows], exists, rng, tick)
+        none, flat = np.zeros_like(exists.U), np.zeros_like(remainder)
+        precision = none.copy(), flat, unbounded(len(D)), remainder
+        return Learned(Association(_random(exists.V, rng), none, D, *precision, **no_doubt(*D.shape[::-1])), left)
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
-        V, U = learned(learned_from)
-        return outward(hidden_units(a[asked], V), U)
+        own_D = learn_linear(a[learned_from], groups, changes)
+        own_left = (delta - outward(a, own_D)) / remainder
+        V, U = _learn_hidden(a[learned_from], own_left[learned_from], exists, rng, tick)
+        known = *inverse_of(a[learned_from], groups, changes), groups, changes.start
+        return np.hstack([own_left[asked], outward(hidden_units(a[asked], V), U), leverage(a[asked], *known)])
 
     # Errors on rows that were learned are smaller than those to come.
-    expected = crossfit(expect, thirds(len(a), lengths, rng), left.shape[1])
-    V, U = learned(slice(None))
-    share = trust(left, expected)
+    fresh = crossfit(expect, thirds(len(a), lengths, rng), 3 * len(D))
+    fresh_left, expected, far = np.split(fresh, 3, axis=1)
+    V, U = _learn_hidden(a, left, exists, rng, tick)
+    share = trust(fresh_left, expected)
     U *= share[:, None]
-    f = hidden_units(a, V)
-    W_S, b_S = learn_precision(f, left - share * expected, rng, tick)
-    return Association(V, U * remainder[:, None], D, W_S, b_S, usual_span(f, W_S, b_S), remainder)
+    f, error = hidden_units(a, V), fresh_left - share * expected
+    W_S, b_S = learn_precision(f, error, rng, tick)
+    span_S = usual_span(f, W_S, b_S)
+    error *= np.exp(np.float32(-0.5) * log_variance(f, W_S, b_S, span_S))
+    doubt = learn_doubt(error, far)
+    error /= np.sqrt(doubt[0] + doubt[1] * far)
+    precision = W_S, b_S, span_S, remainder
+    return Learned(Association(V, U * remainder[:, None], D, *precision, *inverse_of(a, groups, changes), doubt), error)
+
+
+def learn_doubt(error: Array, far: Array) -> Array:
+    """Return g² (2, X) of ``Association.doubt`` from cross-fitted errors and leverages (N, X)."""
+    usual = np.maximum(np.median(far, axis=0), SMALLEST_SPREAD)  # (X,)
+    shown = slice(None, None, -(-len(far) // MOST_DOUBTED))
+    squares, ratio = error[shown].astype(np.float64) ** 2, far[shown] / usual
+    costs = []
+    for tau in DOUBTS:
+        g = (1.0 + tau * ratio) / (1.0 + tau)
+        q = squares / g
+        spread = np.maximum(np.median(q, axis=0), SMALLEST_SPREAD**2)
+        for _ in range(SCALINGS):
+            spread = np.maximum(np.mean(q * (FREEDOM + 1) / (FREEDOM + q / spread), axis=0), SMALLEST_SPREAD**2)
+        costs.append(np.mean(np.log(g * spread) + (FREEDOM + 1) * np.log1p(q / spread / FREEDOM), axis=0))
+    tau = np.array(DOUBTS)[np.argmin(costs, axis=0)]
+    return np.stack([1.0 / (1.0 + tau), tau / (1.0 + tau) / usual]).astype(np.float32)
 
 
 def _random(exists: Array, rng: np.random.Generator) -> Array:

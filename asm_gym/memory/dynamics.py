@@ -72,9 +72,9 @@ def train(
         if progress is not None:
             progress(done, total)
 
-    network, energy = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
+    network, energy, _ = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
     inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
     deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
     independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
-    association = learn_association(inputs, deltas, *layout, rng, tick, lengths, independent)
-    return Trained(network.with_association(association), energy)
+    association, errors = learn_association(inputs, deltas, *layout, rng, tick, lengths, independent)
+    return Trained(network.with_association(association), energy, errors)

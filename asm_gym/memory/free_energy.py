@@ -9,8 +9,8 @@
     reaction      (x, u) ← argmin F over the command and the row that it will lead to
     learning      ΔW ∝ -∂F/∂W of every synapse, in its own term
 
-ε and μ are those of ``traces`` or ``settling``, e and σ of ``association``. τ is the spread left in healthy rows, so
-that both sums are in nats.
+ε and μ are those of ``traces`` or ``settling``, e and σ of ``association`` at usual leverage. τ is the spread left in
+healthy rows, so that both sums are in nats.
 
 Sources: Friston 2005 (Phil. Trans. R. Soc. B) for the sum and its precisions; Millidge et al. 2024 for the part through
 time; Adams, Shipp and Friston 2013 (Brain Struct. Funct.) for actions that descend the energy of their outcome.
@@ -178,7 +178,7 @@ class FreeEnergy:
 
 def _between(association: Association, a: Floats, changes: Floats) -> tuple[float, Floats, Floats]:
     """Return Σ ½(e/σ)² + log σ for inputs (I,) and changes (X,), and its gradients by both."""
-    V, U, D, W_S, b_S, span, s = association
+    V, U, D, W_S, b_S, span, s = association[:7]
     f = np.tanh(V @ a)
     raw = W_S @ f + b_S
     log_variance = np.clip(raw, span[0], span[1])

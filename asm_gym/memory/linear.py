@@ -19,7 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dgemm, dsyrk
 
-from asm_gym.memory.association import LARGEST, SMALLEST, Association, complete, hidden_units, log_variance, synapses
+from asm_gym.memory.association import (
+    LARGEST,
+    SMALLEST,
+    Association,
+    complete,
+    hidden_units,
+    leverage,
+    log_variance,
+    synapses,
+)
 from asm_gym.memory.energy import Array
 
 Floats = NDArray[np.float64]
@@ -28,6 +37,7 @@ PENALTIES = 10.0 ** np.arange(-8, 3)  # λ, in units of the variance of a standa
 EXACT = 1e-8  # mean squared errors below this are equally good
 MOST_INPUTS = 8192  # C of these takes 0.5 GiB, and its eigenvectors minutes
 FEW_PENALTY = 1e-4  # λ where rows are too few to choose it
+LEAST_VARIANCE = 1e-4  # λ of leverage: inputs that are constant, or copies of others, have no endless one
 HELD_OUT = 5  # the last one in so many rows is held out
 LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped when penalties of ``specialise`` are compared
 
@@ -82,6 +92,14 @@ def check_inputs(count: int) -> None:
         )
 
 
+def inverse_of(a: Array, groups: NDArray[np.intp], changes: slice) -> tuple[Array, Array]:
+    """Return P (I, I) and ``own`` (X, X) of ``Association`` from rows (N, I); the rest as in ``synapses``."""
+    exact = np.asarray(a, np.float64)
+    P = np.linalg.inv(gram(exact) / len(exact) + LEAST_VARIANCE * np.eye(exact.shape[1]))
+    within = P[changes, changes] * (groups[:, None] == groups)
+    return P.astype(np.float32), np.linalg.inv(within).astype(np.float32)
+
+
 def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[np.float32]:
     """Return D (X, I) learned from rows (N, I) of whole episodes; other arguments as in ``conditional``."""
     fresh = np.asarray(held_out(a), np.float64)
@@ -126,6 +144,9 @@ def specialise(
     fresh = len(held_out(a))
     f, a, delta = f[-fresh:], a[-fresh:], delta[-fresh:]
     error = (delta - complete(f, a, U, D)) / known.remainder
+    if len(known.P):
+        far = leverage(a, known.P, known.own, groups, changes.start)
+        error /= np.sqrt(known.doubt[0] + known.doubt[1] * far)
     # The body's memory knows how errors differ between contexts; the policy's rows tell how large they are overall.
     scale = np.mean(error**2 * np.exp(-log_variance(f, known.W_S, known.b_S, known.span_S)), axis=0)
     larger = np.log(np.maximum(scale, 1e-6)).astype(np.float32)

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.action_meaning import ACTIONS, found_meaning
 from asm_gym.data.episode import Episode
-from asm_gym.detection import Detection, Nominal
+from asm_gym.detection import Detection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import Calibrated
@@ -154,12 +154,18 @@ class CalibratedMonitor(Calibrated):
                 return
             self.model.fit(learned, rng, progress)
             self._place_errors()
-            nominal = Nominal(episodes, learned, held_out or learned, lambda own: model_outputs(self.model, own))
+            nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
             for detection in self.detections.values():
                 taken = self.model.learned_.keys() & set(detection.arrays)
                 if taken:
                     raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
                 detection.fit(nominal, rng)
+            model.crossfitted = {}
+
+    def _nominal_outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
+        """Return the model's outputs, with the cross-fitted errors of what it has learned."""
+        known, found = self.model.crossfitted, model_outputs(self.model, episodes)
+        return [o._replace(errors=known.get(id(e), o.errors)) for e, o in zip(episodes, found, strict=True)]
 
     @typed
     def initial_state(self, batch: int = 1) -> MonitorState:

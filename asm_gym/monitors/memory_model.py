@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.association import Association, association_shapes, follow_drift
+from asm_gym.memory.association import Association, association_shapes, follow_drift, no_doubt
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
-from asm_gym.memory.temporal import MemoryState, TemporalNetwork
+from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.layout import Layout
 from asm_gym.monitors.row_kernel import expect_rows, layout_of, uninitialised
@@ -46,6 +46,7 @@ class MemoryModel(ScaledModel):
     """
 
     kind = "neural_asm"
+    held_out = 0  # what it learns of errors is cross-fitted
 
     def __init__(
         self, spec: StreamSpec, hidden_size: int, association_size: int, schedule: Schedule, dynamics: str = TRACES
@@ -79,6 +80,11 @@ class MemoryModel(ScaledModel):
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
         trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
         learned = {**senses.arrays, "energy": trained.energy}
+        self.crossfitted = {}
+        ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
+        for episode, errors in zip(episodes, np.split(trained.errors, ends), strict=True):
+            errors[:lag] *= UNSURE
+            self.crossfitted[id(episode)] = np.vstack([np.zeros_like(errors[:1]).repeat(lag, 0), errors])
         network, completion = trained.network, Completion.fit(senses, streams)
         filled = completion.named() if completion is not None else {}
         return self.restore({**learned, **network.weights._asdict(), **network.association._asdict(), **filled})
@@ -100,11 +106,15 @@ class MemoryModel(ScaledModel):
         senses = StreamScaler.of(self.spec, learned, self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
+        if "P" not in learned:  # made before leverage was learned
+            learned = {**learned, **no_doubt(senses.inputs, X)}
         if (found := dynamics_of(learned)) != self.dynamics:
             raise ValueError(f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}")
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
+        if not learned["P"].size:
+            shapes["P"] = (0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         if missing := [name for name in shapes if name not in learned]:

@@ -43,7 +43,8 @@ def layout_of(network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str
     unused = {name: np.zeros(shape, np.float32) for shapes, _ in both for name, shape in shapes.items()}
     singles = unused | weights | network.association._asdict() | dict(names)
     doubles = {"mean": scaler.mean, "spread": scaler.spread, "change": scaler.change}
-    places = {"sensory": spec.sensory, "motor": spec.motor, "slow": scaler.slow, "spans": network.spans}
+    places = {"sensory": spec.sensory, "motor": spec.motor, "slow": scaler.slow, "groups": scaler.groups}
+    places["spans"] = network.spans
     arrays = {
         name: np.asarray(array, kind)
         for kind, own in ((np.float32, singles), (np.float64, doubles), (np.int64, places))
@@ -226,7 +227,8 @@ def expect_rows(
     hidden = matrix(singles, at.V), matrix(singles, at.U), matrix(singles, at.D)
     spread = matrix(singles, at.W_S), vector(singles, at.b_S), matrix(singles, at.span_S)
     beyond = vector(singles, at.remainder), matrix(places, at.spans)
-    error, units = normalised_errors(inputs, changes, whole, *hidden, *spread, *beyond)
+    far = matrix(singles, at.P), matrix(singles, at.own), matrix(singles, at.doubt), vector(places, at.groups)
+    error, units = normalised_errors(inputs, changes, whole, *hidden, *spread, *beyond, *far, rows.shape[1])
     for n in range(len(rows)):
         # Nothing came before the first rows, so that no change is known.
         sure = np.float32(0.0) if steps[n] < lag else UNSURE

@@ -37,6 +37,7 @@ class StreamModel:
         held_out: one in so many episodes is not learned, but shows how large errors usually are; 0 for none.
         learned_: arrays that ``fit`` has found, by name; empty before.
         skills_: names of the skills it knows; empty where it was given none.
+        crossfitted: errors (T, X) of learned episodes by what was learned without them, by id, while it is fitted.
     """
 
     kind: str
@@ -47,6 +48,7 @@ class StreamModel:
         self.spec = spec
         self.learned_: Arrays = {}
         self.skills_: tuple[str, ...] = ()
+        self.crossfitted: dict[int, NDArray[np.floating[Any]]] = {}
 
     @property
     def error_columns(self) -> NDArray[np.intp]:

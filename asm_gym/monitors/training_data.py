@@ -16,6 +16,8 @@ from asm_gym.spec import StreamSpec
 
 WILD = 1e6  # largest distance of a number from its channel's median, in ranges of the channel
 
+ALIKE = 1.0 - 1e-9  # correlation of copies
+
 Hashes = NDArray[np.float64]
 """One of each episode, of 52 bits, which a double holds exactly."""
 
@@ -50,6 +52,17 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
                 f"episode {n}, step {step}, {label} is {value:g}, where 98 % of all lie between {low[column]:g} and "
                 f"{high[column]:g}: leave the episode out"
             )
+
+
+def mute_channels(episodes: Sequence[Episode]) -> list[str]:
+    """Say, a line each, which numbers of the stream never move, and which are copies of others."""
+    rows, labels = np.concatenate([e.stream for e in episodes]).astype(np.float64), episodes[0].spec.labels
+    moves = np.ptp(rows, axis=0) > 0
+    lines = [f"{labels[i]} never moves in these episodes: any move of it will surprise" for i in np.flatnonzero(~moves)]
+    moving = np.flatnonzero(moves)
+    alike = np.abs(np.corrcoef(rows[:, moving], rowvar=False).reshape(len(moving), -1)) > ALIKE
+    pairs = ((i, np.argmax(own)) for i, own in enumerate(alike) if np.argmax(own) < i)
+    return lines + [f"{labels[moving[i]]} says what {labels[moving[j]]} says, and cannot check it" for i, j in pairs]
 
 
 def hashes_of(episodes: Sequence[Episode]) -> Hashes:
