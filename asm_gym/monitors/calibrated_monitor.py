@@ -14,10 +14,12 @@ from threadpoolctl import threadpool_limits
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.action_meaning import ACTIONS, found_meaning
 from asm_gym.data.episode import Episode
-from asm_gym.detection import Detection, ModelOutput, Nominal
+from asm_gym.detection import Blocks, Detection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
+from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.monitors.base import Progress, State, Surprise
-from asm_gym.monitors.calibration import Calibrated
+from asm_gym.monitors.calibration import LOG, AlarmRate, require_sight
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
 from asm_gym.monitors.stream_model import (
     StreamModel,
@@ -27,7 +29,7 @@ from asm_gym.monitors.stream_model import (
     parameter_names,
     side_by_side,
 )
-from asm_gym.monitors.training_data import Hashes, check_nominal, hashes_of
+from asm_gym.monitors.training_data import Hashes, check_fresh, check_nominal, hashes_of
 from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
 
 
@@ -40,7 +42,7 @@ class MonitorState(NamedTuple):
     values: State = ()  # of the monitor of values
 
 
-class CalibratedMonitor(Calibrated):
+class CalibratedMonitor:
     """Any model under any detection, with a threshold that is conformal on the maxima of nominal episodes.
 
     Args:
@@ -51,6 +53,12 @@ class CalibratedMonitor(Calibrated):
     Attributes:
         about: JSON values to save with it, such as its ``name``.
         learned_from_, ceilings_from_: hashes of the episodes of ``fit`` and of ``learn_ceilings``; None before.
+        threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
+        maxima_: (n,) largest surprise in each calibration episode.
+        blocks_: the same by the hour, as ``detection.conformal`` counts it.
+        promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
+        healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
+            limits; empty where the stream has no such channels.
     """
 
     model: StreamModel
@@ -61,6 +69,10 @@ class CalibratedMonitor(Calibrated):
         self.seed = check_number("seed", seed, low=0, whole=True)
         self.spec, self.model, self.detection = model.spec, model, detections[0]
         self.detections = {d.name: d for d in detections}
+        self.threshold_: float | None
+        self.maxima_: NDArray[np.float64] | None
+        self.blocks_: Blocks | None
+        self.healthy_: tuple[float, ...]
         self._uncalibrate()
         self.learned_from_: Hashes | None = None
         self.ceilings_from_: Hashes | None = None
@@ -168,6 +180,83 @@ class CalibratedMonitor(Calibrated):
         return [o._replace(errors=known.get(id(e), o.errors)) for e, o in zip(episodes, found, strict=True)]
 
     @typed
+    def calibrate(
+        self,
+        episodes: Sequence[Episode],
+        false_alarm_rate: float | None = None,
+        *,
+        false_alarms_per_hour: float | None = None,
+        each: Sequence[str] = (),
+    ) -> Self:
+        """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
+
+        ``threshold_at`` then knows the threshold of every other rate too.
+
+        Args:
+            episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
+            false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
+            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
+                comes back within a minute of the same episode, is one alarm.
+            each: task or policy of each episode, where the promise is to hold in each of them.
+
+        Raises:
+            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
+                by the hour also an episode given twice, or that ``fit`` has learned from. Or not exactly one rate.
+        """
+        self._require_fitted()
+        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
+        check_nominal(episodes, self.spec, self.model.shortest)
+        if each and len(each) != len(episodes):
+            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
+        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+        try:
+            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
+        except ValueError as error:
+            if asked.per == HOUR:
+                raise
+            LOG.warning("%s; the promise by the episode does not hold for these", error)
+        new = self._balanced(episodes)
+        values = [s.value for s in new.score_episodes(episodes)]
+        threshold = asked.threshold_of(values, self.spec.dt, each)
+        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
+        vars(self).update(vars(new))
+        self.threshold_, self.promised_ = threshold, asked.per
+        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
+        self.healthy_ = healthy_forces([episode.stream for episode in episodes], self.spec)
+        return self
+
+    @property
+    def threshold(self) -> float:
+        """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
+        if self.threshold_ is None:
+            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
+        return self.threshold_
+
+    @typed
+    def threshold_at(
+        self, false_alarm_rate: float | None = None, *, false_alarms_per_hour: float | None = None
+    ) -> float:
+        """Return the threshold of another rate, from the episodes of ``calibrate``; raises as that does."""
+        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
+        kept = self.blocks_ if asked.per == HOUR else self.maxima_
+        if kept is None or self.maxima_ is None:
+            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
+        return asked.threshold(self.maxima_, self.blocks_)
+
+    @property
+    def promise(self) -> Promise:
+        """How often the threshold promises an alarm in nominal operation. Raises RuntimeError before ``calibrate``."""
+        if self.maxima_ is None:
+            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
+        if self.promised_ == HOUR and self.blocks_ is not None:
+            return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
+        return Promise.of(self.maxima_, self.threshold)
+
+    def _balanced(self, episodes: Sequence[Episode]) -> Self:
+        """Return it, or a copy, with its parts weighted by what nominal episodes make of each."""
+        return self
+
+    @typed
     def initial_state(self, batch: int = 1) -> MonitorState:
         """Return the state before the first row of ``batch`` streams."""
         check_number("batch", batch, low=1, whole=True)
@@ -248,6 +337,10 @@ class CalibratedMonitor(Calibrated):
             if arrays.keys() >= set(detection.arrays):
                 detection.restore({n: arrays[n] for n in detection.arrays})
         return self
+
+    def _uncalibrate(self) -> None:
+        self.threshold_ = self.maxima_ = self.blocks_ = None
+        self.promised_, self.healthy_ = EPISODE, ()
 
     @property
     def _name(self) -> str:

@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection import Blocks, Detection, EvidenceDetection, conformal_episodes, conformal_threshold
+from asm_gym.detection import Blocks, EvidenceDetection, conformal_episodes, conformal_threshold
 from asm_gym.detection.base import Array
-from asm_gym.detection.conformal import (
-    EPISODE,
-    HOUR,
-    Promise,
-    check_hours,
-    check_per_hour,
-    hourly_promise,
-    hourly_threshold,
-)
-from asm_gym.detection.contact_limits import healthy_forces
+from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, hourly_threshold
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES
-from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.stream_model import StreamModel, model_outputs
-from asm_gym.monitors.training_data import Hashes, check_fresh, check_nominal, hashes_of
+from asm_gym.monitors.stream_model import model_outputs
+from asm_gym.monitors.training_data import check_fresh, check_nominal, hashes_of
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
+
+if TYPE_CHECKING:
+    from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 
 LOG = logging.getLogger("asm_gym.monitors")
 
@@ -88,123 +80,6 @@ class AlarmRate(NamedTuple):
         return threshold
 
 
-class Calibrated:
-    """A threshold, conformal on the maxima of nominal episodes; what it rests on is None before ``calibrate``.
-
-    Attributes:
-        threshold_: surprise above which a row is an alarm.
-        maxima_: (n,) largest surprise in each calibration episode.
-        blocks_: the same by the hour, as ``detection.conformal`` counts it.
-        promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
-        healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
-            limits; empty where the stream has no such channels.
-    """
-
-    spec: StreamSpec
-    model: StreamModel
-    detection: Detection
-    detections: dict[str, Detection]
-    learned_from_: Hashes | None
-    ceilings_from_: Hashes | None
-    threshold_: float | None
-    maxima_: NDArray[np.float64] | None
-    blocks_: Blocks | None
-    promised_: str
-    healthy_: tuple[float, ...]
-
-    @typed
-    def calibrate(
-        self,
-        episodes: Sequence[Episode],
-        false_alarm_rate: float | None = None,
-        *,
-        false_alarms_per_hour: float | None = None,
-        each: Sequence[str] = (),
-    ) -> Self:
-        """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
-
-        ``threshold_at`` then knows the threshold of every other rate too.
-
-        Args:
-            episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
-            false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
-            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
-                comes back within a minute of the same episode, is one alarm.
-            each: task or policy of each episode, where the promise is to hold in each of them.
-
-        Raises:
-            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
-                by the hour also an episode given twice, or that ``fit`` has learned from. Or not exactly one rate.
-        """
-        self._require_fitted()
-        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
-        check_nominal(episodes, self.spec, self.model.shortest)
-        if each and len(each) != len(episodes):
-            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
-        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
-        try:
-            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
-        except ValueError as error:
-            if asked.per == HOUR:
-                raise
-            LOG.warning("%s; the promise by the episode does not hold for these", error)
-        new = self._balanced(episodes)
-        values = [s.value for s in new.score_episodes(episodes)]
-        threshold = asked.threshold_of(values, self.spec.dt, each)
-        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
-        vars(self).update(vars(new))
-        self.threshold_, self.promised_ = threshold, asked.per
-        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
-        self.healthy_ = healthy_forces([episode.stream for episode in episodes], self.spec)
-        return self
-
-    @property
-    def threshold(self) -> float:
-        """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
-        if self.threshold_ is None:
-            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
-        return self.threshold_
-
-    @typed
-    def threshold_at(
-        self, false_alarm_rate: float | None = None, *, false_alarms_per_hour: float | None = None
-    ) -> float:
-        """Return the threshold of another rate, from the episodes of ``calibrate``; raises as that does."""
-        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
-        kept = self.blocks_ if asked.per == HOUR else self.maxima_
-        if kept is None or self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
-        return asked.threshold(self.maxima_, self.blocks_)
-
-    @property
-    def promise(self) -> Promise:
-        """How often the threshold promises an alarm in nominal operation. Raises RuntimeError before ``calibrate``."""
-        if self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
-        if self.promised_ == HOUR and self.blocks_ is not None:
-            return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
-        return Promise.of(self.maxima_, self.threshold)
-
-    def _balanced(self, episodes: Sequence[Episode]) -> Self:
-        """Return it, or a copy, with its parts weighted by what nominal episodes make of each."""
-        return self
-
-    @abstractmethod
-    def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
-        """Return the surprise of each step of each episode."""
-
-    @abstractmethod
-    def _require_fitted(self) -> None: ...
-
-    def _uncalibrate(self) -> None:
-        self.threshold_ = self.maxima_ = self.blocks_ = None
-        self.promised_, self.healthy_ = EPISODE, ()
-
-    @property
-    def _name(self) -> str:
-        return type(self).__name__
-
-
 def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> list[str]:
     """Return the labels of the senses whose errors alone could never pass the threshold, however large and lasting.
 
@@ -235,7 +110,7 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
 
 
 @typed
-def learn_ceilings(monitor: Calibrated, episodes: Sequence[Episode]) -> Calibrated:
+def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> CalibratedMonitor:
     """Learn from healthy hours how far each sense goes at its worst, and return the monitor.
 
     The episodes it was fitted to, babbling say, are not like hours of operation. It has no threshold then: calibrate it
@@ -266,7 +141,9 @@ def learn_ceilings(monitor: Calibrated, episodes: Sequence[Episode]) -> Calibrat
     return monitor
 
 
-def _worst_of(monitor: Calibrated, detection: EvidenceDetection, episodes: Sequence[Episode]) -> NDArray[np.float64]:
+def _worst_of(
+    monitor: CalibratedMonitor, detection: EvidenceDetection, episodes: Sequence[Episode]
+) -> NDArray[np.float64]:
     """Return the largest v (N, G, X) in each of N episodes.
 
     Surprise is v to a power of a half or less, so that v is divided by the square of what divides surprise.
