@@ -119,7 +119,9 @@ def test_doubt_is_learned_from_how_errors_grow_with_leverage():
 
 def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
     rng = np.random.default_rng(0)
-    a = np.hstack([rng.normal(size=(1500, 100)), np.ones((1500, 1))]).astype(np.float32)  # nothing predicts anything
+    cause = rng.normal(size=(1500, 96))
+    caused = cause @ rng.normal(size=(96, 4)) + rng.normal(size=(1500, 4))
+    a = np.hstack([caused, cause, np.ones((1500, 1))]).astype(np.float32)
     delta, groups = np.ascontiguousarray(a[:, :4]), np.arange(4)
     w, errors = learn_association(a, delta, groups, slice(0, 4), 1, np.random.default_rng(1))
     shown = normalised_errors(a, delta, np.ones((1500, 1), np.float32), *w[:7], spans(w.U), *w[7:], groups, 0)[0]

@@ -58,7 +58,7 @@ def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(as
 
     as_it_was = found()
     learn_ceilings(asm, hours[:350])
-    assert found() > as_it_was + 0.5
+    assert found() > as_it_was + 0.1
 
 
 def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
