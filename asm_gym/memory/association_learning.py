@@ -19,7 +19,6 @@ maximum-likelihood precision; Lange et al. 1989 for the t distribution of 4 degr
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,13 +83,6 @@ def association_change(
     return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a) if D.size else D), error
 
 
-class Learned(NamedTuple):
-    """What was learned, and the normalised errors (N, X) of rows by what was learned without them."""
-
-    association: Association
-    errors: Array
-
-
 def learn_association(
     a: Array,
     delta: Array,
@@ -101,7 +93,7 @@ def learn_association(
     tick: Tick = lambda: None,
     lengths: Sequence[int] = (),
     independent: int | None = None,
-) -> Learned:
+) -> tuple[Association, Array]:
     """Learn the linear part, then the hidden units, then the precision.
 
     Args:
@@ -111,6 +103,9 @@ def learn_association(
         rng, tick: draws initial weights and the order of the rows; is called ``ALL_TICKS`` times.
         lengths: rows of each episode; without them cross-fitting cuts the rows into three consecutive parts.
         independent: number of rows if overlapping changes are counted once; N where None.
+
+    Returns:
+        What was learned, and the normalised errors (N, X) of rows by what was learned without them.
     """
     few = (independent or len(a)) < ROWS_PER_INPUT * a.shape[1]
     exists = synapses(groups, changes, a.shape[1], size)
@@ -123,7 +118,7 @@ def learn_association(
             tick()
         none, flat = np.zeros_like(exists.U), np.zeros_like(remainder)
         precision = none.copy(), flat, unbounded(len(D)), remainder
-        return Learned(Association(_random(exists.V, rng), none, D, *precision, **no_doubt(*D.shape[::-1])), left)
+        return Association(_random(exists.V, rng), none, D, *precision, **no_doubt(*D.shape[::-1])), left
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
         own_D = learn_linear(a[learned_from], groups, changes)
@@ -144,8 +139,8 @@ def learn_association(
     error *= np.exp(np.float32(-0.5) * log_variance(f, W_S, b_S, span_S))
     doubt = learn_doubt(error, far)
     error /= np.sqrt(doubt[0] + doubt[1] * far)
-    precision = W_S, b_S, span_S, remainder
-    return Learned(Association(V, U * remainder[:, None], D, *precision, *inverse_of(a, groups, changes), doubt), error)
+    inverse = inverse_of(a, groups, changes)
+    return Association(V, U * remainder[:, None], D, W_S, b_S, span_S, remainder, *inverse, doubt), error
 
 
 def learn_doubt(error: Array, far: Array) -> Array:

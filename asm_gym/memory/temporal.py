@@ -141,7 +141,7 @@ class Trained(NamedTuple):
 
     network: TemporalNetwork
     energy: NDArray[np.float64]  # (epochs,) mean energy of a step in each epoch
-    errors: Array = np.zeros((0, 0))  # (N, X) of association, see ``association_learning.Learned``
+    errors: Array = np.zeros((0, 0))  # (N, X) of association, see ``learn_association``
 
 
 Learn = Callable[[Sequence[Trajectory], int, Schedule, np.random.Generator, Tick], Trained]

@@ -62,6 +62,10 @@ class CalibratedMonitor:
     """
 
     model: StreamModel
+    threshold_: float | None
+    maxima_: NDArray[np.float64] | None
+    blocks_: Blocks | None
+    healthy_: tuple[float, ...]
 
     def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
         if not detections:
@@ -69,10 +73,6 @@ class CalibratedMonitor:
         self.seed = check_number("seed", seed, low=0, whole=True)
         self.spec, self.model, self.detection = model.spec, model, detections[0]
         self.detections = {d.name: d for d in detections}
-        self.threshold_: float | None
-        self.maxima_: NDArray[np.float64] | None
-        self.blocks_: Blocks | None
-        self.healthy_: tuple[float, ...]
         self._uncalibrate()
         self.learned_from_: Hashes | None = None
         self.ceilings_from_: Hashes | None = None
