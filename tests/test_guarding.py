@@ -1,9 +1,14 @@
 """What a guard promises at its edges: to copy, to be bound to its robot, and to see its monitor change."""
 
+from dataclasses import replace
+
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.arms import ACT as ARM_ACT
@@ -156,3 +161,77 @@ def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
     assert [i["cost_sum"] for i in infos] == [0, 1, 2, 2, 2, 2, 3, 3]
     assert infos[-1]["asm"]["alarms"] == 3
     assert env.reset(seed=0)[1]["cost_sum"] == 0
+
+
+# ---------------------------------------------------------------- guards around guards, and memories of others
+
+
+class Rammed(gym.Wrapper):
+    """Counts what reaches the robot in a step of several parts."""
+
+    def step(self, action):
+        for _ in range(2):
+            outcome = self.env.step(action)
+        return outcome
+
+
+def strict(env, monitor, **limits):
+    return NeuralASMSafety(env, monitor, "hold", contact_limits=ContactLimits(**limits))
+
+
+def test_of_guards_around_one_environment_the_strictest_limits_count_and_an_outer_one_takes_none_away(lift):
+    robot, memory = lift.unwrapped, NeuralASM.pretrained("panda")
+    inner = strict(lift, memory, wrist_force=50.0, hand_speed=0.1)
+    NeuralASMSafety(inner, memory, "monitor").reset(seed=0)
+    assert robot.contact_limits.stays
+    assert robot.contact_limits.hand_speed == 0.1
+    NeuralASMSafety(inner, memory, "hold", contact_limits=None).reset(seed=0)
+    assert robot.contact_limits.wrist_force == 50.0
+    outer = strict(inner, memory, wrist_force=200.0, external_torque=10.0, hand_speed=0.05)
+    outer.reset(seed=0)
+    felt = robot.felt_channels
+    assert robot.contact_limits.hand_speed == 0.05
+    most = np.minimum(*(ContactLimits(*both).most(felt) for both in ((50.0, 40.0), (200.0, 10.0))))
+    np.testing.assert_array_equal(robot.contact_limits.most(felt), most)
+    lift.reset(seed=0)
+    assert robot.contact_limits is None
+
+
+def test_a_guard_inside_a_vector_guard_keeps_its_limits_and_its_costs(lift):
+    memory = NeuralASM.pretrained("panda")
+    inner = NeuralASMSafety(lift, CueMonitor([2], memory.spec), "hold", contact_limits=ContactLimits(wrist_force=50.0))
+    env = VectorNeuralASMSafety(SyncVectorEnv([lambda: inner]), memory, "hold", contact_limits=None)
+    env.reset(seed=0)
+    assert lift.unwrapped.contact_limits.wrist_force == 50.0
+    costs = [env.step(np.zeros((1, 7), np.float32))[4]["cost"][0] for _ in range(4)]
+    assert costs == [0.0, 1.0, 0.0, 0.0]
+
+
+def test_a_hold_of_an_outer_guard_lasts_through_all_parts_of_its_step(lift):
+    memory, action = NeuralASM.pretrained("panda"), np.full(7, 0.5, np.float32)
+    inner = NeuralASMSafety(lift, CueMonitor([], memory.spec), "hold", contact_limits=None)
+    env = NeuralASMSafety(Rammed(inner), CueMonitor([1], memory.spec), "hold", contact_limits=None)
+    env.reset(seed=0)
+    env.step(action)
+    before = env.step(action)[4]["stream"][memory.spec.slices["joint_position"]]
+    for _ in range(3):
+        info = env.step(action)[4]
+    assert info["asm"]["intervened"]
+    np.testing.assert_allclose(info["stream"][memory.spec.slices["joint_position"]], before, atol=0.01)
+
+
+def test_a_memory_of_another_robot_controller_or_rate_is_refused_and_both_are_named(lift):
+    with pytest.raises(ValueError, match=r"Sawyer.*Panda"):
+        NeuralASMSafety(lift, NeuralASM.pretrained("sawyer"))
+    with pytest.raises(ValueError, match=r"0\.01 s against 0\.05 s"):
+        NeuralASMSafety(lift, NeuralASM.pretrained("panda_100hz"))
+    memory = NeuralASM.pretrained("panda")
+    memory.about = {**memory.about, "controller": "IK_POSE"}
+    with pytest.raises(ValueError, match=r"IK_POSE.*OSC_POSE"):
+        NeuralASMSafety(lift, memory)
+    memory.about = {}  # nothing is known of it
+    env = NeuralASMSafety(lift, memory)
+    with pytest.raises(ValueError, match=r"Sawyer.*Panda"):
+        env.monitor = NeuralASM.pretrained("sawyer")
+    for source in ("", "table"):
+        NeuralASMSafety(lift, CueMonitor([], replace(memory.spec, source=source)))

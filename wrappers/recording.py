@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode
+from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.spec import StreamSpec, flat
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32
@@ -102,7 +102,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observations=np.stack(kept) if kept else np.zeros((0, 0), np.float32),
             rewards=np.asarray(rewards, np.float32),
             faults=np.concatenate(faults),
-            info={"terminated": self._terminated},
+            info={"terminated": self._terminated, CONTROLLER: getattr(self.env.unwrapped, CONTROLLER, "")},
         )
         self.episodes.append(episode)
         self._clear(None)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
+from uuid import uuid4
 
 import gymnasium as gym
 import numpy as np
@@ -322,10 +324,15 @@ class Guarding:
     _spec: StreamSpec  # of the streams that are watched
     _rows_per_step = 1
 
+    @cached_property
+    def _name(self) -> str:
+        """Its name among all guards around one environment."""
+        return uuid4().hex
+
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
         check_answer(monitor)
-        check_monitor(monitor, self._spec)
+        check_monitor(monitor, self._spec, str(Members(self.env).first("controller", "")))
         found = getattr(monitor, "about", {}).get(ACTIONS)
         meaning = None if found is None else ActionMeaning.from_json(found)
         self._robots, self._places = robots_of(self.env, monitor.spec, meaning, self._options.action_means)
@@ -347,5 +354,5 @@ class Guarding:
 
     @monitor.setter
     def monitor(self, monitor: Monitor) -> None:
-        check_monitor(monitor, self._spec)
+        check_monitor(monitor, self._spec, str(Members(self.env).first("controller", "")))
         self._next = monitor

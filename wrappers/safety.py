@@ -45,6 +45,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     with an alarm) and ``info["cost_sum"]`` (of the episode so far). ``info["overridden"]`` is True after a step that
     began with another action than the policy's: a policy with a state then resumes from its state before.
 
+    Guards may stand around one another: of their contact limits and speeds the strictest count, and cost and alarm are
+    those of all; ``info["asm"]`` is the outermost's.
+
     Args:
         env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
             Without a Box action space ``on_alarm`` must be ``"monitor"`` or ``"terminate"``.
@@ -81,7 +84,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response; a response that lets a pressing arm go on; a reflex
-            made for another environment; a monitor fitted for another stream or rate (the message names what differs);
+            made for another environment; a monitor of another robot, controller, stream or rate (both are named);
             no shipped memory that fits (the message lists them); a hold where nothing tells what
             actions mean, or where they are torques; ``"recall"`` with a monitor that expects no action; a
             wrapper inside that changes actions, where a reflex cannot know what reaches the robot.
@@ -183,9 +186,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
                 raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
         self._ended = True  # where anything raises, nobody knows what was done
         self._executed = action
-        overridden = self._box is not None and self._command(action)
         self._rows: list[RowReport] = []
-        observation, reward, terminated, truncated, info = self._run()
+        overridden, (observation, reward, terminated, truncated, info) = self._run()
         info = dict(info)  # an environment may use its own again
         if "success" in info:
             self._solved |= bool(info["success"])
@@ -222,18 +224,26 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             self._inner.holding = True
         return bool(command.overridden[0])
 
-    def _run(self) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step the environment; rows within the step are judged meanwhile, and a hold lasts through all its parts."""
+    def _run(self) -> tuple[bool, tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]]:
+        """Command and step the environment; return whether the policy was overridden, and what came of it.
+
+        Rows within the step are judged meanwhile, and a hold lasts through all its parts; one that a guard outside has
+        asked for goes on.
+        """
         hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else None
         if hooks is not None:
             hooks.append(self._judge)
-        if self._holds:
-            self._inner.keeps_holding = True
+        inner = self._inner
+        kept = self._holds and inner.keeps_holding
+        held = kept and inner.holding
         try:
-            return stepped(self._stepped, self._executed)
+            if self._holds:
+                inner.keeps_holding = True
+            overridden = self._box is not None and self._command(self._executed)
+            return overridden, stepped(self._stepped, self._executed)
         finally:
             if self._holds:
-                self._inner.keeps_holding = self._inner.holding = False
+                inner.keeps_holding, inner.holding = kept, held
             if hooks is not None:
                 hooks.remove(self._judge)
 
@@ -254,13 +264,14 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Tell the environment its contact limits, where they have changed; a new episode has forgotten them."""
         limits = self._engine.limits[0]
         if self._robots.limits_contact and (anew or limits is not self._limits):
-            self._inner.contact_limits = limits
+            self._inner.limits_of_guard = self._name, limits
         self._limits: Any = limits
 
     def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
         """Say in ``info`` what became of a step."""
         surprise = max([float(row.surprise.value[0]) for row in rows])
-        alarm = True in [bool(row.alarm[0]) for row in rows]
+        alarm = True in [bool(row.alarm[0]) for row in rows] or bool(info.get("asm_alarm"))  # of a guard inside
+        intervened = True in [bool(row.intervened[0]) for row in rows] or bool(info.get("asm_intervened"))
         self._alarms += alarm
         robots, asked = self._robots, self._executed
         more: dict[str, float] = {"alarms": self._alarms}
@@ -273,7 +284,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
         info["asm"] = LazyInfo(told)
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
-        info["asm_intervened"] = np.bool_(True in [bool(row.intervened[0]) for row in rows])
+        info["asm_intervened"] = np.bool_(intervened)
         info["cost_sum"] = np.float64(self._alarms)
 
 

@@ -235,7 +235,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         """Tell the environments their contact limits, where those have changed."""
         limits = self._engine.limits
         if self._robots.limits_contact and limits is not self._limits:
-            self._members.set_attr("contact_limits", list(limits))
+            self._members.set_attr("limits_of_guard", [(self._name, own) for own in limits])
         self._limits = limits
 
     def _report(
@@ -247,12 +247,13 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         slowed: NDArray[np.float64] | None = None,
     ) -> None:
         """Add ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        self._alarms += report.alarm
+        alarm = report.alarm | np.asarray(infos.get("asm_alarm", False), bool)  # of guards inside
+        self._alarms += alarm
         found: dict[str, Any] = {
             "asm_surprise": report.surprise.value,
-            "asm_alarm": report.alarm,
-            "asm_intervened": report.intervened,
-            "cost": report.alarm.astype(np.float64),
+            "asm_alarm": alarm,
+            "asm_intervened": report.intervened | np.asarray(infos.get("asm_intervened", False), bool),
+            "cost": alarm.astype(np.float64),
             "cost_sum": self._alarms.astype(np.float64),
         }
         slowed = np.zeros(self.num_envs) if slowed is None else slowed

@@ -19,6 +19,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
 KIND = "episode"
+CONTROLLER = "controller"  # where an episode, or a monitor, says under which one it was recorded
 ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
 """Arrays of a file, and the kinds of numbers that each may have."""
 
@@ -66,7 +67,7 @@ class Episode:
         faults: (T,) bool, a fault was active in that row of the stream.
         contact_force: (T,) float32, between the robot and everything else [N].
         label: task and role that it was recorded for; None where unknown.
-        info: anything else; JSON-serialisable.
+        info: anything else, such as the name of the ``controller``; JSON-serialisable.
 
     Example:
         >>> import numpy as np

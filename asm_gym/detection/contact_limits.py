@@ -74,6 +74,18 @@ class ContactLimits:
             healthy=tuple(forces * value for value in self.healthy),
         )
 
+    def and_those_of(self, other: ContactLimits, felt: Sequence[Channel]) -> ContactLimits:
+        """Return limits as strict as the stricter of two; those for which an arm stays count alone, if one does."""
+        if self.stays != other.stays:
+            return self if self.stays else other
+        return replace(
+            self,
+            wrist_force=min(self.wrist_force, other.wrist_force),
+            external_torque=min(self.external_torque, other.external_torque),
+            hand_speed=min(self.hand_speed, other.hand_speed),
+            healthy=tuple(np.minimum(self.most(felt), other.most(felt)).tolist()),
+        )
+
     @property
     def limits_speed(self) -> bool:
         """Whether there is a limit of speed."""

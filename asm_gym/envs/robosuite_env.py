@@ -197,6 +197,7 @@ class RobosuiteEnv(SteppedEnv):
         self._diverged = self._divergences()
         self._steps_taken, self.holding = 0, False
         self.contact_limits = None
+        self._limits_of_guards.clear()
         self._action = np.zeros(self._actions.size, np.float32)
         self._reading = self._read()
         self._ended = self._solved = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 import gymnasium as gym
@@ -53,6 +54,21 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then holds ``contact_load``,
         the largest share of a limit that was reached within the step, ``contact_left_s``, when in it a limit was passed
         [s], NaN where none was, and ``contact_felt``, the step's mean load."""
+        self._limits_of_guards: dict[str, ContactLimits | None] = {}
+
+    @property
+    def limits_of_guard(self) -> Any:
+        """The contact limits of each guard around this environment, by its name; the strictest count.
+
+        Set to a pair, a guard's name and its limits, or None for no limits of its own.
+        """
+        return self._limits_of_guards
+
+    @limits_of_guard.setter
+    def limits_of_guard(self, told: tuple[str, ContactLimits | None]) -> None:
+        self._limits_of_guards.update([told])
+        known = [limits for limits in self._limits_of_guards.values() if limits is not None]
+        self.contact_limits = reduce(lambda a, b: a.and_those_of(b, self.felt_channels), known) if known else None
 
     def _run(self, action: NDArray[np.float32]) -> None:
         """Run the substeps of a control step, and read the rows of the stream before its end."""

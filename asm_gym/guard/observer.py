@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.episode import CONTROLLER
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.rows import Rows
 from asm_gym.monitors import (
@@ -32,6 +33,8 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, short_repr
 
 LOG = logging.getLogger("asm_gym.safety")
+
+UNNAMED = {"", "spaces", "table"}  # sources of streams that do not say whose they are
 
 STALE = "monitor: it was fitted while it watched; reset() takes it over"
 
@@ -67,16 +70,20 @@ def _parts(monitor: Monitor) -> tuple[Any, ...]:
     return monitor, getattr(monitor, "diagnosis_", None), None
 
 
-def check_monitor(monitor: Monitor, watched: StreamSpec) -> float:
-    """Return the monitor's threshold, once it can watch such a stream.
+def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -> float:
+    """Return the monitor's threshold, once it can watch such a stream of a body under a ``controller``.
 
     Raises:
-        ValueError: it is for another stream (the message names what differs), or would never alarm.
+        ValueError: it is for another stream, robot or controller (the message names both), or would never alarm.
         RuntimeError: it is not calibrated.
     """
     if not all(callable(getattr(monitor, name, None)) for name in ("initial_state", "observe")):
         raise TypeError(f"monitor must have initial_state() and observe(), got {short_repr(monitor)}")
     monitor.spec.require(watched, "the monitor")
+    learned = getattr(monitor, "about", {}).get(CONTROLLER, "")
+    for what, mine, theirs in ("robot", monitor.spec.source, watched.source), (CONTROLLER, learned, controller):
+        if mine != theirs and not {mine, theirs} & UNNAMED:
+            raise ValueError(f"the monitor knows the {what} {mine}, and is to watch {theirs}: give it one of {theirs}")
     return check_number("the monitor's threshold", monitor.threshold)
 
 

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.action_meaning import ACTIONS, found_meaning
-from asm_gym.data.episode import Episode
+from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.detection import Blocks, Detection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
@@ -143,6 +143,9 @@ class CalibratedMonitor:
         new = self._copy()  # an interrupt leaves this one as it was
         new._learn(episodes, progress or (lambda done, total: None), warm_start)
         new.about = {**self.about, "specialised_on": len(episodes)} if warm_start else {}
+        controllers = {episode.info.get(CONTROLLER, "") for episode in episodes}
+        if len(controllers) == 1 and controllers != {""}:
+            new.about[CONTROLLER] = controllers.pop()
         if len(self.spec.motor) and not warm_start:
             new.about[ACTIONS] = found_meaning(episodes).to_json()
         vars(self).update(vars(new))

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode, save_episode
+from asm_gym.data.episode import CONTROLLER, Episode, save_episode
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, InterventionOutcome, ScoredEpisode
 from asm_gym.faults import Fault, Push
@@ -144,7 +144,7 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
         faults=recorded.faults,
         contact_force=np.asarray([] if np.isnan(forces).all() else forces, np.float32),
         label=replace(trial.label, affected_channels=affected),
-        info={"skill": trial.task},
+        info={"skill": trial.task, CONTROLLER: recorded.info[CONTROLLER]},
     )
 
 
