@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asm_gym.data.action_meaning import ACTIONS, ActionMeaning, found_meaning
-from asm_gym.monitors import NeuralASM, Surprise
+from asm_gym.monitors import Surprise
 from asm_gym.policies.reflexes import Hold
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
 
@@ -186,26 +186,3 @@ def test_a_target_arm_whose_policy_fails_at_once_stays_where_it_is():
     for _ in range(5):
         env.step(np.full(JOINTS, np.nan, np.float32))
     np.testing.assert_allclose(env.unwrapped.q, [0.3, 1.2, -1.5], atol=0.01)
-
-
-def test_a_memory_that_learns_on_the_job_is_not_taken_for_one_that_was_fitted_anew():
-    env = Arm(SAME, noise=0.01, rates=False)
-    episodes = recorded(env, 40)
-    asm = NeuralASM(episodes[0].spec, hidden_size=16, association_size=48, epochs=5, seed=0)
-    asm.fit(episodes[:20]).calibrate(episodes[20:], false_alarm_rate=0.05)
-    before = {name: asm.learned_[name].copy() for name in "UD"}
-    guard = NeuralASMSafety(env, asm, "hold", online_learning_rate=0.01)
-    alarms = 0.0
-    for seed in range(3):
-        guard.reset(seed=seed)
-        phase = np.random.default_rng(seed).uniform(0, 6, JOINTS)
-        for t in range(STEPS):
-            info = guard.step(policy(env.means, t, phase))[4]
-            assert not info["asm"]["failure"]
-            alarms += info["cost"]
-    assert alarms < 30
-    assert any((asm.learned_[name] != weights).any() for name, weights in before.items())
-    guard.reset(seed=0)
-    asm.fit(episodes[:20])
-    with pytest.warns(UserWarning, match="it was fitted while it watched"):
-        assert guard.step(policy(env.means, 0, phase))[4]["cost"]

@@ -11,7 +11,6 @@ from asm_gym.data.episode import Episode
 from asm_gym.memory import association_learning
 from asm_gym.memory.association import (
     complete,
-    follow_drift,
     hidden_units,
     leverage,
     log_variance,
@@ -33,7 +32,7 @@ from asm_gym.memory.association_learning import (
 from asm_gym.memory.linear import LEAST_VARIANCE, conditional, inverse_of, moments
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import NeuralASM, make_monitor
-from tests.problems import CHANGES, energy, some_association
+from tests.problems import CHANGES, energy
 from tests.streams import frozen, sine_episodes, sine_spec
 
 GROUPS = np.array([0, 0, 1, 2, 2])
@@ -173,18 +172,6 @@ def mixed_rows(N: int = 500) -> np.ndarray:
     rng = np.random.default_rng(0)
     mixed = rng.normal(size=(N, 12)) @ rng.normal(size=(12, 12)) + rng.normal(size=12)
     return np.hstack([mixed, np.ones((N, 1))]).astype(np.float32)
-
-
-def test_following_removes_the_share_of_an_error_that_was_asked_for():
-    rng = np.random.default_rng(0)
-    w = some_association(rng, 13, 6, 5)
-    a, delta = rng.normal(size=(1, 13)).astype(np.float32), rng.normal(size=(1, 5)).astype(np.float32)
-    w = w._replace(remainder=np.full(5, 100.0, np.float32))  # no error is clipped
-
-    def error(w):
-        return delta - complete(hidden_units(a, w.V), a, w.U, w.D)
-
-    np.testing.assert_allclose(error(follow_drift(w, a, delta, 0.25)), 0.75 * error(w), rtol=1e-3, atol=1e-4)
 
 
 SIZES = {"hidden_size": 8, "association_size": 24, "epochs": 2}

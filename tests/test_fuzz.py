@@ -59,12 +59,12 @@ def test_a_fault_is_described_well_or_refused(name, data):
 
 WRAPPERS = {
     "safety": (lambda **more: NeuralASMSafety(FakeEnv(), **({"monitor": CueMonitor()} | more)), (
-        "monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate",
-        "online_learning_rate", "monitor_freq", "contact_limits", "responses",
+        "monitor", "on_alarm", "release_after", "max_override", "try_after", "truncate",
+        "monitor_freq", "contact_limits", "responses",
     )),
     "many": (lambda **more: VectorNeuralASMSafety(
         gym.vector.SyncVectorEnv([FakeEnv]), **({"monitor": FadingMonitor()} | more)
-    ), ("monitor", "on_alarm", "release_after", "release_below", "max_override", "try_after", "truncate")),
+    ), ("monitor", "on_alarm", "release_after", "max_override", "try_after", "truncate")),
 }  # fmt: skip
 
 

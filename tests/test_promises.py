@@ -62,7 +62,7 @@ def test_a_monitor_that_talks_nonsense_leaves_the_reflex_in_charge(how):
     assert infos[-1]["cost"] == 1.0
 
 
-@pytest.mark.parametrize("ability", ["expected_action", "reset_evidence", "adapt"])
+@pytest.mark.parametrize("ability", ["expected_action", "reset_evidence"])
 def test_abilities_of_a_monitor_that_fail_do_not_end_the_guard(ability):
     class Able(CueMonitor):
         def expected_action(self, state):
@@ -71,16 +71,12 @@ def test_abilities_of_a_monitor_that_fail_do_not_end_the_guard(ability):
         def reset_evidence(self, state):
             return fails("reset_evidence", state)
 
-        def adapt(self, before, stream, surprise, rate):
-            return fails("adapt", None)
-
     def fails(what, value):
         if what == ability:
             raise RuntimeError(what)
         return value
 
-    rate = 0.1 if ability == "adapt" else 0.0
-    env = NeuralASMSafety(FakeEnv(), Able([2]), on_alarm="recall", online_learning_rate=rate)
+    env = NeuralASMSafety(FakeEnv(), Able([2]), on_alarm="recall")
     env.reset()
     infos = [env.step(ACT)[4] for _ in range(6)]
     assert ability in next(i["asm"]["failure"] for i in infos if i["asm"]["alarm"])

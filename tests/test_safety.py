@@ -111,8 +111,6 @@ OTHER = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("
         ({}, {"on_alarm": 3}, ValueError, "predict"),
         ({"spec": OTHER}, {}, ValueError, "weight"),
         ({"threshold": None}, {}, RuntimeError, "calibrate"),
-        ({}, {"release_below": 0.0}, ValueError, "release_below"),
-        ({}, {"release_below": 1.1}, ValueError, "release_below"),
         ({}, {"max_override": 0}, ValueError, "max_over"),
     ],
 )
@@ -171,7 +169,7 @@ def test_control_is_not_handed_back_before_surprise_is_well_below_the_threshold(
             value = {3: 0.9, 4: 0.9, 5: 0.5, 6: 0.5}.get(state - 1, surprise.value[0])
             return state, surprise._replace(value=np.array([value]))
 
-    infos = run(NeuralASMSafety(FakeEnv(), Lingering([2]), on_alarm="hold", release_after=2, release_below=0.8), 9)
+    infos = run(NeuralASMSafety(FakeEnv(), Lingering([2]), on_alarm="hold", release_after=2), 9)
     assert [i["asm"]["intervened"] for i in infos[1:]] == [False] * 3 + [True] * 4 + [False] * 2
 
 
@@ -187,22 +185,6 @@ def test_evidence_that_was_acted_on_is_not_counted_again():
     forgotten.clear()
     run(NeuralASMSafety(FakeEnv(), Remembering([2, 4]), on_alarm="monitor"), 8)
     assert not forgotten  # who only reports, reports all there is
-
-
-def test_a_monitor_learns_on_the_job_only_when_asked_and_never_from_an_override():
-    class Learner(CueMonitor):
-        def adapt(self, before, stream, surprise, rate):
-            learned.append((before, rate))
-
-    learned: list[tuple[int, float]] = []
-    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2), 7)
-    assert not learned
-    run(NeuralASMSafety(FakeEnv(), Learner([2]), on_alarm="hold", release_after=2, online_learning_rate=0.25), 7)
-    assert learned == [(t, 0.25) for t in (0, 1, 2, 5, 6)]  # steps 3 and 4 were held
-    with pytest.raises(ValueError, match="CueMonitor cannot learn"):
-        NeuralASMSafety(FakeEnv(), CueMonitor(), online_learning_rate=0.1)
-    with pytest.raises(ValueError, match=r"online_learning_rate must be a number in \[0, 1\], got 3"):
-        NeuralASMSafety(FakeEnv(), Learner(), online_learning_rate=3)
 
 
 class Broken:

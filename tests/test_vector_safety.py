@@ -170,8 +170,8 @@ def test_what_makes_no_sense_is_refused(lift):
     with pytest.raises(ValueError, match="give its name"):
         VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(lift))
     VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5)))  # has no memory
-    with pytest.raises(ValueError, match="release_below"):
-        VectorNeuralASMSafety(many, monitor(), release_below=2.0)
+    with pytest.raises(ValueError, match="release_after"):
+        VectorNeuralASMSafety(many, monitor(), release_after=0)
     with pytest.raises(ValueError, match="DISABLED, got SAME_STEP"):
         VectorNeuralASMSafety(SyncVectorEnv(fakes(lambda e: e), autoreset_mode=AutoresetMode.SAME_STEP), monitor())
     with pytest.raises(TypeError, match="VectorEnv"):

@@ -2,9 +2,9 @@
 
     row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before it is sent
 
-From an alarm on, until ``quiet_s`` without one, a hold is sent and judged in place of the policy's action. A memory
-that was fitted without rests is surprised by a hold, which then does not end. Only finite numbers are sent; until every
-joint has been sensed or commanded once, an alarm sends nothing.
+From an alarm on, until surprise has been low for ``quiet_s``, a hold is sent and judged in place of the policy's
+action. A memory that was fitted without rests is surprised by a hold, which then does not end. Only finite numbers are
+sent; until every joint has been sensed or commanded once, an alarm sends nothing.
 
 Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 """
@@ -55,7 +55,7 @@ class LeRobotGuard:
     Args:
         monitor: calibrated, on a LeRobot dataset of this robot (``asm-gym fit DATASET``); or its file.
         on_alarm: one of ``ON_ALARM``.
-        quiet_s: how long without an alarm until the policy acts again [s].
+        quiet_s: for how long surprise must be under 80 % of the threshold until the policy acts again [s].
         action_means: as in ``NeuralASMSafety``, by the order of the memory's actions. By default ``.pos`` is a target
             and ``.vel`` a velocity.
 
@@ -162,7 +162,7 @@ class LeRobotGuard:
         robots = Robots(1, low, high, rest=unknown, grip=grip, dt=dt, meaning=self._meaning())
         quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
         reaction: OnAlarmName = "hold" if self.on_alarm != "monitor" else "monitor"
-        return Engine(robots, self.monitor, GuardOptions(reaction, quiet_rows, 1.0, contact_limits=None))
+        return Engine(robots, self.monitor, GuardOptions(reaction, quiet_rows, contact_limits=None))
 
     def _meaning(self) -> ActionMeaning:
         """Return what the actions mean: what is told, or what LeRobot's names say.

@@ -32,7 +32,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     """Guard an environment with a Box action space under any policy; other environments can be watched.
 
     From the step after an alarm on, a reflex acts in the policy's place, until surprise has stayed under
-    ``release_below`` of the threshold for ``release_after`` steps. A failure is an alarm too: a monitor that raises or
+    80 % of the threshold for ``release_after`` steps. A failure is an alarm too: a monitor that raises or
     returns nonsense, a stream that is missing, an action of the policy that is not finite (it is not executed). A
     reflex that fails is replaced by a hold.
 
@@ -59,14 +59,11 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             that makes a policy for an environment, is given this one. None for ``"graded"`` with a monitor that names
             causes, and for ``"hold"`` with any other.
         release_after: control steps of low surprise after which control is handed back.
-        release_below: share of the threshold, in (0, 1], under which surprise is low.
         max_override: control steps for which a reflex may act, after which the episode ends; an alarm within
             ``release_after`` steps of handing back continues the count. None for no limit, with ``"graded"`` for 3 s.
         try_after: control steps of override after which control is handed back on trial; after each trial that fails,
             twice as many. None for no trials, with ``"graded"`` for 0.5 s.
         truncate: an episode that is ended by an alarm is truncated rather than terminated.
-        online_learning_rate: above 0 the monitor goes on learning from steps that do not surprise it, by its
-            ``adapt``, which changes it for all that use it.
         monitor_freq: rows watched a second [Hz], on environments whose ``stream_freq`` can be set, which it is. None
             for the rate that the environment's stream has.
         adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
@@ -107,11 +104,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         on_alarm: OnAlarm | None = None,
         *,
         release_after: int = 10,
-        release_below: float = 0.8,
         max_override: int | None = None,
         try_after: int | None = None,
         truncate: bool = False,
-        online_learning_rate: float = 0.0,
         monitor_freq: int | None = None,
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
@@ -121,11 +116,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._options = GuardOptions(
             on_alarm=on_alarm,
             release_after=release_after,
-            release_below=release_below,
             max_override=max_override,
             try_after=try_after,
             truncate=truncate,
-            online_learning_rate=online_learning_rate,
             adaptive_threshold=adaptive_threshold,
             responses=responses,
             contact_limits=contact_limits,

@@ -63,7 +63,6 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         on_alarm: OnAlarm | None = None,
         *,
         release_after: int = 10,
-        release_below: float = 0.8,
         max_override: int | None = None,
         try_after: int | None = None,
         truncate: bool = False,
@@ -76,7 +75,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
         refuse_running_statistics(env, "VectorNeuralASMSafety")
-        options = on_alarm, release_after, release_below, max_override, try_after, truncate
+        options = on_alarm, release_after, max_override, try_after, truncate
         self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold, action_means=action_means)
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:

@@ -22,6 +22,8 @@ from asm_gym.guard.responses import GOING_ON, Response
 
 LOG = logging.getLogger("asm_gym.safety")
 
+RELEASE_BELOW = 0.8  # share of the threshold that surprise must be under before a reflex hands back
+
 MOSTLY_AFTER = 200  # rows under the policy after which it is said that most of them alarm
 
 MOSTLY = (
@@ -203,7 +205,7 @@ class Arbiter:
         """Count the row, and return what it comes to."""
         i, rule, response, counts = robot, self._rule, row.response, self.counts
         overriding = self.state[i] == REFLEX
-        low = row.surprise <= self.threshold[i] * (rule.release_below if row.intervened else 1.0)
+        low = row.surprise <= self.threshold[i] * (RELEASE_BELOW if row.intervened else 1.0)
         counts[CALM, i] = counts[CALM, i] + 1 if low and not row.alarm else 0
         counts[FREE, i] = counts[FREE, i] + 1 if response.touched is False and row.intervened else 0
         goes_on = response.name in GOING_ON and not row.presses

@@ -29,7 +29,7 @@ from asm_gym.guard.responses import Response, responses_from
 from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.guard.rows import Believed, Rows
 from asm_gym.guard.severity import Severity, SeverityEstimator, nothing_felt
-from asm_gym.monitors import ExpectsActions, LearnsOnTheJob, Monitor
+from asm_gym.monitors import ExpectsActions, Monitor
 from asm_gym.policies.base import Policy
 
 FAULTY, KNOCKED = EVENTS.index(FAULT), EVENTS.index(KNOCK)
@@ -62,7 +62,7 @@ class Engine:
 
     Raises:
         ValueError: a reflex that these robots cannot do, or contact limits of another arm; ``"recall"`` with a monitor
-            that expects no action, or learning on the job with one that cannot.
+            that expects no action.
     """
 
     def __init__(
@@ -80,8 +80,6 @@ class Engine:
         recalls = name == "recall"
         if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
             raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
-        if options.online_learning_rate > 0 and not isinstance(monitor, LearnsOnTheJob):
-            raise ValueError(f"{type(monitor).__name__} cannot learn on the job: online_learning_rate must be 0")
         self.fitted = Fitted.of(monitor, spec)
         self.options, self.ends_on_alarm = options, name == "terminate"
         self._count, self._spec, self._name, self._graded = n, spec, name, graded
@@ -93,7 +91,7 @@ class Engine:
         self._diagnostician = Diagnostician(spec, diagnosis, responses_from(options.responses), graded)
         completion = diagnosis.completion if diagnosis is not None and graded else None
         self._rows = Rows(robots, spec, completion, self._diagnostician.rows)
-        self._observer = Observer(monitor, n, self._rows, options, recalls)
+        self._observer = Observer(monitor, n, self._rows, recalls)
         limits, acts_on_them = limits_of(options.contact_limits, monitor), name != "monitor" and robots.rest.size > 0
         self._limits = EpisodeLimits(robots, limits, acts_on_them)
         self.running = self._arbiter.running
@@ -183,7 +181,7 @@ class Engine:
         failed = self._failures(failures or NOTHING, refused, active)
         unsaid, self._unsaid = self._unsaid, NOTHING
         believed = self._rows.next(rows, active)
-        observed = self._observer.observe(believed.rows, _joined_in_each(failed, believed.failures), held, active)
+        observed = self._observer.observe(believed.rows, _joined_in_each(failed, believed.failures), active)
         for i, said in observed.failures.items():
             self._warn(i, said, "which counts as an alarm")
         intervened = held if refused is self._nobody else held | refused

@@ -16,14 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import CONTROLLER
-from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.rows import Rows
 from asm_gym.monitors import (
     CalibratedMonitor,
     ExpectsActions,
     ExplainsItself,
     ForgetsEvidence,
-    LearnsOnTheJob,
     Monitor,
     NeuralASM,
     Surprise,
@@ -66,7 +64,7 @@ class Fitted(NamedTuple):
 
 def _parts(monitor: Monitor) -> tuple[Any, ...]:
     if isinstance(monitor, NeuralASM):
-        return monitor, monitor.model.completion_, monitor.model.senses_  # which ``adapt`` leaves as they are
+        return monitor, monitor.model.completion_, monitor.model.senses_
     return monitor, getattr(monitor, "diagnosis_", None), None
 
 
@@ -123,17 +121,14 @@ class Observer:
         monitor: fitted and calibrated.
         count: n.
         rows: they know which surprise counts.
-        options: say whether it learns on the job.
         recalls: the monitor is asked what it expects to be commanded.
     """
 
-    def __init__(self, monitor: Monitor, count: int, rows: Rows, options: GuardOptions, recalls: bool) -> None:
+    def __init__(self, monitor: Monitor, count: int, rows: Rows, recalls: bool) -> None:
         self._monitor, self._count, self._size, self._rows = monitor, count, monitor.spec.size, rows
-        self._rate = options.online_learning_rate
         self._ours = monitor if isinstance(monitor, NeuralASM) else None
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
-        self._learns = monitor if isinstance(monitor, LearnsOnTheJob) and self._rate > 0 else None
         self._recalls = monitor if isinstance(monitor, ExpectsActions) and recalls else None
         self.begin(np.ones(count, bool))
 
@@ -144,13 +139,12 @@ class Observer:
         elif which.any():
             self._state = choose(which, self._initial, self._state)
 
-    def observe(self, rows: NDArray[np.float32], failures: Mapping[int, str], held: Mask, active: Mask) -> Observation:
+    def observe(self, rows: NDArray[np.float32], failures: Mapping[int, str], active: Mask) -> Observation:
         """Return what counts of the surprise at the next rows.
 
         Args:
             rows: (n, D) as they are believed, perhaps not finite.
             failures: that are known already, by robot.
-            held: (n,) the reflex acts.
             active: (n,) whose rows count.
         """
         free, self._before = self._before, self._state
@@ -173,15 +167,9 @@ class Observer:
             if not value > -math.inf:  # NaN too
                 failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
         everyone = all(active.tolist())
-        if everyone and not (failures or self._rows.repairs or self._learns is not None):
+        if everyone and not (failures or self._rows.repairs):
             return Observation(surprise, expected, failures, latency)
         surprise = self._rows.counted(_infinite(surprise, failures), failures)
-        if self._learns is not None and not failures and not held.any():
-            try:
-                self._learns.adapt(self._before, rows, surprise, self._rate)
-            except Exception as error:
-                failures = dict.fromkeys(range(self._count), f"monitor: {error!r}")
-                surprise = surprise._replace(value=np.full(self._count, np.inf))
         surprise = surprise if everyone else surprise.silenced(~active)
         return Observation(surprise, expected, failures, latency)
 

@@ -36,7 +36,6 @@ class ReleaseRule:
     """When control is handed back, and when the episode ends, counted in rows; infinite for never."""
 
     release_after: int = 10  # calm rows after which control is handed back
-    release_below: float = 0.8  # share of the threshold, in (0, 1], that surprise must be under to count as calm
     max_override: float = math.inf  # rows of a reflex, those before a hand-back after which the alarm was soon back too
     try_after: float = math.inf  # rows until a trial; after each trial that fails, twice as many
     free_after: int = 5  # rows without contact after which it is over; after each that was too early, twice as many
@@ -55,14 +54,12 @@ class GuardOptions:
 
     on_alarm: OnAlarm | None = None
     release_after: int = 10
-    release_below: float = 0.8
     max_override: int | None = None
     try_after: int | None = None
     truncate: bool = False
     responses: Mapping[str, str] | None = None
     contact_limits: ContactLimits | str | None = "memory"
     adaptive_threshold: AdaptiveThreshold | None = None
-    online_learning_rate: float = 0.0
     action_means: ActionMeans | None = None
 
     def __post_init__(self) -> None:
@@ -71,7 +68,6 @@ class GuardOptions:
                 f"unknown on_alarm {short_repr(self.on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy"
             )
         check_number("release_after", self.release_after, low=1, whole=True)
-        check_number("release_below", self.release_below, above=0, high=1)
         for name in ("max_override", "try_after"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), low=1, whole=True)
@@ -84,7 +80,6 @@ class GuardOptions:
             raise TypeError(
                 f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(self.adaptive_threshold)}"
             )
-        check_number("online_learning_rate", self.online_learning_rate, low=0, high=1)
 
     def reaction(self, names_causes: bool) -> OnAlarm:
         """Return ``on_alarm``, or what None means for a monitor that names causes or does not.
@@ -108,7 +103,6 @@ class GuardOptions:
 
         return ReleaseRule(
             rows_per_step * self.release_after,
-            self.release_below,
             rows(self.max_override, GIVE_UP_AFTER_S),
             rows(self.try_after, TRY_AFTER_S),
             rows_per_step * ReleaseRule.free_after,

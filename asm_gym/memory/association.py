@@ -29,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, kernel, outward
-from asm_gym.memory.learning import coincidence
 
 SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)  # log σ² of 0.25 % of a channel's spread, and of 55 spreads
 
@@ -191,14 +190,3 @@ def normalised_errors(
             for i in range(out.shape[1]):
                 out[n, i] /= np.sqrt(doubt[0, i] + doubt[1, i] * far[n, i])
     return out, f
-
-
-def follow_drift(association: Association, a: Array, delta: Array, rate: float) -> Association:
-    """Return the association after a batch of inputs (B, I) and changes (B, X), ``rate`` being η in (0, 1]."""
-    _, U, D, W_S, b_S, span_S, remainder = association[:7]
-    f = hidden_units(a, association.V)
-    spread = remainder * np.exp(np.float32(0.5) * log_variance(f, W_S, b_S, span_S))
-    error = np.clip(delta - complete(f, a, U, D), -spread, spread)
-    error *= np.float32(rate) / (np.sum(f * f, axis=1) + np.sum(a * a, axis=1))[:, None]
-    exists_U, exists_D = ((W != 0).astype(np.float32) for W in (U, D))
-    return association._replace(U=U + coincidence(error, f) * exists_U, D=D + coincidence(error, a) * exists_D)

@@ -6,7 +6,6 @@ from asm_gym.monitors.base import (
     ExpectsActions,
     ExplainsItself,
     ForgetsEvidence,
-    LearnsOnTheJob,
     Monitor,
     Surprise,
 )
@@ -33,7 +32,6 @@ __all__ = [
     "ExpectsActions",
     "ExplainsItself",
     "ForgetsEvidence",
-    "LearnsOnTheJob",
     "MemoryConfig",
     "Monitor",
     "NeuralASM",

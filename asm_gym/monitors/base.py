@@ -115,17 +115,6 @@ class ExpectsActions(Protocol):
 
 
 @runtime_checkable
-class LearnsOnTheJob(Protocol):
-    """A monitor that learns from rows that did not surprise it."""
-
-    def adapt(
-        self, before: State, stream: NDArray[np.floating[Any]], surprise: Surprise, rate: float = ...
-    ) -> NDArray[np.bool_]:
-        """Return which of the rows (B, D) were learned from (B,); ``before`` is the state that ``observe`` got."""
-        ...
-
-
-@runtime_checkable
 class ExplainsItself(Protocol):
     """A monitor that can name the cause of its surprise, and complete a faulty sense."""
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.association import Association, association_shapes, follow_drift, no_doubt
+from asm_gym.memory.association import Association, association_shapes, no_doubt
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.free_energy import FreeEnergy
@@ -147,20 +147,6 @@ class MemoryModel(ScaledModel):
         motor, senses = self.spec.motor, self.senses_
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
-
-    def adapt(
-        self, before: MemoryState, rows: NDArray[np.float64], normal: NDArray[np.bool_], rate: float
-    ) -> NDArray[np.bool_]:
-        """Let association follow the rows (B, D) that are ``normal`` (B,); return which it learned from (B,)."""
-        history = before.history
-        reading = self.senses_.read(rows, history.before[:, 0], history.earlier[:, 0])
-        learned: NDArray[np.bool_] = normal & (history.steps >= 2 * self.lag) & (reading.whole[:, 0] > 0)
-        if learned.any():
-            read = reading.inputs[learned], reading.changes[learned]
-            now = follow_drift(self.network.association, *read, rate)
-            self.learned_ = {**self.learned_, "U": now.U, "D": now.D}
-            self._take(self.network.with_association(now))
-        return learned
 
     def free_energy(self, healthy: Sequence[Episode]) -> FreeEnergy:
         """Return F of all that it predicts, in the spreads that fresh ``healthy`` episodes leave."""

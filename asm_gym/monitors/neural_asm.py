@@ -39,8 +39,6 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, typed
 
-ADAPTED_BELOW = 0.5  # share of the threshold below which ``adapt`` learns from a row
-
 
 class NeuralASM(CalibratedMonitor):
     """A predictive coding network through time, association across the senses, and a calibrated threshold.
@@ -203,30 +201,6 @@ class NeuralASM(CalibratedMonitor):
     def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), in the units of the action, after this state."""
         return self.model.expected_action(state.model)
-
-    @typed
-    def adapt(
-        self, before: MonitorState, stream: NDArray[np.floating[Any]], surprise: Surprise, rate: float = 0.1
-    ) -> NDArray[np.bool_]:
-        """Learn from rows that were just observed, where they were not surprising: for a body that slowly wears.
-
-        The promise of ``calibrate`` holds for the weights it was made with, so calibrate anew now and then.
-
-        Args:
-            before: the state that ``observe`` was given.
-            stream: (B, D) the rows that ``observe`` was given.
-            surprise: what ``observe`` returned for them; only rows below half of the threshold are learned from.
-            rate: share of an error that one step takes away, in (0, 1].
-
-        Returns:
-            (B,) which rows were learned from.
-
-        Raises:
-            RuntimeError: there is no threshold yet.
-        """
-        rate = check_number("rate", rate, above=0.0, high=1.0)
-        normal = surprise.value < ADAPTED_BELOW * self.threshold
-        return self.model.adapt(before.model, self._rows(before, stream), normal, rate)
 
     def rounded(self) -> Self:
         """Return a copy with weights of 8 bits, whose file is a quarter as large; ``calibrate`` it anew."""
