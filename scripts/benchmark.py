@@ -177,7 +177,7 @@ def measure_safety(args: Args, console: Console) -> Table:
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
         bare, inner = _made(args.task, rate), _made(args.task, rate)
         memory = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)  # no step is overridden
-        guarded = NeuralASMSafety(inner, memory, monitor_freq=rate)
+        guarded = NeuralASMSafety(inner, memory)
         compare(name, 1, bare, guarded)
         bare.close()
         guarded.close()

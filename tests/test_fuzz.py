@@ -60,7 +60,7 @@ def test_a_fault_is_described_well_or_refused(name, data):
 WRAPPERS = {
     "safety": (lambda **more: NeuralASMSafety(FakeEnv(), **({"monitor": CueMonitor()} | more)), (
         "monitor", "on_alarm", "release_after", "max_override", "try_after", "truncate",
-        "monitor_freq", "contact_limits", "responses",
+        "contact_limits", "responses",
     )),
     "many": (lambda **more: VectorNeuralASMSafety(
         gym.vector.SyncVectorEnv([FakeEnv]), **({"monitor": FadingMonitor()} | more)

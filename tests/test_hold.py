@@ -110,10 +110,9 @@ def test_a_hold_keeps_the_grip_whatever_wrapper_is_inside(lift):
 
 
 def test_held_within_a_step_the_robot_stays_too():
-    env = made(controller="IK_POSE")
-    spec = env.unwrapped.stream_spec_at(100)
-    monitor = CueMonitor(range(5 * AT - 3, 2500), spec=spec)
-    env = NeuralASMSafety(env, monitor, monitor_freq=100, contact_limits=None)
+    env = made(controller="IK_POSE", stream_freq=100)
+    monitor = CueMonitor(range(5 * AT - 3, 2500), spec=env.unwrapped.stream_spec)
+    env = NeuralASMSafety(env, monitor, contact_limits=None)
     assert_stays(*motion(env))
     env.close()
 

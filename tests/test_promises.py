@@ -242,13 +242,3 @@ def test_an_environment_without_rest_asks_for_a_safe_action():
         NeuralASMSafety(env, CueMonitor())
     NeuralASMSafety(env, CueMonitor(), on_alarm=Hold(env, safe_action=np.full(3, 0.6, np.float32)))
     NeuralASMSafety(env, CueMonitor(), on_alarm="monitor")
-
-
-def test_a_refused_wrapper_leaves_the_environment_at_its_rate():
-    lift = gym.make("asm_gym/Lift-v0")
-    before = lift.unwrapped.stream_freq
-    unfit, fit = CueMonitor(spec=lift.unwrapped.stream_spec), CueMonitor(spec=lift.unwrapped.stream_spec_at(100))
-    for monitor, more in ((unfit, {}), (fit, {"on_alarm": "panic"}), (fit, {"truncate": 3})):
-        with pytest.raises(ValueError, match=r"dt: 0\.05|panic|truncate"):
-            NeuralASMSafety(lift, monitor, monitor_freq=100, **more)
-        assert lift.unwrapped.stream_freq == before

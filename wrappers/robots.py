@@ -23,7 +23,7 @@ from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
-from asm_gym.validation import as_float32, check_number, short_repr
+from asm_gym.validation import as_float32, short_repr
 
 DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
 
@@ -298,22 +298,6 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
         )
     policy: Policy = made
     return policy
-
-
-def sensing_within_steps(env: gym.Env[Any, Any], rate: int) -> Any:
-    """Return the environment underneath. Raises ValueError where its stream cannot run at ``rate`` [Hz]."""
-    check_number("monitor_freq", rate, low=1, whole=True)
-    inner: Any = env.unwrapped
-    if not hasattr(inner, "stream_spec_at"):
-        raise ValueError(f"monitor_freq needs an environment of asm_gym, which {inner} is not: leave it out")
-    wrapper = env
-    while isinstance(wrapper, gym.Wrapper):
-        if isinstance(wrapper, gym.ActionWrapper) and rate > 1 / control_period(env):
-            raise ValueError(
-                f"{type(wrapper).__name__} changes actions, and a reflex within a step would pass it by: put it outside"
-            )
-        wrapper = wrapper.env
-    return inner
 
 
 class Guarding:

@@ -19,11 +19,10 @@ from asm_gym.guard.arbiter import ENDED
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
-from asm_gym.policies.reflexes import HoldsItself
-from asm_gym.spec import control_period
+from asm_gym.policies.reflexes import HoldsItself, changed_by, outside
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensed_row, sensing_within_steps
+from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensed_row
 
 COUNTS = "stable_baselines3.common.monitor"  # module of a wrapper that counts episodes
 
@@ -64,8 +63,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         try_after: control steps of override after which control is handed back on trial; after each trial that fails,
             twice as many. None for no trials, with ``"graded"`` for 0.5 s.
         truncate: an episode that is ended by an alarm is truncated rather than terminated.
-        monitor_freq: rows watched a second [Hz], on environments whose ``stream_freq`` can be set, which it is. None
-            for the rate that the environment's stream has.
         adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
             then holds ``ceiling`` and ``level`` too. Alarms above the ceiling, alarms that went on while the reflex
             acted, and episodes with ``confirm_alarm`` do not count as false. None for a threshold that stays.
@@ -107,7 +104,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         max_override: int | None = None,
         try_after: int | None = None,
         truncate: bool = False,
-        monitor_freq: int | None = None,
         adaptive_threshold: AdaptiveThreshold | None = None,
         responses: Mapping[str, str] | None = None,
         contact_limits: ContactLimits | Literal["memory"] | None = "memory",
@@ -124,7 +120,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             contact_limits=contact_limits,
             action_means=action_means,
         )
-        recorded = {"monitor": monitor, "monitor_freq": monitor_freq, **vars(self._options)}
+        recorded = {"monitor": monitor, **vars(self._options)}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
@@ -135,13 +131,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._stepped = self.env if self._relay is None else self._relay.env
         self._source = StreamSource(env)
         self._spec = self._source.spec
-        if monitor_freq is not None:
-            sensing = sensing_within_steps(env, monitor_freq)
-            self._spec = sensing.stream_spec_at(monitor_freq)
-        self._rows_per_step = max(1, round(control_period(env) / self._spec.dt)) if self._source.own else 1
+        self._rows_per_step = self._source.rows_per_step
+        if self._rows_per_step > 1 and (wrapper := changed_by(env)) is not None:
+            raise ValueError(outside(wrapper, "a reflex within a step"))
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
-        if monitor_freq is not None:
-            sensing.stream_freq = monitor_freq  # nothing changes before everything is known to fit
         self._inner: Any = env.unwrapped
         self._holds = isinstance(self._inner, HoldsItself)
         self._ended = True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal, NoReturn
 
 import gymnasium as gym
@@ -149,18 +148,8 @@ class RobosuiteEnv(SteppedEnv):
 
     @property
     def stream_freq(self) -> int:
-        """Rows of the stream a second [Hz]; may be set between episodes, to a rate that fits physics and control."""
+        """Rows of the stream a second [Hz]."""
         return PHYSICS_FREQ // self._row_substeps
-
-    @stream_freq.setter
-    def stream_freq(self, rate: int) -> None:
-        self._row_substeps = backend.row_substeps(rate, PHYSICS_FREQ // self.substeps)
-        self._build_spaces()
-
-    def stream_spec_at(self, rate: int) -> StreamSpec:
-        """Return ``stream_spec`` as it would be at another rate [Hz]; raise ValueError for one that does not fit."""
-        substeps = backend.row_substeps(rate, PHYSICS_FREQ // self.substeps)
-        return replace(self.stream_spec, dt=substeps / PHYSICS_FREQ)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode.

@@ -165,7 +165,7 @@ def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]
     if settings is None:
         return env
     memory = NeuralASM.pretrained(f"{case.config.robot}".lower() + ("" if case.rate == 20 else f"_{case.rate}hz"))
-    return NeuralASMSafety(env, memory, monitor_freq=case.config.stream_freq, **settings)
+    return NeuralASMSafety(env, memory, **settings)
 
 
 def episode(job: tuple[Case, str]) -> Record:
