@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import takewhile
 from typing import Any, Literal, SupportsFloat
 
 import gymnasium as gym
@@ -127,8 +126,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if self._box is None and not (isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
-        self._relay = relay_beneath_counts(env, ends=not (isinstance(on_alarm, str) and on_alarm == "monitor"))
-        self._stepped = self.env if self._relay is None else self._relay.env
+        if not (isinstance(on_alarm, str) and on_alarm == "monitor"):
+            _check_counts(env)
         self._source = StreamSource(env)
         self._spec = self._source.spec
         self._rows_per_step = self._source.rows_per_step
@@ -196,11 +195,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if gave_up or (self._engine.ends_on_alarm and any(row.ends[0] for row in self._rows)):
             terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
-        outcome = observation, reward, terminated, truncated, info
-        if self._relay is None:
-            return outcome
-        self._relay.outcome = outcome
-        return stepped(self.env, action)  # the wrappers in between count what came of it
+        return observation, reward, terminated, truncated, info
 
     def _command(self, action: NDArray[np.float32]) -> bool:
         """Choose what is to be done next: the policy's ``action`` (A,), or something else."""
@@ -226,7 +221,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             if self._holds:
                 inner.keeps_holding = True
             overridden = self._box is not None and self._command(self._executed)
-            return overridden, stepped(self._stepped, self._executed)
+            return overridden, stepped(self.env, self._executed)
         finally:
             if self._holds:
                 inner.keeps_holding, inner.holding = kept, held
@@ -274,50 +269,17 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         info["cost_sum"] = np.float64(self._alarms)
 
 
-class Relay(gym.Wrapper[Any, Any, Any, Any]):
-    """Pass on ``outcome`` in place of one step, where there is one.
-
-    It stands beneath a wrapper that counts episodes inside a guard, as ``make_vec_env(wrapper_class=NeuralASMSafety)``
-    of Stable-Baselines3 puts its Monitor there. The guard steps the environment beneath the counting wrapper, and then
-    steps the wrapper once, which is handed the guard's outcome.
-    """
-
-    outcome: tuple[Any, ...] | None = None
-
-    def step(self, action: Any) -> Any:
-        outcome, self.outcome = self.outcome, None
-        return self.env.step(action) if outcome is None else outcome
-
-
-def relay_beneath_counts(env: gym.Env[Any, Any], ends: bool) -> Relay | None:
-    """Put a relay beneath the counting wrappers that stand outermost in ``env``, and return it; None without any.
-
-    Args:
-        ends: the guard may end episodes, which a counting wrapper further inside would not see.
-
-    Raises:
-        ValueError: there is such a wrapper.
-    """
-    layers: list[gym.Wrapper[Any, Any, Any, Any]] = []
+def _check_counts(env: gym.Env[Any, Any]) -> None:
+    """Raise ValueError where a wrapper inside counts episodes, and would not see those that the guard ends."""
     while isinstance(env, gym.Wrapper):
-        layers.append(env)
+        own = any(kind.__module__ == COUNTS for kind in type(env).__mro__)
+        if own or isinstance(env, RecordEpisodeStatistics):
+            name = type(env).__name__
+            usual = (
+                "; with Stable-Baselines3, make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))" if own else ""
+            )
+            raise ValueError(
+                f"{name} counts episodes inside, and would not see those that the guard ends: put it outside, as in "
+                f"{name}(NeuralASMSafety(env, monitor)){usual}"
+            )
         env = env.env
-    outermost = list(takewhile(_counts, layers))
-    hidden = next(filter(_counts, layers[len(outermost) :]), None)
-    if ends and hidden is not None:
-        name = type(hidden).__name__
-        raise ValueError(
-            f"{name} counts episodes inside, and would not see those that the guard ends: put it outside, as in "
-            f"{name}(NeuralASMSafety(env, monitor)), or directly beneath the guard"
-        )
-    if not outermost:
-        return None
-    inner = outermost[-1].env
-    relay = inner if isinstance(inner, Relay) else Relay(inner)
-    outermost[-1].env = relay
-    return relay
-
-
-def _counts(layer: Any) -> bool:
-    known = isinstance(layer, RecordEpisodeStatistics)
-    return known or any(kind.__module__ == COUNTS for kind in type(layer).__mro__)
