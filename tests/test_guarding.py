@@ -5,9 +5,11 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import SyncVectorEnv
 
 from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.guard.options import ON_ALARM
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies.reflexes import Hold
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
@@ -235,3 +237,15 @@ def test_a_memory_of_another_robot_controller_or_rate_is_refused_and_both_are_na
         env.monitor = NeuralASM.pretrained("sawyer")
     for source in ("", "table"):
         NeuralASMSafety(lift, CueMonitor([], replace(memory.spec, source=source)))
+
+
+@pytest.mark.parametrize("name", ON_ALARM)
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
+def test_a_guarded_environment_keeps_gymnasiums_contract_and_its_info_equals_itself(name, lift):
+    env = NeuralASMSafety(lift, NeuralASM.pretrained("panda"), name)
+    check_env(env, skip_render_check=True, skip_close_check=True)
+    said = []
+    for _ in range(2):
+        env.reset(seed=4)
+        said.append([env.step(np.full(7, 0.3, np.float32))[4] for _ in range(3)])
+    assert data_equivalence(*said, exact=True)

@@ -332,6 +332,11 @@ class Guarding:
             self._watch_with(self._next)
 
     @property
+    def latency(self) -> float:
+        """How long the monitor took for the last rows [s]."""
+        return self._engine.latency
+
+    @property
     def monitor(self) -> Monitor:
         """The monitor in use; one that is assigned, or was fitted or calibrated since, takes over at the next reset."""
         return self._engine.fitted.monitor

@@ -117,6 +117,11 @@ class Engine:
         return self._held
 
     @property
+    def latency(self) -> float:
+        """How long the monitor took for the last rows [s]."""
+        return self._observer.latency
+
+    @property
     def limits(self) -> tuple[Any, ...]:
         """Of each robot its contact limits now; the same objects as long as nothing has changed."""
         return self._limits.now
@@ -205,7 +210,6 @@ class Engine:
             _joined_in_each({i: said for i, said in unsaid.items() if not refused[i]}, observed.failures),
             NOTHING,
             believed.lost,
-            observed.latency,
         )
         if some or self._rows.repairs:
             row = _Row(believed, observed, severity, over, event, executed, intervened, refused)

@@ -111,7 +111,6 @@ class Observation(NamedTuple):
     surprise: Surprise  # infinite, and attributed to nothing, where there is a failure
     expected: NDArray[np.float32] | None  # (n, A) what is likely to be commanded next; None where nobody asks
     failures: Mapping[int, str]  # what failed, by robot
-    latency: float  # of the monitor [s]
 
 
 class Observer:
@@ -130,6 +129,7 @@ class Observer:
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
         self._recalls = monitor if isinstance(monitor, ExpectsActions) and recalls else None
+        self.latency = 0.0  # of the monitor at the last rows [s]
         self.begin(np.ones(count, bool))
 
     def begin(self, which: Mask) -> None:
@@ -148,7 +148,7 @@ class Observer:
             active: (n,) whose rows count.
         """
         free, self._before = self._before, self._state
-        start, latency, expected = time.perf_counter(), 0.0, None
+        start, expected = time.perf_counter(), None
         try:
             if self._ours is None:
                 state, surprise = self._monitor.observe(self._before, rows)
@@ -156,7 +156,7 @@ class Observer:
             else:
                 reused = None if free is self._initial or free is self._before else free
                 state, surprise = self._ours.observe(self._before, rows, reused)
-            latency = time.perf_counter() - start
+            self.latency = time.perf_counter() - start
             if self._recalls is not None:
                 expected = self._expected(self._recalls, state)
             self._state = state
@@ -168,10 +168,10 @@ class Observer:
                 failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
         everyone = all(active.tolist())
         if everyone and not (failures or self._rows.repairs):
-            return Observation(surprise, expected, failures, latency)
+            return Observation(surprise, expected, failures)
         surprise = self._rows.counted(_infinite(surprise, failures), failures)
         surprise = surprise if everyone else surprise.silenced(~active)
-        return Observation(surprise, expected, failures, latency)
+        return Observation(surprise, expected, failures)
 
     def amend(self, rows: NDArray[np.float32]) -> None:
         """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""

@@ -49,7 +49,6 @@ class RowReport(NamedTuple):
     failure: Mapping[int, str] = NOTHING
     repairs: Mapping[int, tuple[str, ...]] = NOTHING  # the sensors that are not believed
     lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
-    latency: float = 0.0  # of the monitor [s]
 
     @property
     def gave_up(self) -> Mask:
@@ -113,11 +112,11 @@ def report(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: An
         "cause": caused.cause,  # of an alarm: family, part, probability of the family, probabilities of all
         "response": caused.name,  # what is done about it under "graded"
         "case": caused.case,  # the row of the table of responses that says so
-        "severity": last.severity.named(robot),  # how bad it is, see ``Severity``
+        # How bad it is, see ``Severity``; None for what is not known, so that a report equals itself.
+        "severity": {k: v if v == v else None for k, v in last.severity.named(robot).items()},
         "executed_action": None if executed is None else np.array(executed),  # after the limit of the hand's speed
         "attribution": dict(zip(spec.labels, shares, strict=True)),  # what each number adds to the largest surprise
         "surprises": surprises,  # (k,) of all rows in this step
-        "latency_us": 1e6 * max(row.latency for row in rows),  # the longest time that the monitor took for a row
         "completed": last.repairs.get(robot, ()),  # the sensors that are not believed now
         "lost": last.lost.get(robot, ()),  # the numbers that were not finite
     }
@@ -129,7 +128,10 @@ def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, first in each[0].items():
         values = [said[key] for said in each]
-        if key in ("severity", "attribution"):
+        if key == "severity":
+            known = [row.severity.named(i) for i in range(len(each))]
+            found[key] = {name: np.array([value[name] for value in known]) for name in first}
+        elif key == "attribution":
             found[key] = {name: np.array([value[name] for value in values]) for name in first}
         elif isinstance(first, dict | tuple):
             found[key] = np.empty(len(values), object)
