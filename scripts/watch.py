@@ -16,6 +16,7 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -42,7 +43,8 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
 from asm_gym.files import writable, write_text
-from asm_gym.guard.live import ALARM, LiveEvent, follow, run_hook
+from asm_gym.guard.live import ALARM, LiveEvent, follow, hold_by_hook, run_hook
+from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, origin, run
@@ -50,7 +52,7 @@ from asm_gym.scripts.log_options import LogOptions
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
-LIVE_ONLY = ("until_alarm", "json", "hook")  # options
+LIVE_ONLY = ("until_alarm", "json", "hook", "watchdog", "policy")  # options
 SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
 
 
@@ -74,6 +76,10 @@ class Args(LogOptions):
     """Print what a live source gives as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
     hook: str | None = option(None, metavar="COMMAND")
     """Shell command, run at every alarm of a live source, with the alarm as a line of JSON on its standard input."""
+    watchdog: float | None = option(None, check=partial(check_number, "watchdog", above=0.0), metavar="SECONDS")
+    """Run the hook from a process of its own too: after so long without a row, and where this process dies."""
+    policy: int | None = option(None, least=1, metavar="PID")
+    """Number of the policy's process, whose death the watchdog takes for an alarm."""
     rerun: Path | None = option(None, metavar="FILE.rrd")
     """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
@@ -172,9 +178,22 @@ def watch(args: Args, console: Console) -> int:
 
         bridge = bridge_of(args.bridge, monitor.spec.dt)
         lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
-        alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm)
+        with _watchdog(args, monitor.spec.dt) as watchdog:
+            beat = None if watchdog is None else watchdog.beat
+            alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm, beat)
         return BAD_NEWS if alarms else DONE
     return review(args, monitor, console)
+
+
+def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:
+    """Return the watchdog that is asked for. Raises ValueError where it could not do anything."""
+    if args.watchdog is None and args.policy is None:
+        return nullcontext()
+    if args.watchdog is None or args.hook is None:
+        raise ValueError("a watchdog needs --watchdog SECONDS and --hook COMMAND, which makes the robot hold")
+    if args.watchdog <= dt:
+        raise ValueError(f"--watchdog must be longer than the {dt:g} s between two rows, got {args.watchdog:g}")
+    return Watchdog(partial(hold_by_hook, args.hook), args.watchdog, [] if args.policy is None else [args.policy])
 
 
 main = partial(run, "watch", Args, watch)

@@ -31,6 +31,7 @@ from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
+from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
 
@@ -58,6 +59,7 @@ class LeRobotGuard:
         quiet_s: for how long surprise must be under 80 % of the threshold until the policy acts again [s].
         action_means: as in ``NeuralASMSafety``, by the order of the memory's actions. By default ``.pos`` is a target
             and ``.vel`` a velocity.
+        watchdog: told of every row; where it has died, that is an alarm.
 
     Attributes:
         alarm, intervened: whether there was an alarm at the newest row, and whether a hold was sent.
@@ -75,6 +77,7 @@ class LeRobotGuard:
         on_alarm: str = "hold",
         quiet_s: float = 1.0,
         action_means: ActionMeans | None = None,
+        watchdog: Watchdog | None = None,
     ) -> None:
         check_choice("on_alarm", on_alarm, ON_ALARM)
         self.on_alarm = on_alarm
@@ -84,7 +87,7 @@ class LeRobotGuard:
         self._spec = self.monitor.spec
         check_monitor(self.monitor, self._spec)
         self._motors = [_motor_of(label) for label in self._spec.labels]
-        self._told = action_means
+        self._told, self._watchdog = action_means, watchdog
         self._rows_lately = max(2, round(STALL_S / self._spec.dt))
         try:
             from lerobot.processor import ProcessorStep
@@ -126,7 +129,8 @@ class LeRobotGuard:
         executed = engine.act(asked, lambda _: None).actions if acts else asked
         row = self._row(observation, executed[0])
         overriding, in_alarm = bool(engine.overriding[0]), self.alarm
-        report = engine.judge(row[None], self._sent)
+        alone = self._watchdog is not None and not self._watchdog.beat()
+        report = engine.judge(row[None], self._sent, failures={0: "watchdog: it has died"} if alone else None)
         self.alarm, self.intervened = bool(report.alarm[0]), overriding or bool(engine.overriding[0])
         if self.alarm:
             self.last_alarm = self._described(row, report, observation)

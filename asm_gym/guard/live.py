@@ -35,7 +35,8 @@ RETRY_S = 0.2  # time between two attempts to open a source again [s]
 TOGETHER_S = 1.0  # lines that cannot be read, and come within this time of another, are one alarm [s]
 
 ALARM, NOTE, SUMMARY = "alarm", "note", "summary"  # kinds of events
-DIED, UNREADABLE, CLOCK, RATE = "source died", "unreadable", "clock", "rate"  # why there is an alarm, beside surprise
+DIED, UNREADABLE, CLOCK, RATE, WATCHDOG = "source died", "unreadable", "clock", "rate", "watchdog"
+"""Why there is an alarm, beside surprise."""
 
 Opened = Callable[[float], Iterator[str]]
 
@@ -71,6 +72,11 @@ def run_hook(command: str, event: LiveEvent) -> None:
     Thread(target=process.wait, daemon=True).start()
 
 
+def hold_by_hook(command: str, why: str) -> None:
+    """Run a shell command as ``run_hook`` does, for a watchdog that tells ``why``."""
+    run_hook(command, LiveEvent(ALARM, 0.0, f"{why}: an alarm", WATCHDOG))
+
+
 def follow(
     lines: Iterable[str],
     monitor: Any,
@@ -79,6 +85,7 @@ def follow(
     again: Opened | None = None,
     wait: float = 0.0,
     until_alarm: bool = False,
+    beat: Callable[[], bool] | None = None,
 ) -> int:
     """Say every alarm as it is raised, and why; return how many there were.
 
@@ -89,11 +96,12 @@ def follow(
         again, wait: opens the source anew after it has died; for how long that is tried [s]. It is given how long the
             first line may take.
         until_alarm: the first alarm ends the watch.
+        beat: of a watchdog, told of every row that was judged; it returns whether the watchdog lives.
 
     Raises:
         ValueError: no row came, or the first line of a source that cannot be opened anew is no row.
     """
-    watch = _Watch(monitor, say, seconds)
+    watch = _Watch(monitor, say, seconds, beat)
     source: Iterable[str] | None = lines
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*rows under this policy alarm")  # every alarm is said here
@@ -112,8 +120,10 @@ def follow(
 class _Watch:
     """The state of a source while it is watched; the arguments are those of ``follow``."""
 
-    def __init__(self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float) -> None:
-        self.say, self.seconds, self.spec = say, seconds, monitor.spec
+    def __init__(
+        self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float, beat: Callable[[], bool] | None
+    ) -> None:
+        self.say, self.seconds, self.spec, self.beat = say, seconds, monitor.spec, beat
         spec: StreamSpec = monitor.spec
         self.engine = Engine(Robots.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
         self.reader = RowReader(spec)
@@ -197,6 +207,9 @@ class _Watch:
         numbers = row.numbers
         report = self._judge(numbers, bridged=self.bridge.over(np.isnan(numbers)))
         self.latencies.append(1e3 * (time.perf_counter() - arrived))
+        if self.beat is not None and not self.beat():
+            self.beat = None
+            self.alarm("the watchdog has died: an alarm", WATCHDOG)
         excess = float(report.surprise.value[0] / report.threshold[0])
         if excess > 1.0 and not self.above:
             at, why = blamed(numbers, report.surprise.attribution[0]), reason(numbers)

@@ -1,0 +1,101 @@
+"""Tell an arm to hold when the process that guards it, or one that it depends on, dies or falls silent.
+
+The watchdog is a process of its own, which does nothing but wait:
+
+    guard ── beat, a row ──► watchdog ── no beat for ``patience``, or a process has ended ──► hold(why)
+
+It ends with the guard, after ``close`` without a hold. Where the watchdog itself dies, ``beat`` says so to the guard.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import wait
+from typing import Any, Self
+
+from asm_gym.validation import check_number
+
+PATIENCE_S = 0.2  # without a beat for so long the guard is silent [s]
+POLL_S = 0.02  # how often the last beat is looked at [s]
+OVER = -1.0  # in place of the time of a beat: the guard has ended as it should
+
+Hold = Callable[[str], object]
+
+
+class Watchdog:
+    """Watches the process that makes it.
+
+    Args:
+        hold: tells the arm to hold, and takes the reason. It runs in the watchdog's process, which imports it anew: a
+            function of a module that opens what it needs.
+        patience: time without ``beat`` after which the guard is silent [s]; it is waited for from the first beat on.
+        processes: numbers of other processes that must live, such as the policy's.
+
+    Raises:
+        ProcessLookupError: one of the processes does not live.
+        RuntimeError: the watchdog's process did not begin.
+
+    Example:
+        >>> watchdog = Watchdog(print, patience=0.25)  # doctest: +SKIP
+        >>> guard = LeRobotGuard("so101.asm", watchdog=watchdog)  # doctest: +SKIP
+    """
+
+    def __init__(self, hold: Hold, patience: float = PATIENCE_S, processes: Sequence[int] = ()) -> None:
+        check_number("patience", patience, above=0.0)
+        for process in processes:
+            os.kill(process, 0)
+        context = multiprocessing.get_context("spawn")
+        self._beat: Any = context.Value("d", 0.0, lock=False)  # time of the last one [s]; 0 before the first
+        ready = context.Event()
+        self.process = context.Process(target=_watch, args=(hold, patience, processes, self._beat, ready), daemon=True)
+        self.process.start()
+        while not ready.wait(POLL_S):
+            if not self.process.is_alive():
+                raise RuntimeError("the watchdog's process did not begin: its hold must be a function of a module")
+
+    def beat(self) -> bool:
+        """Say that a row was judged; return whether the watchdog lives."""
+        self._beat.value = time.monotonic()
+        return self.process.is_alive()
+
+    def close(self) -> None:
+        """End the watch without a hold."""
+        self._beat.value = OVER
+        self.process.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *rest: object) -> None:
+        if kind is None:  # after an error nobody guards any more
+            self.close()
+
+
+def _watch(hold: Hold, patience: float, processes: Sequence[int], beat: Any, ready: Any) -> None:
+    """Wait, and hold."""
+    os.setsid()  # what ends the guard's group does not end the watchdog
+    signal.signal(signal.SIGTERM, lambda *_: hold("the guard has ended without closing its watchdog") or os._exit(0))
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    others = {os.pidfd_open(process): process for process in processes}
+    watched: list[Any] = [parent.sentinel, *others]
+    ready.set()
+    silent = False
+    while beat.value != OVER:
+        ended = wait(watched, POLL_S)
+        if beat.value == OVER:
+            return
+        if parent.sentinel in ended:
+            hold("the guard's process has died")
+            return
+        for one in ended:
+            watched.remove(one)
+            hold(f"process {others[int(one)]} has died")  # type: ignore[call-overload]
+        late = beat.value > 0.0 and time.monotonic() - beat.value > patience
+        if late and not silent:
+            hold(f"the guard has judged no row for {patience:g} s")
+        silent = late
