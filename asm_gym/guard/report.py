@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,7 +110,7 @@ def report(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: An
         "transition": next((t for o in reversed(outcomes) if (t := o.decision.transition)), ""),
         # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
         "failure": joined(*(row.failure.get(robot, "") for row in rows)),
-        "cause": caused.cause,  # of an alarm: family, part, probability of the family, probabilities of all
+        "cause": deepcopy(caused.cause),  # of an alarm: family, part, probability of the family, probabilities of all
         "response": caused.name,  # what is done about it under "graded"
         "case": caused.case,  # the row of the table of responses that says so
         # How bad it is, see ``Severity``; None for what is not known, so that a report equals itself.
