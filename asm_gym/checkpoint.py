@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,19 +26,16 @@ FORMAT = "asm-gym"
 VERSION = 1
 HEADER = "header.json"
 
-LONGEST_HEADER = 16 * 2**20  # [bytes]
-
 MOST_EXPANDED = 30
 """Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1."""
 
-DAMAGE = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError, NotImplementedError)
+DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError, NotImplementedError),
+    *(MemoryError, OverflowError, SyntaxError),
+)
 """Errors that reading a damaged zip may raise."""
 
 _npy: Any = np.lib.format
-
-
-class _OtherCheckpointError(ValueError):
-    """An undamaged checkpoint of another kind or version."""
 
 
 class Checkpoint(NamedTuple):
@@ -89,30 +86,31 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         FileNotFoundError: there is none.
         ValueError: the file is damaged, foreign, of another kind, or of a newer format.
     """
-    with _opened(path, "is damaged or not a checkpoint of asm-gym", expanded=1) as file:
-        header = _header(file)
-        if header.get("version") != VERSION:
-            raise _OtherCheckpointError(
-                f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads {VERSION}; "
-                "a newer asm-gym may have written it"
-            )
-        if header.get("kind") != kind:
-            raise _OtherCheckpointError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
-        names = {n.removesuffix(".npy") for n in file.namelist() if n != HEADER}
+    header = read_header(path)
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads {VERSION}; "
+            "a newer asm-gym may have written it"
+        )
+    if header.get("kind") != kind:
+        raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
+    with _opened(path) as file:
+        arrays = {n.removesuffix(".npy"): _read(file, n) for n in sorted(file.namelist()) if n != HEADER}
         declared = header.pop("arrays", None)  # the shipped agents declare none
-        if declared is not None and set(declared) != names:
-            raise ValueError(f"its header declares other arrays: {', '.join(sorted(set(declared) ^ names))}")
-        arrays = {name: _read(file, f"{name}.npy") for name in sorted(names)}
-        for name, as_declared in (declared or {}).items():
-            if [arrays[name].dtype.str, *arrays[name].shape] != as_declared:
-                raise ValueError(f"{name} is {arrays[name].dtype} {arrays[name].shape}, and declared otherwise")
+        found = {name: [array.dtype.str, *array.shape] for name, array in arrays.items()}
+        if declared is not None and found != declared:
+            wrong = sorted(n for n in found.keys() | declared.keys() if found.get(n) != declared.get(n))
+            raise ValueError(f"its header declares otherwise: {', '.join(wrong)}")
     return Checkpoint(header, arrays)
 
 
 def read_header(path: str | Path) -> dict[str, Any]:
     """Return the JSON values of a checkpoint. Raises FileNotFoundError, or ValueError where the file is damaged."""
-    with _opened(path, "is damaged or not a checkpoint of asm-gym", expanded=1) as file:
-        return _header(file)
+    with _opened(path) as file:
+        header = json.loads(file.read(HEADER), parse_constant=_finite, parse_float=_finite)
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise ValueError("it has no header of asm-gym")
+    return header
 
 
 @typed
@@ -124,53 +122,36 @@ def kind_of(path: str | Path) -> str:
 @typed
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
-    with _opened(path, "is damaged", expanded=MOST_EXPANDED) as file:
+    with _opened(path, "is damaged", MOST_EXPANDED) as file:
         return {n.removesuffix(".npy"): _read(file, n, kinds="biufU") for n in file.namelist()}
 
 
 @contextmanager
-def opened_zip(source: str | Path | IO[bytes], size: int, expanded: int) -> Iterator[zipfile.ZipFile]:
-    """Open a zip whose members are checked before anything is read.
+def _opened(
+    path: str | Path, what: str = "is damaged or not a checkpoint of asm-gym", expanded: int = 1
+) -> Iterator[zipfile.ZipFile]:
+    """Open a zip whose members are checked before anything is read; its errors become one line that names it.
 
     Args:
-        source: a file, or the bytes of one.
-        size: of it [bytes].
+        path: of a regular file.
+        what: is wrong with it, in the message.
         expanded: largest size of its content, in sizes of the file; 1 where nothing may be compressed.
-
-    Raises:
-        ValueError: two members have one name, or they are too large.
     """
-    with zipfile.ZipFile(source) as file:
-        members = file.infolist()
-        if len({m.filename for m in members}) < len(members):
-            raise ValueError("two of its members have one name")
-        if expanded == 1 and any(m.compress_type != zipfile.ZIP_STORED for m in members):
-            raise ValueError("its members are compressed, which asm-gym does not do")
-        if sum(m.file_size for m in members) > expanded * size:
-            raise ValueError(f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}")
-        yield file
-
-
-@contextmanager
-def _opened(path: str | Path, what: str, expanded: int) -> Iterator[zipfile.ZipFile]:
-    """Open a zip, whose errors become one line that names it."""
     try:
-        with opened_zip(path, regular_file(path), expanded) as file:
+        size = regular_file(path)
+        with zipfile.ZipFile(path) as file:
+            members = file.infolist()
+            if len({m.filename for m in members}) < len(members):
+                raise ValueError("two of its members have one name")
+            if expanded == 1 and any(m.compress_type != zipfile.ZIP_STORED for m in members):
+                raise ValueError("its members are compressed, which asm-gym does not do")
+            if sum(m.file_size for m in members) > expanded * size:
+                raise ValueError(f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}")
             yield file
-    except (FileNotFoundError, _OtherCheckpointError):
+    except FileNotFoundError:
         raise
     except DAMAGE as error:
         raise ValueError(f"{path} {what}: {error}") from error
-
-
-def _header(file: zipfile.ZipFile) -> dict[str, Any]:
-    size = file.getinfo(HEADER).file_size
-    if size > LONGEST_HEADER:
-        raise ValueError(f"its header takes {size} bytes, {LONGEST_HEADER} at most")
-    header = json.loads(file.read(HEADER), parse_constant=_finite, parse_float=_finite)
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError("it has no header of asm-gym")
-    return header
 
 
 def _finite(text: str) -> float:
@@ -182,18 +163,8 @@ def _finite(text: str) -> float:
 
 
 def _read(file: zipfile.ZipFile, name: str, kinds: str = "biuf") -> NDArray[Any]:
-    """Read an array of numbers, whose shape agrees with the bytes that are there."""
-    data = file.read(name)
-    start = io.BytesIO(data)
-    version = _npy.read_magic(start)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"{name} is of the unknown npy version {version}")
-    shape, fortran, dtype = (_npy.read_array_header_1_0 if version == (1, 0) else _npy.read_array_header_2_0)(start)
-    if dtype.kind not in kinds or not dtype.isnative:
-        raise ValueError(f"{name} cannot be of {dtype!r}")
-    found = len(data) - start.tell()
-    if any(n < 0 for n in shape) or math.prod(shape) * dtype.itemsize != found:
-        raise ValueError(f"{name} has {found} bytes, which are no {dtype} {shape}")
-    array: NDArray[Any] = np.frombuffer(data, dtype, offset=start.tell()) if found else np.zeros(0, dtype)
-    # In its own memory order, on which the rounding of products depends.
-    return array.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    """Read an array of numbers, in its own memory order, on which the rounding of products depends."""
+    array: NDArray[Any] = _npy.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
+    if array.dtype.kind not in kinds or not array.dtype.isnative:
+        raise ValueError(f"{name} cannot be of {array.dtype!r}")
+    return array

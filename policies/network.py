@@ -1,17 +1,13 @@
-"""Trained agents: a network from observation to action, in arrays and JSON, or an archive of stable-baselines3.
+"""Trained agents: a network from observation to action, in arrays and JSON.
 
     a = squash(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s
 
-``squash`` is tanh, scaled from [-1, 1] to the action space (SAC, TD3, DDPG), or a clip to it (PPO, A2C).
-
-An archive holds JSON, in which what is no JSON is pickled, and tensors. The network is rebuilt from the tensors and the
-plain text of the JSON, without unpickling anything; a policy that its tensors do not describe is refused.
+``squash`` is tanh, scaled from [-1, 1] to the action space, or a clip to it.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,8 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.checkpoint import MOST_EXPANDED, opened_zip, read_checkpoint, write_checkpoint
-from asm_gym.extras import require
+from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.policies.base import StatefulPolicy
 from asm_gym.validation import check_choice
 
@@ -35,19 +30,6 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 }
 SQUASHES = ("tanh", "clip")
 KIND = "agent"
-
-NETWORK_OPTIONS = (
-    *("net_arch", "activation_fn", "log_std_init", "ortho_init", "use_sde", "n_critics", "normalize_images"),
-    *("optimizer_class", "optimizer_kwargs", "share_features_extractor"),
-)
-"""Options of ``policy_kwargs`` under which a policy is the plain network that its tensors describe."""
-
-POLICIES = {
-    "stable_baselines3.sac.policies": ("SAC", "relu"),
-    "stable_baselines3.td3.policies": ("TD3", "relu"),
-    "stable_baselines3.common.policies": ("PPO", "tanh"),
-}
-"""The first of the algorithms that use a module's policies, and their activation by default."""
 
 
 class NetworkPolicy(StatefulPolicy):
@@ -157,42 +139,3 @@ def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
         rate = int(inner.metadata["render_fps"])
         found |= {"robots": list(inner.robots), "controller": inner.controller, "control_freq": rate}
     return found
-
-
-def read_archive(path: Path) -> NetworkPolicy:
-    """Read what ``model.save`` wrote of SAC, TD3, DDPG, PPO or A2C with an ``MlpPolicy``; refuse anything else."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no agent at {path}")
-    saving = require("stable_baselines3.common.save_util", what="an agent of stable-baselines3")
-    try:
-        with opened_zip(path, path.stat().st_size, MOST_EXPANDED) as archive:
-            data = json.loads(archive.read("data"))
-        # Tensors alone: torch refuses everything else in them.
-        found = saving.load_from_zip_file(path, load_data=False, device="cpu")[1]["policy"]
-        tensors = {name: tensor.numpy().astype(np.float32) for name, tensor in found.items()}
-        module = str(data["policy_class"].get("__module__"))
-        if module not in POLICIES:
-            raise ValueError(f"its policy is from {module}; known: {', '.join(POLICIES)}")
-        algorithm, activation = POLICIES[module]
-        options = {k: v for k, v in (data.get("policy_kwargs") or {}).items() if k not in (":type:", ":serialized:")}
-        unknown = sorted(set(options) - set(NETWORK_OPTIONS))
-        if unknown:
-            raise ValueError(f"its policy_kwargs hold {unknown}; only {', '.join(NETWORK_OPTIONS)} are understood")
-        if "activation_fn" in options:
-            activation = str(options["activation_fn"]).rstrip("'>").rsplit(".", 1)[-1].lower()
-        return network(algorithm, tensors, activation)
-    except Exception as error:  # whatever members that are not what they should be raise
-        why = str(error) or type(error).__name__
-        raise ValueError(f"{path} is not an agent that can be read: {why}") from error
-
-
-def network(algorithm: str, tensors: dict[str, Array], activation: str, **kwargs: Any) -> NetworkPolicy:
-    """Build the network of ``"SAC"``, ``"TD3"`` (as DDPG) or ``"PPO"`` (as A2C) from the tensors of its policy."""
-    hidden, last, squash = {
-        "TD3": ("actor.mu", (), "tanh"),
-        "SAC": ("actor.latent_pi", ("actor.mu",), "tanh"),
-        "PPO": ("mlp_extractor.policy_net", ("action_net",), "clip"),
-    }[algorithm]
-    numbers = [k.removeprefix(f"{hidden}.").removesuffix(".weight") for k in tensors]
-    names = [*(f"{hidden}.{n}" for n in sorted(map(int, filter(str.isdecimal, numbers)))), *last]
-    return NetworkPolicy([(tensors[f"{n}.weight"], tensors[f"{n}.bias"]) for n in names], activation, squash, **kwargs)

@@ -9,7 +9,7 @@ from typing import Any, cast
 import gymnasium as gym
 
 from asm_gym.policies.base import Policy
-from asm_gym.policies.network import NetworkPolicy, read_archive
+from asm_gym.policies.network import NetworkPolicy
 from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
@@ -19,7 +19,7 @@ from asm_gym.policies.scripted.sway import Arm, Pusher, Swaying
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
 from asm_gym.tasks import TaskSpec
-from asm_gym.validation import typed
+from asm_gym.validation import check_choice, typed
 
 EXPERTS: dict[str, Callable[..., Policy]] = {
     "Lift": LiftExpert,
@@ -34,6 +34,9 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 POLICIES = ("scripted", "hold", "sway")  # names that ``make_policy`` knows, besides agents
 REGISTERED: Registry[Callable[..., Policy]] = Registry("policy", "asm_gym.policies.registry:REGISTERED")
 """Policies that ``register_policy`` added."""
+
+ALGORITHMS = ("SAC", "TD3", "DDPG", "PPO", "A2C")
+"""Algorithms of stable-baselines3 whose archives ``make_policy`` loads."""
 
 SHIPPED = Path(__file__).resolve().parent / "agents"  # trained agents that come with the package
 
@@ -74,8 +77,8 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     Args:
         name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), ``"sway"`` (smooth motion in any
             environment with Box actions), an agent that comes with the package, such as ``"lift_sac"``, or the path of
-            one: ``.npz`` of ``asm-gym train``, ``.zip`` of stable-baselines3, ``.asm`` of a Neural ASM that learned to
-            act.
+            one: ``.npz`` of ``asm-gym train``, ``.asm`` of a Neural ASM that learned to act; or an archive of
+            stable-baselines3 after its algorithm, ``"SAC:model.zip"``, which runs code in it: load only your own.
         seed: of whatever the policy draws.
         kwargs: handed to the expert, for example ``style=Style(noise=0.1)``.
 
@@ -107,11 +110,13 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name == "hold":
         return Hold(env)
     if name.endswith(".zip"):
-        return read_archive(Path(name)).fit_to(env, name)
+        algorithm, _, file = name.partition(":")
+        check_choice("algorithm", algorithm, ALGORITHMS)
+        return cast(Policy, target(f"stable_baselines3:{algorithm}").load(file, env, device="cpu"))
     if name.endswith(".asm"):
         memory_policy: Any = target("asm_gym.monitors.memory_policy:NeuralASMPolicy")
         return cast(Policy, memory_policy.load(name, env))
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
     known = ", ".join((*POLICIES, *REGISTERED, *agents()))
-    raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .zip, .asm)")
+    raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .asm, SAC:….zip)")

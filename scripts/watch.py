@@ -112,7 +112,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     write_text(args.out / "alarms.csv", table.getvalue())
     written = publish(args, summary, alarms, worst)
     if args.rerun is not None:
-        write_rerun(args.rerun, monitor.spec, worst, getattr(monitor, "model", None))
+        write_rerun(args.rerun, monitor.spec, worst)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")

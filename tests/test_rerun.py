@@ -35,7 +35,7 @@ def asm():
     return made.calibrate([episode(100 + n) for n in range(19)], 0.05)
 
 
-def test_a_log_is_written_for_the_viewer_with_the_band_of_predictions_that_a_stuck_sense_leaves(asm, tmp_path):
+def test_a_log_is_written_for_the_viewer(asm, tmp_path):
     asm.save(tmp_path / "x.asm")
     rows = swing(ARM, 500).stream.copy()
     rows[40:, 0] += 1.0
@@ -46,9 +46,5 @@ def test_a_log_is_written_for_the_viewer_with_the_band_of_predictions_that_a_stu
     assert main(["watch", str(tmp_path / "log.npz"), *options]) == 1
     np.testing.assert_allclose(np.ravel(column(path, "surprise")), asm.score(episode).value)
     assert set(np.ravel(column(path, "threshold"))) == {asm.threshold}
-    low, high, sensed = (np.array(column(path, f"senses/q/{what}"))[:, 0] for what in ("low", "high", "sensed"))
-    np.testing.assert_allclose(sensed, rows[:, 0], rtol=1e-6)
-    inside = (low <= sensed) & (sensed <= high)
-    assert inside[1:40].mean() > 0.8
-    assert inside[41:].mean() < 0.2
+    np.testing.assert_allclose(np.array(column(path, "senses/q"))[:, 0], rows[:, 0], rtol=1e-6)
     assert column(path, "log", "TextLog:text")[0][0].startswith("alarm: ")

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.data.episode import spans
 from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.extras import require
-from asm_gym.memory.completion import Completion
 from asm_gym.spec import StreamSpec
 
 
@@ -94,21 +92,17 @@ def excused_in(trace: ScoredEpisode) -> dict[str, int]:
     return {e: len(spans((raw > trace.threshold) & ~trace.alarm)) for e, raw in trace.excused.items()}
 
 
-BAND = 2.0  # half width of the band about an expected sense, in standard deviations
-
-
-def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode], model: object = None) -> None:
+def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode]) -> None:
     """Write episodes, one after another, to a ``.rrd`` file, which ``rerun FILE.rrd`` opens.
 
-        senses/<channel>/sensed, expected, low, high     each number, and the completion of each sense from all others
-        surprise, threshold, shares/<channel>            what each channel adds to surprise
-        log                                              the alarms
+        senses/<channel>                         what was sensed
+        surprise, threshold, shares/<channel>    what each channel adds to surprise
+        log                                      the alarms
 
     Raises:
         ImportError: rerun-sdk is not installed.
     """
     rr = require("rerun", what="a recording for Rerun's viewer")
-    completion: Completion | None = getattr(model, "completion_", None)
     path.parent.mkdir(parents=True, exist_ok=True)
     recording = rr.RecordingStream("asm-gym")
     recording.save(path)
@@ -117,12 +111,10 @@ def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode], m
         assert trace.attribution is not None
         assert trace.stream is not None
         index = rr.TimeColumn("time", duration=begin + (np.arange(len(trace)) + 1) * trace.dt)
-        stream = trace.stream.astype(np.float64)
-        lines = {"sensed": stream} | (_predicted(completion, stream) if completion else {})
         columns = {"surprise": trace.surprise, "threshold": np.full(len(trace), trace.threshold)}
         for channel in spec.channels:
             place = spec.slices[channel.name]
-            columns |= {f"senses/{channel.name}/{what}": values[:, place] for what, values in lines.items()}
+            columns[f"senses/{channel.name}"] = trace.stream[:, place].astype(np.float64)
             columns[f"shares/{channel.name}"] = trace.attribution[:, place].sum(axis=1)
         for entity, values in columns.items():
             rr.send_columns(entity, [index], rr.Scalars.columns(scalars=values), recording=recording)
@@ -133,12 +125,3 @@ def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode], m
         begin += len(trace) * trace.dt
     recording.flush()
     recording.disconnect()
-
-
-def _predicted(completion: Completion, stream: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Return prediction and band of every number (T, D); actions are their own prediction."""
-    expected, band = stream.copy(), np.zeros_like(stream)
-    sensory, spread = completion.spec.sensory, completion.senses.spread[completion.spec.sensory]
-    expected[:, sensory] -= completion.unexplained(completion.lift(stream)) * spread
-    band[:, sensory] = BAND * completion.error[sensory] * spread
-    return {"expected": expected, "low": expected - band, "high": expected + band}

@@ -25,7 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from asm_gym.data.episode import Episode
 from asm_gym.policies import rollout
-from asm_gym.policies.network import NetworkPolicy, describe, network
+from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.rollouts.parallel import Progress
 
 ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
@@ -54,27 +54,16 @@ class Plan:
 
 
 class Standardised(gym.ObservationWrapper[Floats, Any, Any]):
-    """Observations as the learner sees them; tells of success by stable-baselines3's name."""
+    """Observations as the learner sees them."""
 
     def __init__(self, env: gym.Env[Any, Any], mean: Floats, scale: Floats) -> None:
         super().__init__(env)
-        self.mean, self.scale, self._solved = mean, scale, False
+        self.mean, self.scale = mean, scale
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, mean.shape, np.float32)
 
     def observation(self, observation: Any) -> Floats:
         """Return the standardised observation."""
         return np.asarray((observation - self.mean) / self.scale, np.float32)
-
-    def reset(self, **kwargs: Any) -> Any:
-        """Begin an episode."""
-        self._solved = False
-        return super().reset(**kwargs)
-
-    def step(self, action: Any) -> Any:
-        """Run one step."""
-        observation, reward, terminated, truncated, info = super().step(action)
-        self._solved |= bool(info.get("success", info.get("is_success", False)))
-        return observation, reward, terminated, truncated, {**info, "is_success": self._solved}
 
 
 class GuardedSAC(SAC):
@@ -196,12 +185,12 @@ def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda
         progress(n + 1, updates)
 
 
-def export(learner: Any, view: Standardised) -> NetworkPolicy:
+def export(learner: SAC, view: Standardised) -> NetworkPolicy:
     """Return the learner's policy for unstandardised observations, without its noise, to act in the environment."""
-    tensors = {name: tensor.detach().cpu().numpy().copy() for name, tensor in learner.policy.state_dict().items()}
-    trained_in = describe(view.env)
-    made = network("SAC", tensors, "relu", mean=view.mean, scale=view.scale, trained_in=trained_in)
-    return made.fit_to(view.env, "the agent")
+    parts = [part for part in (*learner.actor.latent_pi, learner.actor.mu) if isinstance(part, torch.nn.Linear)]
+    layers = [tuple(t.detach().cpu().numpy().copy() for t in (part.weight, part.bias)) for part in parts]
+    how = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
+    return NetworkPolicy(layers, "relu", "tanh", **how).fit_to(view.env, "the agent")
 
 
 def success_rate(agent: NetworkPolicy, env: gym.Env[Any, Any], seeds: Sequence[int]) -> float:
