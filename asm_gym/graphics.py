@@ -5,14 +5,12 @@ Nothing looked for here is imported here: the answer has to come where ``import 
 
 from __future__ import annotations
 
-import ctypes
 import os
 import subprocess
 import sys
 from functools import cache
 
-BACKENDS = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}
-"""Values of ``MUJOCO_GL`` and their libraries; EGL first: it uses a GPU where there is one."""
+BACKENDS = ("egl", "osmesa")  # values of ``MUJOCO_GL``; EGL first: it uses a GPU where there is one
 GET_RENDERING = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
 
 # A lit white ball on black: a driver that draws nothing returns a frame of one colour.
@@ -27,15 +25,6 @@ with mujoco.Renderer(model, 32, 32) as renderer:
     frame = renderer.render()  # (32, 32, 3) uint8
 assert frame.min() < frame.max(), "the frame is one colour"
 """
-
-
-def loads(library: str) -> bool:
-    """Return whether the dynamic linker finds ``library`` and everything that it links to."""
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
 
 
 @cache
@@ -55,9 +44,3 @@ def draws_a_frame(backend: str) -> bool:
         return subprocess.run(command, env=env, capture_output=True, timeout=120, check=False).returncode == 0
     except subprocess.TimeoutExpired:
         return False
-
-
-def rendering_problem() -> str:
-    """Return why nothing can be drawn here; empty where it can."""
-    found = ", ".join(f"{lib} {'draws nothing' if loads(lib) else 'missing'}" for lib in BACKENDS.values())
-    return "" if rendering_backend() else f"no video: {found}"

@@ -1,14 +1,14 @@
 """Trained agents: a network from observation to action, in arrays and JSON.
 
-    a = squash(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s
+    a = tanh(W_n f(… f(W_1 x + b_1) …) + b_n),   x = (o - m) / s,   f = max(·, 0)
 
-``squash`` is tanh, scaled from [-1, 1] to the action space, or a clip to it.
+The action is scaled from [-1, 1] to the action space.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +19,11 @@ from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.policies.base import StatefulPolicy
-from asm_gym.validation import check_choice
 
 Array = NDArray[np.float32]
 
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "relu": lambda x: np.maximum(x, np.float32(0.0)),
-    "tanh": np.tanh,
-    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, np.float32(0.0)))),
-}
-SQUASHES = ("tanh", "clip")
 KIND = "agent"
+RULE = {"activation": "relu", "squash": "tanh"}  # in the header of each file
 
 
 class NetworkPolicy(StatefulPolicy):
@@ -37,27 +31,21 @@ class NetworkPolicy(StatefulPolicy):
 
     Args:
         layers: (out, in) weights and (out,) biases, first to last.
-        activation: of the hidden layers, one of ``ACTIVATIONS``.
-        squash: what brings the output into the action space, one of ``SQUASHES``.
         mean, scale: (O,) what observations are standardised by; 0 and 1 where None.
         trained_in: the agent's environment, by name: see ``describe``.
 
     Raises:
-        ValueError: layers that do not fit one another, or an unknown name.
+        ValueError: layers that do not fit one another, or numbers that are not finite.
     """
 
     def __init__(
         self,
         layers: Sequence[tuple[Array, Array]],
-        activation: str,
-        squash: str,
         *,
         mean: Array | None = None,
         scale: Array | None = None,
         trained_in: dict[str, Any] | None = None,
     ) -> None:
-        check_choice("activation", activation, ACTIVATIONS)
-        check_choice("squash", squash, SQUASHES)
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
         shapes = [W.shape for W, _ in self.layers]
         if not shapes or len(shapes[0]) != 2:
@@ -68,7 +56,6 @@ class NetworkPolicy(StatefulPolicy):
                 raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
             size = len(W)
         self.action_size = size
-        self.activation, self.squash = activation, squash
         self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
         self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
         if self.mean.shape != (inputs,) or self.scale.shape != (inputs,) or not (self.scale > 0).all():
@@ -97,14 +84,11 @@ class NetworkPolicy(StatefulPolicy):
 
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[Array, Any]:
         """Return the action (A,), or (n, A) for n observations; and the state as it was."""
-        f = ACTIVATIONS[self.activation]
         x = (np.asarray(observation, np.float32) - self.mean) / self.scale
         for W, b in self.layers[:-1]:
-            x = f(x @ W.T + b)
+            x = np.maximum(x @ W.T + b, np.float32(0.0))
         W, b = self.layers[-1]
-        out = x @ W.T + b
-        if self.squash == "tanh":
-            out = self._low + 0.5 * (np.tanh(out) + 1.0) * (self._high - self._low)
+        out = self._low + 0.5 * (np.tanh(x @ W.T + b) + 1.0) * (self._high - self._low)
         return np.clip(out, self._low, self._high).astype(np.float32), state
 
     def save(self, path: str | Path, **about: Any) -> None:
@@ -112,8 +96,7 @@ class NetworkPolicy(StatefulPolicy):
         arrays = {"mean": self.mean, "scale": self.scale}
         for n, (W, b) in enumerate(self.layers):
             arrays |= {f"W{n}": W, f"b{n}": b}
-        header = {"activation": self.activation, "squash": self.squash, "trained_in": self.trained_in, "about": about}
-        write_checkpoint(path, KIND, header, arrays)
+        write_checkpoint(path, KIND, {"trained_in": self.trained_in, "about": about} | RULE, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> NetworkPolicy:
@@ -126,7 +109,9 @@ class NetworkPolicy(StatefulPolicy):
             scaling = {name: arrays.pop(name) for name in ("mean", "scale")}
             if arrays:
                 raise ValueError(f"an agent has no {', '.join(arrays)}")
-            return cls(layers, header["activation"], header["squash"], trained_in=header["trained_in"], **scaling)
+            if any(header[name] != known for name, known in RULE.items()):
+                raise ValueError(f"its network is not of {RULE}")
+            return cls(layers, trained_in=header["trained_in"], **scaling)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
 

@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from asm_gym.extras import BROUGHT_BY, TESTED, fitting, remedy
-from asm_gym.graphics import GET_RENDERING, rendering_backend, rendering_problem
+from asm_gym.graphics import GET_RENDERING, rendering_backend
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
@@ -42,12 +42,12 @@ class Check(NamedTuple):
 
 def run_checks() -> list[Check]:
     """Return every check, in the order in which one remedy helps the next."""
-    no_picture = rendering_problem()
+    backend = rendering_backend()
     return [
         python(),
         *map(package, PACKAGES),
         cache(),
-        Check("rendering", no_picture or f"MUJOCO_GL={rendering_backend()} draws", GET_RENDERING if no_picture else ""),
+        Check("rendering", f"MUJOCO_GL={backend}" if backend else "no video", "" if backend else GET_RENDERING),
     ]
 
 

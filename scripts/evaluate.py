@@ -1,4 +1,4 @@
-"""Record nominal, faulty and harmless episodes once, let every monitor judge them, and report who noticed what.
+"""Record nominal and faulty episodes once, let every monitor judge them, and report who noticed what.
 
 A run lives in one folder and can be killed at any time: what was recorded, and what was fitted, is not made again. The
 same arguments give the same table.
@@ -19,11 +19,11 @@ from rich.console import Console
 
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
-from asm_gym.evaluation.detection_tables import brief_monitors_table, harmless_table, kept_table, kinds_table
+from asm_gym.evaluation.detection_tables import brief_monitors_table, kept_table, kinds_table
 from asm_gym.evaluation.report import publish
 from asm_gym.evaluation.scoring import benchmark
 from asm_gym.faults import anywhere
-from asm_gym.faults.suite import HARMLESS, SEVERITIES, kinds_of
+from asm_gym.faults.suite import SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.collect import record_missing
@@ -31,14 +31,13 @@ from asm_gym.rollouts.corpus import VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map, parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
-from asm_gym.rollouts.trial import EXECUTIONS, RolloutConfig, Trial, evaluation_trials
+from asm_gym.rollouts.trial import RolloutConfig, Trial, evaluation_trials
 from asm_gym.scripts.command import Options, one_line, option, run
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 from asm_gym.validation import check_choice, check_number
 
-_HARMLESS = (*HARMLESS, *EXECUTIONS)
-ROLES = ("fit", "calibration", "nominal", "faulty", "harmless")
+ROLES = ("fit", "calibration", "nominal", "faulty")
 
 _QUICK = (
     *("neural_asm", "association_linear+evidence", "kalman+evidence"),
@@ -71,8 +70,6 @@ class Args(Options):
     """Kinds of fault, by default all; development or test for the halves of robosuite's."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """How bad each is."""
-    harmless: tuple[str, ...] = option(_HARMLESS, check=partial(check_choice, "harmless variation", known=_HARMLESS))
-    """Harmless variations, which should raise no alarm."""
     fit_episodes: int = option(60, quick=16, least=1)
     """Nominal episodes of each task to learn from."""
     calibration_episodes: int = option(60, quick=10, least=1)
@@ -81,8 +78,6 @@ class Args(Options):
     """Nominal episodes of each task to test on."""
     faulty_episodes: int = option(20, quick=3, least=1)
     """Episodes of each task for each kind and severity; each is the twin of a nominal one."""
-    harmless_episodes: int = option(20, quick=2, least=1)
-    """Episodes of each task for each harmless variation."""
     false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
     workers: str = option("2", check=parse_workers, metavar="N")
@@ -156,8 +151,7 @@ def without_unfit_monitors(args: Args, console: Console) -> Args:
 
 def trials_of(args: Args, task: str) -> list[Trial]:
     """Return every trial of a task."""
-    what = args.faults, args.severities, args.harmless
-    return evaluation_trials(env_id(task), task, args.config, args.episodes, *what, args.seed)
+    return evaluation_trials(env_id(task), task, args.config, args.episodes, args.faults, args.severities, args.seed)
 
 
 def evaluate(args: Args, console: Console) -> None:
@@ -187,8 +181,6 @@ def evaluate(args: Args, console: Console) -> None:
     tables = [brief_monitors_table(result), kept_table(result)]
     if args.elsewhere:
         tables.append(kinds_table(result))
-    if any(monitor.harmless for monitor in result.monitors.values()):
-        tables.append(harmless_table(result, list(result.monitors)[:1]))
     for table in tables:
         console.print(table)
     console.print(f"Wrote {args.out / 'report.html'} and {args.out / 'results.parquet'}")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import gymnasium as gym
 import torch
 from rich.console import Console
 
@@ -24,7 +25,7 @@ from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.training import Plan, success_rate, train
+from asm_gym.rollouts.training import success_rate, train
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import ROBOTS, TASKS, env_id
@@ -62,8 +63,8 @@ def train_agent(args: Args, console: Console) -> None:
     """Train, judge the best agent, and write it to ``out/agent.npz``."""
     task, config = env_id(args.task), RolloutConfig(robot=args.robot)
     names = ("steps", "cloning_updates", "evaluate_every", "evaluation_episodes", "seed")
-    plan = Plan(task, dict(config.settings), **{name: getattr(args, name) for name in names})
-    plan.make().close()  # bad options are refused before the folder is made
+    make = partial(gym.make, task, **dict(config.settings))
+    make().close()  # bad options are refused before the folder is made
     if args.dataset is None:
         check(task, config)
     episodes = None if args.dataset is None else read_dataset(args.dataset, env_id=task)
@@ -80,8 +81,8 @@ def train_agent(args: Args, console: Console) -> None:
         if not solved:
             raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
         with stage("cloning and learning", console, {}) as tick:
-            agent = train(plan, args.out, solved, tick)
-        with stage("judging", console, {}), closing(plan.make()) as env:
+            agent = train(make, args.out, solved, tick, **{name: getattr(args, name) for name in names})
+        with stage("judging", console, {}), closing(make()) as env:
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
             success = success_rate(agent.fit_to(env, "the agent"), env, seeds)
         minutes = round((time.perf_counter() - start) / 60, 1)

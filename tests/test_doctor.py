@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import platform
 import subprocess
@@ -28,21 +27,16 @@ def no_remembered_backend() -> Iterator[None]:
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Make this machine look like one that lacks some libraries and backends, and has some versions."""
+    """Make this machine look like one that draws with some backends, and has some versions."""
     version = metadata.version
 
-    def make(lacks: tuple[str, ...] = (), draws: tuple[str, ...] = ("egl",), **versions: str | None) -> None:
-        def load(name: str) -> None:
-            if name in lacks:
-                raise OSError(f"{name}: cannot open shared object file: No such file or directory")
-
+    def make(draws: tuple[str, ...] = ("egl",), **versions: str | None) -> None:
         def installed(name: str) -> str:
             found = versions.get(name, version(name))
             if found is None:
                 raise metadata.PackageNotFoundError(name)
             return found
 
-        monkeypatch.setattr(ctypes, "CDLL", load)
         monkeypatch.setattr(metadata, "version", installed)
         monkeypatch.setattr(graphics, "draws_a_frame", lambda backend: backend in draws)
         monkeypatch.setattr(sys, "platform", "linux")
@@ -62,10 +56,9 @@ def test_a_complete_machine_passes_every_check(machine: Any, capsys: Any) -> Non
 
 
 def test_what_only_video_needs_is_optional(machine: Any, capsys: Any) -> None:
-    machine(lacks=("libOSMesa.so.8",), draws=())
+    machine(draws=())
     found = failed()
     assert (found["rendering"].needed, found["rendering"].remedy) == (False, graphics.GET_RENDERING)
-    assert found["rendering"].found == "no video: libEGL.so.1 draws nothing, libOSMesa.so.8 missing"
     assert doctor.main([]) == 0
     assert "without rendering" in capsys.readouterr().out
 

@@ -14,9 +14,9 @@ from asm_gym.scripts.evaluate import Args, main, trials_of
 MONITORS = ("neural_asm", "kalman+evidence", "association_linear", "force_limit")
 SMALL = [
     *("--tasks", "Lift", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
-    *("--harmless", "touch", "slower", "--fit-episodes", "4", "--calibration-episodes", "24"),
+    *("--fit-episodes", "4", "--calibration-episodes", "24"),
     *("--monitors", *MONITORS),
-    *("--nominal-episodes", "4", "--faulty-episodes", "2", "--harmless-episodes", "1"),
+    *("--nominal-episodes", "4", "--faulty-episodes", "2"),
     *("--false-alarm-rate", "0.05", "--workers", "1"),
 ]
 
@@ -30,7 +30,7 @@ def run(tmp_path_factory):
 
 def test_it_writes_a_table_a_row_for_each_episode_and_a_report(run):
     rows = pq.read_table(run / "results.parquet").to_pylist()
-    assert len(rows) == len(MONITORS) * (4 + 3 * 2 * 2 + 2)
+    assert len(rows) == len(MONITORS) * (4 + 3 * 2 * 2)
     push = [r for r in rows if r["kind"] == "push" and r["severity"] == "strong"]
     assert all(r["ideal_separation"] > 100 and len(r["surprise"]) == r["steps"] for r in push)
     assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
@@ -78,7 +78,6 @@ def test_a_folder_of_other_settings_is_refused(run, capsys):
         ("--monitors oracle", "'oracle'.*neural_asm"),
         ("--monitors force_limit+magic", "'magic'.*evidence"),
         ("--severities deadly", "'deadly'.*mild"),
-        ("--harmless hurricane", "'hurricane'.*touch"),
         ("--false-alarm-rate 0.001", "needs 999 calibration"),
         ("--faulty-episodes 5", "at most 4, got 5"),
         ("--fit-episodes 0", "fit_episodes.*0"),
@@ -103,7 +102,7 @@ def test_quick_is_less_of_everything_that_was_not_asked_for():
 
 
 def test_a_fault_that_cannot_happen_in_a_task_is_left_out():
-    args = Args(tasks=("Door",), faults=("push", "slip"), harmless=("touch",), false_alarm_rate=0.05)
+    args = Args(tasks=("Door",), faults=("push", "slip"), false_alarm_rate=0.05)
     trials = trials_of(args, "Door")
-    assert {trial.label.kind for trial in trials} == {"", "push", "touch"}  # nothing could slip from a door
+    assert {trial.label.kind for trial in trials} == {"", "push"}  # nothing could slip from a door
     assert len({trial.label.path for trial in trials}) == len(trials)

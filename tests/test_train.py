@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from asm_gym.data.datasets import write_dataset
 from asm_gym.data.episode import Episode
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.rollouts.training import Plan, Standardised, clone, export, fill_buffer, make_learner, train
+from asm_gym.rollouts.training import Standardised, clone, export, fill_buffer, make_learner, train
 from asm_gym.scripts.cli import main
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -74,15 +75,16 @@ def test_the_buffer_holds_the_action_that_was_executed():
 
 
 def test_an_agent_is_cloned_improved_and_judged(tmp_path):
-    plan = Plan("Pendulum-v1", {}, 30, 10, 15, 1, 3)
-    agent = train(plan, tmp_path, linear_expert(), lambda done, total: None)
+    counts = {"steps": 30, "cloning_updates": 10, "evaluate_every": 15, "evaluation_episodes": 1, "seed": 3}
+    how, make = counts | {"progress": lambda done, total: None}, partial(gym.make, "Pendulum-v1")
+    agent = train(make, tmp_path, linear_expert(), **how)
     assert np.load(tmp_path / "log" / "evaluations.npz")["timesteps"].tolist() == [15, 30]
     assert (agent.observation_size, agent.action_size) == (3, 1)
-    again = train(plan, tmp_path / "again", linear_expert(), lambda done, total: None)
+    again = train(make, tmp_path / "again", linear_expert(), **how)
     seen = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
     np.testing.assert_array_equal(agent.predict(seen)[0], again.predict(seen)[0])
     with pytest.raises(ValueError, match="demonstration 0 has observations of 3 numbers, the environment 2"):
-        train(replace(plan, env_id="MountainCarContinuous-v0"), tmp_path, linear_expert(), lambda *_: None)
+        train(partial(gym.make, "MountainCarContinuous-v0"), tmp_path, linear_expert(), **how)
 
 
 def test_the_command_clones_an_expert(tmp_path):

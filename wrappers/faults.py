@@ -18,8 +18,8 @@ from asm_gym.validation import short_repr, typed
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Injects timed faults.
 
-    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth;
-    ``info["variation"]`` the same for harmless variations. Wrappers around one another add up.
+    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth.
+    Wrappers around one another add up.
 
     Args:
         env: a robosuite environment of this package, wrapped or not; for faults of senses and actions, any with Boxes.
@@ -66,7 +66,6 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._step = 0
         observation, info = self.env.reset(seed=seed, options=options)
         info.setdefault("fault", ())
-        info.setdefault("variation", ())
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -76,9 +75,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             elif k in self._running:
                 self._running.pop(k).close()
         observation, reward, terminated, truncated, info = stepped(self.env, action)
-        active = [self.faults[k] for k in self._running]
-        info["fault"] = (*info.get("fault", ()), *(f.name for f in active if not f.harmless))
-        info["variation"] = (*info.get("variation", ()), *(f.name for f in active if f.harmless))
+        info["fault"] = (*info.get("fault", ()), *(self.faults[k].name for k in self._running))
         self._step += 1
         return observation, reward, terminated, truncated, info
 

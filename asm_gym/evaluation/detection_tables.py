@@ -122,17 +122,6 @@ def kinds_table(result: BenchmarkResult) -> Table:
     )
 
 
-def harmless_table(result: BenchmarkResult, monitors: Sequence[str]) -> Table:
-    """Return the episodes with an alarm under harmless variations, of these monitors."""
-    episodes = [result.monitors[name].harmless for name in monitors]
-    kinds = dict.fromkeys(t.kind for own in episodes for t in own)
-    rows = []
-    for kind in kinds:
-        alarms = (metrics.false_alarms([t for t in own if t.kind == kind]) for own in episodes)
-        rows.append((in_words((kind, "")), *(count(share) if share.n else "" for share in alarms)))
-    return Table("Episodes with an alarm under harmless variations.", ("Variation", *monitors), rows)
-
-
 def lead_table(result: BenchmarkResult) -> Table:
     """Return how far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
     first, *others = result.on_visible

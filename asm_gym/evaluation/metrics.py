@@ -139,7 +139,6 @@ class DetectionMetrics:
         nominal: episodes that the faulty ones are compared with.
         window_s: an alarm within this time of the onset is a detection [s].
         calibration: other thresholds to detect by.
-        harmless: episodes of harmless variations.
     """
 
     name: str
@@ -147,7 +146,6 @@ class DetectionMetrics:
     nominal: Sequence[ScoredEpisode]
     window_s: float
     calibration: Calibration = field(default_factory=Calibration)
-    harmless: Sequence[ScoredEpisode] = ()
 
     def only(self, kinds: Collection[Kind]) -> DetectionMetrics:
         """Return the same of these kinds and severities of fault."""

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult
-from asm_gym.evaluation.detection_tables import harmless_table, kept_table, kinds_table, lead_table, monitors_table
+from asm_gym.evaluation.detection_tables import kept_table, kinds_table, lead_table, monitors_table
 from asm_gym.evaluation.scored_episode import window_steps
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import require
@@ -94,8 +94,6 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
     tables = [monitors_table(result), kept_table(result), kinds_table(result)]
     if len(result.monitors) > 1:
         tables.insert(1, lead_table(result))
-    if any(monitor.harmless for monitor in result.monitors.values()):
-        tables.append(harmless_table(result, list(result.monitors)))
     write_text(folder / "results.md", "\n\n".join(map(markdown, tables)) + "\n")
     write_tables(folder / "results.json", tables, details)
     intro = (
@@ -115,7 +113,7 @@ def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:
     """Yield what each monitor made of each episode."""
     possible = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
     for monitor in result.monitors.values():
-        for trace in (*monitor.nominal, *monitor.traces, *monitor.harmless):
+        for trace in (*monitor.nominal, *monitor.traces):
             ideal = possible.get((trace.task, trace.kind, trace.severity, trace.seed))
             after, window = trace.detected_after, window_steps(result.window_s, trace.dt)
             yield {

@@ -35,7 +35,7 @@ class ScoredEpisode:
     row t was raised at ``(t + 1) * dt``.
 
     Attributes:
-        kind: ``"nominal"``, or the name of the fault or the harmless variation; ``severity`` of the fault.
+        kind: ``"nominal"``, or the name of the fault; ``severity`` of the fault.
         seed: of ``reset``; twins share it.
         dt: period of the rows [s].
         threshold: surprise above it is an alarm.

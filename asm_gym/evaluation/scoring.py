@@ -106,7 +106,7 @@ def _results(
 def judged(
     name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float, window_s: float
 ) -> DetectionMetrics:
-    """Calibrate a fitted monitor, and score the nominal, faulty and harmless episodes."""
+    """Calibrate a fitted monitor, and score the nominal and faulty episodes."""
     monitor.calibrate(by_role["calibration"], rate)
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
     hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
@@ -117,10 +117,8 @@ def judged(
         monitor.blocks_,
     )
     threshold = calibration.thresholds[by_episode(rate)]
-    nominal, faulty, harmless = (
-        traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty", "harmless")
-    )
-    return DetectionMetrics(name, faulty, nominal, window_s, calibration, harmless)
+    nominal, faulty = (traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty"))
+    return DetectionMetrics(name, faulty, nominal, window_s, calibration)
 
 
 @cache

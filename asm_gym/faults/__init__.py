@@ -20,10 +20,8 @@ from asm_gym.faults.body import Collision as Collision
 from asm_gym.faults.body import HeldByPerson as HeldByPerson
 from asm_gym.faults.body import Payload as Payload
 from asm_gym.faults.body import Push as Push
-from asm_gym.faults.body import Touch as Touch
 from asm_gym.faults.object import Heavy as Heavy
 from asm_gym.faults.object import Missing as Missing
-from asm_gym.faults.object import ObjectFriction as ObjectFriction
 from asm_gym.faults.object import ObjectMass as ObjectMass
 from asm_gym.faults.object import Slip as Slip
 from asm_gym.faults.object import Snatch as Snatch
@@ -35,6 +33,5 @@ from asm_gym.faults.sensor import Dropout as Dropout
 from asm_gym.faults.sensor import Freeze as Freeze
 from asm_gym.faults.sensor import FrozenEncoder as FrozenEncoder
 from asm_gym.faults.sensor import Noise as Noise
-from asm_gym.faults.sensor import NoisySensors as NoisySensors
 from asm_gym.faults.sensor import Scale as Scale
 from asm_gym.faults.sensor import Spikes as Spikes

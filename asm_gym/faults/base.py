@@ -53,7 +53,6 @@ class Fault(ABC):
     duration: int | None = within(None, low=1)
     seed: int = within(0, low=0, high=2**63)
 
-    harmless: ClassVar[bool] = False  # a variation that should raise no alarm
     anywhere: ClassVar[bool] = False  # whether it needs no more than an ``Interface``
     groups: ClassVar[tuple[str, ...]] = ()  # groups of channels in which it shows first
 

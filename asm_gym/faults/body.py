@@ -38,14 +38,6 @@ class Push(BodyFault, EditingFault):
         return [(env.simulation.data.xfrc_applied, [where], lambda others: others + force)]
 
 
-class Touch(Push):
-    """Somebody touches the arm; 2 N is the most that is harmless."""
-
-    harmless = True
-
-    newtons: float = within(1.5, low=-2, high=2)
-
-
 class Payload(BodyFault, EditingFault):
     """A mass of so many ``kilograms`` on a ``body`` that the controller does not know of."""
 

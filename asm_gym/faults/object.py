@@ -130,20 +130,7 @@ class Heavy(ObjectFault, EditingFault):
 class ObjectMass(ObjectFault, EditingFault):
     """The mass of the ``object`` is ``factor`` times the usual."""
 
-    harmless = True
-
     factor: float = within(1.1, above=0, high=100)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
         return [(env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass * self.factor)]
-
-
-class ObjectFriction(ObjectFault, EditingFault):
-    """The friction of the ``object`` is ``factor`` times the usual."""
-
-    harmless = True
-
-    factor: float = within(0.9, low=0, high=100)
-
-    def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(env.simulation.model.geom_friction, [*self.friction_of(env)], lambda mu: mu * self.factor)]

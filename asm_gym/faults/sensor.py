@@ -151,20 +151,3 @@ class FrozenEncoder(JointFault, HookedFault):
             row[position], row[velocity] = stuck_at, 0.0
 
         return freeze
-
-
-class NoisySensors(HookedFault):
-    """Multiply the standard deviation of every sensor's noise by ``factor``."""
-
-    harmless = True
-    hooks = "corruptions"
-
-    factor: float = within(2.0, low=1, high=1e3)
-
-    def hook(self, env: RobosuiteEnv, clock: Clock) -> Callable[[Floats], None]:
-        extra = np.sqrt(self.factor**2 - 1.0) * (env.measured_spec.noise * env.sensor_noise)
-
-        def add(row: Floats) -> None:
-            row += extra * self.rng(2 + clock.k).standard_normal(len(row))
-
-        return add

@@ -1,4 +1,4 @@
-"""The fault suite: every kind at three severities, and the harmless variations beside them.
+"""The fault suite: every kind at three severities.
 
 The joint, axis, direction or reading that a fault acts on is drawn from the episode's seed.
 """
@@ -112,17 +112,6 @@ def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(kind for name in names for kind in GROUPS.get(name, (name,))))
 
 
-HARMLESS: dict[str, Callable[[Drawn], Fault]] = {
-    "lighter_object": lambda d: object.ObjectMass(factor=0.9),
-    "heavier_object": lambda d: object.ObjectMass(factor=1.1),
-    "smoother_object": lambda d: object.ObjectFriction(factor=0.9),
-    "rougher_object": lambda d: object.ObjectFriction(factor=1.1),
-    "touch": lambda d: body.Touch(body=d.link, direction=d.direction, duration=10),
-    "noisy_sensors": lambda d: sensor.NoisySensors(),
-}
-"""Each harmless variation for an episode; what is a property of the world holds from its beginning."""
-
-
 def register_fault(name: str, make: Kind | str) -> None:
     """Register a kind of fault, in this process and in its workers; raise ValueError where the name is taken.
 
@@ -159,17 +148,10 @@ def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: i
     return replace(fault, onset=onset, seed=seed)
 
 
-def harmless_variation(kind: str, env: RobosuiteEnv, onset: int, seed: int) -> Fault:
-    """Return one harmless variation for the episode with this seed."""
-    check_choice("harmless variation", kind, HARMLESS)
-    return replace(HARMLESS[kind](draw(env, onset, seed)), onset=onset if kind == "touch" else 0, seed=seed)
-
-
 def possible(kind: str, env: RobosuiteEnv) -> bool:
     """Whether the environment has what a kind of fault acts on: a loose object, a gripper."""
-    make = KINDS.get(kind) or (lambda d, _: HARMLESS[kind](d))
     try:
-        make(draw(env, 0, 0), 1).check(env)
+        KINDS[kind](draw(env, 0, 0), 1).check(env)
     except ValueError:
         return False
     return True

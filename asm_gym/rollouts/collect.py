@@ -21,15 +21,14 @@ from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, InterventionOutcome, ScoredEpisode
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
-from asm_gym.faults.suite import KINDS, draw, harmless_variation, suite_fault
+from asm_gym.faults.suite import draw, suite_fault
 from asm_gym.guard.options import OnAlarmName
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, Seeded, make_policy, rollout
-from asm_gym.policies.scripted.base import Style
 from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import EXECUTIONS, PASSING, PolicySource, RolloutConfig, Settings, Trial
+from asm_gym.rollouts.trial import PASSING, PolicySource, RolloutConfig, Settings, Trial
 from asm_gym.spec import control_period
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
@@ -61,7 +60,7 @@ def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tu
 
     Outside of robosuite, magnitudes are relative to how far senses move in three nominal episodes as of ``config``.
     """
-    if trial.faults is not None or trial.kind == NOMINAL or trial.kind in EXECUTIONS:
+    if trial.faults is not None or trial.kind == NOMINAL:
         return trial.faults or ()
     inner: Any = env.unwrapped
     onset = trial.begins(env)
@@ -71,9 +70,7 @@ def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tu
     if trial.kind == PASSING:
         drawn, steps = draw(inner, onset, trial.seed), max(1, round(0.3 / control_period(env)))
         return (Push(body=drawn.link, newtons=20.0, direction=drawn.direction, duration=steps, onset=onset),)
-    if trial.kind in KINDS:
-        return (suite_fault(trial.kind, inner, trial.severity, onset, trial.seed),)
-    return (harmless_variation(trial.kind, inner, onset, trial.seed),)
+    return (suite_fault(trial.kind, inner, trial.severity, onset, trial.seed),)
 
 
 def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
@@ -108,17 +105,14 @@ def play(
     on_step: Callable[[dict[str, Any]], None] | None = None,
 ) -> bool:
     """Run the policy in a staged and wrapped ``env``; return whether the task was solved at some step."""
-    kwargs: dict[str, Any] = {}
-    if trial.kind in EXECUTIONS and config.policy == "scripted":
-        kwargs["style"] = Style(speed=EXECUTIONS[trial.kind])
-    policy = policy_for(config.policy, env, trial.seed, **kwargs)
+    policy = policy_for(config.policy, env, trial.seed)
     return rollout(env, policy, trial.seed, on_step, trial.steps_in(env))
 
 
-def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int, **kwargs: Any) -> Policy:
+def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Policy:
     """Return the policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
     if isinstance(source, str | Path):
-        return make_policy(str(source), env, seed=seed, **kwargs)
+        return make_policy(str(source), env, seed=seed)
     policy = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
     if isinstance(policy, Seeded):
         policy.set_random_seed(seed)

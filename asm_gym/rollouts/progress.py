@@ -22,37 +22,27 @@ def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Pr
     Yields:
         A function of (done, total), for the block to call.
     """
-    start = time.perf_counter()
-    with (_bar if console.is_terminal else _lines)(name, console) as progress:
-        yield progress
-    seconds[name] = round(time.perf_counter() - start, 1)
-
-
-@contextmanager
-def _bar(name: str, console: Console) -> Iterator[Progress]:
-    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Bars(*columns, console=console) as bars:
-        bar = bars.add_task(name, total=None)
-        yield lambda done, total: bars.update(bar, completed=done, total=total)
-        total = bars.tasks[bar].total or 1
-        bars.update(bar, total=total, completed=total)
-
-
-@contextmanager
-def _lines(name: str, console: Console) -> Iterator[Progress]:
     start = printed = time.perf_counter()
     reached = ""
 
-    def show(text: str) -> None:
-        line = f"{name}: {text}{time.perf_counter() - start:.0f} s"
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    def say(text: str) -> None:
+        if not console.is_terminal:
+            line = f"{name}: {text}{time.perf_counter() - start:.0f} s"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def note(done: int, total: int) -> None:
         nonlocal printed, reached
+        bars.update(bar, completed=done, total=total)
         reached = f"{done} of {total}, "
         if time.perf_counter() - printed >= EVERY_S:
             printed = time.perf_counter()
-            show(reached)
+            say(reached)
 
-    yield note
-    show(f"{reached}done in ")
+    columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
+        bar = bars.add_task(name, total=None)
+        yield note
+        total = bars.tasks[bar].total or 1
+        bars.update(bar, total=total, completed=total)
+    say(f"{reached}done in ")
+    seconds[name] = round(time.perf_counter() - start, 1)

@@ -8,9 +8,8 @@ The actor learns more slowly than the critics, so that cloned behaviour is impro
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,23 +33,6 @@ BATCH, LOG_STD, CLONING_RATE = 256, -3.5, 1e-3
 """Of cloning: batch size; the actor's log standard deviation before tanh; learning rate."""
 
 Floats = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is trained where, and how long; the names are those of ``asm-gym train``'s options."""
-
-    env_id: str
-    settings: dict[str, Any]
-    steps: int
-    cloning_updates: int
-    evaluate_every: int
-    evaluation_episodes: int
-    seed: int
-
-    def make(self) -> gym.Env[Any, Any]:
-        """Make the environment."""
-        return gym.make(self.env_id, **self.settings)
 
 
 class Standardised(gym.ObservationWrapper[Floats, Any, Any]):
@@ -97,41 +79,52 @@ def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:
     )
 
 
-def train(plan: Plan, out: Path, demonstrations: Sequence[Episode], progress: Progress) -> NetworkPolicy:
-    """Return the best agent of the evaluations; without any of them, the last one.
+def train(
+    make: Callable[[], gym.Env[Any, Any]],
+    out: Path,
+    demonstrations: Sequence[Episode],
+    progress: Progress,
+    *,
+    steps: int,
+    cloning_updates: int,
+    evaluate_every: int,
+    evaluation_episodes: int,
+    seed: int,
+) -> NetworkPolicy:
+    """Return the best agent of the evaluations; without any of them, the last one. ``make`` makes the environment.
 
     Raises:
         TypeError: spaces other than Boxes with one axis.
         ValueError: demonstrations of other sizes.
     """
-    with closing(plan.make()) as env, closing(plan.make()) as other:  # the learner's own must not be reset
+    with closing(make()) as env, closing(make()) as other:  # the learner's own must not be reset
         check_sizes(env, demonstrations)
         observations = np.concatenate([e.observations for e in demonstrations])
         spread = observations.std(axis=0)
         standard = observations.mean(axis=0), np.where(spread > 1e-3, spread, 1.0).astype(np.float32)
         view = Standardised(env, *standard)
-        learner = make_learner(Monitor(view), plan.seed)
+        learner = make_learner(Monitor(view), seed)
         formats = ["csv"] + ["tensorboard"] * (importlib.util.find_spec("tensorboard") is not None)
         learner.set_logger(configure(str(out / "log"), formats))
         fill_buffer(learner, demonstrations, view)
-        clone(learner, plan.cloning_updates, plan.seed, progress)
-        if plan.steps:
+        clone(learner, cloning_updates, seed, progress)
+        if steps:
             judge = EvalCallback(
                 Monitor(Standardised(other, *standard)),
-                n_eval_episodes=plan.evaluation_episodes,
-                eval_freq=plan.evaluate_every,
+                n_eval_episodes=evaluation_episodes,
+                eval_freq=evaluate_every,
                 log_path=str(out / "log"),
                 best_model_save_path=str(out),
                 verbose=0,
             )
-            judge.eval_env.seed(plan.seed + 1)
+            judge.eval_env.seed(seed + 1)
 
             def show(own: dict[str, Any], _: Any) -> bool:
-                progress(min(own["self"].num_timesteps, plan.steps), plan.steps)
+                progress(min(own["self"].num_timesteps, steps), steps)
                 return True
 
-            learner.learn(plan.steps, [judge, ConvertCallback(show)])
-        if plan.steps >= plan.evaluate_every:
+            learner.learn(steps, [judge, ConvertCallback(show)])
+        if steps >= evaluate_every:
             learner.set_parameters(str(out / "best_model.zip"))
         return export(learner, view)
 
@@ -190,7 +183,7 @@ def export(learner: SAC, view: Standardised) -> NetworkPolicy:
     parts = [part for part in (*learner.actor.latent_pi, learner.actor.mu) if isinstance(part, torch.nn.Linear)]
     layers = [tuple(t.detach().cpu().numpy().copy() for t in (part.weight, part.bias)) for part in parts]
     how = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
-    return NetworkPolicy(layers, "relu", "tanh", **how).fit_to(view.env, "the agent")
+    return NetworkPolicy(layers, **how).fit_to(view.env, "the agent")
 
 
 def success_rate(agent: NetworkPolicy, env: gym.Env[Any, Any], seeds: Sequence[int]) -> float:

@@ -26,7 +26,6 @@ PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
 """What ``make_policy`` takes, any object with ``predict``, or a factory for an environment."""
 
 PASSING = "passing_push"  # 20 N for 0.3 s: a kind beside those of the suite
-EXECUTIONS = {"slower": 0.85, "faster": 1.15}  # harmless variations of the expert itself: its speed
 AFTER_S = 2.0  # how long a faulty episode is recorded after its onset [s]
 
 
@@ -52,13 +51,11 @@ class Trial:
 
     Attributes:
         seed: of the environment and of the policy: trials that share it are twins.
-        kind: ``"nominal"``, ``"passing_push"``, a fault or harmless variation of the suite (of this ``severity``), or,
-            with ``faults``, their name.
+        kind: ``"nominal"``, ``"passing_push"``, a fault of the suite (of this ``severity``); with ``faults``, a name.
         onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
         acting: ``"policy alone"``, or a value of ``on_alarm``.
         after_s: the episode ends so long after the onset [s]; by default it runs to its end.
-        role: what it is recorded for: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"``, ``"harmless"`` or
-            ``"babble"``.
+        role: what it is recorded for: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"`` or ``"babble"``.
     """
 
     env_id: str
@@ -79,7 +76,7 @@ class Trial:
     @property
     def label(self) -> EpisodeLabel:
         """The label of its recording."""
-        kind = self.kind if self.role in ("faulty", "harmless") else ""
+        kind = self.kind if self.role == "faulty" else ""
         return EpisodeLabel(self.task, self.role, kind, self.severity, self.seed, self.onset)
 
     @property
@@ -115,14 +112,13 @@ def horizon_of(env: gym.Env[Any, Any]) -> int:
     return int(getattr(env.unwrapped, "horizon", limit) or 0)
 
 
-def kinds_in(env: gym.Env[Any, Any], faults: Sequence[str], harmless: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the kinds of fault, and of harmless variation, that are possible in ``env``; all faults for none."""
+def kinds_in(env: gym.Env[Any, Any], faults: Sequence[str]) -> list[str]:
+    """Return the kinds of fault that are possible in ``env``; all for none."""
     inner = env.unwrapped
     if not isinstance(inner, RobosuiteEnv):
         FaultyInterface(env)  # refuses spaces that no fault can act on
-        return list(faults or anywhere.KINDS), []
-    kinds = [k for k in kinds_of(faults or tuple(KINDS)) if possible(k, inner)]
-    return kinds, [k for k in harmless if k in EXECUTIONS or possible(k, inner)]
+        return list(faults or anywhere.KINDS)
+    return [k for k in kinds_of(faults or tuple(KINDS)) if possible(k, inner)]
 
 
 def evaluation_trials(
@@ -132,23 +128,20 @@ def evaluation_trials(
     episodes: Mapping[str, int],
     faults: Sequence[str],
     severities: Sequence[str],
-    harmless: Sequence[str],
     seed: int,
 ) -> list[Trial]:
-    """Return the trials of one task: nominal episodes by role, faulty twins of some, and harmless variations.
+    """Return the trials of one task: nominal episodes by role, and faulty twins of some.
 
     Raises:
         ValueError: the policy cannot act in the environment.
     """
     with closing(gym.make(env_id, **dict(config.settings))) as env:
         make_policy(str(config.policy), env, seed=0)
-        kinds, variations = kinds_in(env, faults, harmless)
-        horizon = horizon_of(env)
-    seeds = {role: role_seeds(seed, name, role, count) for role, count in episodes.items() if role != "faulty"}
-    trials = [t for role in ("fit", "calibration", "nominal") for t in nominal_trials(env_id, role, seeds[role])]
+        kinds, horizon = kinds_in(env, faults), horizon_of(env)
+    roles = ("fit", "calibration", "nominal")
+    seeds = {role: role_seeds(seed, name, role, episodes[role]) for role in roles}
     twins = seeds["nominal"][: episodes["faulty"]]
-    trials += [faulty_trial(env_id, k, severity, s, horizon) for k in kinds for severity in severities for s in twins]
-    others = seeds["harmless"]
+    trials = [t for role in roles for t in nominal_trials(env_id, role, seeds[role])]
     return trials + [
-        Trial(env_id, s, k, onset=draw_onset(s, horizon), role="harmless") for k in variations for s in others
+        faulty_trial(env_id, k, severity, s, horizon) for k in kinds for severity in severities for s in twins
     ]
