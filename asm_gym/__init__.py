@@ -20,35 +20,22 @@ from asm_gym.tasks import TASKS
 from asm_gym.version import __version__  # noqa: F401
 
 if TYPE_CHECKING:
-    from asm_gym.data.episode import Episode
-    from asm_gym.faults.suite import register_fault
-    from asm_gym.monitors import NeuralASM, make_monitor, register_monitor
-    from asm_gym.policies import make_policy
-    from asm_gym.policies.registry import register_policy
-    from asm_gym.rollouts.collect import collect
-    from asm_gym.rollouts.pretraining.healthy import harmless
-    from asm_gym.spec import Channel, StreamSpec
-    from asm_gym.tasks import register_task
-    from asm_gym.wrappers import FaultInjection, NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
-
-__all__ = [
-    "Channel",
-    "Episode",
-    "FaultInjection",
-    "NeuralASM",
-    "NeuralASMSafety",
-    "StreamRecorder",
-    "StreamSpec",
-    "VectorNeuralASMSafety",
-    "collect",
-    "harmless",
-    "make_monitor",
-    "make_policy",
-    "register_fault",
-    "register_monitor",
-    "register_policy",
-    "register_task",
-]
+    from asm_gym.data.episode import Episode as Episode
+    from asm_gym.faults.suite import register_fault as register_fault
+    from asm_gym.monitors import NeuralASM as NeuralASM
+    from asm_gym.monitors import make_monitor as make_monitor
+    from asm_gym.monitors import register_monitor as register_monitor
+    from asm_gym.policies import make_policy as make_policy
+    from asm_gym.policies.registry import register_policy as register_policy
+    from asm_gym.rollouts.collect import collect as collect
+    from asm_gym.rollouts.pretraining.healthy import harmless as harmless
+    from asm_gym.spec import Channel as Channel
+    from asm_gym.spec import StreamSpec as StreamSpec
+    from asm_gym.tasks import register_task as register_task
+    from asm_gym.wrappers import FaultInjection as FaultInjection
+    from asm_gym.wrappers import NeuralASMSafety as NeuralASMSafety
+    from asm_gym.wrappers import StreamRecorder as StreamRecorder
+    from asm_gym.wrappers import VectorNeuralASMSafety as VectorNeuralASMSafety
 
 _HOME = {
     **dict.fromkeys(("NeuralASM", "make_monitor", "register_monitor"), "monitors"),
@@ -62,6 +49,8 @@ _HOME = {
     "register_task": "tasks",
 }
 """Which room a name comes from."""
+
+__all__ = [*_HOME]
 
 for _task in TASKS.values():
     # Without max_episode_steps: the environment truncates itself, so that `horizon` is an argument like any other.

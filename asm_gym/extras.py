@@ -16,7 +16,6 @@ EXTRAS = {
     "agents": ("torch", "stable_baselines3", "tensorboard"),
     "data": ("minari", "h5py"),
     "report": ("matplotlib", "imageio", "imageio_ffmpeg", "PIL", "pyarrow", "sklearn", "loky"),
-    "cluster": ("distributed", "dask"),
     "video": ("moviepy",),
     "environments": ("gymnasium_robotics", "shimmy", "dm_control"),
     "learners": ("torchrl",),

@@ -18,7 +18,7 @@ from contextlib import suppress
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import SimpleNamespace, UnionType
-from typing import Any, Literal, ParamSpec, TypedDict, TypeVar, Unpack, get_args, get_origin, get_type_hints
+from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,31 +28,24 @@ R = TypeVar("R")
 SHOWN = 80  # characters of a refused value that a message shows
 
 
-class Bounds(TypedDict, total=False):
-    """Limits of a number: ``low`` and ``high`` are allowed, ``above`` and ``below`` are not."""
-
-    low: float | None
-    high: float | None
-    above: float | None
-    below: float | None
-
-
 @typing.overload
 def check_number(
-    name: str, value: object, *, whole: Literal[True], infinite: bool = False, **bounds: Unpack[Bounds]
+    name: str, value: object, *, whole: Literal[True], infinite: bool = False, **bounds: float | None
 ) -> int: ...
 
 
 @typing.overload
 def check_number(
-    name: str, value: object, *, whole: Literal[False] = False, infinite: bool = False, **bounds: Unpack[Bounds]
+    name: str, value: object, *, whole: Literal[False] = False, infinite: bool = False, **bounds: float | None
 ) -> float: ...
 
 
 def check_number(
-    name: str, value: object, *, whole: bool = False, infinite: bool = False, **bounds: Unpack[Bounds]
+    name: str, value: object, *, whole: bool = False, infinite: bool = False, **bounds: float | None
 ) -> float:
     """Return ``value`` as a Python number, a ``whole`` one, or perhaps an ``infinite`` one, within ``bounds``.
+
+    ``low`` and ``high`` are allowed, ``above`` and ``below`` are not.
 
     Raises:
         ValueError: it is no such number; the message begins with ``name``.
@@ -69,7 +62,7 @@ def check_number(
     return number
 
 
-def check_numbers(name: str, values: ArrayLike, *shape: int, **bounds: Unpack[Bounds]) -> NDArray[np.float64]:
+def check_numbers(name: str, values: ArrayLike, *shape: int, **bounds: float | None) -> NDArray[np.float64]:
     """Return ``values`` as float64. Raises ValueError unless they are finite, within bounds and of this shape."""
     wanted = f"{_described('finite numbers', **bounds)} in the shape {shape}"
     try:
@@ -186,7 +179,12 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin in (int, float, bool, np.ndarray):
         return True
     if origin is Sequence:
-        return _is_sequence(value) and all(_fits(item, each) for each in get_args(kind) for item in value)
+        listed = hasattr(value, "__len__") and getattr(value, "ndim", 1) > 0
+        return (
+            listed
+            and not isinstance(value, str | bytes | dict | set)
+            and all(_fits(item, each) for each in get_args(kind) for item in value)
+        )
     if not isinstance(origin, type) or origin in (object, Any):
         return True
     if getattr(origin, "_is_protocol", False):
@@ -201,23 +199,14 @@ def _methods(protocol: type) -> list[str]:
     return [name for base in bases for name, m in vars(base).items() if inspect.isfunction(m) and name[0] != "_"]
 
 
-def _is_sequence(value: Any) -> bool:
-    try:
-        len(value)
-    except TypeError:
-        return False
-    return not isinstance(value, (str, bytes, dict, set))
-
-
-def _within(number: float, **bounds: Unpack[Bounds]) -> bool:
+def _within(number: float, **bounds: float | None) -> bool:
     compare = {"low": operator.ge, "high": operator.le, "above": operator.gt, "below": operator.lt}
-    given: dict[str, Any] = {**bounds}
-    return all(bound is None or compare[name](number, bound) for name, bound in given.items())
+    return all(bound is None or compare[name](number, bound) for name, bound in bounds.items())
 
 
-def _described(what: str, **bounds: Unpack[Bounds]) -> str:
+def _described(what: str, **bounds: float | None) -> str:
     """Return for example ``whole number of at least 1``, or ``number in (0, 1]``."""
-    low, high, above, below = bounds.get("low"), bounds.get("high"), bounds.get("above"), bounds.get("below")
+    low, high, above, below = (bounds.get(name) for name in ("low", "high", "above", "below"))
     least, greatest = low if above is None else above, high if below is None else below
     if least is not None and greatest is not None:
         brackets = ("[" if above is None else "(", "]" if below is None else ")")

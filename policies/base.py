@@ -30,14 +30,6 @@ class Policy(Protocol):
         """The action for ``observation``, and the state to pass in next time."""
 
 
-@runtime_checkable
-class Seeded(Protocol):
-    """What draws at random and can be told to draw the same again, as every stable-baselines3 model can."""
-
-    def set_random_seed(self, seed: int) -> None:
-        """All that is drawn from now on follows from ``seed``."""
-
-
 class StatefulPolicy(ABC):
     """A policy whose state begins anew in every episode."""
 

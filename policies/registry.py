@@ -15,7 +15,7 @@ from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
-from asm_gym.policies.scripted.sway import Arm, Pusher, Swaying
+from asm_gym.policies.scripted.sway import Arm, Swaying
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
 from asm_gym.tasks import TaskSpec
@@ -99,7 +99,7 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name in REGISTERED:
         return REGISTERED[name](env, seed=seed, **kwargs)
     if name == "scripted":
-        experts = {**EXPERTS, "Pusher-v5": Pusher, "asm_gym/SyntheticArm-v0": Arm}
+        experts = {**EXPERTS, "asm_gym/SyntheticArm-v0": Arm}
         task = getattr(env.unwrapped, "task", None)
         key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
         if key not in experts:

@@ -26,7 +26,6 @@ from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.collect import environment, record_missing
 from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
 from asm_gym.rollouts.pretraining.exam import Exam, Marks, card, examine, summary, usual_force
 from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
@@ -66,8 +65,8 @@ class Args(Options):
     """A corpus of asm-gym corpus, whose experts' healthy hours are calibrated on, too."""
     exam_episodes: int = option(60, quick=0, least=0)
     """Healthy episodes of each examination; 0 examines nothing."""
-    workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
+    workers: int = option(2, least=1)
+    """Processes."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
     tasks: tuple[str, ...] | None = option(None)

@@ -17,7 +17,6 @@ from rich.console import Console
 from asm_gym.data.datasets import require_minari, write_dataset
 from asm_gym.data.episode import load_episode
 from asm_gym.rollouts.collect import check, collect_to
-from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.seeds import episode_seeds
@@ -40,8 +39,8 @@ class Args(Options):
     """How many; a second call with more of them continues."""
     only_successful: bool = False
     """Leave failed episodes out of the dataset."""
-    workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
+    workers: int = option(2, least=1)
+    """Processes."""
     out: Path = option(Path("runs/collect"), metavar="FOLDER")
     """Folder of the episodes and of the dataset."""
 

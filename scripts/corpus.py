@@ -13,7 +13,6 @@ from pathlib import Path
 from rich.console import Console
 
 from asm_gym.rollouts.corpus import PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
-from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.scripts.command import Options, option, run
@@ -27,8 +26,8 @@ class Args(Options):
     """Parts to record."""
     rounds: int = option(ROUNDS, quick=1, least=1)
     """How many rounds; each has as much of every task, and the first what is learned from."""
-    workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
+    workers: int = option(2, least=1)
+    """Processes."""
     out: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of the corpus."""
 

@@ -2,7 +2,7 @@
 
 The demo collects nominal episodes, fits and calibrates a memory of the task, and runs nominal and faulty episodes with
 the policy alone and under the safety wrapper, paired by seed. It prints one table, and writes a report with figures,
-the memory and every number as JSON.
+and the memory.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import by_condition, typical
-from asm_gym.evaluation.report import write_report, write_tables
+from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import tabulate
@@ -128,10 +128,8 @@ def demonstrate(args: Args, console: Console) -> None:
     console.print(result)
     examples = [typical(m.watched) for m in rows]
     details = asdict(args) | versions("numba") | {"window_s": WINDOW_S}
-    write_tables(args.out / "demo.json", [table], details)
     drawn = {
         "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
-        "Time until faults were noticed": figures.delay_figure(rows),
         "Faults against nominal episodes at the same time": figures.roc_figure(rows),
     }
     intro = (

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import platform
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -23,7 +22,6 @@ from asm_gym.scripts.command import BAD_NEWS, DONE, run
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
 NAME_CACHE = "export NUMBA_CACHE_DIR=FOLDER, one that you can write to, then asm-gym warmup"
 REINSTALL = "install asm-gym anew (in a clone: make clean, then make doctor)"
-OTHER_PYTHON = "python3.13 -m venv, and install there (in a clone: make doctor PYTHON=python3.13)"
 
 
 @dataclass(frozen=True)
@@ -44,19 +42,10 @@ def run_checks() -> list[Check]:
     """Return every check, in the order in which one remedy helps the next."""
     backend = rendering_backend()
     return [
-        python(),
         *map(package, PACKAGES),
         cache(),
         Check("rendering", f"MUJOCO_GL={backend}" if backend else "no video", "" if backend else GET_RENDERING),
     ]
-
-
-def python() -> Check:
-    """Check the running Python against ``requires-python``."""
-    version, wanted = platform.python_version(), SpecifierSet(metadata.metadata("asm-gym")["Requires-Python"] or "")
-    if wanted.contains(version, prereleases=True):
-        return Check("Python", version)
-    return Check("Python", f"{version}, but asm-gym needs {wanted}", OTHER_PYTHON, needed=True)
 
 
 def package(name: str) -> Check:

@@ -28,7 +28,7 @@ from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.collect import record_missing
 from asm_gym.rollouts.corpus import VERSION, skill_files
-from asm_gym.rollouts.parallel import parallel_map, parse_workers
+from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.trial import RolloutConfig, Trial, evaluation_trials
@@ -80,8 +80,8 @@ class Args(Options):
     """Episodes of each task for each kind and severity; each is the twin of a nominal one."""
     false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
-    workers: str = option("2", check=parse_workers, metavar="N")
-    """Processes; or a Dask cluster that is running, as dask:tcp://host:8786, which shares the folder."""
+    workers: int = option(2, least=1)
+    """Processes."""
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
     corpus: Path | None = option(None, metavar="FOLDER")

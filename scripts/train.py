@@ -21,7 +21,6 @@ from asm_gym.data.datasets import read_dataset
 from asm_gym.data.episode import load_episode
 from asm_gym.files import write_text
 from asm_gym.rollouts.collect import check, collect_to
-from asm_gym.rollouts.parallel import parse_workers
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
@@ -53,8 +52,8 @@ class Args(Options):
     """Episodes of each evaluation."""
     final_episodes: int = option(100, quick=2, least=1)
     """Episodes of the last evaluation, on other seeds."""
-    workers: str = option("1", check=parse_workers, metavar="N")
-    """Processes that record demonstrations; or a Dask cluster that is running, as dask:tcp://host:8786."""
+    workers: int = option(1, least=1)
+    """Processes that record demonstrations."""
     out: Path = option(Path("runs/train"), metavar="FOLDER")
     """Folder of the run."""
 

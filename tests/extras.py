@@ -48,8 +48,7 @@ CHECKS = {
     "agents": Check("agents", "tests/test_learners.py"),
     "learners": Check("learners", "tests/test_learners.py"),
     "tianshou": Check("agents", "tests/test_learners.py", "tianshou"),
-    "rllib": Check("cluster", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
-    "cluster": Check("robosuite,report,cluster", "tests/test_parallel.py -k cluster"),
+    "rllib": Check("report", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
     "notebooks": Check("robosuite,report,notebooks", "tests/test_docs.py -k notebook"),
     "hub": Check("hub", "tests/test_hub.py"),
     "environments": Check("environments,report", "tests/test_elsewhere.py"),
@@ -82,7 +81,7 @@ def check(name: str, wheel: Path) -> str:
 
 EXTRAS = (
     *("robosuite", "report", "data", "agents", "environments", "learners", "hub", "notebooks"),
-    *("cluster", "rerun", "ros", "video", "dds"),
+    *("rerun", "ros", "video", "dds"),
 )
 STILL_RUNS = (
     "import gymnasium as gym; from asm_gym import NeuralASMSafety; e = NeuralASMSafety(gym.make('asm_gym/Lift-v0'));"

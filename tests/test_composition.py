@@ -238,7 +238,7 @@ NotFinite = returning("not_finite", lambda state, output: (state, output._replac
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("NoModel", "is no model: it has no kind, fit, start, predict, restore; derive from"),
+        ("NoModel", "is no model: derive from"),
         ("Lopsided", r"predict of lopsided must give errors \(\d+, 12\), got \(\d+, 11\)"),
         ("Stateless", "must give a state and a ModelOutput, got ModelOutput"),
         ("NotFinite", "must give errors that are finite where the rows are"),

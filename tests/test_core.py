@@ -151,7 +151,7 @@ def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under
     for extra, package in bounded:  # others bring it
         extras[extra].remove(package)
     extras["robosuite"].add("robosuite")  # by a line of its own
-    assert extras == {e: {n for n in BROUGHT_BY if BROUGHT_BY[n] == e and n != "dask"} for e in BROUGHT_BY.values()}
+    assert extras == {e: {n for n in BROUGHT_BY if BROUGHT_BY[n] == e} for e in BROUGHT_BY.values()}
 
 
 def test_a_wheel_holds_every_file_of_the_package(tmp_path):

@@ -75,7 +75,7 @@ def test_one_changed_bit_is_refused(recorded):
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
     assert corpus.episodes("fit")
-    with pytest.raises(ValueError, match=f"{path.name} is damaged"):
+    with pytest.raises(ValueError, match=path.name):
         corpus.episodes()
 
 

@@ -156,7 +156,7 @@ def test_a_dataset_of_somebody_elses_environment_is_read_as_observation_and_acti
 
 def test_streams_that_run_faster_than_control_are_kept_whole(tmp_path):
     env = StreamRecorder(gym.make("asm_gym/Lift-v0", stream_freq=100, horizon=4))
-    rollout(env, make_policy("scripted", env, seed=0), 0)
+    rollout(env, make_policy("sway", env, seed=0), 0)
     episode = env.finish()
     assert (len(episode.stream), len(episode.actions)) == (20, 4)
     write_dataset(tmp_path, "asm_gym/lift-v0", [episode], env, {})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import platform
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -106,12 +105,6 @@ def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(mach
     assert found["robosuite"].remedy == extras.INSTALL_ROBOSUITE
     assert doctor.main([]) == 1
     assert extras.INSTALL_ROBOSUITE in capsys.readouterr().out  # in one line, however narrow the terminal is
-
-
-@pytest.mark.parametrize(("version", "ok"), [("3.10.14", False), ("3.11.0", True), ("3.13.0", True)])
-def test_python_is_checked_against_requires_python(monkeypatch: pytest.MonkeyPatch, version: str, ok: bool) -> None:
-    monkeypatch.setattr(platform, "python_version", lambda: version)
-    assert ("PYTHON=" in doctor.python().remedy) is not ok
 
 
 def test_a_machine_that_keeps_no_compiled_code_is_told_which_variable_names_a_folder(

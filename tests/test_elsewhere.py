@@ -279,7 +279,23 @@ EVALUATE = [
 
 
 def test_any_environment_can_be_evaluated(tmp_path, capsys):
-    assert main(["evaluate", "--tasks", "Pusher-v5", "--steps", "40", *EVALUATE, "--out", str(tmp_path / "run")]) == 0
+    assert (
+        main(
+            [
+                "evaluate",
+                "--tasks",
+                "Pusher-v5",
+                "--policy",
+                "sway",
+                "--steps",
+                "40",
+                *EVALUATE,
+                "--out",
+                str(tmp_path / "run"),
+            ]
+        )
+        == 0
+    )
     said = " ".join(capsys.readouterr().out.split())
     assert "force_limit is left out" in said
     for row in ("ideal observer", "kalman+evidence", "frozen sense strong", "lost rows strong", "action scale strong"):

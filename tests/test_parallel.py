@@ -7,12 +7,9 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from asm_gym.rollouts import collect, parallel_map
-from asm_gym.rollouts.parallel import parse_workers
-from tests.needs import needs
+from asm_gym.rollouts import parallel_map
 
 PARENT = """
 import os, signal, sys, threading, time
@@ -101,58 +98,4 @@ def _kill_myself(how: int) -> None:
 
 
 def test_nothing_to_do_needs_nobody():
-    assert parallel_map(abs, [], "dask:tcp://127.0.0.1:1") == []
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    """A real cluster on this machine, with two workers."""
-    quiet = {"processes": True, "threads_per_worker": 1, "dashboard_address": None, "silence_logs": 50}
-    with needs("distributed").LocalCluster(2, **quiet) as made:
-        yield f"dask:{made.scheduler_address}"
-
-
-@pytest.mark.slow
-def test_a_cluster_keeps_the_order_raises_errors_and_leaves_no_thread_to_chance(cluster):
-    seen = []
-    squares = parallel_map(lambda x: x * x, range(20), cluster, lambda done, total: seen.append((done, total)))
-    assert squares == [x * x for x in range(20)]
-    assert seen == [(k, 20) for k in range(1, 21)]
-    assert os.getpid() not in parallel_map(lambda _: os.getpid(), range(4), cluster)
-    with pytest.raises(ZeroDivisionError):
-        parallel_map(lambda x: 1 // x, [1, 0], cluster)
-
-
-@pytest.mark.slow
-def test_a_cluster_runs_again_what_a_lost_worker_had(cluster, tmp_path):
-    def die_once(item: int) -> int:
-        first = tmp_path / str(item)
-        if not first.exists():
-            first.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return -item
-
-    assert parallel_map(die_once, [1, 2], cluster) == [-1, -2]
-
-
-@pytest.mark.slow
-def test_a_cluster_collects_the_same_episodes(cluster):
-    here, there = (collect("asm_gym/Lift-v0", episodes=3, seed=5, workers=w, horizon=15) for w in (1, cluster))
-    for a, b in zip(here, there, strict=True):
-        np.testing.assert_array_equal(a.stream, b.stream)
-        np.testing.assert_array_equal(a.observations, b.observations)
-
-
-@pytest.mark.slow
-def test_no_cluster_at_the_address_is_said():
-    needs("distributed")
-    with pytest.raises(ConnectionError, match=r"tcp://127\.0\.0\.1:1"):
-        parallel_map(abs, [1], "dask:tcp://127.0.0.1:1")
-
-
-def test_workers_are_named_in_one_word():
-    assert parse_workers("3") == parse_workers(3) == 3
-    assert parse_workers("dask:tcp://host:8786") == "tcp://host:8786"
-    for wrong in ("", "two", 0, "-1", 10**9, "loky", "dask", "slurm:host"):
-        with pytest.raises(ValueError, match="workers must be"):
-            parse_workers(wrong)
+    assert parallel_map(abs, [], 2) == []

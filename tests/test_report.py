@@ -48,7 +48,6 @@ def figures_of(traces: list[ScoredEpisode]) -> dict[str, Figure]:
     faulty = next(t for t in traces if t.delay is not None)
     return {
         "surprise": figures.surprise_figure([traces[0], faulty]),
-        "delay": figures.delay_figure(by_condition(traces, 1.0)),
         "roc": figures.roc_figure(by_condition(traces, 1.0)),
     }
 
@@ -73,15 +72,6 @@ def test_the_roc_curve_encloses_the_auroc_it_names(traces):
         auroc = time_matched_auroc([t for t in alone if t.condition == condition], nominal, 1.0)
         assert area == pytest.approx(auroc)
         assert line.get_label() == f"{condition}: {auroc:.3f}"
-
-
-def test_the_delay_curve_ends_at_the_share_detected_in_the_window(traces):
-    ax = figures.delay_figure(by_condition(traces, 0.5)).axes[0]
-    rows = [r for r in by_condition(traces, 0.5) if r.name != "nominal"]
-    for line, row in zip(ax.lines, rows, strict=True):
-        x, y = line.get_data()
-        assert y[x <= 500.0][-1] == pytest.approx(row.detected.value)
-    assert len({line.get_color() for line in ax.lines}) == len({str(line._dash_pattern) for line in ax.lines}) == 2
 
 
 def test_infinite_and_zero_surprise_can_be_drawn(traces, tmp_path: Path):

@@ -24,7 +24,7 @@ from asm_gym.data.behaviour import is_constant
 from asm_gym.data.columns import Column
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
-from asm_gym.evaluation.metrics import DetectionMetrics, delays_ms, placements
+from asm_gym.evaluation.metrics import DetectionMetrics, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.files import written_whole
 
@@ -92,25 +92,6 @@ def roc_figure(groups: Sequence[DetectionMetrics]) -> Figure:
         ax.set(xlabel="share of nominal episodes above", ylabel="share of faulty episodes above")
         ax.grid()
         fig.legend(loc="outside right upper", handlelength=3.5, title="AUROC")
-    return fig
-
-
-def delay_figure(groups: Sequence[DetectionMetrics]) -> Figure:
-    """Draw the share of faults detected within so many ms of the onset."""
-    faulty = [g for g in groups if g.faulty]
-    _require_some(faulty)
-    window_ms = 1e3 * max(g.window_s for g in faulty)
-    with figure(height=4.4) as fig:
-        ax = fig.subplots()
-        for i, group in enumerate(faulty):
-            delays = np.minimum(delays_ms(group.faulty, group.window_s), 2 * window_ms)  # a miss is out of the picture
-            colour, line, _ = look(i)
-            label = f"{group.name} ({group.detected.k} of {group.detected.n})"
-            ax.ecdf(delays, color=colour, linestyle=line, linewidth=2, label=label)
-        ax.set(xlim=(0, window_ms), ylim=(0, 1.02), xlabel="time since the onset of the fault [ms]")
-        ax.set_ylabel("share of faults detected")
-        ax.grid()
-        fig.legend(loc="outside right upper", handlelength=3.5)
     return fig
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -79,15 +78,8 @@ def _figure(caption: str, figure: Figure) -> str:
     return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def write_tables(path: Path, tables: Sequence[Table], settings: Mapping[str, Any]) -> None:
-    """Write tables and the settings that they follow from as JSON."""
-    summary = {"settings": settings, "tables": [{"headings": t.headings, "rows": t.rows} for t in tables]}
-    with written_whole(path) as file:
-        file.write((json.dumps(summary, indent=2, default=str) + "\n").encode())
-
-
 def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -> None:
-    """Write ``results.parquet``, ``results.json``, ``results.md`` and ``report.html``."""
+    """Write ``results.parquet``, ``results.md`` and ``report.html``."""
     require("pyarrow", what="results.parquet")
     with written_whole(folder / "results.parquet") as file:
         pd.DataFrame(_rows(result)).to_parquet(file, index=False)
@@ -95,7 +87,6 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
     if len(result.monitors) > 1:
         tables.insert(1, lead_table(result))
     write_text(folder / "results.md", "\n\n".join(map(markdown, tables)) + "\n")
-    write_tables(folder / "results.json", tables, details)
     intro = (
         f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
         "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."
@@ -104,7 +95,6 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         "ROC over all faults, each against nominal episodes of its task in the same steps.": figures.roc_figure(
             list(result.monitors.values())
         ),
-        "How soon faults were found.": figures.delay_figure(list(result.monitors.values())),
     }
     write_report(folder / "report.html", "Who notices what", intro, tables, drawn, details=details)
 

@@ -11,7 +11,7 @@ from asm_gym.detection import EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.files import restored
-from asm_gym.monitors.stream_model import made, parameter_names
+from asm_gym.monitors.stream_model import StreamModel, made, parameter_names
 from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
@@ -61,9 +61,6 @@ class MonitorKind:
 
     def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
         """Return the monitor, not yet fitted."""
-        unknown = hyperparameters.keys() - set(self.hyperparameters)
-        if unknown:
-            raise TypeError(f"{self.model_class.kind} has no hyperparameter {', '.join(sorted(unknown))}")
 
         def part(kind: Any) -> Any:
             return made(kind, spec, {n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters})
@@ -147,7 +144,9 @@ def check_monitor_name(name: str) -> None:
     """
     model, plus, detection = name.partition("+")
     if ":" in model and model not in MONITORS:
-        own = _model_class(target(model), model)
+        own: Any = target(model)
+        if not isinstance(own, type) or not issubclass(own, StreamModel | CalibratedMonitor):
+            raise ValueError(f"{name} is no model: derive from asm_gym.monitors.stream_model.StreamModel")
         if own.kind not in MONITORS:
             register_monitor(own.kind, own, getattr(own, "detection", "evidence"))
         MONITORS[model] = MONITORS[own.kind]
@@ -155,17 +154,6 @@ def check_monitor_name(name: str) -> None:
         check_choice("detection", detection, DETECTIONS)
     else:
         check_choice("monitor", name, MONITORS)
-
-
-def _model_class(own: Any, name: str) -> Any:
-    """Return a class of models or of whole monitors. Raises ValueError where a method is missing."""
-    whole = isinstance(own, type) and issubclass(own, CalibratedMonitor)
-    missing = [n for n in ("kind", "fit", *(() if whole else ("start", "predict", "restore"))) if not hasattr(own, n)]
-    if missing:
-        raise ValueError(
-            f"{name} is no model: it has no {', '.join(missing)}; derive from asm_gym.monitors.stream_model.StreamModel"
-        )
-    return own
 
 
 @typed

@@ -24,7 +24,7 @@ from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import draw, suite_fault
 from asm_gym.guard.options import OnAlarmName
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies import Policy, Seeded, make_policy, rollout
+from asm_gym.policies import Policy, make_policy, rollout
 from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
@@ -113,10 +113,11 @@ def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Polic
     """Return the policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
     if isinstance(source, str | Path):
         return make_policy(str(source), env, seed=seed)
-    policy = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
-    if isinstance(policy, Seeded):
+    policy: Any = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
+    if hasattr(policy, "set_random_seed"):
         policy.set_random_seed(seed)
-    return policy
+    made: Policy = policy
+    return made
 
 
 def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
@@ -151,7 +152,7 @@ def record_missing(
     trials: Sequence[Trial],
     config: RolloutConfig,
     folder: Path,
-    workers: int | str = 2,
+    workers: int = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the trials that are not in ``folder`` yet; return the files of all."""
@@ -165,7 +166,7 @@ def collect(
     policy: PolicySource = "scripted",
     episodes: int = 100,
     seed: int = 0,
-    workers: int | str = 2,
+    workers: int = 2,
     *,
     stage: int = 0,
     progress: Progress | None = None,
@@ -183,7 +184,7 @@ def collect(
             random must have ``set_random_seed``.
         episodes: how many.
         seed: of everything; the same seed gives the same episodes.
-        workers: processes, 1 of which is this one; or a cluster, such as ``dask:tcp://host:8786``.
+        workers: processes, 1 of which is this one.
         stage: sets of episodes with the same ``seed`` and different stages are different.
         progress: is called as (done, total).
         env_kwargs: arguments of ``gym.make``.
@@ -219,7 +220,7 @@ def collect_to(
     env_id: str,
     config: RolloutConfig,
     seeds: Sequence[int],
-    workers: int | str = 2,
+    workers: int = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the episodes that are not in ``folder`` yet; return the files of all."""

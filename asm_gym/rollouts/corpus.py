@@ -1,6 +1,6 @@
-"""The corpus on which every table of detection is judged: recorded in rounds, and checked while it is read.
+"""The corpus on which every table of detection is judged, recorded in rounds.
 
-    FOLDER/manifest.json                              the files, with the SHA-256 of each
+    FOLDER/manifest.json                              the files, with label and length of each
     FOLDER/POLICY/episodes/TASK/ROLE/KIND-SEVERITY-SEED.npz
 
 Roles are ``fit`` to learn from, ``calibration`` for thresholds, ``nominal`` to test on, and ``faulty``: each the twin
@@ -10,7 +10,6 @@ smaller one.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,8 +35,8 @@ SKILLS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblyRound", "PickPlac
 """Tasks with episodes to learn from, to calibrate on and to test on."""
 MANIFEST = "manifest.json"
 _LABEL = ("task", "role", "kind", "severity", "seed", "onset")
-COLUMNS = ("policy", *_LABEL, "sha256", "seconds")
-"""Of the manifest: the policy, the episode's label, the file's checksum, and its length [s]."""
+COLUMNS = ("policy", *_LABEL, "seconds")
+"""Of the manifest: the policy, the episode's label, and its length [s]."""
 
 
 class Source(NamedTuple):
@@ -100,30 +99,18 @@ class Corpus:
             chosen = chosen[chosen[name].isin(values)] if values else chosen
         return chosen
 
-    def verified(self, path: str) -> Path:
-        """Return where a file is. Raises ValueError where it is damaged."""
-        where = self.folder / path
-        if digest(where) != self.files.sha256[path]:
-            raise ValueError(f"{where} is damaged: its checksum is not the manifest's; delete it, and record it anew")
-        return where
-
     def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
-        """Load episodes by role, policy and task, and compare each with its checksum; all where none is named."""
-        return [load_episode(self.verified(path)) for path in self.select(*roles, policies=policies, tasks=tasks).index]
+        """Load episodes by role, policy and task; all where none is named."""
+        return [load_episode(self.folder / p) for p in self.select(*roles, policies=policies, tasks=tasks).index]
 
 
 def skill_files(folder: Path, tasks: Sequence[str] = SKILLS) -> list[Path]:
-    """Return the files of the experts' skills, verified, and sorted by kind and severity."""
+    """Return the files of the experts' skills, sorted by kind and severity."""
     corpus = Corpus.open(folder)
     order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
     chosen = corpus.select(policies=("scripted",), tasks=tasks)
     chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
-    return [corpus.verified(path) for path in chosen.index]
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return [corpus.folder / path for path in chosen.index]
 
 
 def place(policy: str, label: EpisodeLabel) -> str:
@@ -178,7 +165,7 @@ def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
 
 
 def record_corpus(
-    folder: Path, sources: Sequence[Source], number: int, rounds: int, workers: int | str, progress: Progress
+    folder: Path, sources: Sequence[Source], number: int, rounds: int, workers: int, progress: Progress
 ) -> None:
     """Record what is missing of a round, source by source, and add it to the manifest."""
     there = (folder / MANIFEST).is_file()
@@ -193,5 +180,5 @@ def record_corpus(
                 episode = load_episode(file)
                 seconds = round(len(episode) * episode.spec.dt, 6)
                 label = {name: getattr(trial.label, name) for name in _LABEL}
-                known[path] = {"policy": source.policy, **label, "sha256": digest(file), "seconds": seconds}
+                known[path] = {"policy": source.policy, **label, "seconds": seconds}
         write_manifest(folder, known)

@@ -1,4 +1,4 @@
-"""Map work over items in order: processes on this machine, or a running Dask cluster."""
+"""Map work over items in order, in processes of this machine."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
 import cloudpickle
-from threadpoolctl import threadpool_limits
 
 from asm_gym.extras import require
 from asm_gym.registries import added, knowing
@@ -25,8 +24,6 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[int, int], None]
 """Is called as (done, total)."""
-Submit = Callable[[bytes, Any], "Future[Any]"]
-"""Runs a pickled task on an item, as ``concurrent.futures.Executor.submit`` does."""
 
 MOST_WORKERS = 1000
 IDLE_S = 300.0  # a process without work ends after this time [s]
@@ -35,53 +32,33 @@ ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 """Environment of each worker: more threads would compete for the same cores."""
 
 
-def parse_workers(workers: int | str) -> int | str:
-    """Return the number of processes, or the address of a cluster.
-
-    Args:
-        workers: processes on this machine, 1 of which is this one; or a running cluster, ``dask:ADDRESS``, whose
-            workers have this package and share the folder of the results.
-
-    Raises:
-        ValueError: it is none of these.
-    """
-    if not isinstance(workers, str) or workers.lstrip("-").isdecimal():
-        count = int(workers) if isinstance(workers, str) else workers
-        return check_number("workers", count, low=1, high=MOST_WORKERS, whole=True)
-    backend, _, address = workers.partition(":")
-    if backend != "dask" or not address:
-        raise ValueError(f"workers must be a number, or a scheduler such as dask:tcp://host:8786, got {workers!r}")
-    return address
-
-
 @typed
 def parallel_map(
     task: Callable[[Item], Result],
     items: Sequence[Item],
-    workers: int | str = 2,
+    workers: int = 2,
     progress: Progress | None = None,
 ) -> list[Result]:
-    """Return ``[task(item) for item in items]``, computed by ``workers`` as of ``parse_workers``.
+    """Return ``[task(item) for item in items]``, computed by so many processes, 1 of which is this one.
 
-    Processes stay alive between calls, and end with this one. A cluster repeats the task of a lost worker.
+    Processes stay alive between calls, and end with this one.
 
     Raises:
         ValueError: fewer than one worker, or more than ``MOST_WORKERS``. What a task raises is raised here.
         TypeError: the task cannot be sent to another process.
-        ConnectionError: there is no cluster at the address.
         ChildProcessError: a process was killed.
     """
-    where = parse_workers(workers)
+    check_number("workers", workers, low=1, high=MOST_WORKERS, whole=True)
     report = progress or (lambda done, total: None)
     found: dict[int, Result] = {}
-    if where == 1:
+    if workers == 1:
         for index, item in enumerate(items):
             found[index] = task(item)
             report(len(found), len(items))
     elif items:
         pickled = _pickled(task)
-        with _dask(where) if isinstance(where, str) else _loky(min(where, len(items))) as submit:
-            index_of = {submit(pickled, item): index for index, item in enumerate(items)}
+        with _loky(min(workers, len(items))) as executor:
+            index_of = {executor.submit(_call, pickled, item): index for index, item in enumerate(items)}
             for future in as_completed(index_of):
                 found[index_of[future]] = future.result()
                 report(len(found), len(items))
@@ -105,22 +82,13 @@ def _call(task: bytes, item: Any) -> Any:
     return pickle.loads(task)(item)
 
 
-_ONE_AT_A_TIME = threading.Lock()
-
-
-def _call_on_cluster(task: bytes, item: Any) -> Any:
-    """Run in a worker that may have several threads: an environment serves one at a time."""
-    with _ONE_AT_A_TIME, threadpool_limits(1):
-        return _call(task, item)
-
-
 @contextmanager
-def _loky(workers: int) -> Iterator[Submit]:
+def _loky(workers: int) -> Iterator[Any]:
     get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
     how = {"timeout": IDLE_S, "initializer": _end_with_parent, "initargs": (os.getpid(),), "env": ONE_THREAD}
     executor = get_reusable_executor(workers, **how)
     try:
-        yield partial(executor.submit, _call)
+        yield executor
     except BrokenProcessPool as error:
         raise ChildProcessError(f"a worker process was killed, perhaps for want of memory: {error}") from error
     except BaseException:
@@ -138,14 +106,3 @@ def _end_with_parent(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[Submit]:
-    distributed = require("distributed", what="a Dask cluster")
-    try:
-        client = distributed.Client(address, timeout=10)
-    except OSError as error:
-        raise ConnectionError(f"no dask scheduler answers at {address}: {error}") from error
-    with client:  # closing it cancels what still runs
-        yield partial(client.get_executor(pure=False).submit, _call_on_cluster)

@@ -74,7 +74,7 @@ def make_missing(
     make: Callable[[Item], Path],
     items: Sequence[Item],
     place: Callable[[Item], Path],
-    workers: int | str = 2,
+    workers: int = 2,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Make the files that are missing; return the paths of all, in the order of ``items``.

@@ -62,16 +62,6 @@ class Swaying(StatefulPolicy):
         return np.clip(chosen, self.space.low, self.space.high).astype(np.float32), state
 
 
-class Pusher(Swaying):
-    """Joints follow sines around a pose, by a proportional and derivative law."""
-
-    POSE = np.array([-0.3, 0.4, 0.0, -0.6, 0.0, -0.4, 0.0])
-
-    def intended(self, observation: Any) -> Floats:
-        towards = self.POSE + self.width * self.sine() - observation[:7]
-        return np.asarray(1.5 * towards - 0.3 * observation[7:14], np.float64)
-
-
 class Arm(Swaying):
     """The synthetic arm goes through four poses, a second each, and sways a little on the way."""
 
