@@ -114,12 +114,6 @@ def read_header(path: str | Path) -> dict[str, Any]:
 
 
 @typed
-def kind_of(path: str | Path) -> str:
-    """Return what a file is a checkpoint of. Raises FileNotFoundError, or ValueError where it is none."""
-    return str(read_header(path).get("kind"))
-
-
-@typed
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
     with _opened(path, "is damaged", MOST_EXPANDED) as file:

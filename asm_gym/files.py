@@ -16,9 +16,6 @@ from asm_gym.validation import short_repr
 
 UNFINISHED = ".unfinished"
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""What writing ends with where a disk, a share of it, or a file takes no more."""
-
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
@@ -36,7 +33,7 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{token_hex(4)}{UNFINISHED}")
     try:
-        with named(path), temporary.open("xb") as file:  # "x" follows no link; who may read it, the umask says
+        with temporary.open("xb") as file:  # "x" follows no link; who may read it, the umask says
             yield file
         os.replace(temporary, path)
     except BaseException:
@@ -55,22 +52,11 @@ def no_links(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
-@contextmanager
-def named(path: Path) -> Iterator[None]:
-    """Says where a disk is full: Python does not, of a file that is open."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in FULL and error.filename is None:
-            error.filename = str(path)
-        raise
-
-
 def writable(path: str | Path) -> None:
     """Raise an error where a file could not be written there, before the work is done that it is to hold."""
     folder = _checked(path).parent
     folder.mkdir(parents=True, exist_ok=True)
-    with named(folder), tempfile.NamedTemporaryFile(dir=folder, prefix=f".{Path(path).name}.", suffix=UNFINISHED):
+    with tempfile.NamedTemporaryFile(dir=folder, prefix=f".{Path(path).name}.", suffix=UNFINISHED):
         pass
 
 

@@ -53,7 +53,7 @@ def write_commands(app: Sphinx) -> None:
     """Write ``reference/commands.md``: what ``asm-gym COMMAND --help`` prints, command by command."""
     parts = ["# Commands"]
     for name in COMMANDS:
-        command = [sys.executable, "-m", "asm_gym.scripts.cli", name, "--help"]
+        command = [sys.executable, "-m", "asm_gym", name, "--help"]
         done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=HERE.parent)
         parts.append(f"## asm-gym {name}\n\n```text\n{done.stdout.strip()}\n```")
     (HERE / "reference" / "commands.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")

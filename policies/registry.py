@@ -114,8 +114,8 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         check_choice("algorithm", algorithm, ALGORITHMS)
         return cast(Policy, target(f"stable_baselines3:{algorithm}").load(file, env, device="cpu"))
     if name.endswith(".asm"):
-        memory_policy: Any = target("asm_gym.monitors.memory_policy:NeuralASMPolicy")
-        return cast(Policy, memory_policy.load(name, env))
+        memory: Any = target("asm_gym.monitors:NeuralASM").load(name)
+        return cast(Policy, target("asm_gym.monitors.memory_policy:NeuralASMPolicy")(memory, env))
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
     known = ", ".join((*POLICIES, *REGISTERED, *agents()))

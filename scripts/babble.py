@@ -175,6 +175,3 @@ def babble(args: Args, console: Console) -> None:
 
 
 main = partial(run, "babble", Args, babble)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

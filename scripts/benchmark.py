@@ -280,6 +280,3 @@ def measure(args: Args, console: Console) -> None:
 
 
 main = partial(run, "benchmark", Args, measure)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -54,7 +54,3 @@ def main(argv: list[str] | None = None) -> int:
         return code
 
     return exit_code(name if name in COMMANDS else "", work)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -75,6 +75,3 @@ def collect(args: Args, console: Console) -> None:
 
 
 main = partial(run, "collect", Args, collect)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

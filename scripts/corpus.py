@@ -51,6 +51,3 @@ def make(args: Args, console: Console) -> None:
 
 
 main = partial(run, "corpus", Args, make)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

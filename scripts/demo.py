@@ -142,6 +142,3 @@ def demonstrate(args: Args, console: Console) -> None:
 
 
 main = partial(run, "demo", Args, demonstrate)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -98,6 +98,3 @@ def report(args: Args, console: Console) -> int:
 
 
 main = partial(run, "doctor", Args, report)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -187,6 +187,3 @@ def evaluate(args: Args, console: Console) -> None:
 
 
 main = partial(run, "evaluate", Args, evaluate)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -258,6 +258,3 @@ def fit(args: Args, console: Console) -> None:
 
 
 main = partial(run, "fit", Args, fit)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

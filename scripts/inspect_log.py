@@ -101,6 +101,3 @@ def differences(first: Inspection, other: Inspection) -> str:
 
 
 main = partial(run, "inspect", Args, inspect)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

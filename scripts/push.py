@@ -34,6 +34,3 @@ def upload(args: Args, console: Console) -> None:
 
 
 main = partial(run, "push", Args, upload)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -92,6 +92,3 @@ def train_agent(args: Args, console: Console) -> None:
 
 
 main = partial(run, "train", Args, train_agent)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -62,6 +62,3 @@ def _guard(progress: Progress) -> None:
 
 
 main = partial(run, "warmup", Args, warm_up)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

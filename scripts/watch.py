@@ -197,6 +197,3 @@ def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:
 
 
 main = partial(run, "watch", Args, watch)
-
-if __name__ == "__main__":
-    raise SystemExit(main())

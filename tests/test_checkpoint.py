@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from asm_gym.checkpoint import kind_of, read_arrays, read_checkpoint, write_checkpoint
+from asm_gym.checkpoint import read_arrays, read_checkpoint, read_header, write_checkpoint
 
 
 def test_checkpoint_keeps_every_bit(tmp_path):
@@ -135,7 +135,7 @@ def test_no_flipped_bit_changes_what_is_read(tmp_path, seed):
             np.testing.assert_array_equal(found.arrays[name], good.arrays[name])
 
 
-@pytest.mark.parametrize("read", [partial(read_checkpoint, kind="test"), kind_of, read_arrays])
+@pytest.mark.parametrize("read", [partial(read_checkpoint, kind="test"), read_header, read_arrays])
 def test_a_pipe_is_no_checkpoint_and_nobody_waits_for_it(read, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="is no regular file"):

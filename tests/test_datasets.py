@@ -77,7 +77,7 @@ def test_collecting_touches_nothing_outside_its_folder(tmp_path, monkeypatch):
 
 
 def test_a_killed_run_loses_only_what_was_running(tmp_path):
-    command = [sys.executable, "-m", "asm_gym.scripts.cli", "collect", "Lift", *ONE, "400", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "asm_gym", "collect", "Lift", *ONE, "400", "--out", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while len(list((tmp_path / "episodes").glob("[0-9]*.npz"))) < 2 and time.monotonic() < deadline:

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from asm_gym.data.arrays import check_hdf5
 from asm_gym.data.episode import Episode, check_recorded
 from asm_gym.extras import require
-from asm_gym.files import named
 from asm_gym.spec import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
@@ -81,14 +80,13 @@ def write_dataset(
     if shutil.disk_usage(data).free < size + SPARE_BYTES:  # HDF5 may end the process where a disk is full
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / ARRAYS))
     spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
-    with named(data):
-        storage = MinariStorage.new(data, **spaces, env_spec=env.spec)
-        storage.update_episodes([_buffer(n, episode) for n, episode in enumerate(episodes)])
-        storage.update_episode_metadata(
-            {"success": bool(episode.success), "info": json.dumps(episode.info)} for episode in episodes
-        )
-        about = {"stream_spec": spec.to_json(), **details}
-        storage.update_metadata(about | {"dataset_id": dataset_id, "minari_version": minari.__version__})
+    storage = MinariStorage.new(data, **spaces, env_spec=env.spec)
+    storage.update_episodes([_buffer(n, episode) for n, episode in enumerate(episodes)])
+    storage.update_episode_metadata(
+        {"success": bool(episode.success), "info": json.dumps(episode.info)} for episode in episodes
+    )
+    about = {"stream_spec": spec.to_json(), **details}
+    storage.update_metadata(about | {"dataset_id": dataset_id, "minari_version": minari.__version__})
     if folder.exists():
         folder.rename(replaced)
     unfinished.rename(folder)

@@ -14,7 +14,7 @@ Source: Usher and McClelland 2001 (Psychological Review 108(3)), without their m
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -110,11 +110,6 @@ class NeuralASMPolicy(StatefulPolicy):
         self.memory = memory
         self._readout = CommandReadout(env)
         memory.initial_state()
-
-    @classmethod
-    def load(cls, path: str, env: gym.Env[Any, Any]) -> Self:
-        """Return the policy of the memory in a file."""
-        return cls(NeuralASM.load(path), env)
 
     def begin(self, observation: Any) -> ActingState:
         return ActingState(self.memory.initial_state(), np.zeros(len(self.memory.spec.motor), np.float32))

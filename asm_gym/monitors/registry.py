@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from asm_gym.checkpoint import kind_of, read_checkpoint
+from asm_gym.checkpoint import read_checkpoint, read_header
 from asm_gym.detection import EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
@@ -204,7 +204,7 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
         FileNotFoundError: there is no such file.
         ValueError: the file is damaged, from a newer version, of a monitor that is not registered, or something else.
     """
-    kind = monitor_class(kind_of(path))
+    kind = monitor_class(str(read_header(path).get("kind")))
     saved = read_checkpoint(path, kind.model_class.kind)
     monitor: CalibratedMonitor = restored(
         path, saved, replace(kind, detection=saved.header.get("detection", kind.detection))
