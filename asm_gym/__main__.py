@@ -2,4 +2,5 @@
 
 from asm_gym.scripts.cli import main
 
-raise SystemExit(main())
+if __name__ == "__main__":
+    raise SystemExit(main())

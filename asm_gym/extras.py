@@ -15,7 +15,7 @@ EXTRAS = {
     "robosuite": ("mujoco", "robosuite", "termcolor"),
     "agents": ("torch", "stable_baselines3", "tensorboard"),
     "data": ("minari", "h5py"),
-    "report": ("matplotlib", "imageio", "imageio_ffmpeg", "PIL", "pyarrow", "sklearn", "loky"),
+    "report": ("matplotlib", "PIL", "pyarrow", "sklearn", "loky"),
     "video": ("moviepy",),
     "environments": ("gymnasium_robotics", "shimmy", "dm_control"),
     "learners": ("torchrl",),

@@ -37,7 +37,8 @@ T = TypeVar("T")
 Args = TypeVar("Args")
 DONE, BAD_NEWS, REFUSED = 0, 1, 2
 USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
-"""Errors that a user can put right; a cluster that is not at its address is an OSError too."""
+"""Errors that a user can put right."""
+MOST_NAMES = 7  # that the help of an option lists; a wrong name lists all
 _SAME: Any = object()
 _ANNOTATED: Any = Annotated
 
@@ -110,13 +111,18 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
     """Return the options of a command; those not typed have their defaults, or with ``--quick`` their quick values.
 
     Raises:
-        SystemExit: help was asked for, or options are unknown or unreadable; tyro printed why.
-        ValueError: the dataclass refuses a value.
+        SystemExit: help was asked for, or options are unreadable; tyro printed why.
+        ValueError: there is no such option, or the dataclass refuses a value.
     """
     import tyro
 
     args = list(sys.argv[1:] if argv is None else argv)
     text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
+    named = [each.name.replace("_", "-") for each in fields(kind) if not each.metadata.get("positional")]
+    options = [f"--{name}" for name in (*named, "help")]
+    for word in args:
+        if word.startswith("--") and not word.startswith("--tyro-"):
+            check_choice("option", word.partition("=")[0].replace("_", "-"), options)
     flags = (tyro.conf.FlagCreatePairsOff,)
     readable = _readable(kind, "--quick" in args)
     typed = tyro.cli(readable, args=args, prog=f"asm-gym {name}", description=text, config=flags)
@@ -146,7 +152,8 @@ def _hint(about: Any) -> Callable[[str], str]:
 
     def hint(default: str) -> str:
         names, quick = about.get("known", ()), about.get("quick", _SAME)
-        parts = [f"known: {', '.join(names)}"] if names else []
+        more = ", …" if len(names) > MOST_NAMES else ""
+        parts = [f"known: {', '.join([*names][:MOST_NAMES])}{more}"] if names else []
         if default not in ("", "None", "True", "False"):
             parts.append("required" if default == "(required)" else f"default: {default}")
         if quick is not _SAME:

@@ -84,8 +84,10 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
         assert part in shown
 
 
-@pytest.mark.parametrize(("typed", "near"), [("docter", "doctor"), ("reproduce abstrac", "abstract")])
-def test_a_misspelt_command_is_answered_with_the_nearest_one(typed, near, capsys):
+@pytest.mark.parametrize(
+    ("typed", "near"), [("docter", "doctor"), ("reproduce abstrac", "abstract"), ("watch --monitr x", "--monitor")]
+)
+def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2
     assert f"did you mean '{near}'?" in capsys.readouterr().err
 

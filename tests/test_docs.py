@@ -8,6 +8,7 @@ import inspect
 import io
 import json
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -35,6 +36,9 @@ PAGES = [
     *(p for p in sorted(DOCS.rglob("*.md")) if not any(p.is_relative_to(made) for made in MADE)),
 ]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+EXAMPLES = sorted(
+    p for p in (DOCS / "examples").glob("*.py") if p.stem != "ros2_stop"
+)  # which tests/test_ros2_stop.py runs
 
 FENCE = re.compile(r"^```([\w{}-]*)\n(.*?)^```\s*$", re.M | re.S)
 CODE = re.compile(r"`[^`\n]*`")
@@ -204,6 +208,18 @@ def test_code_of_a_notebook_runs_and_no_output_is_kept(path: Path, tmp_path: Pat
         if cell["cell_type"] == "code":
             assert not cell["outputs"]
             exec(compile("".join(cell["source"]), str(path), "exec", dont_inherit=True), names)
+
+
+SLOW = ("film_an_alarm", "guard_a_vector", "guard_sb3_agent", "live_udp", "own_task")
+
+
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, marks=pytest.mark.slow if p.stem in SLOW else (), id=p.stem) for p in EXAMPLES]
+)
+def test_an_example_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(path)])
+    runpy.run_path(str(path), run_name="__main__")
 
 
 @pytest.mark.parametrize("public", sorted(asm_gym.__all__))

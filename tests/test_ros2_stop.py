@@ -27,7 +27,7 @@ def test_an_alarm_or_the_end_of_the_watch_deactivates_the_controllers(lines, lef
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.setattr(sys, "argv", ["ros2_stop.py", "arm_controller"])
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines)))
-    runpy.run_path(str(ROOT / "docs" / "guides" / "ros2_stop.py"), run_name="__main__")
+    runpy.run_path(str(ROOT / "docs" / "examples" / "ros2_stop.py"), run_name="__main__")
     assert [*map(str.strip, sys.stdin)] == left
     ((request,), _) = ros.create_node().create_client().call_async.call_args
     assert request.deactivate_controllers == ["arm_controller"]
