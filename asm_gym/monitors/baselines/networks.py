@@ -135,6 +135,12 @@ def train_on_episodes(
     module.load_state_dict(best)
 
 
+def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.optim.Optimizer, Any]:
+    """Return Adam and its cosine decay, the default of those who publish such models."""
+    optimiser = torch.optim.Adam(module.parameters(), rate)
+    return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
+
+
 def descend(loss: Tensor, optimiser: torch.optim.Optimizer, schedule: Any = None, clip: float = 1.0) -> None:
     """Update once, with the gradient cut off at ``clip``."""
     optimiser.zero_grad()
@@ -248,8 +254,7 @@ class LogpZO(TorchModel):
     def train(
         self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
     ) -> None:
-        optimiser = torch.optim.Adam(module.parameters(), 1e-3)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, self.updates)
+        optimiser, schedule = adam(module, self.updates)
         rows = np.concatenate([_features(r) for r in readings])
         for n, chosen in zip(range(self.updates), shuffled(len(rows), ROWS, rng), strict=False):
             progress(n, self.updates)
