@@ -18,17 +18,15 @@ class CostInReward(gym.Wrapper):
         return observation, reward - PRICE * info["cost"], terminated, truncated, info
 
 
-episodes = collect(ARM, policy="scripted", episodes=40, workers=1, horizon=100)
+def guarded(env):
+    return CostInReward(NeuralASMSafety(env, monitor, on_alarm="hold"))
+
+
+agent = PPO("MlpPolicy", gym.make(ARM, horizon=50), n_steps=100, batch_size=50, seed=0)
+episodes = collect(ARM, policy=agent, episodes=40, workers=1, horizon=50)  # how it explores while nothing is wrong
 monitor = make_monitor("kalman", episodes[0].spec).fit(episodes[:20]).calibrate(episodes[20:], false_alarm_rate=0.05)
 
-
-def guarded(env):
-    return CostInReward(NeuralASMSafety(env, monitor, on_alarm="monitor"))  # "hold" would stop wild exploration
-
-
-envs = make_vec_env(
-    ARM, 2, wrapper_class=guarded, env_kwargs={"horizon": 50}, monitor_kwargs={"info_keywords": ("cost_sum",)}
-)
+agent.set_env(make_vec_env(ARM, 1, wrapper_class=guarded, env_kwargs={"horizon": 50}))
 safety = SafetyCallback()  # safety/alarms, safety/cost, safety/overridden, safety/surprise, safety/slowed
-PPO("MlpPolicy", envs, n_steps=100, batch_size=50, seed=0).learn(400, callback=safety)
+agent.learn(400, callback=safety)
 print(f"steps in alarm by episode: {[episode['cost'] for episode in safety.ended]}")
