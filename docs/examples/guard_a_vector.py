@@ -10,8 +10,7 @@ from asm_gym import NeuralASM, NeuralASMSafety, VectorNeuralASMSafety
 LIFT = "asm_gym/Lift-v0"
 memory = NeuralASM.pretrained("panda")  # one memory judges all members
 
-guard = {"monitor": memory, "on_alarm": "graded"}
-robots = VecNormalize(make_vec_env(LIFT, 2, wrapper_class=NeuralASMSafety, wrapper_kwargs=guard))
+robots = VecNormalize(make_vec_env(lambda: NeuralASMSafety(gym.make(LIFT), memory), 2))
 robots.reset()
 for _ in range(10):
     observations, rewards, dones, infos = robots.step(np.zeros((2, 7), np.float32))
