@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.readings import resolution
 from asm_gym.spec import StreamSpec
 
@@ -121,13 +121,13 @@ class StreamScaler:
         return ScaledRows(*_read(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow))
 
 
-@compiled
+@inner
 def _bounded(number: float) -> float:
     """Cut off at ``FARTHEST``; a difference of two infinite numbers is 0."""
     return 0.0 if number != number else min(max(number, -FARTHEST), FARTHEST)
 
 
-@compiled
+@inner
 def _believed(number: float) -> float:
     """Return 0 where the number would be cut off."""
     return number if abs(number) < FARTHEST else 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
 
 from asm_gym.memory.association import Association, association_shapes, no_doubt, unbounded
@@ -11,6 +12,11 @@ from asm_gym.memory.learning import Schedule, Trajectory
 
 CHANGES = slice(5, 10)
 """Where the changes of five senses stand among the inputs."""
+
+
+def called(function):
+    """Return what only compiled functions call, as Python can call it."""
+    return numba.njit(lambda *arguments: function(*arguments))
 
 
 def energy(z, mu, x, W_F, pi_z, pi_x):

@@ -32,7 +32,7 @@ from asm_gym.memory.association_learning import (
 from asm_gym.memory.linear import LEAST_VARIANCE, conditional, inverse_of, moments
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import NeuralASM, make_monitor
-from tests.problems import CHANGES, energy
+from tests.problems import CHANGES, called, energy
 from tests.streams import frozen, sine_episodes, sine_spec
 
 GROUPS = np.array([0, 0, 1, 2, 2])
@@ -123,7 +123,7 @@ def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
     a = np.hstack([caused, cause, np.ones((1500, 1))]).astype(np.float32)
     delta, groups = np.ascontiguousarray(a[:, :4]), np.arange(4)
     w, errors = learn_association(a, delta, groups, slice(0, 4), 1, np.random.default_rng(1))
-    shown = normalised_errors(a, delta, np.ones((1500, 1), np.float32), *w[:7], spans(w.U), *w[7:], groups, 0)[0]
+    shown = called(normalised_errors)(a, delta, np.ones((1500, 1), np.float32), *w[:7], spans(w.U), *w[7:], groups, 0)[0]
     assert np.mean(errors**2) > 1.05 * np.mean(shown**2)
     assert 0.8 < np.mean(errors**2) < 1.2
 

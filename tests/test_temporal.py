@@ -31,7 +31,7 @@ from asm_gym.memory.traces import (
 )
 from asm_gym.monitors import MemoryConfig, NeuralASM
 from asm_gym.monitors.skills import recall
-from tests.problems import energy, problem, schedule, some_rows, trajectory
+from tests.problems import called, energy, problem, schedule, some_rows, trajectory
 from tests.streams import sine_episodes, sine_spec
 
 H, S, A = 7, 4, 2
@@ -49,12 +49,12 @@ def test_products_along_synapses_and_back_are_matrix_products(batch, senses):
     a, W = rng.normal(size=(batch, 6)), rng.normal(size=(senses, 6))
     np.testing.assert_allclose(outward(a, W), a @ W.T, rtol=1e-12)
     x, pi = rng.normal(size=(batch, senses)), rng.uniform(size=(batch, senses))
-    np.testing.assert_allclose(feedback(a, x, W, pi), (pi * (x - a @ W.T)) @ W, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(called(feedback)(a, x, W, pi), (pi * (x - a @ W.T)) @ W, rtol=1e-12, atol=1e-12)
 
 
 def test_energy_gradient_is_that_of_finite_differences():
     z, *rest = problem(0, dtype=np.float64)
-    gradient, _ = energy_gradient(z, *rest)
+    gradient, _ = called(energy_gradient)(z, *rest)
     for index in np.ndindex(z.shape):
         step = np.zeros_like(z)
         step[index] = 1e-5

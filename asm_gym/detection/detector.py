@@ -83,7 +83,8 @@ def _step(
             share = errors[n, i] / bound
             limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
             shares[n, i] = 0.0
-    whitened = np.dot(limited, whitening)
+    whitened = np.empty((B, X))
+    np.dot(limited, whitening, whitened)
     for n in range(B):
         counted[n] = steps[n] + 1
         greatest = LEAST

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.detection.kinematics import HAND, Chain, hand_at
 from asm_gym.guard.robots import NO_COLUMNS
 from asm_gym.memory.completion import sensors_of
@@ -223,7 +223,7 @@ def compare(rows: Any, at: Any, *known: Any) -> bool:
     return some
 
 
-@compiled
+@inner
 def _left(q: Any, x: Any, weights: Any, axes: Any, anchors: Any, hand: Any, z: Any) -> float:
     """Write z (9,), what angles (J,) leave of the hand; return |z|²."""
     hand_at(q, axes, anchors, hand, z)
@@ -234,7 +234,7 @@ def _left(q: Any, x: Any, weights: Any, axes: Any, anchors: Any, hand: Any, z: A
     return total
 
 
-@compiled
+@inner
 def _solve(H: Any, b: Any, n: int) -> None:
     """Write the solution of H x = b to ``b`` (n,), for a symmetric H (n, n) that is positive definite."""
     for i in range(n):

@@ -152,8 +152,9 @@ def _clip(actions: Any, low: Any, high: Any, acts: Any, idle: Any, executed: Any
         for i in range(len(low)):
             executed[n, i] = min(max(actions[n, i], low[i]), high[i])
             more = more or not np.isfinite(actions[n, i])
-    if not more:
-        last[:] = executed
+    for n in range(0 if more else len(actions)):
+        for i in range(len(low)):
+            last[n, i] = executed[n, i]
     return more
 
 
@@ -172,7 +173,9 @@ def _feel(
             felt = float(rows[n, columns[j]])
             torque[n, j] = felt if np.isfinite(felt) else 0.0
         if not intervened[n]:
-            for k in range(path.shape[1] - 1):
-                path[n, k] = path[n, k + 1]
-            path[n, path.shape[1] - 1] = executed[n]
+            newest = path.shape[1] - 1
+            for i in range(executed.shape[1]):
+                for k in range(newest):
+                    path[n, k, i] = path[n, k + 1, i]
+                path[n, newest, i] = executed[n, i]
             steps[n] = min(steps[n] + 1, path.shape[1])

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.guard.arbiter import CALM, FREE, MOSTLY_AFTER, POLICY, ROWS, SINCE, STRIKES, Arbiter
 from asm_gym.monitors import Surprise
@@ -97,7 +97,7 @@ def _forces(channels: Sequence[Channel]) -> tuple[NDArray[np.intp], NDArray[np.i
     return _vectors(channels, "wrist_force"), torques.astype(np.intp)
 
 
-@compiled
+@inner
 def largest_norm(numbers: Any, triples: Any) -> float:
     """Return the largest norm of vectors; not a number where one is none, or there are none."""
     found = -np.inf
@@ -109,7 +109,7 @@ def largest_norm(numbers: Any, triples: Any) -> float:
     return np.nan if found == -np.inf else found
 
 
-@compiled
+@inner
 def contact_force(numbers: Any, wrists: Any, torques: Any) -> float:
     """Return the contact force [N] that numbers tell of; not a number where they tell of none."""
     wrist, largest = largest_norm(numbers, wrists), -np.inf  # with the weight of the hand, 5 to 10 N

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, activate, kernel, outward
+from asm_gym.memory.energy import Array, activate, inner_kernel, kernel, outward
 
 SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)  # log σ² of 0.25 % of a channel's spread, and of 55 spreads
 
@@ -149,7 +149,7 @@ def leverage(a: Array, P: Array, own: Array, groups: NDArray[np.intp], first: in
     return out
 
 
-@kernel
+@inner_kernel
 def normalised_errors(
     inputs: Array,
     changes: Array,

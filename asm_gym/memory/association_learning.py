@@ -61,7 +61,8 @@ ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS  # progress reports of ``lea
 @kernel
 def inward(pulled: Array, f: Array, back: Array) -> Array:
     """Return f'(h) ⊙ Bᵀ ε (B, M) for errors (B, X), hidden units ``f`` (B, M) and feedback ``back`` (X, M)."""
-    out: Array = np.dot(pulled, back)
+    out = np.empty((len(pulled), back.shape[1]), pulled.dtype)
+    np.dot(pulled, back, out)
     for n in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[n, j] *= np.float32(1) - f[n, j] * f[n, j]

@@ -19,7 +19,7 @@ import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded here, so that its threads can be limited)
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.validation import check_number
 
 Array = NDArray[np.floating[Any]]
@@ -35,6 +35,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 def kernel(function: F) -> F:
     """Compile ``function``, once a machine. Inputs must be finite, so that loops can use vector registers."""
     return compiled(function, fastmath=True)
+
+
+def inner_kernel(function: F) -> F:
+    """Compile ``function`` into kernels that call it."""
+    return inner(function, fastmath=True)
 
 
 @kernel
@@ -82,7 +87,7 @@ def outward(a: Array, W: Array) -> Array:
     return out
 
 
-@kernel
+@inner_kernel
 def beside(a: Array, b: Array) -> Array:
     """Return the columns of ``a`` (B, P), then those of ``b`` (B, Q); numba takes far longer to compile ``hstack``."""
     out = np.empty((a.shape[0], a.shape[1] + b.shape[1]), a.dtype)
@@ -94,7 +99,7 @@ def beside(a: Array, b: Array) -> Array:
     return out
 
 
-@kernel
+@inner_kernel
 def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
     """Return W_Fᵀ Π_x ε_x (B, H) for firing rates ``f`` (B, H); for a single row each weight is read once."""
     X, H = W_F.shape
@@ -131,7 +136,7 @@ def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
     return out
 
 
-@kernel
+@inner_kernel
 def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> tuple[Array, Array]:
     """Return ∂F/∂z (B, H), and the most that the bend of f adds to the curvature of F (B,).
 

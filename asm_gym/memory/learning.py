@@ -73,14 +73,13 @@ def coincidence(post: Array, pre: Array) -> Array:
 
 @kernel
 def adapt(W: Array, mean: Array, square: Array, change: Array, rate: float, count: int) -> None:
-    """Move ``W`` along ``change`` in place; all four have one shape. ``count``: updates so far, this one included."""
-    w, m, s, c = W.reshape(-1), mean.reshape(-1), square.reshape(-1), change.reshape(-1)
+    """Move ``W`` along ``change`` in place; all four are (N,). ``count``: updates so far, this one included."""
     m_scale = np.float32(rate / (1.0 - 0.9**count))
     s_scale = np.float32(1.0 / (1.0 - 0.999**count))
-    for k in range(w.size):
-        m[k] = np.float32(0.9) * m[k] + np.float32(0.1) * c[k]
-        s[k] = np.float32(0.999) * s[k] + np.float32(0.001) * c[k] * c[k]
-        w[k] += m_scale * m[k] / (np.sqrt(s_scale * s[k]) + np.float32(1e-8))
+    for k in range(len(W)):
+        mean[k] = np.float32(0.9) * mean[k] + np.float32(0.1) * change[k]
+        square[k] = np.float32(0.999) * square[k] + np.float32(0.001) * change[k] * change[k]
+        W[k] += m_scale * mean[k] / (np.sqrt(s_scale * square[k]) + np.float32(1e-8))
 
 
 class Synapse:
@@ -88,21 +87,23 @@ class Synapse:
 
     def __init__(self, W: Array) -> None:
         self.W = W
-        self.mean, self.square, self.count = np.zeros_like(W), np.zeros_like(W), 0
+        self.mean, self.square, self.count = np.zeros(W.size, W.dtype), np.zeros(W.size, W.dtype), 0
 
     def learn(self, change: Array, rate: float) -> None:
         """Take a step of about ``rate`` a synapse along ``change``, which has the shape of ``W``."""
         if self.W.size:
             self.count += 1
-            adapt(self.W, self.mean, self.square, change, rate, self.count)
+            adapt(self.W.reshape(-1), self.mean, self.square, change.reshape(-1), rate, self.count)
 
 
 @kernel
 def power_iteration(W: Array, v: Array) -> tuple[float, Array]:
     """Take a step towards ‖W‖² (spectral) and its right singular vector ``v`` (H,); return both, ‖v‖ = 1."""
-    v = np.dot(np.dot(W, v), W)
-    norm = np.sqrt(np.sum(v * v))
-    return norm, v / (norm + np.float32(1e-12))
+    through, back = np.empty(W.shape[0], v.dtype), np.empty(v.shape, v.dtype)
+    np.dot(W, v, through)  # numba takes half as long where the result exists already
+    np.dot(through, W, back)
+    norm = np.sqrt(np.sum(back * back))
+    return norm, back / (norm + np.float32(1e-12))
 
 
 class Moment(NamedTuple):

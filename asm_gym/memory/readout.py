@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, kernel, outward
+from asm_gym.memory.energy import Array, inner_kernel, outward
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 UPDATES, BATCH, RATE = 6000, 512, 1e-2
@@ -33,7 +33,7 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
     return shares
 
 
-@kernel
+@inner_kernel
 def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Array:
     """Return L_t (B, K) from L_{t-1}, f(h) (B, M) and f(μ) (B, H), which is not used where W_K has M columns only."""
     rates, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]

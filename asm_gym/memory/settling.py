@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, Scalar, activate, infer, kernel, outward
+from asm_gym.memory.energy import Array, Scalar, activate, infer, inner_kernel, outward
 from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
@@ -45,7 +45,7 @@ def settling_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[in
     return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (S, H), "b_F": (S,), "W_A": (A, H)}
 
 
-@kernel
+@inner_kernel
 def settle(
     z: Array,
     u: Array,

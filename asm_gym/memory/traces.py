@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, Scalar, activate, beside, infer, kernel, outward
+from asm_gym.memory.energy import Array, Scalar, activate, beside, infer, inner_kernel, kernel, outward
 from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
@@ -98,7 +98,7 @@ def sense(z: Array, W_F: Array) -> Array:
     return outward(activate(z), W_F)
 
 
-@kernel
+@inner_kernel
 def carry(
     c: Array,
     u: Array,

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import inner
 
 KINDS = np.float32, np.float64, np.int64
 LINE = 64  # bytes
@@ -47,14 +47,14 @@ class Layout(NamedTuple):
         return cls(singles, doubles, integers, np.array([(*places.values(), *numbers.values())], fields))
 
 
-@compiled
+@inner
 def matrix(flat: Any, place: Any) -> Any:
     """Return the matrix of a ``Layout`` that is at ``place``."""
     begin, rows, columns = place[0], place[1], place[2]
     return flat[begin : begin + rows * columns].reshape((rows, columns))
 
 
-@compiled
+@inner
 def vector(flat: Any, place: Any) -> Any:
     """Return the vector of a ``Layout`` that is at ``place``."""
     return flat[place[0] : place[0] + place[1] * place[2]]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from asm_gym.compilation import compiled, must_compile
+from asm_gym.compilation import compiled, inner, must_compile
 from asm_gym.detection.detector import _step
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.events import _step as _excuse
@@ -154,7 +154,14 @@ def uninitialised(state: Any) -> Any:
     return type(state)(*map(uninitialised, state))
 
 
-@compiled
+@inner
+def _copy(rows: Any, to: Any, n: int) -> None:
+    """Copy row ``n``; numba takes seconds to compile an assignment of rows, with its message about shapes."""
+    for i in range(rows.shape[1]):
+        to[n, i] = rows[n, i]
+
+
+@inner
 def _compare(
     rows: Any, before: Any, earlier: Any, steps: Any, new_before: Any, new_earlier: Any, new_steps: Any
 ) -> Any:
@@ -210,7 +217,8 @@ def expect_rows(
 
     for n in range(len(rows)):
         due = due or steps[n] % lag == 0
-        new_traces[n], new_expected[n] = traces[n], expected[n]
+        _copy(traces, new_traces, n)
+        _copy(expected, new_expected, n)
     if due:  # f(μ_t) (B, H) and c_t (B, I), were it due for all streams
         how = at.prior_precision, at.sensory_precision, at.curvature, at.iterations
         W_F = matrix(singles, at.W_F)
@@ -222,7 +230,8 @@ def expect_rows(
             state, carried = carry(traces, commands, senses, seen, matrix(singles, at.W_C), W_F, *others, *how, context)
         for n in range(len(rows)):
             if steps[n] % lag == 0:
-                new_traces[n], new_expected[n] = carried[n], state[n]
+                _copy(carried, new_traces, n)
+                _copy(state, new_expected, n)
 
     hidden = matrix(singles, at.V), matrix(singles, at.U), matrix(singles, at.D)
     spread = matrix(singles, at.W_S), vector(singles, at.b_S), matrix(singles, at.span_S)
@@ -238,7 +247,7 @@ def expect_rows(
     if skill.shape[1]:
         named = add_up(skill, units, new_expected, matrix(singles, at.W_K), vector(singles, at.b_K))
         for n in range(len(rows)):
-            new_skill[n] = named[n]
+            _copy(named, new_skill, n)
     return error, finite
 
 
@@ -312,7 +321,7 @@ def judge_rows(
                     attribution[n, i] /= divisor[n]
 
 
-@compiled
+@inner
 def _attribute(
     shares: Any, unlikely: Any, offset: Any, sensory: Any, finite: Any, value: Any, attribution: Any
 ) -> None:
