@@ -123,9 +123,8 @@ def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
     a = np.hstack([caused, cause, np.ones((1500, 1))]).astype(np.float32)
     delta, groups = np.ascontiguousarray(a[:, :4]), np.arange(4)
     w, errors = learn_association(a, delta, groups, slice(0, 4), 1, np.random.default_rng(1))
-    shown = called(normalised_errors)(a, delta, np.ones((1500, 1), np.float32), *w[:7], spans(w.U), *w[7:], groups, 0)[
-        0
-    ]
+    rows = a, delta, np.ones((1500, 1), np.float32)
+    shown, _ = called(normalised_errors)(*rows, *w[:7], spans(w.U), *w[7:], groups, 0)
     assert np.mean(errors**2) > 1.05 * np.mean(shown**2)
     assert 0.8 < np.mean(errors**2) < 1.2
 
