@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
+from packaging.version import Version
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -19,7 +20,7 @@ from asm_gym.extras import BROUGHT_BY, TESTED, fitting, remedy
 from asm_gym.graphics import GET_RENDERING, rendering_backend
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 
-PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "stable-baselines3", "torch")
+PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "pyarrow", "stable-baselines3", "torch")
 NAME_CACHE = "export NUMBA_CACHE_DIR=FOLDER, one that you can write to, then asm-gym warmup"
 REINSTALL = "install asm-gym anew (in a clone: make clean, then make doctor)"
 
@@ -59,6 +60,8 @@ def package(name: str) -> Check:
     wanted = next((r.specifier for r in asked if not r.marker or r.marker.evaluate({"extra": extra})), SpecifierSet())
     if name in TESTED and not TESTED[name].contains(version, prereleases=True):
         return Check(name, f"{version}, but needs {TESTED[name]}", fitting(name), needed=True)
+    if name == "pyarrow" and Version(version).major >= 26 and Version(metadata.version("numpy")).major < 2:
+        return Check(name, f"{version}, but needs NumPy 2", "pip install 'pyarrow<26'")  # pip does not know
     if wanted.contains(version, prereleases=True):
         return Check(name, version)
     return Check(name, f"{version}, but needs {wanted}", f"pip install '{name}{wanted}'", needed=True)

@@ -131,14 +131,14 @@ def matrix(asked: str = "") -> int:
     for name in (each for each in MATRIX if asked in each):
         python, numpy = name.split()
         # The tested versions; with NumPy 1 what still goes with it, but the same PyTorch.
-        keep = "torch==" if numpy == "numpy<2" else ""
+        keep, others = ("torch==", "'pyarrow<26'") if numpy == "numpy<2" else ("", "")
         with TemporaryDirectory(prefix="asm-gym-matrix-") as folder:
             pins = (line for line in (ROOT / "constraints.txt").read_text().splitlines(keepends=True) if keep in line)
             Path(folder, "pins.txt").write_text("".join(pins))
             steps = (
                 f"git clone -q --depth 1 file://{ROOT} tree",
                 f"uv venv -q --seed --python {python} tree/.venv",
-                f"uv pip install -q --python tree/.venv -c pins.txt -e 'tree[dev]' '{numpy}'",
+                f"uv pip install -q --python tree/.venv -c pins.txt -e 'tree[dev]' '{numpy}' {others}",
                 f"uv pip install -q --python tree/.venv --no-deps {ROBOSUITE}",
                 "touch tree/.venv/.installed",
                 "make -C tree test",

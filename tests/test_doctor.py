@@ -85,6 +85,19 @@ def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name
     assert ("--no-deps" in check.remedy) == (name == "robosuite")  # which brings NumPy below 2
 
 
+@pytest.mark.parametrize("numpy", ["1.26.4", "2.4.6"])
+def test_a_pyarrow_that_needs_numpy_2_is_named(machine: Any, numpy: str) -> None:
+    machine(numpy=numpy, pyarrow="26.0.1")
+    assert [c.remedy for c in failed().values() if "pyarrow" in c.name] == ["pip install 'pyarrow<26'"] * (numpy < "2")
+
+
+def test_an_old_gymnasium_is_named_with_what_replaces_it(machine: Any) -> None:
+    machine(gymnasium="0.29.1")
+    check = failed()["gymnasium"]
+    assert check.needed
+    assert check.remedy.startswith("pip install 'gymnasium>=")
+
+
 @pytest.mark.parametrize(("name", "fits", "fails"), [("mujoco", "3.11.0", "3.12.0"), ("robosuite", "1.5.2", "1.5.1")])
 def test_a_simulator_out_of_range_is_refused_before_it_is_imported(
     name: str, fits: str, fails: str, monkeypatch: pytest.MonkeyPatch

@@ -1,7 +1,6 @@
 """The compiled mathematics against MuJoCo's, numpy's and robosuite's own."""
 
 import mujoco
-import numba
 import numpy as np
 import pytest
 
@@ -9,11 +8,7 @@ from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs import control
 from asm_gym.envs.backend import import_robosuite
 from asm_gym.envs.mujoco_views import Work
-
-
-def called(function):
-    """A function that only compiled ones call, for Python to call."""
-    return numba.njit(lambda *arguments: function(*arguments))
+from tests.problems import called
 
 
 @pytest.fixture

@@ -117,11 +117,11 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
 
 
 @compiled
-def feel(joints: Ints, limits: SubstepLimits, k: int, samples: Floats) -> bool:
+def feel(joints: Ints, limits: SubstepLimits, held: Ints, k: int, samples: Floats) -> None:
     """Compare the load of arms of so many ``joints`` (A,) in substep ``k`` with the limits; NaN passes a limit.
 
-    Returns:
-        Whether the arms must stop now; true once in a control step.
+    Where a limit is the first to be passed in a control step, and asks for it, all arms are ``held`` (A,) from the next
+    substep on where they then are; those that are held already, where they were.
     """
     state = limits.state
     for a in range(len(joints) if state[ARMED] else 0):
@@ -135,14 +135,8 @@ def feel(joints: Ints, limits: SubstepLimits, k: int, samples: Floats) -> bool:
                 state[PASSED_IN] = state[SUBSTEPS]
     state[SUBSTEPS] += 1
     if state[ACTS] == 0 or state[PASSED_IN] < 0 or state[STAYED] != 0:
-        return False
+        return
     state[STAYED] = 1
-    return True
-
-
-@compiled
-def hold(held: Ints) -> None:
-    """Hold the arms from the next substep on where they then are; those that are held already, where they were."""
     for a in range(len(held)):
         if held[a] == 0:
             held[a] = HELD
@@ -190,8 +184,7 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
             control(views, nominal, arms, goals, work, a)
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)  # the place for all that is measured in every substep
-        if feel(arms.joints, limits, k, samples):
-            hold(goals.held)
+        feel(arms.joints, limits, goals.held, k, samples)
 
 
 @compiled

@@ -14,6 +14,7 @@ from asm_gym.compilation import must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.commands import move_gripper, scaling_of
+from asm_gym.envs.control import HELD
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
@@ -124,7 +125,7 @@ class Simulation:
                 nothing. So they are braked beneath their controllers (``control.brake``).
         """
         if hold:
-            kernels.hold(self._goals.held)
+            self._goals.held[self._goals.held == 0] = HELD
         else:
             self._goals.held[:] = 0
         self._goals.action[:] = action
@@ -157,8 +158,7 @@ class Simulation:
                 kernels.brake_held(self.views, nominal, self.arms, self._goals, self._work)
             self.env.sim.step2()
             kernels.sample(self.views, nominal, self.arms, k, self._samples)
-            if kernels.feel(self.arms.joints, self._limits, k, self._samples):
-                kernels.hold(self._goals.held)
+            kernels.feel(self.arms.joints, self._limits, self._goals.held, k, self._samples)
             self._fresh = False
 
     def _run(self, count: int) -> None:
