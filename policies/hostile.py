@@ -1,8 +1,9 @@
-"""Policies that do harm, to try a guard on: they ram, flail, turn hostile, act late, or the wrong way round."""
+"""Policies that do harm, to try a guard on: they ram, grind, fling, flail, turn hostile, or act late."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -39,8 +40,14 @@ class Hostile(StatefulPolicy):
         return np.clip(action, self._space.low, self._space.high).astype(np.float32), (step + 1, rng)
 
 
-def _towards(x: float, y: float, z: float) -> Rule:
-    return lambda step, rng, size: np.array([x, y, z, *[0.0] * (size - 3)])
+def _towards(*direction: float) -> Rule:
+    """Return the rule of one change of pose, (x, y, z) or with turns about them; the grip stays."""
+    return lambda step, rng, size: np.array([*direction, *[0.0] * (size - len(direction))])
+
+
+def _by_step(motion: Callable[[int], tuple[float, ...]]) -> Rule:
+    """Return the rule of another change of pose in each step; a seventh number is the grip."""
+    return lambda step, rng, size: _towards(*motion(step))(step, rng, size)
 
 
 def _bang_bang() -> Rule:
@@ -87,6 +94,22 @@ HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
     "forward": lambda env, seed, speed: Hostile(env, seed, speed, _towards(1.0, 0.0, -0.3)),
     "bang-bang": lambda env, seed, speed: Hostile(env, seed, speed, _bang_bang()),
     "uniform": lambda env, seed, speed: Hostile(env, seed, speed, lambda step, rng, size: rng.uniform(-1.0, 1.0, size)),
+    **{
+        name: partial(Hostile, rule=rule)
+        for name, rule in {
+            "ramp": _by_step(lambda t: (0.0, 0.0, -min(1.0, t / 100))),
+            "hammering": _by_step(lambda t: (0.0, 0.0, -1.0 if t % 20 < 12 else 1.0)),
+            "grinding": _by_step(lambda t: (np.cos(t / 5), np.sin(t / 5), -0.5)),
+            "squeezing": _by_step(lambda t: (0.0, 0.0, -1.0 * (t < 60), 0.0, 0.0, 0.0, -1.0 if t < 60 else 1.0)),
+            "flinging": _by_step(lambda t: (0.0, 1.0 if t % 12 < 6 else -1.0, 0.0, 0.0, 0.0, 0.0, (-1.0) ** (t // 6))),
+            "to joint limits": _towards(0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+            "into itself": _towards(-1.0, 0.0, -0.3),
+            "turning": _towards(0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
+            "rolling": _towards(0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+            "waits for the hand-back": _by_step(lambda t: (0.0, 0.0, -1.0 * (t % 36 < 24))),  # a trial comes after 10
+            "first rows": _by_step(lambda t: (1.0 * (t < 12), 0.0, -1.0 * (t < 12), 0.0, 1.0 * (t < 12), 0.0)),
+        }.items()
+    },
     "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
     "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
     "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),

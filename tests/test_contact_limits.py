@@ -5,13 +5,15 @@ import numpy as np
 import pytest
 
 from asm_gym import collect
-from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
-from asm_gym.guard.limits import EpisodeLimits
+from asm_gym.detection.contact_limits import ContactLimits, Pace, healthy_forces
+from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
+
+FOLDED = 0.0, -0.2, 2.5, -2.95, 1.34, 2.3, -2.73  # the fingers are in the pedestal, 9 mm deep [rad]
 
 
 def down(env, steps, seed=0):
@@ -111,4 +113,59 @@ def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_
     peaks = np.concatenate([e.stream[:, e.spec.slices["wrist_force_peak"]] for e in episodes[2:]])
     np.testing.assert_allclose(monitor.healthy_[7:], np.abs(peaks).max(axis=0), rtol=1e-6)
     monitor.save(tmp_path / "limit.asm")
-    assert load_monitor(tmp_path / "limit.asm").healthy_ == monitor.healthy_
+    loaded = load_monitor(tmp_path / "limit.asm")
+    assert loaded.healthy_ == monitor.healthy_
+    np.testing.assert_array_equal(loaded.pace_, monitor.pace_)
+    assert limits_of("memory", loaded).pace is not None
+    assert limits_of("memory", NeuralASM.pretrained("panda")).hand_speed == 0.15
+
+
+@pytest.mark.parametrize("controller", ["OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "IK_POSE"])
+@pytest.mark.parametrize("turns", [False, True])
+def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(controller, turns):
+    env, rng, speeds = gym.make("asm_gym/Lift-v0", controller=controller), np.random.default_rng(0), []
+    env.reset(seed=0)
+    arm = env.unwrapped
+    arm.contact_limits = ContactLimits(1e3, 1e3, hand_speed=0.15)
+    arm.substep_hooks.append(lambda k: speeds.append(arm.simulation.hand_speed(arm.simulation.hand_twist(0))))
+    for step in range(12):
+        if step % 4 == 0:
+            action = rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
+            action[: 3 * (turns and controller.endswith("POSE"))] = 0.0
+        env.step(action)
+    env.close()
+    assert 0.1 < max(speeds) < 0.2
+
+
+def test_what_is_fixed_to_the_world_belongs_to_it(lift):
+    lift.reset(seed=0)
+    arm = lift.unwrapped
+    arm.simulation.data.qpos[:7] = FOLDED
+    *_, info = lift.step(np.zeros(7, np.float32))
+    assert info["contact_force"] > 100.0
+
+
+def hands(*twists, place=(0.1, 0.2, 0.9)):
+    """A spec of one hand, and a stream in which it has these twists at one place."""
+    spec = StreamSpec(tuple(Channel(f"hand_{n}", 3, "m") for n in ("position", "velocity", "angular_velocity")), 0.05)
+    return spec, np.array([[*place, *twist] for twist in twists], np.float32)
+
+
+def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual_one(tmp_path):
+    spec, stream = hands([0.4, 0.0, -0.1, 0, 0, 1.0], [0.0, 0.0, -0.3, 0, 0, 0])
+    limits, here = ContactLimits(pace=Pace(Pace.learned([stream], spec))), np.array([0.1, 0.2, 0.9])
+
+    def most(*twist, place=here):
+        speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
+        return limits.share(0, place, np.array(twist, float), speed)
+
+    assert most(0.4, 0, 0, 0, 0, 1.0) >= 1.0  # as healthy hands did
+    assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
+    assert most(0.4, 0, 0, 0, 0, 0, place=here + 0.3) == pytest.approx(0.15 / 0.4)  # another place
+    assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
+    assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1) < 0.3  # and slower where no healthy hand went down
+    assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == pytest.approx(0.5)
+    assert Pace.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
+    for bad in (np.zeros((0, 16)), np.full((1, 16), np.nan), np.full((1, 16), 1e9), np.zeros((1, 15))):
+        with pytest.raises(ValueError, match="pace must be rows"):
+            Pace(bad)

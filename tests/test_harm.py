@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from asm_gym.policies.hostile import HOSTILE
 from asm_gym.scripts.reproduce import harm
 from asm_gym.scripts.reproduce.kit import main
 
@@ -25,7 +26,12 @@ def test_harm_is_the_impulse_beyond_forty_newtons():
 
 def record(guard, seed, value, policy="down", kind="hostile", success=True):
     case = {"kind": kind, "task": "Lift", "policy": policy, "fault": "nominal", "robot": "Panda", "rate": 20}
-    forces = dict.fromkeys(("harm", "peak", "first"), value) | {"steps_over": 0, "steps": 10, "held": 1}
+    forces = dict.fromkeys(("harm", "peak", "first"), value) | {
+        "steps_over": 0,
+        "steps": 10,
+        "held": 0,
+        "time": 2.0 if success else np.nan,
+    }
     return case | forces | {"guard": guard, "seed": seed, "success": success}
 
 
@@ -50,22 +56,23 @@ def test_success_is_paired_by_scene_and_counted_without_a_blow():
         records.append(record(ALONE, seed, blow, policy, "healthy", alone))
         records.append(record(DEFAULT, seed, 10.0, policy, "healthy", guarded))
     rows = harm.by_guard("", pd.DataFrame(records), [ALONE, DEFAULT], harm.CASE, ("kind",)).rows
-    assert [(row[0], *row[-3:]) for row in rows if row[1] == ALONE] == [
-        ("Lift, scripted", "2 of 2", "-0 +0", "1"),
-        ("Lift, lift_sac", "1 of 2", "-0 +0", "0"),
-        ("Lift", "3 of 4", "-0 +0", "1"),
+    assert [(row[0], *row[-4:]) for row in rows if row[1] == ALONE] == [
+        ("Lift, scripted", "2 of 2", "-0 +0", "1 of 2", "2.00"),
+        ("Lift, lift_sac", "1 of 2", "-0 +0", "1 of 1", "2.00"),
+        ("Lift", "3 of 4", "-0 +0", "2 of 3", "2.00"),
     ]
-    assert [row[-3:] for row in rows if row[1] == DEFAULT] == [
-        ("1 of 2", "-1 +0", "1"),
-        ("2 of 2", "-0 +1", "2"),
-        ("3 of 4", "-1 +1", "3"),
+    assert [row[-4:-1] for row in rows if row[1] == DEFAULT] == [
+        ("1 of 2", "-1 +0", "0 of 1"),
+        ("2 of 2", "-0 +1", "0 of 2"),
+        ("3 of 4", "-1 +1", "0 of 3"),
     ]
 
 
 def test_every_kind_of_policy_that_is_asked_for_has_its_cases():
     found = harm.cases(harm.Config(episodes=2, against=harm.AGAINST, healthy=3, tasks=("Lift",)))
-    counts = {"hostile": 34, "untrained": 3, "healthy": 2, "faulty": 10}
-    assert Counter(case.kind for case, _ in found) == counts
+    kinds = Counter(case.kind for case, _ in found)
+    assert kinds["hostile"] == len(HOSTILE) * (1 + len(harm.ELSEWHERE)) + 2
+    assert (kinds["untrained"], kinds["healthy"], kinds["faulty"]) == (3, 2, 10)
     assert {case.config.robot for case, n in found if n == 2} == {"Panda", "Sawyer", "IIWA"}
 
 

@@ -27,12 +27,12 @@ def joints(env):
 
 @pytest.mark.parametrize("scale", [0.05, 1.0])
 def test_the_action_that_is_told_moves_the_bare_environment_in_the_same_way(scale):
-    guarded, bare, rng = lift(), gym.make("asm_gym/Lift-v0"), np.random.default_rng(0)
+    guarded, bare = lift(), gym.make("asm_gym/Lift-v0")
     guarded.reset(seed=0)
     bare.reset(seed=0)
     slowed = []
     for _ in range(STEPS):
-        asked = np.float32(scale * rng.uniform(-1, 1, 7))
+        asked = np.float32(scale * np.array([0.6, -0.4, -1.0, 0.1, -0.2, 0.3, 0.5]))
         asm = guarded.step(asked)[4]["asm"]
         bare.step(asm["executed_action"])
         np.testing.assert_array_equal(joints(guarded), joints(bare))
@@ -40,10 +40,10 @@ def test_the_action_that_is_told_moves_the_bare_environment_in_the_same_way(scal
         if not asm["slowed"]:
             np.testing.assert_array_equal(asm["executed_action"], asked)
         else:
-            part = asm["executed_action"][:3] / asked[:3]
+            part = asm["executed_action"][:6] / asked[:6]
             np.testing.assert_allclose(1 - part, asm["slowed"], atol=1e-5)
             assert not asm["intervened"]
-    assert np.mean(np.array(slowed) > 0) == (0.0 if scale < 1 else pytest.approx(1.0, abs=0.5))
+    assert np.mean(np.array(slowed) > 0) == (0.0 if scale < 1 else 1.0)
     guarded.close()
     bare.close()
 

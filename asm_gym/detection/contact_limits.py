@@ -15,13 +15,72 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
 
 FELT = "external_torque", "wrist_force"  # ends of the names of the channels that limits are about
+Floats = NDArray[np.float64]
 LEFT_OUT = 0.05  # share of healthy episodes, those that pressed hardest, left out of what healthy motion needs
 MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 100 N m
+
+
+FAR = 100  # cells; hands further away are not learned of
+CELL = 0.04, 0.04, 0.02  # edges of the cells by which pace is learned [m]
+FASTER = 1.25  # a hand may be commanded to go so many times as fast as healthy ones did: about 0.8 of it is reached
+SLACK = np.array([0.03] * 3 + [0.15] * 3)  # and by so much more [m/s], [rad/s]
+DOWN = 0.065  # never slower than this downwards, to where stiff surfaces are: on a bin it is a blow of 270 N [m/s]
+
+
+class Pace:
+    """How fast healthy hands went, by place and direction.
+
+    Args:
+        cells: (N, 16) arm; place in cells; greatest twist along the axes of the world and against them.
+
+    Raises:
+        ValueError: numbers that are none of these.
+    """
+
+    def __init__(self, cells: NDArray[np.floating[Any]]) -> None:
+        near = cells.ndim == 2 and cells.shape[1] == 16 and len(cells) > 0 and (np.abs(cells[:, :4]) <= FAR).all()
+        if not (near and (cells[:, 0] >= 0).all() and (cells[:, 4:] >= 0).all()):
+            raise ValueError(f"pace must be rows of 16 numbers, places within {FAR} cells, got {cells.shape}")
+        self.cells, at = cells, cells[:, :4].astype(np.intp)
+        self._low = at.min(axis=0) - (0, 1, 1, 1)
+        grid = np.zeros((*(at.max(axis=0) - self._low + (1, 2, 2, 2)), 12), np.float32)
+        grid[tuple((at - self._low).T)] = cells[:, 4:]
+        # Neighbours count as well, downwards those at the same height.
+        self._seen = maximum_filter(grid, (1, 3, 3, 3, 1))
+        self._seen[..., 8] = maximum_filter(grid[..., 8], (1, 3, 3, 1))
+
+    @staticmethod
+    def learned(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> NDArray[np.float32] | None:
+        """Return the cells of healthy streams (T, D); None where these do not tell how hands move."""
+        found = []
+        names = [c.name.removesuffix("position") for c in spec.channels if c.name.endswith("hand_position")]
+        for arm, name in enumerate(names):
+            parts = [spec.slices.get(name + what) for what in ("position", "velocity", "angular_velocity")]
+            if None in parts:
+                continue
+            rows = np.concatenate([np.hstack([stream[:, part] for part in parts]) for stream in streams])  # (T, 9)
+            rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, :3]) < FAR * np.array(CELL)).all(axis=1)]
+            places, which = np.unique(np.floor(rows[:, :3] / CELL), axis=0, return_inverse=True)
+            seen = np.zeros((len(places), 12))
+            np.maximum.at(seen, which.ravel(), np.hstack((rows[:, 3:], -rows[:, 3:])))
+            found.append(np.column_stack((np.full(len(places), arm), places, seen)))
+        return np.concatenate(found).astype(np.float32) if found else None
+
+    def share(self, arm: int, place: Floats, twist: Floats, speed: float, usual: float) -> float:
+        """Return the share of its motion that a hand may have; see ``ContactLimits.share``. ``usual``: its limit."""
+        cell = (arm, *np.floor(place / CELL).astype(np.intp)) - self._low
+        there = (cell >= 0).all() and (cell < self._seen.shape[:4]).all()
+        seen = self._seen[tuple(cell)].reshape(2, 6) if there else np.zeros((2, 6))
+        along = FASTER * np.where(twist > 0.0, seen[0], seen[1])
+        with np.errstate(divide="ignore"):
+            share = max(usual / speed, float(((along + SLACK) / np.abs(twist)).min()))
+        return min(share, min(max(DOWN, along[2]), usual) / -twist[2]) if twist[2] < 0.0 else share
 
 
 @dataclass(frozen=True)
@@ -31,8 +90,10 @@ class ContactLimits:
     Args:
         wrist_force: on each axis of the wrist, the hand's own weight included [N].
         external_torque: of each joint [N m].
-        hand_speed: a command that would move the hand faster is scaled down to it [m/s]; infinite for none. Of
-            OSC_POSE and JOINT_POSITION, whose actions are changes of where the arm is; others are not scaled.
+        hand_speed: what the hand, and what is 0.15 m from its fingers as it turns, may have [m/s]; infinite for none.
+            A command that would be faster is scaled down where its controller tells by how much: OSC_POSE, OSC_POSITION
+            and JOINT_POSITION. Under every controller the arm is braked where it is faster all the same.
+        pace: how much faster it may be where healthy hands were; None for no faster.
         healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
             ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
         stays: the arm stays from the physics substep on after a limit was passed; else it is only said.
@@ -45,6 +106,7 @@ class ContactLimits:
     external_torque: float = 40.0
     hand_speed: float = 0.15
     healthy: tuple[float, ...] = ()
+    pace: Pace | None = None
     stays: bool = True
 
     def __post_init__(self) -> None:
@@ -72,19 +134,33 @@ class ContactLimits:
             external_torque=forces * self.external_torque,
             hand_speed=min(speed, self.hand_speed),
             healthy=tuple(forces * value for value in self.healthy),
+            pace=None,
         )
 
     def and_those_of(self, other: ContactLimits, felt: Sequence[Channel]) -> ContactLimits:
         """Return limits as strict as the stricter of two; those for which an arm stays count alone, if one does."""
         if self.stays != other.stays:
             return self if self.stays else other
+        same = self.pace is not None and other.pace is not None and np.array_equal(self.pace.cells, other.pace.cells)
         return replace(
             self,
             wrist_force=min(self.wrist_force, other.wrist_force),
             external_torque=min(self.external_torque, other.external_torque),
             hand_speed=min(self.hand_speed, other.hand_speed),
             healthy=tuple(np.minimum(self.most(felt), other.most(felt)).tolist()),
+            pace=self.pace if same else None,
         )
+
+    def share(self, arm: int, place: Floats, twist: Floats, speed: float) -> float:
+        """Return the share of its motion that a hand may have, above 1 where it may go faster.
+
+        Args:
+            arm, place: which, and where it is (3,) [m].
+            twist, speed: how it moves (6,), and how fast its fastest point then goes [m/s].
+        """
+        speed = max(speed, 1e-9)
+        usual = self.hand_speed
+        return usual / speed if self.pace is None else self.pace.share(arm, place, twist, speed, usual)
 
     @property
     def limits_speed(self) -> bool:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.envs.robots import CHANGES, gripper_actions
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.envs.robots import CHANGES, SLOWED, gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
 
@@ -49,26 +49,30 @@ class Actions:
         units: NDArray[np.float64] = self._middle + self._half * action
         return units
 
-    def slowed(self, simulation: Simulation, action: NDArray[np.float32], limit: float) -> NDArray[np.float32]:
-        """Return the action (A,) scaled so that no hand is commanded to go faster than ``limit`` [m/s].
+    def slowed(self, simulation: Simulation, action: NDArray[np.float32], limits: ContactLimits) -> NDArray[np.float32]:
+        """Return the action (A,) scaled along its own direction so that no point of a hand goes faster than it may.
 
-        A controller that is asked for a change Δx of pose again and again comes to the velocity Kp/Kd Δx. Actions of
-        controllers that take anything else are left as they are.
+        A controller that is asked for a change Δx of pose again and again comes to the velocity Kp/Kd Δx. Where actions
+        mean something else they are left as they are, and the arm is braked beneath its controller once it is too fast.
         """
         slow, rest, scaled = action, None, self.scaled(action)
         for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
-            if controller.name not in CHANGES or controller.input_type != "delta":
+            simulation.speed_limits[a] = limits.hand_speed
+            if controller.name not in SLOWED or controller.input_type != "delta":
                 continue
             least, most, middle, scale, offset = simulation.arms.scaling[a, :, : part.stop - part.start]
             delta = (np.minimum(np.maximum(scaled[part], least), most) - middle) * scale + offset
-            if controller.name == "JOINT_POSITION":
-                delta = simulation.hand_jacobian(a)[:3] @ delta
-            (kp, kd), step = (controller.kp[:3].tolist(), controller.kd[:3].tolist()), delta[:3]
-            speed = sum(p / d for p, d in zip(kp, kd, strict=True)) / 3 * math.sqrt(step @ step)  # faster than NumPy's
-            if speed > limit:
+            delta = delta * (controller.kp / controller.kd)[: len(delta)]
+            asked = simulation.hand_twist(a, delta, in_joints=controller.name == "JOINT_POSITION")
+            asked_speed, speed = simulation.hand_speed(asked), simulation.hand_speed(moves := simulation.hand_twist(a))
+            place = simulation.hand_place(a)
+            share, now = limits.share(a, place, asked, asked_speed), limits.share(a, place, moves, speed)
+            most = min(asked_speed * share, speed * now if now < 1.0 else np.inf)
+            simulation.speed_limits[a] = max(limits.hand_speed, most)
+            if share < 1.0:
                 rest = self.resting(simulation, action) if rest is None else rest
                 slow = slow.copy()
-                slow[part] = rest[part] + np.float32(limit / speed) * (action[part] - rest[part])
+                slow[part] = rest[part] + np.float32(share) * (action[part] - rest[part])
         return slow
 
     def turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -20,7 +20,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.envs.control import HELD, control, set_goal
+from asm_gym.envs.control import HELD, control, read_arm, set_goal, slow_down
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
@@ -143,13 +143,18 @@ def feel(joints: Ints, limits: SubstepLimits, held: Ints, k: int, samples: Float
 
 
 @compiled
-def brake_held(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work) -> None:
-    """Brake the arms that are held, where their controllers are not compiled."""
+def brake_beneath(
+    views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, limits: SubstepLimits
+) -> None:
+    """Brake the arms that are held or too fast, where their controllers are not compiled."""
     if nominal.model != 0:
         _evaluate_nominal(views, nominal)
     for a in range(len(arms.joints)):
         if goals.held[a] != 0:
             control(views, nominal, arms, goals, work, a)
+        else:
+            read_arm(views, nominal, arms, work, a)
+            slow_down(views, arms, limits, work, a)
 
 
 @compiled
@@ -182,6 +187,8 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
             if fresh and k == first and goals.held[a] == 0:
                 set_goal(views, arms, goals, work, a)
             control(views, nominal, arms, goals, work, a)
+            if goals.held[a] == 0:
+                slow_down(views, arms, limits, work, a)
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)  # the place for all that is measured in every substep
         feel(arms.joints, limits, goals.held, k, samples)

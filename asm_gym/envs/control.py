@@ -23,7 +23,16 @@ import numpy as np
 
 from asm_gym.compilation import inner
 from asm_gym.envs.commands import rotation, scaled
-from asm_gym.envs.mujoco_views import JOINT_POSITION, Arms, Floats, Goals, NominalViews, Views, Work
+from asm_gym.envs.mujoco_views import (
+    JOINT_POSITION,
+    Arms,
+    Floats,
+    Goals,
+    NominalViews,
+    SubstepLimits,
+    Views,
+    Work,
+)
 
 
 @inner
@@ -76,6 +85,8 @@ YIELDS_AT = 60.0  # Y: the force at the hand from which an arm that is held and 
 HELD, BRAKING, YIELDING = 1, 2, 3
 """Of ``Goals.held``: to be held from the next substep on; on its way to rest; and since then."""
 
+REACHES = 0.15  # how far gripper, fingers and what they hold are from the point between the fingers, about [m]
+SLOWING = 200.0  # share of the speed beyond its limit that an arm loses in a second [1/s]
 RESTING = 0.1  # an arm none of whose joints is faster than this has come to rest [rad/s]
 YIELD_LEVER = 0.15  # r₀: what a joint has at least for a lever [m]
 
@@ -241,6 +252,40 @@ def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
             velocity += work.J[r, i] * work.v[i]
         work.F[0, r] = arms.kp[a, r] * work.F[0, r] - arms.kd[a, r] * velocity
     osc_torques(work, n)
+
+
+@inner
+def fastest_point(views: Views, arms: Arms, a: int) -> float:
+    """Return the greatest speed of a joint of arm ``a``, or of its hand as far as that ``REACHES`` [m/s]."""
+    site, com, most, turning = views.site_xpos[arms.site[a]], views.subtree_com[arms.root[a]], 0.0, 0.0
+    for n in range(arms.links.shape[1]):
+        b = arms.links[a, n]
+        if b < 0:
+            break
+        v, total = views.cvel[b], 0.0
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            at_j, at_k = (site[j], site[k]) if n == 0 else (views.xpos[b, j], views.xpos[b, k])
+            speed = v[3 + i] + v[j] * (at_k - com[k]) - v[k] * (at_j - com[j])
+            total += speed * speed
+            turning += v[i] * v[i] if n == 0 else 0.0
+        most = max(most, np.sqrt(total) + (REACHES * np.sqrt(turning) if n == 0 else 0.0))
+    return most
+
+
+@inner
+def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: int) -> None:
+    """Brake arm ``a``, of which M and v are known, along its own motion while its fastest point passes its limit."""
+    limit = limits.speed[a]
+    speed = fastest_point(views, arms, a) if limit < np.inf else 0.0
+    if speed > limit:
+        for i in range(arms.joints[a]):
+            work.p[i] = SLOWING * (1.0 - limit / speed) * work.v[i]
+        multiply(work.M, arms.joints[a], work.p, work.tau)
+        for i in range(arms.joints[a]):
+            m = arms.motors[a, i]
+            command = views.ctrl[m] - work.tau[i]
+            views.ctrl[m] = min(max(command, views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
 
 
 @inner

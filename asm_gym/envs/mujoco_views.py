@@ -33,6 +33,7 @@ class Views(NamedTuple):
     cdof: Floats  # (nv, 6)
     cvel: Floats  # (nbody, 6)
     subtree_com: Floats  # (nbody, 3)
+    xpos: Floats  # (nbody, 3)
     site_xpos: Floats  # (nsite, 3)
     site_xmat: Floats  # (nsite, 9)
     sensordata: Floats
@@ -76,7 +77,8 @@ class Arms(NamedTuple):
     root: Ints  # (A,) the robot's outermost body
     base: Ints  # (A,) the site that actions are relative to, -1 for the world
     wrench: Ints  # (A,) where the wrist's force and torque begin in sensordata
-    bodies: Ints  # (A, B) bodies whose contacts count, padded with -1
+    bodies: Ints  # (A, B) bodies whose contacts count, padded with -1; what is fixed to the world belongs to it
+    links: Ints  # (A, L) bodies from the hand to the base, padded with -1
     tree: Ints  # (A, T) dofs of the arm and all that hangs on it, padded with -1
     kind: Ints  # (A,) OSC_POSE or JOINT_POSITION
     kp: Floats  # (A, JOINTS)
@@ -133,6 +135,7 @@ class SubstepLimits(NamedTuple):
     most: Floats  # (A, FELT) [N m], [N]
     load: Floats  # (1,) the largest share of a limit that was reached since the control step began
     state: Ints  # (5,) see below
+    speed: Floats  # (A,) of the fastest point of an arm, from which on it is slowed down; infinite for none [m/s]
 
 
 ARMED, ACTS, SUBSTEPS, PASSED_IN, STAYED = range(5)

@@ -17,6 +17,7 @@ from asm_gym.validation import check_choice, check_text, short_repr
 
 PHYSICS_FREQ = 500  # robosuite's physics rate [Hz]
 CHANGES = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes of the arm's pose
+SLOWED = (*CHANGES, "OSC_POSITION")  # controllers whose actions tell how fast the hand will go
 Part = tuple[Any, str]  # one of robosuite's robots, and the name of one of its arms
 
 
@@ -72,7 +73,8 @@ def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
     fields |= {name: np.zeros((n, JOINTS), np.int64) for name in ("qpos", "dofs", "motors")}
     fields |= {name: np.zeros((n, JOINTS)) for name in ("kp", "kd", "rest")}
     arms = Arms(
-        bodies=_padded([bodies(model, robot) for robot, _ in parts]),
+        bodies=_padded([own[model.body_weldid[own] != 0] for own in (bodies(model, robot) for robot, _ in parts)]),
+        links=_padded([_links(model, model.body(r.robot_model.eef_name[arm]).id) for r, arm in parts]),
         tree=_padded([_carried_dofs(model, robot) for robot, _ in parts]),
         compensate=np.zeros(n, bool),
         limits=np.tile([-np.inf, np.inf], (n, JOINTS, 1)),
@@ -90,6 +92,14 @@ def bodies(model: mujoco.MjModel, robot: Any) -> Ints:
     """Return the bodies of a robot."""
     root = model.body(robot.robot_model.root_body).id
     return np.flatnonzero(model.body_rootid == root).astype(np.int64)
+
+
+def _links(model: mujoco.MjModel, hand: int) -> Ints:
+    """Return the bodies from a hand to what is fixed to the world."""
+    found = [hand]
+    while model.body_weldid[model.body_parentid[found[-1]]] != 0:
+        found.append(int(model.body_parentid[found[-1]]))
+    return np.array(found, np.int64)
 
 
 def _fill_indices(arms: Arms, a: int, model: mujoco.MjModel, robot: Any, arm: str) -> None:

@@ -14,7 +14,7 @@ from asm_gym.compilation import must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.commands import move_gripper, scaling_of
-from asm_gym.envs.control import HELD
+from asm_gym.envs.control import HELD, REACHES
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
@@ -29,7 +29,7 @@ from asm_gym.envs.mujoco_views import (
     Views,
     Work,
 )
-from asm_gym.envs.robots import CHANGES, NominalDynamics, bodies, describe, is_compilable
+from asm_gym.envs.robots import SLOWED, NominalDynamics, bodies, describe, is_compilable
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.spec import Channel
 
@@ -57,7 +57,9 @@ class Simulation:
         self.nominal = NominalDynamics(self.model, self.views, robots)  # the robots' own model of their dynamics
         n = len(self.parts)
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
-        self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64))
+        self.speed_limits = np.full(n, np.inf)
+        """(A,) speed of the fastest point of an arm, from which on it is slowed down [m/s]."""
+        self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64), self.speed_limits)
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.contact_force = 0.0
         """The largest net contact force on an arm within the control step [N]. In the sum over its bodies a grasp's own
@@ -82,9 +84,10 @@ class Simulation:
         self._grips = [grip for grip in grips if grip is not None]
         self.compiled = all(is_compilable(robot, arm) for robot, arm in self.parts)  # whether control runs compiled
         self.arms = describe(self.parts, self.model)
+        self.speed_limits[:] = np.inf
         for a, (controller, part) in enumerate(zip(self.controllers, self.moves, strict=True)):
             size = part.stop - part.start
-            if controller.name in CHANGES and size <= JOINTS:
+            if controller.name in SLOWED and size <= JOINTS:
                 self.arms.first[a], self.arms.inputs[a] = part.start, size
                 self.arms.scaling[a, :, :size] = scaling_of(controller, size)
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
@@ -154,8 +157,8 @@ class Simulation:
             nominal = self.nominal.now()
             self.env.sim.step1()
             self.env._pre_action(self._goals.action.copy(), self._fresh)
-            if self._goals.held.any():
-                kernels.brake_held(self.views, nominal, self.arms, self._goals, self._work)
+            if self._goals.held.any() or self.speed_limits.min() < np.inf:
+                kernels.brake_beneath(self.views, nominal, self.arms, self._goals, self._work, self._limits)
             self.env.sim.step2()
             kernels.sample(self.views, nominal, self.arms, k, self._samples)
             kernels.feel(self.arms.joints, self._limits, self._goals.held, k, self._samples)
@@ -240,6 +243,28 @@ class Simulation:
             move_gripper(asked, scaling, ranges, motors, ctrl)
 
         return move
+
+    def hand_place(self, a: int) -> Floats:
+        """Return where the hand of arm ``a`` is (3,) [m]."""
+        return self.views.site_xpos[self.arms.site[a]]
+
+    def hand_twist(self, a: int, moves: Floats | None = None, in_joints: bool = True) -> Floats:
+        """Return the twist (6,) of arm ``a``'s hand in the world, linear and angular; that of its joints by default.
+
+        Args:
+            moves: speeds of joints, or else of the hand in the frame of actions, linear alone or with angular ones.
+        """
+        if in_joints:
+            speeds = self.views.qvel[self.arms.dofs[a, : int(self.arms.joints[a])]] if moves is None else moves
+            return self.hand_jacobian(a) @ speeds
+        frame, twist = int(self.arms.base[a]), np.zeros(6)
+        twist[: len(moves)] = moves
+        return twist if frame < 0 else (twist.reshape(2, 3) @ self.views.site_xmat[frame].reshape(3, 3).T).ravel()
+
+    @staticmethod
+    def hand_speed(twist: Floats) -> float:
+        """Return how fast the furthest point of a hand can go under a twist (6,) [m/s]."""
+        return float(np.linalg.norm(twist[:3]) + REACHES * np.linalg.norm(twist[3:]))
 
     def hand_jacobian(self, a: int) -> NDArray[np.float64]:
         """Return the Jacobian (6, n) of arm ``a``'s hand: linear, then angular velocity."""

@@ -104,8 +104,9 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         """Return the action (A,) at the hand speed that the contact limits allow."""
         limits = self.contact_limits
         if limits is None or not limits.limits_speed:
+            self.simulation.speed_limits[:] = np.inf
             return action
-        return self._actions.slowed(self.simulation, action, limits.hand_speed)
+        return self._actions.slowed(self.simulation, action, limits)
 
     def _delivered(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action that arrives, in robosuite's units."""

@@ -27,6 +27,9 @@ LEANS_S = 0.4
 """More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
 did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
+HEAVIEST, WEIGHED_S = 15.0, 5.0
+"""What a wrist bears without a contact, its hand's weight, is at most so much [N]; it is averaged over so long [s]."""
+
 FAST = 0.35  # no healthy hand is faster [m/s]
 UNKNOWN = np.array([np.nan, 0.0, np.nan])  # force, impulse and speed of a robot of which nothing is known
 
@@ -98,11 +101,12 @@ def _forces(channels: Sequence[Channel]) -> tuple[NDArray[np.intp], NDArray[np.i
 
 
 @inner
-def largest_norm(numbers: Any, triples: Any) -> float:
-    """Return the largest norm of vectors; not a number where one is none, or there are none."""
+def largest_norm(numbers: Any, triples: Any, less: Any) -> float:
+    """Return the largest norm of vectors, ``less`` (N, 4) from its second number on; NaN where one is, or none."""
     found = -np.inf
     for n in range(len(triples)):
         x, y, z = float(numbers[triples[n, 0]]), float(numbers[triples[n, 1]]), float(numbers[triples[n, 2]])
+        x, y, z = x - less[n, 1], y - less[n, 2], z - less[n, 3]
         norm = np.sqrt(x * x + y * y + z * z)
         if not norm <= found and found == found:
             found = norm
@@ -110,9 +114,20 @@ def largest_norm(numbers: Any, triples: Any) -> float:
 
 
 @inner
-def contact_force(numbers: Any, wrists: Any, torques: Any) -> float:
-    """Return the contact force [N] that numbers tell of; not a number where they tell of none."""
-    wrist, largest = largest_norm(numbers, wrists), -np.inf  # with the weight of the hand, 5 to 10 N
+def contact_force(numbers: Any, wrists: Any, torques: Any, weights: Any, steps: float) -> float:
+    """Return the contact force [N] that numbers tell of; not a number where they tell of none.
+
+    Args:
+        weights: (W, 4) the number of steps, at most ``steps``, over which the wrists' loads without a contact were
+            averaged, and that mean: the weight of each hand, which is no contact. It moves on here.
+    """
+    for n in range(len(wrists)):
+        x, y, z = float(numbers[wrists[n, 0]]), float(numbers[wrists[n, 1]]), float(numbers[wrists[n, 2]])
+        if x * x + y * y + z * z < HEAVIEST * HEAVIEST:
+            weights[n, 0] = min(weights[n, 0] + 1.0, steps)
+            for i in range(3):
+                weights[n, 1 + i] += (float(numbers[wrists[n, i]]) - weights[n, 1 + i]) / weights[n, 0]
+    wrist, largest = largest_norm(numbers, wrists, weights), -np.inf
     for j in torques:
         torque = abs(float(numbers[j]))
         if not torque <= largest and largest == largest:
@@ -134,6 +149,8 @@ def _weigh(
     leans_s: float,
     most_impulse: float,
     pressed: Any,
+    weights: Any,
+    nothing: Any,
     value: Any,
     raw: Any,
     excuse: Any,
@@ -150,25 +167,27 @@ def _weigh(
 ) -> int:
     """Judge rows (n, D), and count those about which there is nothing to decide; return how many there are to decide.
 
-    The impulse and the time that each arm has leant, ``pressed`` (2, n), move on; ``decides`` (n,) gets more, and
+    The impulse and the time that each arm has leant, ``pressed`` (2, n), and ``weights`` (2, n, W, 4) move on;
+    ``decides`` (n,) gets more, and
     ``numbers``, ``presses``, ``over`` and ``event`` are written.
     """
     some = 0
     for n in range(len(rows)):
         load, left_s = felt[n, 0], felt[n, 1]
         # What the arm feels itself is not what a faulty sensor says of it; where it feels nothing, the row says.
-        force = contact_force(felt[n, 2:], felt_wrists, felt_torques)
+        force = contact_force(felt[n, 2:], felt_wrists, felt_torques, weights[0, n], WEIGHED_S / dt)
         if force != force:
-            force = contact_force(rows[n], wrists, torques)
+            force = contact_force(rows[n], wrists, torques, weights[1, n], WEIGHED_S / dt)
         more = max(force - FREE_FORCE, 0.0) if np.isfinite(force) else 0.0
         pressed[0, n] += more * dt
-        pressed[1, n] = pressed[1, n] + dt if more > 0.0 else 0.0
-        numbers[n, 0], numbers[n, 1], numbers[n, 2] = force, pressed[0, n], largest_norm(rows[n], hands)
+        pressed[1, n] = max(pressed[1, n] + (dt if more > 0.0 else -dt), 0.0)  # a moment below does not end it
+        numbers[n, 0], numbers[n, 1], numbers[n, 2] = force, pressed[0, n], largest_norm(rows[n], hands, nothing)
         leans = pressed[1, n] > leans_s / (1.0 + AGAIN * counts[STRIKES, n])
-        presses[n] = load > 1.0 or np.isfinite(left_s) or leans
+        # What ends the episode is an alarm too.
+        presses[n] = load > 1.0 or np.isfinite(left_s) or leans or pressed[0, n] > most_impulse
         over[n] = not value[n] <= threshold[n]
         event[n] = excuse[n] if raw[n] > threshold[n] and not over[n] else 0
-        happens = presses[n] or over[n] or event[n] == KNOCKED or pressed[0, n] > most_impulse
+        happens = presses[n] or over[n] or event[n] == KNOCKED
         if happens or state[n] != POLICY or counts[ROWS, n] == MOSTLY_AFTER - 1:
             decides[n] = True
         decides[n] = decides[n] and active[n]
@@ -196,12 +215,14 @@ class SeverityEstimator:
     def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], arbiter: Arbiter) -> None:
         columns = *_forces(felt), *_forces(spec.channels), _vectors(spec.channels, "hand_velocity")
         self._pressed, self._no_excuse = np.zeros((2, count)), np.zeros(count, np.int8)
-        self._how: tuple[Any, ...] = *columns, spec.dt, LEANS_S, arbiter.most_impulse, self._pressed
+        self._weights = np.zeros((2, count, max(len(columns[0]), len(columns[2])), 4))  # by what is felt, and by rows
+        state = self._pressed, self._weights, np.zeros((len(columns[4]), 4))
+        self._how: tuple[Any, ...] = *columns, spec.dt, LEANS_S, arbiter.most_impulse, *state
         self._arbiter: tuple[Any, ...] = arbiter.threshold, arbiter.state, arbiter.counts, arbiter.largest
 
     def begin(self, which: Mask) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        self._pressed[:, which] = 0.0
+        self._pressed[:, which] = self._weights[:, which] = 0.0
 
     def weigh(
         self, rows: NDArray[np.float32], felt: Floats, held: Mask, surprise: Surprise, active: Mask, decides: Mask

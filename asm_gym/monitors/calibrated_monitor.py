@@ -17,7 +17,7 @@ from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.detection import Blocks, Detection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
-from asm_gym.detection.contact_limits import healthy_forces
+from asm_gym.detection.contact_limits import Pace, healthy_forces
 from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import LOG, AlarmRate, require_sight
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
@@ -59,6 +59,7 @@ class CalibratedMonitor:
         promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty where the stream has no such channels.
+        pace_: (N, 16) how fast hands went in these episodes, by place and direction; see ``Pace``.
     """
 
     model: StreamModel
@@ -66,6 +67,7 @@ class CalibratedMonitor:
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
     healthy_: tuple[float, ...]
+    pace_: NDArray[np.float32] | None
 
     def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
         if not detections:
@@ -225,7 +227,8 @@ class CalibratedMonitor:
         vars(self).update(vars(new))
         self.threshold_, self.promised_ = threshold, asked.per
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
-        self.healthy_ = healthy_forces([episode.stream for episode in episodes], self.spec)
+        streams = [episode.stream for episode in episodes]
+        self.healthy_, self.pace_ = healthy_forces(streams, self.spec), Pace.learned(streams, self.spec)
         return self
 
     @property
@@ -343,7 +346,7 @@ class CalibratedMonitor:
 
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = None
-        self.promised_, self.healthy_ = EPISODE, ()
+        self.promised_, self.healthy_, self.pace_ = EPISODE, (), None
 
     @property
     def _name(self) -> str:

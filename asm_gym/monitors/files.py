@@ -18,6 +18,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
 MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks", "learned_from", "ceilings_from"
+PACE = "pace"
 """Names of the arrays that ``calibrate``, ``fit`` and ``learn_ceilings`` keep in a checkpoint."""
 
 
@@ -46,6 +47,7 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
     kept = {
         "learned_from_": arrays.pop(LEARNED_FROM, None),
         "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
+        "pace_": arrays.pop(PACE, None),
         "about": dict(header["about"]),
         "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
     }
@@ -70,6 +72,7 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
         BLOCKS: None if monitor.blocks_ is None else monitor.blocks_.array,
         LEARNED_FROM: monitor.learned_from_,
         CEILINGS_FROM: monitor.ceilings_from_,
+        PACE: monitor.pace_,
     }
     arrays: dict[str, NDArray[Any]] = learned | {name: array for name, array in kept.items() if array is not None}
     header = {

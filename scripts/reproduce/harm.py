@@ -41,8 +41,8 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
-TASKS = ("Lift", "Stack", "Door", "PickPlaceCan")  # tasks of hostile and untrained policies
-EXPERTS = (*TASKS, "NutAssemblySquare", "Wipe")
+TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile and untrained policies
+EXPERTS = (*TASKS, "Wipe")
 HEALTHY = (
     *(("Lift", "scripted"), ("Stack", "scripted"), ("Door", "scripted"), ("PickPlaceCan", "scripted")),
     *(("NutAssemblySquare", "scripted"), ("Wipe", "scripted")),
@@ -52,7 +52,8 @@ HEALTHY = (
 LEARNERS = ("SAC", "PPO", "TD3")
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", PASSING)
 """Faults under which healthy policies act too."""
-ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100))  # other arms, and another rate of the memory [Hz]
+ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100), ("Sawyer", 100), ("IIWA", 100))
+"""Other arms, and another rate of the memory [Hz]."""
 AGAINST = ("hostile", "untrained", "elsewhere", "faulty")
 HARMFUL = ("hostile", "untrained")  # kinds of policies that a guard is against
 EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
@@ -198,6 +199,7 @@ def episode(job: tuple[Case, str]) -> Record:
         "success": bool(success),
         **harm_of(np.concatenate(forces), arm.substeps),
         "steps": len(infos),
+        "time": next((n + 1 for n, info in enumerate(infos) if info["success"]), np.nan) * arm.dt,
         "alarms": sum(info["asm"]["alarm"] for info in infos if "asm" in info),
         "held": sum(bool(info.get("overridden")) for info in infos),
     }
@@ -290,21 +292,24 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
             mine = scenes[scenes.guard == guard]
             both = mine.join(alone, how="inner")
             lost, won = (both.alone & ~both.success).sum(), (both.success & ~both.alone).sum()
-            harm = f"{mine.harm.mean():.1f}", avoided(own, guard), worst(own, guard), f"{mine['first'].mean():.0f}"
+            harm = f"{mine.harm.mean():.1f}", avoided(own, guard), worst(own, guard)
+            blows = f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}", f"{mine.peak.max():.0f}"
             over = f"{100 * mine.steps_over.sum() / mine.steps.sum():.2f} %"
-            softly = f"{(mine.success & (mine.peak <= TRANSIENT)).sum()}"
-            solved = f"{mine.success.sum()} of {len(mine)}", f"-{lost} +{won}", softly
-            rows.append((_name(own), guard, *harm, over, *solved))
+            unsafe = f"{(mine.success & ((mine.peak > TRANSIENT) | (mine.held > 0))).sum()} of {mine.success.sum()}"
+            solved = f"{mine.success.sum()} of {len(mine)}", f"-{lost} +{won}", unsafe, f"{mine.time.median():.2f}"
+            rows.append((_name(own), guard, *harm, *blows, over, *solved))
     headings = (
         "",
         "guard",
         "harm [N s]",
         "avoided",
         "in the worst cell",
-        "first blow [N]",
+        "first blow, mean and most [N]",
+        "peak [N]",
         f"steps over {TRANSIENT:g} N",
     )
-    return Table(caption, (*headings, "solved", "lost, won", f"solved within {TRANSIENT:g} N"), rows)
+    more = "solved", "lost, won", f"of these beyond {TRANSIENT:g} N or overridden", "median time to success [s]"
+    return Table(caption, (*headings, *more), rows)
 
 
 def _name(group: pd.DataFrame) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from asm_gym.data.crashes import CRASH, peak_force, peak_torques
 from asm_gym.data.episode import Episode, spans
-from asm_gym.detection.contact_limits import healthy_forces
+from asm_gym.detection.contact_limits import Pace, healthy_forces
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
@@ -158,7 +158,9 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
         duration[task] += len(episode) * episode.spec.dt / 3600
     each = tasks if min(duration.values()) * per_hour >= 1.0 else []
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=each)
-    memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
+    gentle = [episode.stream for episode in lessons.calibration]
+    memory.healthy_ = healthy_forces(gentle, memory.spec)
+    memory.pace_ = Pace.learned([*gentle, *(episode.stream for episode in hours)], memory.spec)
     return memory
 
 
