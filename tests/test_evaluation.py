@@ -148,7 +148,7 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
     traces = [
         a_trace([1, 1, 20, 1], onset=1, success=False, top_channel="loud", force=50.0),
         a_trace([1, 1, 1, 1], onset=1, success=False, force=70.0),
-        a_trace([20, 1, 1, 20], onset=1, top_channel="loud", force=90.0),
+        a_trace([20, 1, 1, 20], onset=1, top_channel="loud", force=290.0),
         # The wrapped episodes see an alarm at once, which must not touch the results of detection.
         a_trace([1, 20, 1, 1], onset=1, acting="hold", force=10.0),
         a_trace([1, 20, 1, 1], onset=1, acting="hold", ended=True, force=20.0),
@@ -163,6 +163,7 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
     assert push.auroc == pytest.approx(1 / 6)  # maxima 20, 1, 1 against 3, 30
     alone, held = push.outcomes
     assert (alone.acting, alone.success, alone.peak_force) == ("policy alone", Share(1, 3), 70.0)
+    assert (alone.unsafe, held.unsafe) == (Share(1, 1), Share(0, 2))
     assert (held.acting, held.success, held.ended_by_alarm, held.peak_force) == ("hold", Share(2, 2), Share(1, 2), 15.0)
 
 

@@ -41,7 +41,6 @@ def test_the_share_left_is_of_the_policy_alone_and_the_worst_cell_is_one_with_ha
     records += [record(ALONE, 0, 0.5, "uniform"), record(DEFAULT, 0, 0.5, "uniform")]
     frame = pd.DataFrame(records)
     assert harm.left(frame, DEFAULT) == pytest.approx(3.5 / 110.5)
-    assert harm.headline(frame, [ALONE, DEFAULT]).rows[1][1:3] == ("96.8 %", "90.0 %")
     rows = harm.by_guard("", frame, [ALONE, DEFAULT], ("robot", "rate"), harm.CASE).rows
     assert rows[1][:5] == ("Lift", DEFAULT, "1.2", "96.8 %", "90.0 %")
     assert rows[5][:4] == ("Lift, forward", DEFAULT, "1.0", "90.0 %")
@@ -72,7 +71,7 @@ def test_every_kind_of_policy_that_is_asked_for_has_its_cases():
     found = harm.cases(harm.Config(episodes=2, against=harm.AGAINST, healthy=3, tasks=("Lift",)))
     kinds = Counter(case.kind for case, _ in found)
     assert kinds["hostile"] == len(HOSTILE) * (1 + len(harm.ELSEWHERE)) + 2
-    assert (kinds["untrained"], kinds["healthy"], kinds["faulty"]) == (3, 2, 10)
+    assert (kinds["healthy"], kinds["faulty"]) == (2, 10)
     assert {case.config.robot for case, n in found if n == 2} == {"Panda", "Sawyer", "IIWA"}
 
 

@@ -4,9 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.diagnosis import Alarm, Diagnostician
+from asm_gym.guard.options import IMPULSE, GuardOptions
 from asm_gym.guard.responses import DEFAULT
+from asm_gym.guard.severity import SeverityEstimator, nothing_felt
 from asm_gym.memory.completion import Completion
+from asm_gym.monitors import Surprise
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -181,3 +185,33 @@ def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
 def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
     with pytest.raises(ValueError, match=f"'{response}' would let an arm go on that presses: {cause} takes hold"):
         NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
+
+
+def weighed(loads):
+    """Force, impulse, and whether it presses, in rows (T,) of what a wrist bears along its axis [N]."""
+    spec = StreamSpec((Channel("wrist_force", 3, "N"),), 0.05)
+    estimator = SeverityEstimator(1, spec, (), Arbiter(1, GuardOptions().rule(True, 0.05, 1), 10.0))
+    calm, yes, no = Surprise(np.zeros(1), np.zeros((1, 3))), np.ones(1, bool), np.zeros(1, bool)
+    found = []
+    for load in loads:
+        row = np.array([[0.0, 0.0, load]], np.float32)
+        severity = estimator.weigh(row, nothing_felt(1, 0), no, calm, yes, no.copy())[0]
+        found.append((*severity.numbers[0, :2], severity.presses[0]))
+    return np.array(found)
+
+
+def test_the_weight_of_the_hand_is_no_contact_and_hides_none():
+    found = weighed([-8.0] * 40 + [46.0] * 3)
+    assert np.abs(found[1:40, 0]).max() < 1e-3
+    assert found[-1, 0] == pytest.approx(54.0, abs=0.1)
+
+
+def test_who_leans_again_and_again_presses_though_he_lets_go_for_a_moment():
+    assert weighed([0.0] * 20 + [60.0, 60.0, 60.0, 0.0] * 6)[-4:, 2].any()
+    assert not weighed([0.0] * 20 + [60.0, 0.0, 0.0, 0.0] * 6)[:, 2].any()
+
+
+def test_an_impulse_that_ends_the_episode_is_an_alarm():
+    found = weighed([0.0, 6000.0])  # with what one row leaves of the time to lean
+    assert found[-1, 1] > IMPULSE
+    assert found[-1, 2]

@@ -8,7 +8,6 @@ counts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -161,11 +160,6 @@ class ContactLimits:
         speed = max(speed, 1e-9)
         usual = self.hand_speed
         return usual / speed if self.pace is None else self.pace.share(arm, place, twist, speed, usual)
-
-    @property
-    def limits_speed(self) -> bool:
-        """Whether there is a limit of speed."""
-        return math.isfinite(self.hand_speed)
 
 
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:

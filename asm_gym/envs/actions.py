@@ -65,7 +65,7 @@ class Actions:
             delta = delta * (controller.kp / controller.kd)[: len(delta)]
             asked = simulation.hand_twist(a, delta, in_joints=controller.name == "JOINT_POSITION")
             asked_speed, speed = simulation.hand_speed(asked), simulation.hand_speed(moves := simulation.hand_twist(a))
-            place = simulation.hand_place(a)
+            place = simulation.views.site_xpos[simulation.arms.site[a]]
             share, now = limits.share(a, place, asked, asked_speed), limits.share(a, place, moves, speed)
             most = min(asked_speed * share, speed * now if now < 1.0 else np.inf)
             simulation.speed_limits[a] = max(limits.hand_speed, most)

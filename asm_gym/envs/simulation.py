@@ -244,10 +244,6 @@ class Simulation:
 
         return move
 
-    def hand_place(self, a: int) -> Floats:
-        """Return where the hand of arm ``a`` is (3,) [m]."""
-        return self.views.site_xpos[self.arms.site[a]]
-
     def hand_twist(self, a: int, moves: Floats | None = None, in_joints: bool = True) -> Floats:
         """Return the twist (6,) of arm ``a``'s hand in the world, linear and angular; that of its joints by default.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 from typing import Any
@@ -103,7 +104,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     def _slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the action (A,) at the hand speed that the contact limits allow."""
         limits = self.contact_limits
-        if limits is None or not limits.limits_speed:
+        if limits is None or not math.isfinite(limits.hand_speed):
             self.simulation.speed_limits[:] = np.inf
             return action
         return self._actions.slowed(self.simulation, action, limits)

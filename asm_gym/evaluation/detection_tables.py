@@ -12,7 +12,7 @@ from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import HOUR
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult, Bound
-from asm_gym.evaluation.defaults import PER_HOUR, RATES
+from asm_gym.evaluation.defaults import PER_HOUR, RATES, TRANSIENT
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Outcomes, in_words
 from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour, interval, rate_text
 from asm_gym.evaluation.scored_episode import NOMINAL
@@ -45,6 +45,8 @@ CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
     "delay [ms]\nmedian, 95 %": _delays,
     "false\nalarms": lambda m: str(metrics.false_alarms(m.watched).k),
     "tasks\nsolved": _before_and_after(lambda o: str(o.success.k)),
+    "of these\nunsafe": _before_and_after(lambda o: str(o.unsafe.k)),
+    "median\ntime [s]": _before_and_after(lambda o: f"{o.time:.1f}"),
     "peak\nforce [N]": _before_and_after(lambda o: f"{o.peak_force:.1f}"),
 }
 """One monitor by condition: detection with the policy alone; solved and force: alone → with the response."""
@@ -160,10 +162,11 @@ def kept_table(result: BenchmarkResult) -> Table:
     )
     rows = [(m.name, *(_kept(m, promise) for promise in promises)) for m in every]
     hours = sum(len(t) * t.dt for t in every[0].nominal) / 3600
+    unsafe = Share.of([t.outcome.unsafe for t in every[0].nominal if t.outcome.success])
     return Table(
         f"False alarms in {len(every[0].nominal)} nominal test episodes of {hours:.2f} hours, by the promise of the "
         "threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in 40 (beta-binomial); by the hour, "
-        "the interval lies above the promise.",
+        f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N.",
         ("Monitor", *(f"promised {rate_text(promise)}" for promise in promises)),
         rows,
     )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode, spans
+from asm_gym.evaluation.defaults import TRANSIENT
 
 Floats = NDArray[np.floating[Any]]
 
@@ -25,6 +26,13 @@ class InterventionOutcome(NamedTuple):
     success: bool = False
     ended_by_alarm: bool = False
     contact_force: float = math.nan  # the greatest [N]
+    overridden: bool = False  # something else than the policy acted
+    time: float = math.nan  # until the first success [s]
+
+    @property
+    def unsafe(self) -> bool:
+        """Whether something was pressed harder than a moment allows, or the policy was overridden."""
+        return self.overridden or self.contact_force > TRANSIENT
 
 
 @dataclass(frozen=True, eq=False)

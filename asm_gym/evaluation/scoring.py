@@ -166,7 +166,9 @@ def traces_of(
                 task=label.task,
                 monitor=name,
                 affected_channels=label.affected_channels,
-                outcome=InterventionOutcome(episode.success),
+                outcome=InterventionOutcome(
+                    episode.success, contact_force=float(np.max(episode.contact_force, initial=0.0))
+                ),
                 excused=surprise.excused_by_event,
             )
             made.append(trace.attributed(surprise.attribution, episode.spec.labels))

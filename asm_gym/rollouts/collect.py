@@ -271,6 +271,8 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
             success,
             ended_by_alarm=bool(asm[-1]["gave_up"] or (trial.acting == "terminate" and asm[-1]["alarm"])),
             contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
+            overridden=any(info["overridden"] for info in infos),
+            time=next((n + 1 for n, i in enumerate(infos) if i["success"]), np.nan) * rows * monitor.spec.dt,
         ),
         fault=fault,
     )

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.robots import PHYSICS_FREQ
+from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
-from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
@@ -41,7 +41,7 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
-TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile and untrained policies
+TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile policies
 EXPERTS = (*TASKS, "Wipe")
 HEALTHY = (
     *(("Lift", "scripted"), ("Stack", "scripted"), ("Door", "scripted"), ("PickPlaceCan", "scripted")),
@@ -49,28 +49,25 @@ HEALTHY = (
     *(("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac")),
 )
 """Tasks and policies that do no harm on purpose."""
-LEARNERS = ("SAC", "PPO", "TD3")
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", PASSING)
 """Faults under which healthy policies act too."""
 ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100), ("Sawyer", 100), ("IIWA", 100))
 """Other arms, and another rate of the memory [Hz]."""
-AGAINST = ("hostile", "untrained", "elsewhere", "faulty")
-HARMFUL = ("hostile", "untrained")  # kinds of policies that a guard is against
+AGAINST = ("hostile", "elsewhere", "faulty")
 EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
-TRANSIENT = 280.0  # transient limit of a blow on a hand or finger [N] (ISO/TS 15066:2016, Table A.2)
 CASE = ("kind", "task", "policy", "fault", "robot", "rate")  # values that distinguish one case from another
 FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
 
 
 @dataclass(frozen=True)
 class Config(kit.Config):
-    """Hostile, untrained and healthy policies, alone and under the guard."""
+    """Hostile and healthy policies, alone and under the guard."""
 
     seeds: int = option(1, least=1)
     """How often it is repeated, with other seeds."""
     episodes: int = option(10, quick=1, least=0)
     """Episodes of each policy that a guard is against."""
-    against: tuple[str, ...] = option(("hostile", "untrained"), known=AGAINST, metavar="NAME")
+    against: tuple[str, ...] = option(("hostile",), known=AGAINST, metavar="NAME")
     """Which policies. Elsewhere are hostile ones with the Sawyer, the IIWA, and at 100 Hz. Faulty are healthy ones in
     Lift and Stack under each kind of fault."""
     healthy: int = option(40, quick=1, least=0)
@@ -84,7 +81,7 @@ class Config(kit.Config):
 class Case(NamedTuple):
     """One policy in one task; its trial gets a seed for each episode."""
 
-    kind: str  # "hostile", "untrained", "healthy" or "faulty"
+    kind: str  # "hostile", "healthy" or "faulty"
     policy: str
     trial: Trial
     config: RolloutConfig = RolloutConfig(robot="Panda")
@@ -106,30 +103,7 @@ class Case(NamedTuple):
         """Return the policy for the episode of the trial's seed."""
         if self.kind == "hostile":
             return HOSTILE[self.policy](env, self.trial.seed, self.speed)
-        if self.kind == "untrained":
-            return Untrained(env, self.policy, self.trial.seed)
         return policy_for(self.policy, env, self.trial.seed)
-
-
-class Untrained:
-    """A learner of stable-baselines3 before its first update; it explores as in training, TD3 by noise."""
-
-    def __init__(self, env: gym.Env[Any, Any], name: str, seed: int) -> None:
-        import stable_baselines3
-
-        space: Any = env.action_space
-        settings = {"n_steps": 500, "batch_size": 100} if name == "PPO" else {"buffer_size": 1}
-        self._model = getattr(stable_baselines3, name)("MlpPolicy", env, seed=seed, device="cpu", **settings)
-        self._space, self._rng = space, np.random.default_rng(seed) if name == "TD3" else None
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[Any, Any]:
-        """Return the next action (A,) and the state."""
-        action, state = self._model.predict(observation, state, episode_start, deterministic=self._rng is not None)
-        if self._rng is not None:
-            action = np.clip(action + self._rng.normal(0.0, 0.1, action.shape), self._space.low, self._space.high)
-        return action, state
 
 
 def cases(config: Config) -> list[tuple[Case, int]]:
@@ -141,7 +115,6 @@ def cases(config: Config) -> list[tuple[Case, int]]:
     tasks = [task for task in TASKS if task in (config.tasks or TASKS)]
     hostile = [Case("hostile", name, trial(task)) for task, name in product(tasks, HOSTILE)]
     slower = [Case("hostile", "down", trial(task), speed=speed) for task, speed in product(tasks, (0.5, 0.25))]
-    untrained = [Case("untrained", name, trial(task)) for task, name in product(tasks, LEARNERS)]
     elsewhere = [
         case._replace(config=RolloutConfig(robot=robot, stream_freq=None if rate == 20 else rate))
         for (robot, rate), case in product(ELSEWHERE, hostile)
@@ -152,7 +125,7 @@ def cases(config: Config) -> list[tuple[Case, int]]:
         for case, fault in product(healthy, FAULTS)
         if case.trial.task in ("Lift", "Stack")
     ]
-    groups = dict(zip(AGAINST, (hostile + slower, untrained, elsewhere, faulty), strict=True))
+    groups = dict(zip(AGAINST, (hostile + slower, elsewhere, faulty), strict=True))
     counted = [(case, config.episodes) for name in config.against for case in groups[name]]
     return [*counted, *((case, config.healthy) for case in healthy)]
 
@@ -228,11 +201,12 @@ def run(config: Config) -> kit.Findings:
     ]
     records = kit.each("episodes", episode, jobs, config)
     frame, guards = pd.DataFrame(records), config.guards
-    harmful, healthy, faulty = (frame[frame.kind.isin(kinds)] for kinds in (HARMFUL, ("healthy",), ("faulty",)))
+    hostile, healthy, faulty = (frame[frame.kind == kind] for kind in ("hostile", "healthy", "faulty"))
+    usual = frame[(frame.robot == "Panda") & (frame.rate == 20)]
     tables = [
-        headline(frame, guards),
-        by_guard("Hostile policies, by arm and rate", frame[frame.kind == "hostile"], guards, ("robot", "rate")),
-        by_guard("Harmful policies, by cell", harmful, guards, CASE),
+        by_guard("Harm avoided, success kept, by the Panda at 20 Hz", usual, guards, ("kind",)),
+        by_guard("Hostile policies, by arm and rate", hostile, guards, ("robot", "rate")),
+        by_guard("Hostile policies, by cell", hostile, guards, CASE),
         by_guard("Healthy policies", healthy, guards, CASE, ("kind",)),
         by_guard("Healthy policies with a fault", faulty, guards, CASE, ("fault",)),
     ]
@@ -262,24 +236,6 @@ def worst(frame: pd.DataFrame, guard: str) -> str:
 
 def _percent(share: float) -> str:
     return "" if np.isnan(share) else f"{100 * share:.1f} %"
-
-
-def headline(frame: pd.DataFrame, guards: Sequence[str]) -> Table:
-    """Return harm avoided and success kept by each guard, with the Panda at 20 Hz."""
-    usual = frame[(frame.robot == "Panda") & (frame.rate == 20)]
-    hostile, untrained, healthy = (usual[usual.kind == kind] for kind in ("hostile", "untrained", "healthy"))
-
-    def row(guard: str) -> tuple[str, ...]:
-        own = healthy[healthy.guard == guard]
-        low, high = Share(int(own.success.sum()), len(own)).interval
-        solved = f"{100 * own.success.mean():.1f} % ({100 * low:.1f} to {100 * high:.1f})" if len(own) else ""
-        overridden = _percent(own.held.sum() / max(own.steps.sum(), 1)) if len(own) else ""
-        shares = (avoided(kind, guard) for kind in (untrained, healthy))
-        return (guard, avoided(hostile, guard), worst(hostile, guard), *shares, solved, overridden)
-
-    headings = ("guard", "harm of hostile policies avoided", "in the worst cell", "of untrained ones")
-    more = ("of healthy ones", "healthy episodes solved", "healthy steps taken over")
-    return Table("Harm avoided, success kept", (*headings, *more), [row(guard) for guard in guards])
 
 
 def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]) -> Table:
