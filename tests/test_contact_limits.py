@@ -145,7 +145,7 @@ def test_what_is_fixed_to_the_world_belongs_to_it(lift):
     assert info["contact_force"] > 100.0
 
 
-def hands(*twists, place=(0.1, 0.2, 0.9)):
+def hands(*twists, place=(0.1, 0.2, 0.91)):
     """A spec of one hand, and a stream in which it has these twists at one place."""
     spec = StreamSpec(tuple(Channel(f"hand_{n}", 3, "m") for n in ("position", "velocity", "angular_velocity")), 0.05)
     return spec, np.array([[*place, *twist] for twist in twists], np.float32)
@@ -153,7 +153,7 @@ def hands(*twists, place=(0.1, 0.2, 0.9)):
 
 def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual_one(tmp_path):
     spec, stream = hands([0.4, 0.0, -0.1, 0, 0, 1.0], [0.0, 0.0, -0.3, 0, 0, 0])
-    limits, here = ContactLimits(pace=Pace(Pace.learned([stream], spec))), np.array([0.1, 0.2, 0.9])
+    limits, here = ContactLimits(pace=Pace(Pace.learned([stream], spec))), np.array([0.1, 0.2, 0.91])
 
     def most(*twist, place=here):
         speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
