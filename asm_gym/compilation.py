@@ -102,7 +102,7 @@ def _cache_of(dispatcher: Any) -> Any:
 
 
 def inner(function: F, fastmath: bool = False) -> F:
-    """Compile ``function`` into compiled functions that call it, and not for itself, which would take as long again."""
+    """Compile ``function`` into compiled functions that call it, and not by itself: a call from Python ends Python."""
     how: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
     how |= {"fastmath": fastmath, "forceinline": fastmath, "pipeline_class": _Inner}
     return cast(F, numba.njit(**how)(function))
