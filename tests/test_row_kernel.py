@@ -40,8 +40,8 @@ def expected_by(asm, state, rows):
     left = (reading.changes - reading.inputs @ a.D.T - units @ a.U.T) / a.remainder
     sure = np.where(history.steps < lag, 0.0, np.where(history.steps < 2 * lag, UNSURE, 1.0))
     errors = reading.whole * left * np.exp(-0.5 * spread) * sure[:, None]
-    if len(a.P):
-        errors /= np.sqrt(a.doubt[0] + a.doubt[1] * leverages(a.P, reading.inputs, model.senses_))
+    if len(a.R):
+        errors /= np.sqrt(a.doubt[0] + a.doubt[1] * leverages(a.R, reading.inputs, model.senses_))
     skill = state.skill
     if asm.skills_:
         p = certainty(np.hstack([units, expected]), model.learned_["W_K"], model.learned_["b_K"])
@@ -49,9 +49,13 @@ def expected_by(asm, state, rows):
     return errors, MemoryState(traces, expected, history.followed_by(rows), skill)
 
 
-def leverages(P, inputs, senses):
+def leverages(R, inputs, senses):
     """Each group's inputs without its own changes, by an inverse of their own (B, X)."""
-    C, places = np.linalg.inv(P.astype(np.float64)), np.arange(senses.inputs)[senses.changes]
+    order = np.arange(senses.inputs)
+    places = order[senses.changes]
+    order = np.r_[np.delete(order, places), places]
+    root, C = np.linalg.inv(R.astype(np.float64)), np.zeros((len(R), len(R)))
+    C[np.ix_(order, order)] = root @ root.T
     found = np.zeros((len(inputs), len(places)))
     for g in np.unique(senses.groups):
         others = np.setdiff1d(np.arange(len(C)), places[senses.groups == g])

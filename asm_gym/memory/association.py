@@ -13,7 +13,9 @@ span_S are the limits of nominal contexts, so that a fault cannot excuse itself 
 
 Leverage is the distance of the inputs from those learned from, for each group without its own changes, by one inverse:
 
-    P = (E[a aᵀ] + λ I)⁻¹     y = P a     l_g = aᵀ y - y_gᵀ P_gg⁻¹ y_g
+    l_g = a_gᵀ (E[a_g a_gᵀ] + λ I)⁻¹ a_g = ‖z‖² - ‖Q_g z_Δ‖²    a_g: a without Δ_g;  z = R a;  Rᵀ R = (E[a aᵀ] + λ I)⁻¹
+
+R is a lower triangle, the changes last, and Q_g an orthonormal basis of what Δ_g adds to their part z_Δ of z.
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
 2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Nagumo and Noda 1967
@@ -43,8 +45,8 @@ class Association(NamedTuple):
     b_S: Array  # noqa: N815 (X,)
     span_S: Array  # noqa: N815 (2, X) limits of log σ²
     remainder: Array  # (X,) s
-    P: Array  # (I, I), or (0, I) where leverage is not known
-    own: Array  # (X, X) P_gg⁻¹ of each group, 0 between groups
+    R: Array  # (I, I) lower triangle, or (0, I) where leverage is not known; the changes come last
+    Q: Array  # (X, X)
     doubt: Array  # (2, X) of g²: its value at leverage 0, and its slope
 
 
@@ -57,16 +59,16 @@ def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple
         "U": (X, M),
         "D": (X, inputs),
         **precision,
-        "P": (inputs, inputs),
-        "own": (X, X),
+        "R": (inputs, inputs),
+        "Q": (X, X),
         "doubt": (2, X),
     }
 
 
 def no_doubt(inputs: int, changes: int) -> dict[str, Array]:
-    """Return P, ``own`` and ``doubt`` by which g is 1 everywhere."""
+    """Return R, Q and ``doubt`` by which g is 1 everywhere."""
     doubt = np.repeat(np.array([[1.0], [0.0]], np.float32), changes, axis=1)
-    return {"P": np.zeros((0, inputs), np.float32), "own": np.zeros((changes, changes), np.float32), "doubt": doubt}
+    return {"R": np.zeros((0, inputs), np.float32), "Q": np.zeros((changes, changes), np.float32), "doubt": doubt}
 
 
 class Change(NamedTuple):
@@ -129,23 +131,30 @@ def unbounded(size: int) -> Array:
 
 
 @kernel
-def leverage(a: Array, P: Array, own: Array, groups: NDArray[np.intp], first: int) -> Array:
+def leverage(a: Array, R: Array, Q: Array, groups: NDArray[np.intp], first: int) -> Array:
     """Return l (B, X) of inputs (B, I), of which the X changes begin at ``first``; ``groups`` (X,) are numbered."""
-    y = outward(a, P)
-    out = np.empty((a.shape[0], len(groups)), a.dtype)
-    each = np.empty(len(groups), a.dtype)  # of a group, at its number
-    for n in range(a.shape[0]):
-        total = np.float32(0)
+    B, X = len(a), len(groups)
+    past = a.shape[1] - X
+    b, z, squares = np.empty_like(a), np.empty_like(a), np.empty(X, a.dtype)  # squares of a group, at its number
+    b[:, :first], b[:, first:past], b[:, past:] = a[:, :first], a[:, first + X :], a[:, first : first + X]
+    if B > 1:
+        np.dot(b, R.T, z)
+    else:
+        for i in range(a.shape[1]):  # each weight is read once, and no zeros
+            total = np.float32(0)
+            for j in range(i + 1):
+                total += R[i, j] * b[0, j]
+            z[0, i] = total
+    out = outward(z[:, past:].copy(), Q)
+    for n in range(B):
+        squares[:] = np.float32(0)
         for i in range(a.shape[1]):
-            total += a[n, i] * y[n, i]
-        each[:] = total
-        for i in range(len(groups)):
-            left = np.float32(0)
-            for j in range(len(groups)):
-                left += own[i, j] * y[n, first + j]
-            each[groups[i]] -= left * y[n, first + i]
-        for i in range(len(groups)):
-            out[n, i] = max(each[groups[i]], np.float32(0))
+            squares[0] += z[n, i] * z[n, i]
+        squares[1:] = squares[0]
+        for i in range(X):
+            squares[groups[i]] -= out[n, i] * out[n, i]
+        for i in range(X):
+            out[n, i] = max(squares[groups[i]], np.float32(0))
     return out
 
 
@@ -162,8 +171,8 @@ def normalised_errors(
     span_S: Array,
     remainder: Array,
     spans: NDArray[np.intp],
-    P: Array,
-    own: Array,
+    R: Array,
+    Q: Array,
     doubt: Array,
     groups: NDArray[np.intp],
     first: int,
@@ -184,8 +193,8 @@ def normalised_errors(
         for i in range(out.shape[1]):
             error = (changes[n, i] - out[n, i]) / remainder[i]
             out[n, i] = whole[n, 0] * error * np.exp(np.float32(-0.5) * spread[n, i])
-    if P.shape[0]:
-        far = leverage(inputs, P, own, groups, first)
+    if R.shape[0]:
+        far = leverage(inputs, R, Q, groups, first)
         for n in range(out.shape[0]):
             for i in range(out.shape[1]):
                 out[n, i] /= np.sqrt(doubt[0, i] + doubt[1, i] * far[n, i])

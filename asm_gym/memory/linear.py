@@ -93,11 +93,13 @@ def check_inputs(count: int) -> None:
 
 
 def inverse_of(a: Array, groups: NDArray[np.intp], changes: slice) -> tuple[Array, Array]:
-    """Return P (I, I) and ``own`` (X, X) of ``Association`` from rows (N, I); the rest as in ``synapses``."""
-    exact = np.asarray(a, np.float64)
-    P = np.linalg.inv(gram(exact) / len(exact) + LEAST_VARIANCE * np.eye(exact.shape[1]))
-    within = P[changes, changes] * (groups[:, None] == groups)
-    return P.astype(np.float32), np.linalg.inv(within).astype(np.float32)
+    """Return R (I, I) and Q (X, X) of ``Association`` from rows (N, I); the rest as in ``synapses``."""
+    exact, X = np.hstack([a[:, : changes.start], a[:, changes.stop :], a[:, changes]]).astype(np.float64), len(groups)
+    R = np.linalg.inv(np.linalg.cholesky(gram(exact) / len(exact) + LEAST_VARIANCE * np.eye(exact.shape[1])))
+    Q = np.zeros((X, X))
+    for g in range(int(groups.max()) + 1):
+        Q[groups == g] = np.linalg.qr(R[-X:, -X:][:, groups == g])[0].T
+    return R.astype(np.float32), Q.astype(np.float32)
 
 
 def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[np.float32]:
@@ -144,8 +146,8 @@ def specialise(
     fresh = len(held_out(a))
     f, a, delta = f[-fresh:], a[-fresh:], delta[-fresh:]
     error = (delta - complete(f, a, U, D)) / known.remainder
-    if len(known.P):
-        far = leverage(a, known.P, known.own, groups, changes.start)
+    if len(known.R):
+        far = leverage(a, known.R, known.Q, groups, changes.start)
         error /= np.sqrt(known.doubt[0] + known.doubt[1] * far)
     # The body's memory knows how errors differ between contexts; the policy's rows tell how large they are overall.
     scale = np.mean(error**2 * np.exp(-log_variance(f, known.W_S, known.b_S, known.span_S)), axis=0)

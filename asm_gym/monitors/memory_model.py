@@ -106,15 +106,15 @@ class MemoryModel(ScaledModel):
         senses = StreamScaler.of(self.spec, learned, self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
-        if "P" not in learned:  # made before leverage was learned
+        if "R" not in learned:  # made before leverage was learned
             learned = {**learned, **no_doubt(senses.inputs, X)}
         if (found := dynamics_of(learned)) != self.dynamics:
             raise ValueError(f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}")
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
-        if not learned["P"].size:
-            shapes["P"] = (0, senses.inputs)
+        if not learned["R"].size:
+            shapes["R"] = (0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         if missing := [name for name in shapes if name not in learned]:

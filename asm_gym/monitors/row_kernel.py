@@ -236,7 +236,7 @@ def expect_rows(
     hidden = matrix(singles, at.V), matrix(singles, at.U), matrix(singles, at.D)
     spread = matrix(singles, at.W_S), vector(singles, at.b_S), matrix(singles, at.span_S)
     beyond = vector(singles, at.remainder), matrix(places, at.spans)
-    far = matrix(singles, at.P), matrix(singles, at.own), matrix(singles, at.doubt), vector(places, at.groups)
+    far = matrix(singles, at.R), matrix(singles, at.Q), matrix(singles, at.doubt), vector(places, at.groups)
     error, units = normalised_errors(inputs, changes, whole, *hidden, *spread, *beyond, *far, rows.shape[1])
     for n in range(len(rows)):
         # Nothing came before the first rows, so that no change is known.
