@@ -85,7 +85,7 @@ class Args(Options):
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
     corpus: Path | None = option(None, metavar="FOLDER")
-    """Judge the recordings of asm-gym corpus, all of its skills, faults and splits; nothing is recorded."""
+    """Judge the recordings of asm-gym corpus, all of its skills, faults and splits but what fit_episodes leaves out."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,7 +161,7 @@ def evaluate(args: Args, console: Console) -> None:
     timed = partial(stage, console=console, seconds=seconds)
     claim: dict[str, Any] = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     if args.corpus is not None:
-        files = skill_files(args.corpus)
+        files = skill_files(args.corpus, fit=args.fit_episodes)
         claim["corpus"] = VERSION
     else:
         trials = [trial for task in args.tasks for trial in trials_of(args, task)]

@@ -54,15 +54,8 @@ def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple
     """Return the shape of each array of ``Association`` by name."""
     M, X = units, changes
     precision = {"W_S": (X, M), "b_S": (X,), "span_S": (2, X), "remainder": (X,)}
-    return {
-        "V": (M, inputs),
-        "U": (X, M),
-        "D": (X, inputs),
-        **precision,
-        "R": (inputs, inputs),
-        "Q": (X, X),
-        "doubt": (2, X),
-    }
+    far = {"R": (inputs, inputs), "Q": (X, X), "doubt": (2, X)}
+    return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), **precision, **far}
 
 
 def no_doubt(inputs: int, changes: int) -> dict[str, Array]:

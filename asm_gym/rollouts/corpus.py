@@ -104,11 +104,13 @@ class Corpus:
         return [load_episode(self.folder / p) for p in self.select(*roles, policies=policies, tasks=tasks).index]
 
 
-def skill_files(folder: Path, tasks: Sequence[str] = SKILLS) -> list[Path]:
-    """Return the files of the experts' skills, sorted by kind and severity."""
+def skill_files(folder: Path, tasks: Sequence[str] = SKILLS, fit: int | None = None) -> list[Path]:
+    """Return the files of the experts' skills, by kind and severity; of each task at most ``fit`` to learn from."""
     corpus = Corpus.open(folder)
     order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
     chosen = corpus.select(policies=("scripted",), tasks=tasks)
+    if fit is not None:
+        chosen = chosen[(chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)]
     chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
     return [corpus.folder / path for path in chosen.index]
 

@@ -20,7 +20,6 @@ INDEPENDENT = {
 }
 STUDIES = {
     **INDEPENDENT,
-    "precision": "what is found, by episodes learned from, with and without doubt",
     "hours": "alarms an hour of a shipped memory, as promised?",
     "real_arms": "faults in recordings of real arms, once downloaded",
 }
