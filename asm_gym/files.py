@@ -33,7 +33,7 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{token_hex(4)}{UNFINISHED}")
     try:
-        with temporary.open("xb") as file:  # "x" follows no link; who may read it, the umask says
+        with named(path), temporary.open("xb") as file:  # "x" follows no link; who may read it, the umask says
             yield file
         os.replace(temporary, path)
     except BaseException:
@@ -44,12 +44,23 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
 def write_text(path: Path, text: str) -> None:
     """Write a text as ``written_whole`` does."""
     with written_whole(path) as file:
-        file.write(text.encode())
+        file.write(text.encode(errors="surrogateescape"))  # names of files under the locale C
 
 
 def no_links(path: str, flags: int) -> int:
     """Open a file that is not reached by a symbolic link; an ``opener`` for ``open``, which raises OSError for one."""
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Name the file where a disk is full: Python does not, of a file that is open."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno == errno.ENOSPC and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 def writable(path: str | Path) -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 import math
 import warnings
+from contextlib import suppress
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from numbers import Real
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, short_repr, typed
 
+CLOCKS = ("time", "sim_time", "simulation_time", "elapsed_time", "t")  # what environments call their clock [s]
 MOTOR = "action"  # the group that holds the commanded action
 
 
@@ -247,7 +250,8 @@ def control_period(env: gym.Env[Any, Any]) -> float:
     """Return the control period of any environment [s], by what it says of time; 1 where it says nothing.
 
     It may say ``dt``, ``tau``, ``control_timestep``, ``frame_skip`` of a model's ``timestep``, or a frequency of
-    control or of its policy. The rate of its videos is taken where nothing else is said, with a warning.
+    control or of its policy; or a copy of it has a clock that goes on by as much in every step. The rate of its videos
+    is taken where nothing else is said, with a warning.
     """
     bare: Any = env.unwrapped
     for name in ("dt", "tau", "control_timestep"):
@@ -262,6 +266,8 @@ def control_period(env: gym.Env[Any, Any]) -> float:
         own = config.get(name) if isinstance(config, dict) else None
         if rate := _positive(own or getattr(env, name, None) or getattr(bare, name, None)):
             return 1.0 / rate
+    if dt := _by_its_clock(bare):
+        return dt
     rate = _positive((env.metadata or {}).get("render_fps"))
     if not rate:
         return 1.0
@@ -272,6 +278,22 @@ def control_period(env: gym.Env[Any, Any]) -> float:
         stacklevel=2,
     )
     return 1.0 / rate
+
+
+def _by_its_clock(bare: Any) -> float:
+    """Return by how much the own clock of an environment goes on in a step of a copy [s]; 0 where nothing tells."""
+    for name in CLOCKS:
+        if isinstance(getattr(bare, name, None), float):
+            with suppress(Exception):  # whatever copying or stepping somebody's environment raises
+                copied = deepcopy(bare)
+                copied.reset()
+                times = [getattr(copied, name)]
+                for _ in range(3):
+                    copied.step(copied.action_space.sample())
+                    times.append(getattr(copied, name))
+                steps = np.diff(times)
+                return _positive(float(steps[0])) if np.allclose(steps, steps[0]) else 0.0
+    return 0.0
 
 
 class PeriodWarning(UserWarning):

@@ -16,14 +16,10 @@ from asm_gym.validation import as_float32
 
 
 class StreamSource:
-    """Where an environment's stream comes from: ``info["stream"]``, or else its observation and the action.
+    """Where an environment's stream comes from: ``info["stream"]`` of its ``own``, or else observation and action.
 
-    Attributes:
-        own: the environment has a stream of its own.
-
-    Raises:
-        TypeError: the environment has no stream, and its spaces cannot be read as rows of numbers.
-        ValueError: it has none, and a wrapper inside changes what it makes of the same sense as it goes on.
+    Without its own, TypeError says that its spaces cannot be read as rows of numbers, and ValueError that a wrapper
+    inside changes what it makes of the same sense as it goes on.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -72,14 +68,10 @@ def stepped(env: gym.Env[Any, Any], action: Any) -> tuple[Any, SupportsFloat, bo
     found: Any = env.step(action)
     if not isinstance(found, tuple) or len(found) != 5:
         size = len(found) if isinstance(found, tuple) else 1
-        cost = (
-            "; of Safety-Gymnasium, safety_gymnasium.wrappers.SafetyGymnasium2Gymnasium(env) makes them"
-            if size == 6
-            else ""
-        )
+        cost = "; of Safety-Gymnasium, safety_gymnasium.wrappers.SafetyGymnasium2Gymnasium(env) makes them"
         raise TypeError(
             f"step of {type(env.unwrapped).__name__} returns {size} values, and Gymnasium's returns observation, "
-            f"reward, terminated, truncated, info{cost}"
+            f"reward, terminated, truncated, info{cost if size == 6 else ''}"
         )
     return found
 

@@ -1,6 +1,7 @@
 """A memory of what is normal, learned from recordings: run folders, Minari datasets, or logs from elsewhere.
 
 Part of the episodes are learned from, the others set the threshold. Episodes that failed or hold a fault are left out.
+A file of a folder that cannot be read is named and left out; the exit code is 2 then.
 """
 
 from __future__ import annotations
@@ -16,20 +17,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from asm_gym.data import selection
 from asm_gym.data.episode import Episode
-from asm_gym.data.gaps import bridge_of, filled
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.selection import (
-    SHORTEST_S,
-    complete_parts,
-    normal_episodes,
-    pieces,
-    split_at_random,
-    split_in_time,
-    with_shared_noise,
-)
+from asm_gym.data.selection import SHORTEST_S, normal_episodes, pieces, with_shared_noise
+from asm_gym.data.timing import bridge_of, filled
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
@@ -43,7 +37,7 @@ from asm_gym.monitors.training_data import mute_channels
 from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import option, run
-from asm_gym.scripts.log_options import LogOptions
+from asm_gym.scripts.log_options import LogOptions, ended
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
@@ -119,7 +113,7 @@ def divide(args: Args, logs: list[list[Episode]], in_time: bool) -> tuple[list[E
     """Return episodes to learn from, and to calibrate on. Raises ValueError where they are too few for the promise."""
     by_episode = args.promise.per == EPISODE
     if in_time or (args.split is not None and not by_episode):
-        fitting, calibration = split_in_time(logs, CALIBRATION_SHARE)
+        fitting, calibration = selection.split_in_time(logs, CALIBRATION_SHARE)
         if len(calibration) < args.needed:
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to calibrate on, got "
@@ -127,7 +121,9 @@ def divide(args: Args, logs: list[list[Episode]], in_time: bool) -> tuple[list[E
             )
     else:
         needed = conformal_episodes(args.false_alarm_rate if by_episode else ANY_EPISODE)
-        fitting, calibration = split_at_random([p for log in logs for p in log], needed, CALIBRATION_SHARE, args.seed)
+        fitting, calibration = selection.split_at_random(
+            [p for log in logs for p in log], needed, CALIBRATION_SHARE, args.seed
+        )
     args.promise.check_hours(hours_of(calibration))
     return fitting[: QUICK_EPISODES if args.quick else None], calibration
 
@@ -141,9 +137,9 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
     dt = episodes[0].spec.dt
     seconds = bridge_of(args.bridge, dt)
     bridged = [replace(e, stream=filled(e.stream, dt, seconds)) for e in episodes]
-    cut = [complete_parts(e) for e in bridged]
+    cut = [selection.complete_parts(e) for e in bridged]
     if args.split is None and sum(map(len, cut)) < args.needed / CALIBRATION_SHARE:
-        shorter = [complete_parts(e) for e in episodes]
+        shorter = [selection.complete_parts(e) for e in episodes]
         if sum(map(len, shorter)) > sum(map(len, cut)):
             bridged, cut = episodes, shorter
     parts = [part for of_one in cut for part in of_one]
@@ -155,27 +151,23 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
             "--ignore leaves such columns out, --bridge SECONDS fills longer gaps"
         )
     rows = sum(
-        int((np.isnan(a.stream) & ~np.isnan(b.stream)).any(axis=1).sum())
+        int((np.isnan(a.stream) != np.isnan(b.stream)).any(axis=1).sum())
         for a, b in zip(episodes, bridged, strict=True)
     )
     said = [f"Filled {rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."] if rows else []
-    known = [bool(np.isfinite(e.stream).all()) for e in bridged]
-    made = sum(len(of_one) for of_one, whole in zip(cut, known, strict=True) if not whole)
-    if not all(known):
+    holed = [of_one for of_one, whole in zip(cut, bridged, strict=True) if not np.isfinite(whole.stream).all()]
+    if holed:
         hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
-        said.append(
-            f"Rows were lost: {known.count(False)} of {len(known)} episodes were cut there, into {made} parts.{hint}"
-        )
+        made = sum(map(len, holed))
+        said.append(f"Rows were lost: {len(holed)} of {len(cut)} episodes were cut there, into {made} parts.{hint}")
     return parts, said
 
 
 def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
     """Return the hyperparameters that suit the recordings."""
-    suitable: dict[str, Any] = {"seed": args.seed}
+    suitable: dict[str, Any] = {"seed": args.seed, "values": spec.source == "table" or judged_by_values(spec)}
     if args.quick:
         suitable["epochs"] = QUICK_EPOCHS
-    if spec.source == "table" or judged_by_values(spec):
-        suitable["values"] = True
     if args.urdf is not None:
         suitable["urdf"] = read_urdf(args.urdf)
     known = monitor_class(args.monitor).hyperparameters
@@ -202,9 +194,7 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         yield f"{args.urdf} is not used, for {left}: see that it holds this arm's masses, and names joints as the log"
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
-    how = (
-        "by name" if model.links.by_name else "in the order that explains the torques best, for no column names a joint"
-    )
+    how = "by name" if model.links.by_name else "by what explains the torques best, for no column names a joint"
     yield f"{args.urdf} is used: {left}; angles are taken {how}: {joints}"
 
 
@@ -213,7 +203,7 @@ def hours_of(episodes: list[Episode]) -> float:
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
-def fit(args: Args, console: Console) -> None:
+def fit(args: Args, console: Console) -> int:
     """Read, learn, calibrate, save, and print a summary."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     live = live_source(str(args.data)) is not None
@@ -236,13 +226,10 @@ def fit(args: Args, console: Console) -> None:
     monitor.save(args.out)
     for line in [*notes, *notes_on_columns(args, spec), *notes_on_body(args, monitor), *mute_channels(fitting)]:
         say(f"Note: {line}.")
-    rows = sum(map(len, fitting))
+    rows, hours = sum(map(len, fitting)), hours_of(calibration)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
-    if left_out:
-        say(f"Left out: {left_out}.")
-    for line in cuts:
+    for line in [f"Left out: {left_out}."] * bool(left_out) + cuts:
         say(line)
-    hours = hours_of(calibration)
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     if args.promise.per == EPISODE:
         promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
@@ -255,6 +242,7 @@ def fit(args: Args, console: Console) -> None:
     )
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
+    return ended(notes)
 
 
 main = partial(run, "fit", Args, fit)

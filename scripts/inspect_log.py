@@ -20,7 +20,7 @@ from asm_gym.data.reader_notes import noted
 from asm_gym.data.tables import Columns
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
-from asm_gym.scripts.log_options import LogOptions
+from asm_gym.scripts.log_options import LogOptions, ended
 
 FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{:.2g}", "repeats": "{:.0%}"}
 """How the facts are printed; others as they are."""
@@ -50,7 +50,7 @@ def inspect(args: Args, console: Console) -> int:
             if source.episode is not None:  # its stream is what it is
                 nominal = replace(nominal, channels=("*",))
             log = inspected(source.name, columns, nominal, [t for t in tables if t is not source.columns])
-            trouble = trouble or bool(log.clock.trouble) or not log.clock.rate
+            trouble = trouble or bool(log.trouble) or not log.rate
             say(log.caption())
             lines = [*(table(log.facts) if first is None else []), *(f"- {line}" for line in log.remarks())]
             for line in lines:
@@ -65,7 +65,7 @@ def inspect(args: Args, console: Console) -> int:
             first = first or log
     for note in notes:
         say(f"Note: {note}.")
-    return BAD_NEWS if trouble else DONE
+    return ended(notes, BAD_NEWS if trouble else DONE)
 
 
 def table_of_source(source: Source) -> Columns:
@@ -95,8 +95,8 @@ def differences(first: Inspection, other: Inspection) -> str:
     mine, theirs = ({c.name for c in log.columns if c.read} for log in (first, other))
     if mine != theirs:
         return f"{other.name} has other columns than {first.name}: {', '.join(sorted(mine ^ theirs)[:6])}"
-    if first.clock.rate and other.clock.rate and abs(first.clock.rate / other.clock.rate - 1) > 0.01:
-        return f"{other.name} comes at {other.clock.rate:.5g} Hz and {first.name} at {first.clock.rate:.5g}: say --rate"
+    if first.rate and other.rate and abs(first.rate / other.rate - 1) > 0.01:
+        return f"{other.name} comes at {other.rate:.5g} Hz and {first.name} at {first.rate:.5g}: say --rate"
     return ""
 
 

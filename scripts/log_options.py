@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from asm_gym.data.columns import LogLayout
-from asm_gym.scripts.command import Checked, option
+from asm_gym.data.reader_notes import UNREAD
+from asm_gym.scripts.command import DONE, REFUSED, Checked, option
 from asm_gym.validation import check_number
 
 
@@ -32,3 +34,8 @@ class LogOptions(Checked):
         """Return how to read logs; ``more`` are other fields of it."""
         said = {"channels": self.channels, "labels": self.label, "columns": self.columns, "ignore": self.ignore}
         return LogLayout(**{"rate": self.rate, "clock": self.clock} | said | more)
+
+
+def ended(notes: Sequence[str], code: int = DONE) -> int:
+    """Return the exit code of a command that read logs: ``REFUSED`` where a file of them could not be read."""
+    return REFUSED if any(UNREAD in line for line in notes) else code

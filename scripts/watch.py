@@ -2,10 +2,10 @@
 
 A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
 udp:PORT for datagrams from this machine (udp:PORT@ADDRESS:PORT for those of one sender), or dds:/joint_states for
-ROS 2: JSON lines (a list of numbers, or an object by channel, one a row), or CSV with a header; every alarm is printed
-as it is raised, in constant memory. A line that cannot be read is an alarm too, and watching goes on.
+ROS 2: JSON lines (a list of numbers, or an object by channel, one a row), or CSV with a header. Every alarm is printed
+as it is raised; a line that cannot be read is an alarm too.
 
-Exit codes: 0 no alarm, 1 alarms, 2 an error.
+Exit codes: 0 no alarm, 1 alarms, 2 an error, also where a file of a folder cannot be read.
 """
 
 from __future__ import annotations
@@ -25,20 +25,12 @@ from typing import Any
 
 from rich.console import Console
 
-from asm_gym.data.gaps import SURPRISING, bridge_of, bridged
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.evaluation.alarms import (
-    HEADINGS,
-    Alarm,
-    alarms_of,
-    excused_in,
-    plain_cell,
-    sensed_peak,
-    traces_of,
-    write_rerun,
-)
+from asm_gym.data.timing import SURPRISING, bridge_of, bridged
+from asm_gym.evaluation import alarms as recorded
+from asm_gym.evaluation.alarms import HEADINGS, Alarm
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for, require
@@ -48,7 +40,7 @@ from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, origin, run
-from asm_gym.scripts.log_options import LogOptions
+from asm_gym.scripts.log_options import LogOptions, ended
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
@@ -98,21 +90,21 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     with stage("watching", console, {}) as progress, noted() as notes:
         logs = iter(read_logs(args.source, args.layout(spec=monitor.spec)))
         while group := list(islice(logs, AT_ONCE)):  # a folder of recordings may be larger than memory
-            traces = traces_of(group, monitor, bridge)
+            traces = recorded.traces_of(group, monitor, bridge)
             over += sum(int(bridged(log.episode.stream, monitor.spec.dt, bridge).sum()) for log in group)
-            alarms += [alarm for trace in traces for alarm in alarms_of(trace)]
-            excused.update(event for trace in traces for event in Counter(excused_in(trace)).elements())
-            worst = sorted([*worst, *traces], key=lambda trace: -sensed_peak(trace))[: args.figures]
+            alarms += [alarm for trace in traces for alarm in recorded.alarms_of(trace)]
+            excused.update(event for trace in traces for event in Counter(recorded.excused_in(trace)).elements())
+            worst = sorted([*worst, *traces], key=lambda trace: -recorded.sensed_peak(trace))[: args.figures]
             episodes += len(group)
             progress(episodes, episodes)
     summary = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
     summary += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
     table = io.StringIO(newline="")
-    csv.writer(table).writerows([HEADINGS, *(map(plain_cell, alarm.cells()) for alarm in alarms)])
+    csv.writer(table).writerows([HEADINGS, *(map(recorded.plain_cell, alarm.cells()) for alarm in alarms)])
     write_text(args.out / "alarms.csv", table.getvalue())
     written = publish(args, summary, alarms, worst)
     if args.rerun is not None:
-        write_rerun(args.rerun, monitor.spec, worst)
+        recorded.write_rerun(args.rerun, monitor.spec, worst)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")
@@ -124,7 +116,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     for log, start, end, channel, why, excess in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(written)
-    return BAD_NEWS if alarms else DONE
+    return ended(notes, BAD_NEWS if alarms else DONE)
 
 
 def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:
@@ -135,21 +127,16 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
             from asm_gym.evaluation.report import write_report
     except ImportError as error:
         return f"Wrote {args.out / 'alarms.csv'}; {error}"
-    drawn = {
-        "surprise": (
-            f"Surprise over time in the {len(worst)} most surprising episodes (--figures)",
-            figures.surprise_figure(worst),
-        ),
-        "stream": ("What its most surprising channels sensed", figures.stream_figure(worst[0])),
-    }
-    for name, (_, figure) in drawn.items():
+    over_time = f"Surprise over time in the {len(worst)} most surprising episodes (--figures)"
+    drawn = {"surprise": figures.surprise_figure(worst), "stream": figures.stream_figure(worst[0])}
+    for name, figure in drawn.items():
         figures.save(figure, args.out / f"{name}.png")
     write_report(
         args.out / "report.html",
         f"asm-gym watch: {args.source}",
         f"{summary}, as {args.monitor} sees them.",
         [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
-        dict(drawn.values()),
+        {over_time: drawn["surprise"], "What its most surprising channels sensed": drawn["stream"]},
         details=origin("watch", args),
     )
     return f"Wrote {args.out / 'report.html'} and alarms.csv"
@@ -167,22 +154,22 @@ def watch(args: Args, console: Console) -> int:
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
-    if live is not None:
-        opened = partial(lines_from, args.source, sys.stdin, args.silence)
+    if live is None:
+        return review(args, monitor, console)
+    opened = partial(lines_from, args.source, sys.stdin, args.silence)
 
-        def say(event: LiveEvent) -> None:
-            text = event.to_json() if args.json else str(event)
-            console.print(text, soft_wrap=True, highlight=False, markup=False)
-            if args.hook and event.kind == ALARM:
-                run_hook(args.hook, event)
+    def say(event: LiveEvent) -> None:
+        text = event.to_json() if args.json else str(event)
+        console.print(text, soft_wrap=True, highlight=False, markup=False)
+        if args.hook and event.kind == ALARM:
+            run_hook(args.hook, event)
 
-        bridge = bridge_of(args.bridge, monitor.spec.dt)
-        lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
-        with _watchdog(args, monitor.spec.dt) as watchdog:
-            beat = None if watchdog is None else watchdog.beat
-            alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm, beat)
-        return BAD_NEWS if alarms else DONE
-    return review(args, monitor, console)
+    bridge = bridge_of(args.bridge, monitor.spec.dt)
+    lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
+    with _watchdog(args, monitor.spec.dt) as watchdog:
+        beat = None if watchdog is None else watchdog.beat
+        alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm, beat)
+    return BAD_NEWS if alarms else DONE
 
 
 def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:

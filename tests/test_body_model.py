@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from itertools import permutations
 
 import mujoco
 import numpy as np
@@ -93,7 +92,15 @@ def test_joints_are_those_that_columns_name_or_the_longest_chain():
     assert not by_order.by_name
     in_part = BodyModel.of(arm(), ["q.elb.elbow_left", "q[lift]", "q[finger]", "q.the_shoulder"])
     assert (in_part.by_name, in_part.columns.tolist()) == (True, [1, 3, 0])
+    finger = (
+        '<link name="tip"/><joint name="panda_finger_joint1" type="prismatic"><parent link="{}"/><child link="tip"/>'
+    )
+    finger = (
+        finger.format(re.findall('link name="([^"]*)"', arm())[-1])
+        + '<child link="tip"/><axis xyz="1 0 0"/></joint></robot>'
+    )
     numbered = arm().replace('"lift"', '"panda_joint1"').replace('"shoulder"', '"panda_joint2"')
+    numbered = numbered.replace("</robot>", finger)
     numbered = numbered.replace('"elbow"', '"panda_joint3"')
     labels = ["position[fer_joint3]", "position[fer_joint1]", "position[fer_joint2]"]
     assert BodyModel.of(numbered, labels).columns.tolist() == [1, 2, 0]
@@ -108,7 +115,7 @@ def test_several_roots_stand_side_by_side():
         np.testing.assert_allclose(one, other)
 
 
-@pytest.mark.parametrize("order", list(permutations(range(3))))
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_unnamed_joints_are_taken_in_the_order_that_explains_the_torques(order):
     columns = recorded(20)
     q, v, torque = (columns[name][:, order] for name in ("position", "velocity", "effort"))

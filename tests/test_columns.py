@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from asm_gym.data.behaviour import code_of, counts, follows, turn_of
 from asm_gym.data.channels import ColumnPlan, read_recorded
-from asm_gym.data.clock import find_clock, seconds_a_row
-from asm_gym.data.columns import LogLayout, decide
+from asm_gym.data.clock import find_clock
+from asm_gym.data.columns import LogLayout, code_of, counts, decide, follows, turn_of
 from asm_gym.data.episode import Episode
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import LogWarning, noted
@@ -80,7 +79,7 @@ def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat()
 HEALTHY = {"time": T, "q0": Q, "q1": np.cos(2 * T) + 1e-3 * RNG.normal(size=ROWS)}
 ASIDE = {
     "sequence": (np.arange(ROWS), "counter"),
-    "hours": (T / 3600, "pace"),
+    "hours": (T / 3600, "counter"),
     "mode": (np.full(ROWS, 7), "constant"),
     "again": (Q, "copy"),
     "nothing": (np.full(ROWS, np.nan), "empty"),
@@ -101,9 +100,19 @@ def test_what_is_no_sense_is_set_aside_and_changes_nothing(name):
     assert found.spec.labels == ("q[0]", "q[1]")
     later = table | {name: values + 30_000 if values.dtype.kind in "iuf" else values}
     np.testing.assert_array_equal(read_recorded(later, LogLayout(found.spec)).stream, found.stream)
-    if role in ("counter", "pace", "constant", "copy", "clock"):
+    if role in ("counter", "constant", "copy", "clock"):
         assert "--channels" in columns[name].why
         assert name in Episode.from_table(table, channels=["q*", name]).spec.labels
+
+
+def test_tables_of_one_robot_have_one_spec_though_a_column_stands_still_in_some():
+    moves = HEALTHY | {"brake": (T > 2).astype(float)}
+    stands = HEALTHY | {"brake": np.ones(ROWS)}
+    for tables in ([stands, moves], [moves, stands]):
+        one, other = Episode.from_tables(tables)
+        assert one.spec == other.spec
+        assert "brake" in one.spec.labels
+    assert "brake" not in Episode.from_table(stands).spec.labels
 
 
 def test_a_joint_that_stands_while_others_move_is_read_and_one_that_all_logs_leave_alone_is_not():
@@ -150,16 +159,6 @@ def test_clocks_that_disagree_are_said_and_the_user_chooses():
     assert Episode.from_table(both).spec.dt == pytest.approx(0.02)
     backwards = HEALTHY | {"time": T[::-1]}
     assert len(Episode.from_table(backwards, rate=50)) == ROWS
-
-
-def test_velocities_tell_how_far_apart_rows_are():
-    assert seconds_a_row({"q [deg]": np.degrees(Q), "qd [rad/s]": np.gradient(Q, 0.02)}) == pytest.approx(
-        0.02, rel=0.01
-    )
-    assert seconds_a_row({"arm_velocity": np.gradient(Q, 1e-3), "arm_position": Q}) == pytest.approx(1e-3, rel=0.01)
-    assert seconds_a_row({"q": Q, "v": RNG.normal(size=ROWS)}) is None
-    with pytest.raises(ValueError, match=r"--rate.*positions and velocities say about 50"):
-        Episode.from_table({"q": Q, "v": np.gradient(Q, 0.02)})
 
 
 def rows_of(header: str, *columns: np.ndarray) -> str:

@@ -101,9 +101,9 @@ def columns() -> dict[str, np.ndarray]:
 def test_an_inspection_says_what_is_known_of_a_log():
     found = inspected("x", columns())
     facts = {row["channel"]: row for row in found.facts}
-    assert found.clock.rate == pytest.approx(100, rel=1e-3)
-    assert found.clock.jitter == pytest.approx(0.1 * np.sqrt(2), rel=0.05)
-    ((start, stop),) = found.clock.gaps
+    assert found.rate == pytest.approx(100, rel=1e-3)
+    assert found.jitter == pytest.approx(0.1 * np.sqrt(2), rel=0.05)
+    ((start, stop),) = found.gaps
     assert stop - start == pytest.approx(2.01, abs=0.02)
     assert {c.name: c.role for c in found.columns} == {
         **{"Time": "clock", "Num": "counter", "q_1": "sense", "current_1": "sense", "fan": "constant"},
@@ -119,7 +119,7 @@ def test_an_inspection_says_what_is_known_of_a_log():
 
 def test_an_inspection_counts_the_rows_that_fit_loses():
     t = np.delete(np.arange(100), [40, 41, 60]) / 50
-    assert np.diff(inspected("x", {"time": t, "q": t}).clock.gaps, axis=1).ravel() == pytest.approx([0.06, 0.04])
+    assert np.diff(inspected("x", {"time": t, "q": t}).gaps, axis=1).ravel() == pytest.approx([0.06, 0.04])
 
 
 def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkeypatch):
@@ -302,6 +302,35 @@ def test_one_or_two_lost_rows_are_bridged_and_what_was_sensed_comes_before_what_
     first, *_, last = capsys.readouterr().out.split("log\n", 1)[1].splitlines()[:20]
     assert "surprise" in first
     assert "missing data" in last
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3, 30])
+def test_up_to_two_lost_rows_are_bridged_and_more_are_an_alarm_behind_every_surprise(memory, lost, tmp_path, capsys):
+    columns = log(100)
+    columns["torque"][70:73] += 5.0  # a collision
+    write_csv(tmp_path / "x.csv", {name: np.delete(values, slice(30, 30 + lost)) for name, values in columns.items()})
+    assert main(["watch", str(tmp_path / "x.csv"), "--monitor", str(memory), "--out", str(tmp_path / "out")]) == 1
+    first, *others = capsys.readouterr().out.split("log\n", 1)[1].splitlines()[:-1]
+    assert "surprise" in first
+    assert any("missing data" in line for line in others) == (lost > 2)
+
+
+def test_a_file_that_cannot_be_read_is_named_and_the_others_of_its_folder_are_read(memory, tmp_path, capsys):
+    (tmp_path / "logs").mkdir()
+    for n in range(24):
+        write_csv(tmp_path / "logs" / f"{n:02}.csv", log(n))
+    (tmp_path / "logs" / "07.csv").write_bytes(b"\x00 no table")
+    (tmp_path / "logs" / "08.parquet").write_bytes(b"cut off")
+    to = ["--out", str(tmp_path / "x.asm"), *FIT, "--false-alarm-rate", "0.1"]
+    how = ["--monitor", str(memory), "--out", str(tmp_path / "out")]
+    for command in (["fit", *to], ["watch", *how], ["inspect", "--out", str(tmp_path / "out")]):
+        assert main([command[0], str(tmp_path / "logs"), *command[1:]]) == 2
+        said = capsys.readouterr().out
+        assert "07.csv: it is no text" in said
+        assert "08.parquet: " in said
+    assert load_monitor(tmp_path / "x.asm").threshold > 0
+    assert main(["fit", str(tmp_path / "logs" / "07.csv"), *to]) == 2
+    assert "07.csv: it is no text" in capsys.readouterr().err
 
 
 def test_a_bridge_never_makes_fit_refuse_what_it_accepts_without(tmp_path, capsys):

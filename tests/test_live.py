@@ -9,13 +9,14 @@ import re
 import socket
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from asm_gym.data.gaps import Bridge, blamed, bridged, filled, reason
-from asm_gym.data.live import SourceDied, lines_from, live_source
+from asm_gym.data.live import SourceDied, lines_from, live_source, record
 from asm_gym.data.rows import NEWEST, Pace, RowReader
+from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
@@ -56,6 +57,18 @@ def test_nested_json_and_units_are_read_as_from_a_file():
     first, second = (row.numbers for row, _ in RowReader(spec).rows(lines))
     np.testing.assert_allclose(first, [np.pi, np.pi / 2, 0.5])
     np.testing.assert_allclose(second, [0.0, np.nan, 0.001])
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost_lacks_its_numbers(as_json):
+    spec = StreamSpec((Channel("position", 2, "rad", elements=("elbow", "lift")),), dt=0.02)
+    rows = [(k, joint, k + 10 * (joint == "lift")) for k in range(5) for joint in ("elbow", "lift")[:: (-1) ** k]]
+    del rows[5]  # the lift's of the third moment
+    lines = [json.dumps({"time": 0.02 * k, "joint": j, "position [rad]": x}) for k, j, x in rows]
+    lines = lines if as_json else ["time,joint,position [rad]", *(f"{0.02 * k},{j},{x}" for k, j, x in rows)]
+    read = [row for row, _ in RowReader(spec).rows(lines)]
+    np.testing.assert_array_equal([r.numbers for r in read], [[0, 10], [1, 11], [2, np.nan], [3, 13], [4, 14]])
+    assert not any(row.lost or row.problem for row in read)
 
 
 @pytest.mark.parametrize(
@@ -311,3 +324,9 @@ def test_reasons_and_blame_of_single_rows():
     assert blamed(np.full(2, np.nan), np.zeros(2)) is None
     assert blamed(np.array([1.0, np.nan]), np.zeros(2)) == 1
     assert blamed(np.array([1.0, 2.0]), np.array([3.0, 1.0])) == 0
+
+
+def test_a_full_disk_is_said_of_the_file_that_it_lacks_room_for():
+    with pytest.raises(OSError, match="No space left") as refused:
+        record(("[1, 2]\n" for _ in range(100_000)), Path("/dev/full"), 1.0)
+    assert refused.value.filename == "/dev/full"

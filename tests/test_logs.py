@@ -162,13 +162,18 @@ def test_clocks_of_every_unit_tell_the_rate_and_are_no_sense(name, times):
     assert len(episode) == 40
 
 
-def test_a_clock_without_a_unit_is_read_by_plausible_rates_and_by_velocities_and_that_is_said():
+def test_a_clock_without_a_unit_is_read_by_plausible_rates_by_the_memory_and_by_velocities_and_that_is_said():
     t = np.arange(0, 2000, 50)
     with pytest.warns(LogWarning, match="'t' goes on by 50 from row to row and says no unit: read in ms"):
-        assert Episode.from_table({"t": t, "q": np.sin(t)}).spec.dt == pytest.approx(0.05)
-    slow = {"t": np.arange(400), "q_0": np.sin(0.02 * np.arange(400)), "v_0": 20 * np.cos(0.02 * np.arange(400))}
-    with pytest.warns(LogWarning, match="as the motion says"):
-        assert Episode.from_table(slow).spec.dt == pytest.approx(1e-3)
+        episode = Episode.from_table({"t": t, "q": np.sin(t)})
+    assert episode.spec.dt == pytest.approx(0.05)
+    fast = {"t": np.arange(400), "q": np.sin(0.02 * np.arange(400))}
+    spec = Episode.from_table(fast, rate=1000.0).spec
+    with pytest.warns(LogWarning, match="read in ms"):
+        assert Episode.from_table(fast, spec).spec.dt == pytest.approx(1e-3)
+    moving = {"t": np.arange(400), "q_0": np.sin(0.02 * np.arange(400)), "v_0": 20 * np.cos(0.02 * np.arange(400))}
+    with pytest.warns(LogWarning, match="read in ms"):
+        assert Episode.from_table(moving).spec.dt == pytest.approx(1e-3)
     assert Episode.from_table({"t": t, "q": np.sin(t)}, clock="t [s]").spec.dt == 50
 
 

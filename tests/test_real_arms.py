@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
+from asm_gym.monitors.body_model import BodyModel
 from asm_gym.scripts.cli import main
-from asm_gym.scripts.reproduce import real_arms
 from asm_gym.scripts.reproduce.real_arms import (
     ARMS,
     FAULTS,
     NEWTONS,
-    PANDA,
     SLIP,
-    UR10,
+    TX40_MEAN,
+    TX40_RATIOS,
     Job,
-    Kinematics,
     Piece,
     examined,
     jacobian,
@@ -24,27 +24,33 @@ from asm_gym.scripts.reproduce.real_arms import (
 )
 from tests.streams import pendulum_columns
 
-TWO_LINKS = Kinematics((0.4, 0.4), (0.0, 0.0), (0.0, 0.0), False)
+INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
+<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>"""
+PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIAL}</link>
+<link name="lower">{INERTIAL}</link>
+<joint name="a" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+<joint name="b" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/>
+</joint></robot>"""
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with a recording of the UR10 alone, which has two joints here."""
-    monkeypatch.setattr(real_arms, "read_joint_states", lambda path: pendulum_columns(1500))
-    monkeypatch.setitem(ARMS, "ur10", ARMS["ur10"]._replace(links=TWO_LINKS))
+    monkeypatch.setitem(ARMS, "ur10", ARMS["ur10"]._replace(read=lambda path: pendulum_columns(1500)))
     place = tmp_path / "arms" / ARMS["ur10"].place
     place.parent.mkdir(parents=True)
     place.touch()
+    (tmp_path / "arms" / "urdf").mkdir()
+    (tmp_path / "arms" / "urdf" / "ur10_robot.urdf").write_text(PENDULUMS)
     return tmp_path / "arms"
+
+
+TWO_LINKS = BodyModel.of(PENDULUMS, ["position[0]", "position[1]"])
 
 
 def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     episode = Episode.from_table(pendulum_columns(200))
-    piece, rng, slices = (
-        Piece(episode, 100, np.array([5.0, 5.0]), TWO_LINKS),
-        np.random.default_rng(0),
-        episode.spec.slices,
-    )
+    piece, rng, slices = Piece(episode, 100, np.array([5.0, 5.0]), None), np.random.default_rng(0), episode.spec.slices
     for kind in ("frozen", "slipped", "late", "step"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
@@ -55,27 +61,37 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
         np.testing.assert_array_equal(found.faults, np.arange(200) >= 100)
     slid = with_fault("slipped", piece, rng).stream - episode.stream
     assert np.abs(slid).max() == pytest.approx(SLIP, rel=1e-3)
+    assert with_fault("push", piece, rng) is None  # motor currents say nothing of newtons
 
 
-def test_a_push_does_the_work_of_its_force():
-    q = np.tile(np.array([0.3, -0.4, 0.2, -1.8, 0.1, 1.5, 0.6]), (100, 1)) + 0.01 * np.arange(100)[:, None]
-    rng = np.random.default_rng(0)
-    velocity, effort = rng.normal(size=(2, *q.shape))
-    episode = Episode.from_table({"position": q, "velocity": velocity, "effort": effort}, rate=50.0)
-    found = with_fault("push", Piece(episode, 50, np.ones(7), PANDA), np.random.default_rng(0))
-    torque = (found.stream - episode.stream)[-1, episode.spec.slices["effort"]].astype(float)
-    force = np.linalg.lstsq(jacobian(PANDA, q[-1]).T, torque, rcond=None)[0]
-    assert np.linalg.norm(force) == pytest.approx(NEWTONS, rel=1e-4)
-    assert force[2] == pytest.approx(0.0, abs=1e-3)
-
-
-def test_kinematics_are_those_of_two_links_and_of_the_simulated_panda():
+def test_a_push_does_the_work_of_its_force_at_the_outermost_link():
     a, b = 0.3, 0.9
-    first, second = 0.4 * np.array([-np.sin(a), np.cos(a), 0]), 0.4 * np.array([-np.sin(a + b), np.cos(a + b), 0])
-    np.testing.assert_allclose(jacobian(TWO_LINKS, [a, b]).T, [first + second, second], atol=1e-12)
-    stretched = jacobian(UR10, np.zeros(6))  # along x, its axes about y
-    np.testing.assert_allclose(np.linalg.norm(stretched[:, 0]), np.hypot(0.612 + 0.5723, 0.163941 + 0.0922), rtol=1e-6)
-    np.testing.assert_allclose(jacobian(PANDA, np.zeros(7))[:, 0], [0.0, 0.088, 0.0], atol=1e-9)  # upright
+    moved = jacobian(TWO_LINKS, np.array([a, b]))  # about y: x and z of the end of the first link, where the second is
+    np.testing.assert_allclose(moved[:, 0], 0.4 * np.array([-np.sin(a), 0.0, -np.cos(a)]), atol=1e-12)
+    np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-12)
+    episode = Episode.from_table(pendulum_columns(200))
+    found = with_fault("push", Piece(episode, 100, np.ones(2), TWO_LINKS), np.random.default_rng(0))
+    torque = (found.stream - episode.stream)[-1, episode.spec.slices["effort"]].astype(float)
+    along = jacobian(TWO_LINKS, episode.stream[-1, episode.spec.slices["position"]].astype(float))[0, 0]
+    assert 0.0 < abs(torque[0] / along) <= NEWTONS
+
+
+def test_the_tables_of_tiago_and_of_the_tx40_become_one_each(tmp_path):
+    names = ["t", "- torso_lift_joint_{0}", "- arm_1_joint_{0}", "- arm_2_joint_{0}"]
+    for n, kind in enumerate(("position", "velocity", "effort")):
+        rows = np.column_stack([0.01 * np.arange(50), np.random.default_rng(n).normal(size=(50, 3))])
+        pd.DataFrame(rows, columns=[x.format(kind) for x in names]).to_csv(tmp_path / f"tiago_{kind}.csv", index=False)
+    tiago = Episode.from_table(ARMS["tiago"].read(tmp_path / "tiago_position.csv"))
+    assert tiago.spec.labels[:2] == ("position[arm_1_joint]", "position[arm_2_joint]")
+    assert tiago.spec.slices["effort"] == slice(4, 6)
+    q = np.random.default_rng(0).normal(size=(30 * TX40_MEAN, 6)).cumsum(axis=0)
+    motors = q * TX40_RATIOS
+    motors[:, 5] += TX40_RATIOS[5] * q[:, 4]
+    for name, values in (("pos_read_data", motors), ("curr_data", q)):
+        np.savetxt(tmp_path / f"{name}.csv", values, delimiter=",", header="Joint_1", comments="")
+    found = ARMS["tx40"].read(tmp_path / "pos_read_data.csv")
+    np.testing.assert_allclose(found["position"], q.reshape(30, TX40_MEAN, 6).mean(axis=1), rtol=1e-9, atol=1e-9)
+    assert Episode.from_table(found).spec.dt == pytest.approx(0.008)
 
 
 def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folder, tmp_path, capsys):
@@ -96,24 +112,14 @@ def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folde
     assert "is missing: it is unisa-acg/inverse-dynamics-solver" in capsys.readouterr().err
 
 
-INERTIAL = """<inertial><origin xyz="0.4 0 0"/><mass value="1"/>
-<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>"""
-PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIAL}</link>
-<link name="lower">{INERTIAL}</link>
-<joint name="a" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
-<joint name="b" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0.4 0 0"/><axis xyz="0 1 0"/>
-</joint></robot>"""
-
-
 def test_the_study_gives_monitors_a_body_model_or_names_the_missing_file(folder, tmp_path, capsys):
     out = ["--out", str(tmp_path / "out"), "--experiments", "ur10", "--workers", "1"]
     command = ["reproduce", "real_arms", str(folder), *out, "--monitors", "association_values, body"]
-    assert main(command) == 2
-    assert "ur10_robot.urdf is missing: it is in example-robot-data" in capsys.readouterr().err
-    (folder / "urdf").mkdir()
-    (folder / "urdf" / "ur10_robot.urdf").write_text(PENDULUMS)
     assert main(command) == 0
     assert "| association_values, body |" in (tmp_path / "out" / "real_arms.md").read_text()
+    (folder / "urdf" / "ur10_robot.urdf").unlink()
+    assert main(command) == 2
+    assert "ur10_robot.urdf is missing: it is in example-robot-data" in capsys.readouterr().err
 
 
 def test_every_monitor_meets_the_same_faults(folder):

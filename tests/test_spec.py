@@ -174,6 +174,15 @@ def test_the_control_period_is_what_an_environment_says_of_time_and_never_silent
         ({"control_freq": 20}, 0.05),
     ):
         assert control_period(env(**said)) == pytest.approx(dt)
+
+    def step(self, action):
+        self.time += 0.2
+        return 0.0, 0.0, False, False, {}
+
+    own = {"time": 3.0, "step": step, "reset": lambda self: None, "action_space": gym.spaces.Discrete(2)}
+    clocked = env(**own)
+    assert control_period(clocked) == pytest.approx(0.2)  # by its own clock, in a copy
+    assert clocked.unwrapped.time == 3.0
     with pytest.warns(PeriodWarning, match="Foreign says nothing of its control period: 0.1 s"):
         assert control_period(env()) == pytest.approx(0.1)
     assert control_period(env(metadata={})) == 1.0

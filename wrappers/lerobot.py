@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import TARGET, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
-from asm_gym.data.gaps import blamed, reason
 from asm_gym.data.rows import ClockWentBack, Pace
+from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,45 +27,39 @@ def read_parquet(path: Path) -> Columns:
 
 def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
     """Return the array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the column ``value``."""
-    if not regular_file(path):
-        raise ValueError(f"{path} is empty")
     try:
         array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # a file shorter than it declares is refused
-    except Exception as error:  # its header is Python, and whatever reading that may raise, damage raises
-        raise ValueError(f"{path} is damaged: {' '.join(str(error).split()) or type(error).__name__}") from error
+    except ValueError as error:  # whose remedy is unsafe
+        raise ValueError("it is damaged, or no array of numbers") from error
     if array.dtype.names and array.ndim == 1:
         return {name: array[name] for name in array.dtype.names if array[name].ndim <= 2}
     if array.dtype.kind not in "biuf" or array.ndim not in (1, 2):
-        raise ValueError(f"{path} must hold rows of numbers, got {array.dtype} of shape {array.shape}")
+        raise ValueError(f"it must hold rows of numbers, got {array.dtype} of shape {array.shape}")
     rows = array.reshape(len(array), -1)
     if columns and rows.shape[1] != len(columns):
-        raise ValueError(f"{len(columns)} columns are named, and {path} has {rows.shape[1]}")
+        raise ValueError(f"{len(columns)} columns are named, and it has {rows.shape[1]}")
     return {name: rows[:, k] for k, name in enumerate(columns)} or {"value": array}
 
 
 def read_mat(path: Path) -> Columns:
-    """Return the variables of a MATLAB file up to version 7, (T,) or (T, k), fields of structures as ``data.q``."""
+    """Return the variables of a MATLAB file, (T,) or (T, k), fields of structures as ``data.q``."""
     from scipy.io import loadmat
 
-    regular_file(path)
     try:
-        found = loadmat(path, squeeze_me=True, struct_as_record=True)
+        return _along_time(_numbers_in(loadmat(path, simplify_cells=True)))
     except NotImplementedError:
         return read_hdf5(path)[""][0]  # version 7.3 is HDF5
-    except Exception as error:  # scipy raises whatever the damage leads to
-        raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
-    return _along_time(_fields("", {n: v for n, v in found.items() if not n.startswith("__")}))
 
 
-def _fields(of: str, values: dict[str, Any]) -> Columns:
-    """The arrays of numbers among variables and the fields of structures."""
+def _numbers_in(tree: Mapping[str, Any]) -> Columns:
+    """The arrays of numbers, of one or two dimensions, in a structure or a group, and in those within it."""
     made: Columns = {}
-    for name, value in values.items():
-        array = np.asarray(value)
-        if array.dtype.names and array.ndim == 0:
-            made |= _fields(f"{of}{name}.", {field: array[field].item() for field in array.dtype.names})
-        elif array.dtype.kind in "biuf" and array.ndim in (1, 2):
-            made[f"{of}{name}"] = array
+    for name, node in tree.items():
+        if hasattr(node, "items"):
+            made |= {f"{name}.{inner}": values for inner, values in _numbers_in(node).items()}
+        elif getattr(node, "ndim", 0) in (1, 2) and node.dtype.kind in "biuf":
+            values = np.asarray(node)
+            made[name] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
     return made
 
 
@@ -83,54 +77,36 @@ def read_hdf5(path: Path) -> dict[str, tuple[Columns, float | None]]:
     Observations are columns of their names, and actions are called so. Source: robomimic, "Dataset Contents".
     """
     h5py = require("h5py", what="an HDF5 file")
-    try:
-        check_hdf5(path)
-        with h5py.File(path, "r") as file:
-            if "data" not in file or not isinstance(file["data"], h5py.Group):
-                return {"": (_along_time(_datasets(h5py, file)), None)}
-            about = json.loads(file["data"].attrs.get("env_args", "{}"))
-            rate = about.get("env_kwargs", {}).get("control_freq")
-            names = sorted(file["data"], key=lambda name: (len(name), name))
-            return {name: (_demonstration(h5py, file["data"][name]), rate) for name in names}
-    except (OSError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
-
-
-def _demonstration(h5py: Any, group: Any) -> Columns:
-    found = _datasets(h5py, group.get("obs", group))
-    found = {name: values for name, values in found.items() if values.ndim <= 2}
-    return found | ({"actions": np.asarray(group["actions"])} if "actions" in group else {})
-
-
-def _datasets(h5py: Any, group: Any) -> Columns:
-    """The arrays of numbers in a group and in those within it."""
-    made: Columns = {}
-    for name, node in group.items():
-        if isinstance(node, h5py.Group):
-            made |= {f"{name}.{inner}": values for inner, values in _datasets(h5py, node).items()}
-        elif node.dtype.kind in "biuf" and node.ndim in (1, 2):
-            values = np.asarray(node)
-            made[name] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
-    return made
+    check_hdf5(path)
+    with h5py.File(path, "r") as file:
+        if not hasattr(file.get("data"), "items"):
+            return {"": (_along_time(_numbers_in(file)), None)}
+        rate = json.loads(file["data"].attrs.get("env_args", "{}")).get("env_kwargs", {}).get("control_freq")
+        made = {}
+        for name in sorted(file["data"], key=lambda name: (len(name), name)):
+            group = file["data"][name]
+            actions = {"actions": np.asarray(group["actions"])} if "actions" in group else {}
+            made[name] = (_numbers_in(group.get("obs", group)) | actions, rate)
+        return made
 
 
 def check_hdf5(path: Path) -> None:
     """Raise ValueError where an HDF5 file declares what was never written, or reads from other files; or OSError."""
     h5py = require("h5py", what="an HDF5 file")
     regular_file(path)
+
+    def check(group: Any) -> None:
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"{group.name}/{name} points elsewhere, which is not followed")
+            node = group[name]
+            if isinstance(node, h5py.Group):
+                check(node)
+            elif isinstance(node, h5py.Dataset):
+                if node.external or node.is_virtual:
+                    raise ValueError(f"{node.name} is kept in another file, which is not read")
+                if node.nbytes and not node.id.get_storage_size():
+                    raise ValueError(f"{node.name} declares {node.nbytes} bytes that were never written")
+
     with h5py.File(path, "r") as file:
-        _check_group(h5py, file)
-
-
-def _check_group(h5py: Any, group: Any) -> None:
-    for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise ValueError(f"{group.name}/{name} points elsewhere, which is not followed")
-        node = group[name]
-        if isinstance(node, h5py.Group):
-            _check_group(h5py, node)
-        elif isinstance(node, h5py.Dataset):
-            if node.external or node.is_virtual:
-                raise ValueError(f"{node.name} is kept in another file, which is not read")
-            if node.nbytes and not node.id.get_storage_size():
-                raise ValueError(f"{node.name} declares {node.nbytes} bytes that were never written")
+        check(file)

@@ -18,7 +18,6 @@ from typing import Any
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import HELD, Columns
 from asm_gym.extras import require
-from asm_gym.files import regular_file
 
 Numbers = dict[str, float]
 
@@ -49,7 +48,6 @@ MESSAGES: dict[str, Callable[[Any], Numbers]] = {
 
 def read_bag(path: Path) -> Columns:
     """Return the columns of a bag, ``time`` [s] among them. Raises ValueError if it is damaged or has no JointState."""
-    regular_file(path)
     highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
@@ -58,10 +56,8 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = (
-            "; a recorder that was killed leaves such a file: mcap recover mends it" if path.suffix == ".mcap" else ""
-        )
-        raise ValueError(f"it is damaged: {error}{mend}") from error
+        mend = "; a recorder that was killed leaves such a file: mcap recover mends it"
+        raise ValueError(f"it is damaged: {error}{mend if path.suffix == '.mcap' else ''}") from error
 
 
 def _columns(bag: Any) -> Columns:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.clock import Clock, find_clock, seconds_a_row
+from asm_gym.data.clock import Clock, find_clock
 from asm_gym.data.columns import Column, LogLayout, decide
 from asm_gym.data.names import TAU, TURN, TURNED, factor, is_command, is_label, label_of, split_unit
 from asm_gym.data.reader_notes import note
@@ -44,18 +45,8 @@ class Recorded(NamedTuple):
 class ColumnPlan:
     """Which columns of a source make a row of a memory's stream, and how: the same for files and for live rows.
 
-    Args:
-        names: of the columns, with their units.
-        spec: of the memory. A channel of sine and cosine is made of the angle of that name.
-
-    Raises:
-        ValueError: a column is missing, or of another unit.
-
-    Example:
-        >>> from asm_gym import Channel, StreamSpec
-        >>> plan = ColumnPlan(["yaw [deg]", "seq"], StreamSpec((Channel("yaw", 1, "rad"),), dt=0.01))
-        >>> plan.row({"yaw [deg]": 180.0, "seq": 7}).round(2)
-        array([3.14])
+    A channel of sine and cosine is made of the angle of that name. Raises ValueError where a column is missing, or of
+    another unit.
     """
 
     def __init__(self, names: Iterable[str], spec: StreamSpec) -> None:
@@ -117,8 +108,10 @@ def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ())
     rows = plan.rows(table)
     labels = [v for n, v in table.items() if n not in plan.columns and is_label(split_unit(n)[0], layout.labels)]
     faults = np.logical_or.reduce([_marked(values) for values in labels]) if labels else np.zeros(0, np.bool_)
-    timing = _timing(table, clock, layout)
-    dt, by_clock = _period(timing, table, layout)
+    timing = None
+    with suppress(ValueError) if layout.rate is not None else nullcontext():
+        timing = None if clock is None else timing_of(table, clock)
+    dt, by_clock = _period(timing, layout)
     if by_clock and timing is not None:
         rows = np.column_stack([rows, faults] if labels else [rows])
         rows = evenly(rows[timing.kept], timing.times, dt)
@@ -142,16 +135,7 @@ def clock_of(table: Columns, layout: LogLayout) -> Clock | None:
         return None
 
 
-def _timing(table: Columns, clock: Clock | None, layout: LogLayout) -> Timing | None:
-    try:
-        return None if clock is None else timing_of(table, clock)
-    except ValueError:
-        if layout.rate is None:
-            raise
-        return None
-
-
-def _period(timing: Timing | None, table: Columns, layout: LogLayout) -> tuple[float, bool]:
+def _period(timing: Timing | None, layout: LogLayout) -> tuple[float, bool]:
     """How far apart rows are to be [s], and whether their clock tells where each belongs."""
     own = timing.dt if timing is not None else None
     said = 1.0 / check_number("rate", layout.rate, low=SLOWEST) if layout.rate is not None else None
@@ -159,10 +143,10 @@ def _period(timing: Timing | None, table: Columns, layout: LogLayout) -> tuple[f
     if own is None or timing is None:
         if (known := said or meant) is not None:
             return known, False
-        moved = seconds_a_row(table)
-        hint = "" if moved is None else f"; positions and velocities say about {1 / moved:.4g}"
-        what = "Say the rate [Hz] of this layout (--rate), or name or add a column of times (--clock)"
-        raise ValueError(f"how many rows come a second? {what}{hint}")
+        raise ValueError(
+            "how many rows come a second? Say the rate [Hz] of this layout (--rate), or name or add a column of times "
+            "(--clock)"
+        )
     if said is None and meant is not None and abs(own / meant - 1) <= RATE_TOLERANCE:
         return meant, True
     dt = said or (layout.spec.dt if layout.spec is not None else own)
@@ -200,16 +184,13 @@ def described(columns: Sequence[Column], layout: LogLayout) -> StreamSpec:
             raise ValueError(f"columns must have different names, got {name!r} twice")
     commanded = {c.name for pattern in layout.action for c in _chosen(used, pattern)}
     if layout.by_name and not layout.action:
-        named = {c.name for c in used if is_command(c.name)}
-        whole = {c.channel for c in used if c.name in named} - {c.channel for c in used if c.name not in named}
-        commanded = {c.name for c in used if c.channel in whole}
-        commanded = set() if len(commanded) == len(used) else commanded
+        sensed = {c.channel for c in used if not is_command(c.name)}
+        commanded = {c.name for c in used if c.channel not in sensed} if sensed else set()
     parts: dict[str, list[Column]] = {}
     for column in sorted(used, key=lambda c: c.name in commanded):  # the action stands last
         parts.setdefault(column.name if column.turn else column.channel, []).append(column)
     channels = tuple(_channel(name, part, commanded) for name, part in parts.items())
-    codes = sorted({c.code for c in used if not math.isnan(c.code)})
-    return StreamSpec(channels, 1.0, "table", tuple(codes))
+    return StreamSpec(channels, 1.0, "table", tuple(sorted({c.code for c in used if not math.isnan(c.code)})))
 
 
 def _chosen(columns: Sequence[Column], pattern: str) -> list[Column]:
@@ -222,10 +203,9 @@ def _chosen(columns: Sequence[Column], pattern: str) -> list[Column]:
 
 
 def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Channel:
-    own = {c.name for c in columns}
+    own, units = {c.name for c in columns}, {c.unit for c in columns if c.unit}
     if commanded & own and own - commanded:
         raise ValueError(f"channel {name!r} is commanded in part: {', '.join(sorted(own))}")
-    units = {c.unit for c in columns if c.unit}
     if len(units) > 1:
         raise ValueError(f"channel {name!r} is of several units: {', '.join(sorted(units))}")
     group = MOTOR if own & commanded else columns[0].channel

@@ -1,7 +1,7 @@
 """Find the clock of a log, and the unit in which it counts.
 
 unit       behind the name; or else by what a number since 1970 would be, by velocities against differences of
-           positions, and by the unit that gives 1 to 1000 rows a second
+           positions, by the memory's rate, and by the unit that gives 1 to 1000 rows a second
 pair       columns of seconds and of nanoseconds are one clock
 choice     the steadiest of those called so; a clock in whole seconds gives way to a counter that agrees with it
 text       ISO 8601, 24/11/2026 10:00:00.5, 10:00:00.5
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import CLOCK, COUNTERS, SECONDS, is_clock, ratio, split_unit
+from asm_gym.data.names import CLOCK, COUNTERS, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
@@ -27,14 +27,15 @@ EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least number 
 SLOWEST_WITHOUT_UNIT = 2.0  # step from which on a clock without a unit is not believed to count seconds
 UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: they were written twice
-ALIKE = 0.2  # how far two clocks, or a clock and the velocities, may be off, as a share, and tell each other's unit
+ALIKE = 0.2  # how far two clocks, or a clock and a memory, may be off, as a share, and tell each other's unit
+
+FEWEST, ALIKE_MOTION = 8, 0.9  # rows from which on velocities tell the unit, and how well they must explain positions
 
 _PAIR = re.compile(r"(?P<of>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nsecs?|ns|usecs?|us|micros)\]?", re.I)
 _SECONDS = ("secs", "sec", "seconds", "s")
-_SPEEDS = {
-    **{"velocity": "position", "velocities": "positions", "vel": "pos", "qvel": "qpos", "qd": "q", "dq": "q"},
-    **{"v": "q", "speed": "position"},
-}
+_PLACES = {"velocity": "position", "velocities": "positions", "vel": "pos", "qvel": "qpos"} | dict.fromkeys(
+    ("qd", "dq", "v"), "q"
+)
 """What a position is called, by what its velocity is called."""
 
 
@@ -124,18 +125,15 @@ def clocks_among(names: Iterable[str]) -> list[Clock]:
     names = list(names)
     lower = {name.lower(): name for name in reversed(names)}
     pairs = {}
-    for name in names:
-        found = _PAIR.fullmatch(name)
+    for name, found in ((name, _PAIR.fullmatch(name)) for name in names):
         for end in _SECONDS if found else ():
-            coarse = lower.get(name[: found.start("unit")].lower() + end + name[found.end("unit") :].lower())  # type: ignore[union-attr]
-            if coarse is not None and coarse != name:
-                unit = "ns" if found["unit"].lower().startswith("n") else "us"  # type: ignore[index]
-                pairs[coarse] = Clock((coarse, name), (1.0, SECONDS[unit]))
-                break
+            assert found is not None
+            coarse = lower.get(name[: found.start("unit")].lower() + end + name[found.end("unit") :].lower(), name)
+            if coarse != name and coarse not in pairs:
+                pairs[coarse] = Clock((coarse, name), (1.0, 1e-9 if found["unit"].lower().startswith("n") else 1e-6))
     fine = {pair.columns[1] for pair in pairs.values()}
-    return [
-        pairs.get(n, Clock((n,), (_named_unit(n),))) for n in names if n in pairs or (is_clock(n) and n not in fine)
-    ]
+    single = {name: Clock((name,), (_named_unit(name),)) for name in names if is_clock(name) and name not in fine}
+    return [found for name in names if (found := pairs.get(name) or single.get(name))]
 
 
 def _named_unit(name: str) -> float | None:
@@ -162,21 +160,18 @@ def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | 
             usable.append((_unsteadiness(clock.seconds(table)), clock))
         except ValueError as error:
             trouble = trouble or str(error)
-    best = min(usable, key=lambda each: each[0], default=None)
-    if best is not None and best[0][0] <= MOST_DOUBLED:
-        others = [c for how, c in usable if c is not best[1] and how[0] <= MOST_DOUBLED]
-        _note_choice(table, best[1], others)
-        return best[1]
+    usable.sort(key=lambda each: each[0])
+    steady = [clock for (doubled, _), clock in usable if doubled <= MOST_DOUBLED]
+    if steady:
+        _note_others(table, *steady)
+        return steady[0]
+    best = usable[0][1] if usable else None
     rising = _rising(table, [clock for _, clock in usable])
-    if rising is not None:
-        if best is not None:
-            note(
-                f"the stamps of {best[1].name!r} repeat themselves: the clock is {rising.name!r}, which rises with them"
-            )
-        return rising
-    if trouble:
+    if rising is not None and best is not None:
+        note(f"the stamps of {best.name!r} repeat themselves: the clock is {rising.name!r}, which rises with them")
+    if rising is None and trouble:
         raise ValueError(trouble)
-    return best[1] if best is not None else None
+    return rising or best
 
 
 def _wanted(table: Mapping[str, NDArray[Any]], wanted: str, dt: float | None) -> Clock:
@@ -203,10 +198,9 @@ def _unsteadiness(times: Floats) -> tuple[float, float]:
     return (0.0 if doubled <= MOST_DOUBLED else doubled) + float(median < 0), round(jitter, 2)
 
 
-def _note_choice(table: Mapping[str, NDArray[Any]], best: Clock, others: Sequence[Clock]) -> None:
-    own = float(np.median(np.diff(best.seconds(table)))) if len(table[best.columns[0]]) > 2 else 0.0
-    for other in others:
-        step = float(np.median(np.diff(other.seconds(table))))
+def _note_others(table: Mapping[str, NDArray[Any]], best: Clock, *others: Clock) -> None:
+    for other in others if len(table[best.columns[0]]) > 2 else ():
+        own, step = (float(np.median(np.diff(clock.seconds(table)))) for clock in (best, other))
         if own > 0 and step > 0 and abs(step / own - 1) > ALIKE:
             rates = f"{1 / own:.4g} and {1 / step:.4g} rows a second"
             note(f"{best.name!r} and {other.name!r} disagree, {rates}: the former is read; --clock NAME chooses")
@@ -221,15 +215,14 @@ def _with_unit(clock: Clock, table: Mapping[str, NDArray[Any]], dt: float | None
     step = float(np.median(np.diff(known))) if len(known) > 2 else 0.0
     if not step > 0 or known[0] >= EPOCHS[-1][0]:
         return clock
-    moved = seconds_a_row(table) or dt
+    plausible = [u for u in UNITS if 1.0 <= 1 / (step * u) <= 1000.0] if step >= SLOWEST_WITHOUT_UNIT else []
+    moved = _seconds_a_row(table) or dt
     alike = [u for u in UNITS if moved is not None and abs(step * u / moved - 1) < ALIKE]
-    guessed = next((u for u in UNITS if 1.0 <= 1 / (step * u) <= 1000.0), 1.0)
-    unit = alike[0] if alike else guessed if step >= SLOWEST_WITHOUT_UNIT else 1.0
+    unit = next(iter([*alike, *plausible]), 1.0)
     if unit != 1.0:
-        why = "as the motion says" if alike else "the unit that gives 1 to 1000 rows a second"
         note(
-            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {UNITS[unit]}, {why}; "
-            f"--clock '{column} [s]' or --rate HZ says otherwise"
+            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {UNITS[unit]}, a plausible "
+            f"rate; --clock '{column} [s]' or --rate HZ says otherwise"
         )
     return Clock((column,), (unit,))
 
@@ -238,7 +231,7 @@ def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock
     """A clock that is not called so: its numbers rise, and its name, their size, or a coarse clock tells the unit."""
     for name, values in table.items():
         unnamed = name.strip().lower() in COUNTERS
-        if unnamed and values.dtype.kind == "O" and len(values):
+        if unnamed and values.dtype.kind == "O" and len(values):  # an index of dates
             with suppress(ValueError):
                 if (np.diff(Clock((name,)).seconds(table)) > 0).all():
                     return Clock((name,))
@@ -248,29 +241,24 @@ def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock
             continue
         unit = _named_unit(name) or (_epoch(float(values[0])) if values[0] >= EPOCHS[1][0] else None)
         unit = 1.0 if unit is None and unnamed and (values != np.rint(values)).any() else unit  # an index of seconds
-        span = float(values[-1]) - float(values[0])
-        for clock in coarse if unit is None else ():
-            whole = float(np.ptp(clock.seconds(table)))
-            unit = next((u for u in UNITS if whole > 0 and abs(span * u / whole - 1) < ALIKE), None)
+        for whole in (float(np.ptp(clock.seconds(table))) for clock in coarse):
+            span = float(values[-1]) - float(values[0])
+            unit = unit or next((u for u in UNITS if whole > 0 and abs(span * u / whole - 1) < ALIKE), None)
         if unit is not None:
             return Clock((name,), (unit,))
     return None
 
 
-def seconds_a_row(table: Mapping[str, NDArray[Any]]) -> float | None:
-    """Return the seconds from row to row by which velocities explain the differences of positions; None without any."""
-    found = []
-    names = {split_unit(name)[0]: name for name in table}
-    for bare, name in names.items():
-        for speed, position in _SPEEDS.items():
-            other = names.get(re.sub(rf"(?<![A-Za-z]){speed}(?![A-Za-z])", position, bare, count=1, flags=re.I), name)
-            pair = table[other], table[name]
-            if other == name or any(x.dtype.kind not in "biuf" or x.ndim != 1 or len(x) < 8 for x in pair):
+def _seconds_a_row(table: Mapping[str, NDArray[Any]]) -> float | None:
+    """The seconds from row to row by which velocities explain the differences of positions; None without any."""
+    names, found = {split_unit(name)[0]: values for name, values in table.items()}, list[float]()
+    for name, speeds in names.items():
+        for speed, place in _PLACES.items():
+            other = re.sub(rf"(?<![A-Za-z]){speed}(?![A-Za-z])", place, name, count=1, flags=re.I)
+            pair = names.get(other, speeds), speeds
+            if other == name or any(x.dtype.kind not in "biuf" or x.ndim != 1 or len(x) < FEWEST for x in pair):
                 continue
-            moved, speeds = np.gradient(pair[0].astype(np.float64)), pair[1].astype(np.float64)
-            use = np.isfinite(moved) & np.isfinite(speeds)
-            power = float(speeds[use] @ speeds[use])
-            if power > 0 and np.corrcoef(moved[use], speeds[use])[0, 1] > 0.9:
-                scale = (ratio(split_unit(other)[1], "rad") or 1.0) / (ratio(split_unit(name)[1], "rad/s") or 1.0)
-                found.append(scale * float(moved[use] @ speeds[use]) / power)
+            moved = np.gradient(pair[0].astype(np.float64))
+            if np.ptp(speeds) > 0 and np.corrcoef(moved, speeds)[0, 1] > ALIKE_MOTION:
+                found.append(float(moved @ speeds) / float(speeds @ speeds))
     return float(np.median(found)) if found and np.median(found) > 0 else None

@@ -1,8 +1,11 @@
-"""Write episodes as Minari datasets, and read those of others.
+"""Write episodes as Minari datasets, and read those of others, and of LeRobot without LeRobot.
 
-A dataset holds T + 1 observations and T actions, rewards, terminations and truncations of each episode; ours hold the
-sensorimotor stream, (T, D), in ``infos`` as well, and name its channels in the metadata. Source: Younis et al. 2024,
-https://minari.farama.org.
+Minari     T + 1 observations and T actions, rewards, terminations and truncations of each episode; ours hold the
+           sensorimotor stream, (T, D), in ``infos`` as well, and name its channels in the metadata
+LeRobot    meta/info.json: version, rate (fps), and the features: dtype, shape, names; data/**/*.parquet: a row a frame.
+           Version 2 has a file for each episode, version 3 many episodes in one
+
+Sources: Younis et al. 2024, https://minari.farama.org; https://huggingface.co/docs/lerobot/lerobot-dataset-v3.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -22,8 +25,9 @@ import numpy as np
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
-from asm_gym.data.arrays import check_hdf5
+from asm_gym.data.arrays import check_hdf5, read_parquet
 from asm_gym.data.episode import Episode, check_recorded
+from asm_gym.data.tables import Columns, as_array
 from asm_gym.extras import require
 from asm_gym.spec import StreamSpec, control_period, flat_rows
 from asm_gym.tasks import TASKS
@@ -32,6 +36,9 @@ from asm_gym.validation import check_text, typed
 METADATA, ARRAYS = "metadata.json", "main_data.hdf5"  # files of a dataset's folder ``data``
 OWN_FILES = (ARRAYS, METADATA, "SHA256SUMS")  # files that this package has written there, the last one until 1.0
 SPARE_BYTES = 10_000_000  # beside the arrays of a data set, that a disk must have
+INFO = Path("meta") / "info.json"
+
+SENSED, COMMANDED = "observation.", "action"  # features that are read begin so; pictures are left out
 
 
 def require_minari() -> None:
@@ -46,14 +53,9 @@ def write_dataset(
 ) -> Path:
     """Write episodes of one spec as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
 
-    Args:
-        root, dataset_id: the folder of all datasets, and a name such as ``asm_gym/lift-v0``.
-        episodes, env: with an action, a reward and a flat observation of every step, recorded in ``env``.
-        details: JSON-serialisable; kept in the metadata.
-
-    Raises:
-        ValueError: episodes are missing, incomplete or of several specs; the name leads elsewhere, or to foreign files.
-        OSError: the disk has no room for it.
+    They hold an action, a reward and a flat observation of every step in ``env``. ``details`` are kept as JSON in the
+    metadata. Raises ValueError where episodes are missing, incomplete or of several specs, or the name leads elsewhere
+    or to foreign files; OSError where the disk has no room.
     """
     require_minari()
     import minari
@@ -82,11 +84,9 @@ def write_dataset(
     spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
     storage = MinariStorage.new(data, **spaces, env_spec=env.spec)
     storage.update_episodes([_buffer(n, episode) for n, episode in enumerate(episodes)])
-    storage.update_episode_metadata(
-        {"success": bool(episode.success), "info": json.dumps(episode.info)} for episode in episodes
-    )
-    about = {"stream_spec": spec.to_json(), **details}
-    storage.update_metadata(about | {"dataset_id": dataset_id, "minari_version": minari.__version__})
+    storage.update_episode_metadata({"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes)
+    about = {"stream_spec": spec.to_json(), "dataset_id": dataset_id, "minari_version": minari.__version__}
+    storage.update_metadata(details | about)
     if folder.exists():
         folder.rename(replaced)
     unfinished.rename(folder)
@@ -96,8 +96,7 @@ def write_dataset(
 
 def _folder(root: Path, dataset_id: str) -> Path:
     """The folder of a dataset, which lies below ``root``."""
-    check_text("dataset_id", dataset_id)
-    if not all(re.fullmatch(r"\w[\w.-]*", part) for part in dataset_id.split("/")):
+    if not all(re.fullmatch(r"\w[\w.-]*", part) for part in check_text("dataset_id", dataset_id).split("/")):
         raise ValueError(f"dataset_id must be a name such as asm_gym/lift-v0, got {dataset_id!r}")
     folder = root.resolve() / dataset_id  # Minari doubles a relative path
     if folder.resolve() != folder:
@@ -133,15 +132,10 @@ def _buffer(n: int, episode: Episode) -> Any:
 
 @typed
 def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
-    """Return the episodes of a Minari dataset; without streams, observation and action are the stream.
+    """Return the episodes of the only Minari dataset at or below ``path``, perhaps one that must be of ``env_id``.
 
-    Args:
-        path: the folder that holds ``metadata.json``, or one with a single dataset anywhere below it.
-        env_id: what the dataset must have been recorded in.
-
-    Raises:
-        FileNotFoundError: there is no dataset.
-        ValueError: the dataset is damaged, of another environment, or of one of ours without streams.
+    Without streams, observation and action are the stream. Raises FileNotFoundError where there is no dataset,
+    ValueError where it is damaged, of another environment, or of one of ours without streams.
     """
     folder = _find_dataset(Path(path))
     require_minari()
@@ -235,3 +229,58 @@ def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
     if not T or len(rows) % T:
         raise ValueError(f"{T} steps cannot have {len(rows)} rows of a stream")
     return rows
+
+
+def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
+    """Yield the columns of each episode, its rate [Hz], and whether it succeeded (by default it did)."""
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        version, rate, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{folder / INFO} is no LeRobot dataset's: {error!r}") from error
+    if not str(version).startswith(("v2", "v3")):
+        raise ValueError(f"{folder} is of LeRobot's {version}, and v2 and v3 can be read")
+    read = {
+        name: _names(feature)
+        for name, feature in features.items()
+        if name.startswith((SENSED, COMMANDED)) and str(feature.get("dtype", "")).startswith(("float", "int"))
+    }
+    if not any(name.startswith(SENSED) for name in read):
+        raise ValueError(f"{folder} has no feature that is sensed, observation.… of numbers: {', '.join(features)}")
+    files = sorted((folder / "data").rglob("*.parquet"))
+    if not files:
+        raise ValueError(f"{folder} holds no data/**/*.parquet")
+    for file in files:
+        columns = read_parquet(file)
+        missing = [name for name in (*read, "episode_index") if name not in columns]
+        if missing:
+            raise ValueError(f"{file} lacks {', '.join(missing)}, which {INFO} declares")
+        index = columns["episode_index"]
+        for episode in dict.fromkeys(index.tolist()):
+            rows = index == episode
+            success = bool(columns["next.success"][rows].any()) if "next.success" in columns else True
+            found = {name: as_array(columns[name][rows]) for name in read}
+            made = {k: v for name in read for k, v in _split(name, found[name], read[name])}
+            stamps = {"timestamp": columns["timestamp"][rows]} if "timestamp" in columns else {}
+            yield stamps | made, rate, success  # frames that were lost are known by the stamps alone
+
+
+def _names(feature: dict[str, Any]) -> list[str]:
+    """Names of the numbers of a feature, in a list or in lists by what they name; empty where they have none."""
+    names = feature.get("names") or []
+    found = list(_words(list(names.values()) if isinstance(names, dict) else names))
+    return found if len(set(found)) == len(found) else []
+
+
+def _words(names: Any) -> Iterator[str]:
+    """The names in lists at any depth."""
+    for name in names if isinstance(names, list) else []:
+        yield from _words(name) if isinstance(name, list) else [str(name)]
+
+
+def _split(name: str, values: NDArray[Any], names: Sequence[str]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """A feature's columns, each by its name where there are names."""
+    if values.ndim == 2 and len(names) == values.shape[1]:
+        yield from ((f"{name}[{element}]", values[:, k]) for k, element in enumerate(names))
+    else:
+        yield name, values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
 from asm_gym.data.channels import read_recorded
 from asm_gym.data.columns import LogLayout
+from asm_gym.data.tables import laid_out
 from asm_gym.files import regular_file
 from asm_gym.readings import spans as spans
 from asm_gym.spec import StreamSpec
@@ -26,24 +27,15 @@ ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f",
 
 @dataclass(frozen=True)
 class EpisodeLabel:
-    """The task and role that an episode was recorded for.
-
-    Args:
-        task: a task's name.
-        role: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"`` or ``"harmless"``.
-        kind, severity: of the fault or harmless variation; empty without one.
-        seed: of the environment and of the policy. Episodes that share it are twins.
-        onset: the first step with the fault or variation; None without one.
-        affected_channels: in which the fault shows first; measured while recording, and not compared.
-    """
+    """The task and role that an episode was recorded for."""
 
     task: str
-    role: str
-    kind: str = ""
+    role: str  # "fit", "calibration", "nominal", "faulty" or "harmless"
+    kind: str = ""  # of the fault or harmless variation; empty without one
     severity: str = ""
-    seed: int = 0
-    onset: int | None = None
-    affected_channels: frozenset[str] = field(default=frozenset(), compare=False)
+    seed: int = 0  # of the environment and of the policy. Episodes that share it are twins
+    onset: int | None = None  # the first step with the fault or variation
+    affected_channels: frozenset[str] = field(default=frozenset(), compare=False)  # where it shows first, as measured
 
     @property
     def path(self) -> Path:
@@ -121,9 +113,15 @@ class Episode:
 
     @classmethod
     @typed
-    def from_table(
+    def from_table(cls, frame: Any, channels: StreamSpec | Sequence[str] | None = None, **how: Any) -> Episode:
+        """Make an episode from a log, as ``from_tables`` makes them from several."""
+        return cls.from_tables([frame], channels, **how)[0]
+
+    @classmethod
+    @typed
+    def from_tables(
         cls,
-        frame: Any,
+        frames: Sequence[Any],
         channels: StreamSpec | Sequence[str] | None = None,
         rate: float | None = None,
         action: Sequence[str] = (),
@@ -131,11 +129,11 @@ class Episode:
         ignore: Sequence[str] = (),
         clock: str = "",
         **fields: Any,
-    ) -> Episode:
-        """Make an episode from a log.
+    ) -> list[Episode]:
+        """Make an episode from each log of one robot, all with one spec: what a column is, they tell together.
 
         Args:
-            frame: a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+            frames: of each a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
             channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all that sense.
             rate: rows a second [Hz]; by default that of its clock.
             action: patterns of the commanded columns.
@@ -150,8 +148,12 @@ class Episode:
         spec = channels if isinstance(channels, StreamSpec) else None
         chosen = () if isinstance(channels, StreamSpec) else tuple(channels or ())
         layout = LogLayout(spec, rate, action, chosen, labels, ignore=ignore, clock=clock)
-        found = read_recorded(frame, layout)
-        return cls(found.stream, found.spec, **{"faults": found.faults} | fields)
+        tables, made = [laid_out(frame) for frame in frames], list[Episode]()
+        for n, table in enumerate(tables):
+            found = read_recorded(table, layout, tables[:n] + tables[n + 1 :] if layout.spec is None else ())
+            layout = replace(layout, spec=found.spec)
+            made.append(cls(found.stream, found.spec, **{"faults": found.faults} | fields))
+        return made
 
 
 def check_recorded(episode: Episode) -> None:

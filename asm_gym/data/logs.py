@@ -18,13 +18,13 @@ from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
 from asm_gym.data.channels import clock_of, read_recorded
 from asm_gym.data.columns import LogLayout
-from asm_gym.data.datasets import METADATA, read_dataset
+from asm_gym.data.datasets import INFO, METADATA, read_dataset, read_lerobot
 from asm_gym.data.episode import Episode, load_episode
-from asm_gym.data.lerobot import INFO, read_lerobot
-from asm_gym.data.reader_notes import note
+from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.tables import Columns, laid_out
 from asm_gym.data.text import read_json_lines, read_text
 from asm_gym.data.timing import recordings
+from asm_gym.files import regular_file
 from asm_gym.validation import typed
 
 FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
@@ -69,13 +69,8 @@ class Source(NamedTuple):
 def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log]:
     """Yield the episodes at ``path``, in the order of their names, each read when it is asked for.
 
-    Args:
-        path: a file, a folder of files at any depth, that of a run, or one with a LeRobot or a Minari dataset.
-        layout: how to read tables.
-
-    Raises:
-        FileNotFoundError: there is nothing of the kind.
-        ValueError: a file cannot be read; the message names it.
+    ``path`` is a file, a folder of files at any depth, that of a run, or one with a LeRobot or a Minari dataset. Raises
+    FileNotFoundError where there is nothing of the kind, ValueError where a log makes no sense; the message names it.
     """
     layout = layout or LogLayout()
     if (Path(path) / INFO).is_file():
@@ -106,37 +101,57 @@ def first_tables(sources: Iterator[Source]) -> tuple[Iterator[Source], list[Colu
 
 
 def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
-    """Yield the recordings at ``path`` as they are in their files: a column a sense, a row a moment."""
+    """Yield the recordings at ``path`` as they are in their files: a column a sense, a row a moment.
+
+    A file that cannot be read is left out, and said; a ValueError is raised where none of them can.
+    """
     path = Path(path)
     files = _files_at(path)
     if (path / INFO).is_file():
         for n, (columns, rate, success) in enumerate(read_lerobot(path)):
             yield from _parts(Source(f"episode {n}", columns, None, rate, success), layout)
-    elif files:
-        for name, file in files.items():
-            try:
-                with file.open("rb") as opened:
-                    if opened.read(len(POINTER)) == POINTER:
-                        raise ValueError("it is a pointer of Git LFS and not the file itself: run git lfs pull")
-                if file.suffix == ".npz" and _is_episode(file):
-                    yield Source(name, {}, load_episode(file))
-                elif file.suffix in HDF5:
-                    for part, (columns, often) in read_hdf5(file).items():
-                        named = f"{name} {part}".strip()
-                        yield from _parts(Source(named, columns, rate=often, file=str(file)), layout)
-                else:
-                    yield from _parts(Source(name, FILES[file.suffix](file, layout), file=str(file)), layout)
-            except (ValueError, zipfile.BadZipFile) as error:
-                raise ValueError(f"{file}: {error}") from error
-    else:
+        return
+    if not files:
         if next(path.rglob(METADATA), None) is None:
             known = ", ".join((*FILES, *HDF5))
             raise FileNotFoundError(f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset")
         yield from (Source(f"episode {n}", {}, episode) for n, episode in enumerate(read_dataset(path)))
+    troubles = []
+    for name, file in files.items():
+        try:
+            parts = [part for source in _read(name, file, layout) for part in _parts(source, layout)]
+        except (ImportError, MemoryError):
+            raise
+        except Exception as error:  # each format's reader raises whatever the damage leads to
+            damaged = "" if isinstance(error, ValueError) else "it is damaged: "
+            troubles.append(f"{file}: {damaged}{' '.join(str(error).split()) or type(error).__name__}")
+            if len(troubles) == len(files):
+                raise ValueError(troubles[0]) from error
+            note(UNREAD + troubles[-1])
+        else:
+            yield from parts
+
+
+def _read(name: str, file: Path, layout: LogLayout) -> Iterator[Source]:
+    """The recordings in a file."""
+    regular_file(file)
+    with file.open("rb") as opened:
+        if opened.read(len(POINTER)) == POINTER:
+            raise ValueError("it is a pointer of Git LFS and not the file itself: run git lfs pull")
+    if file.suffix == ".npz" and "header.json" in zipfile.ZipFile(file).namelist():
+        yield Source(name, {}, load_episode(file))
+    elif file.suffix in HDF5:
+        for part, (columns, often) in read_hdf5(file).items():
+            yield Source(f"{name} {part}".strip(), columns, rate=often, file=str(file))
+    else:
+        yield Source(name, FILES[file.suffix](file, layout), file=str(file))
 
 
 def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
     """The recordings in a table: it is cut where its clock begins anew, or leaps."""
+    if source.episode is not None:
+        yield source
+        return
     table = laid_out(source.columns)
     try:
         clock = clock_of(table, layout)
@@ -164,8 +179,3 @@ def _files_at(path: Path) -> dict[str, Path]:
     root = path / "episodes" if (path / "episodes").is_dir() else path
     found = {f.relative_to(root): f for f in sorted(root.rglob("*")) if f.suffix in known and f.suffix not in ASKED_FOR}
     return {str(name): f for name, f in found.items() if not any(part.startswith(".") for part in name.parts)}
-
-
-def _is_episode(path: Path) -> bool:
-    with zipfile.ZipFile(path) as file:
-        return "header.json" in file.namelist()

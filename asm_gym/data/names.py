@@ -111,6 +111,12 @@ def split_unit(column: str) -> tuple[str, str]:
     return column, ""
 
 
+def element_name(column: str, element: object) -> str:
+    """Return the name of an element of a column: ``q[2] [rad]`` of ``q [rad]``."""
+    name, unit = split_unit(column)
+    return f"{name}[{element}]" + (f" [{unit}]" if unit else "")
+
+
 def ratio(unit: str, other: str) -> float | None:
     """Return how many of ``other`` are in one ``unit``; None where the two do not measure the same."""
     if unit == other:

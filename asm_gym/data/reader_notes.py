@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+UNREAD = "left out, for it cannot be read: "  # begins a note on a file
+
 
 class LogWarning(UserWarning):
     """A log was read, and something of it was not as it should be."""

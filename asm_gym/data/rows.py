@@ -1,6 +1,7 @@
 """Read lines of a live source as rows of a stream, at the rate of the memory.
 
-A JSON line is a list of numbers, or an object by channel or by number; CSV begins with a header. Where there is a time,
+A JSON line is a list of numbers, or an object by channel or by number; CSV begins with a header. A row of each joint
+makes one row of all, once the last of them came. Where there is a time,
 
 own      median step of the newest 32 rows [s]
 right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
@@ -22,19 +23,17 @@ from numpy.typing import NDArray
 
 from asm_gym.data.channels import RESAMPLED, ColumnPlan
 from asm_gym.data.clock import EPOCHS, SLOWEST_WITHOUT_UNIT, UNITS, Clock, clocks_among
-from asm_gym.data.tables import Named, named_columns, named_row
+from asm_gym.data.names import element_name, is_clock, split_unit
+from asm_gym.data.tables import Named, is_key, named_columns, named_row
 from asm_gym.data.text import Dialect, check_cells, flat_row, header_of
 from asm_gym.spec import StreamSpec
+
+NEWEST = 32  # rows that tell the rate, and after which it is told again
+LEAP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
     """Nothing came for longer than a source may be silent."""
-
-
-NEWEST = 32  # rows that tell the rate, and after which it is told again
-
-
-LEAP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
 
 
 class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
@@ -53,9 +52,7 @@ class Pace:
     def lost(self, stamp: float) -> int | None:
         """Return how many rows were lost before the one of this time [s]; None where it is not to be read.
 
-        Raises:
-            ValueError: the time is not finite.
-            ClockWentBack: it is no later than the one before, or later than ``LEAP_S``.
+        Raises ValueError where it is not finite, ClockWentBack where it is not up to ``LEAP_S`` later than the last.
         """
         if not math.isfinite(stamp):
             raise ValueError(f"its time is {stamp}")
@@ -64,8 +61,7 @@ class Pace:
         if not 0 < step <= LEAP_S:
             what = "leapt" if step > 0 else "must increase"
             raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
-        self._before = stamp
-        self._rows += 1
+        self._before, self._rows = stamp, self._rows + 1
         if before is None:
             return 0
         self._steps.append(step)
@@ -90,14 +86,7 @@ class Row(NamedTuple):
 
 
 class RowReader:
-    """Read lines as rows of the stream of a memory.
-
-    Example:
-        >>> from asm_gym import Channel, StreamSpec
-        >>> reader = RowReader(StreamSpec((Channel("q", 2, "rad"),), dt=0.01))
-        >>> [row.numbers.tolist() for row, _ in reader.rows(["[1, 2]", "[3, 4]"])]
-        [[1.0, 2.0], [3.0, 4.0]]
-    """
+    """Read lines as rows of the stream of a memory."""
 
     def __init__(self, spec: StreamSpec) -> None:
         self.spec, self.line = spec, 0
@@ -105,6 +94,8 @@ class RowReader:
         self._header: list[str] | None = None  # of CSV
         self._plan: ColumnPlan | None = None  # of rows by name
         self._named: Named = {}  # columns that name others
+        self._joint = ""  # column that says whose numbers a row holds
+        self._gathered: dict[str, Any] = {}  # of the joints that came, where a row is one of a joint
         self._clock: Clock | None = None
         self._first: float | None = None  # number of a clock whose unit is not known yet
         self._pace = Pace(spec.dt)
@@ -123,7 +114,10 @@ class RowReader:
             try:
                 if self._begins_with(line):
                     continue
-                row = self._row(line)
+                found = self._row(line)
+                if found is None:
+                    continue
+                row = found
             except Exception as error:  # anybody may have sent it: deep, huge or broken, it must not end a watch
                 kind = "no row of numbers" + (", and no header" if self._header is None and not self._known else "")
                 row = Row(np.full(self.spec.size, np.nan), read=False, problem=f"line {self.line} is {kind}: {error}")
@@ -136,16 +130,19 @@ class RowReader:
         if self._known or line.lstrip()[0] in "[{":
             return False
         self._dialect = Dialect.of(line)
-        header = header_of(self._dialect.cells(line), "the header")
+        header = header_of(self._dialect.cells(line))
         self._named = named_columns(header)
-        if not self._named:
+        if not self._named and not any(map(is_key, header)):
             self._match(header)
         self._header = header
         return True
 
-    def _row(self, line: str) -> Row:
-        """Return the row of a line; ValueError where it is none."""
-        numbers, stamp = self._numbers(line)
+    def _row(self, line: str) -> Row | None:
+        """Return the row of a line, None where more joints are to come; ValueError where it is none."""
+        found = self._numbers(line)
+        if found is None:
+            return None
+        numbers, stamp = found
         if numbers.shape != (self.spec.size,):
             raise ValueError(f"it must hold {self.spec.size} numbers, got the shape {numbers.shape}")
         self._known = True
@@ -163,19 +160,19 @@ class RowReader:
             return Row(numbers, problem=str(error))
         return Row(numbers, lost or 0, lost is not None, self._pace.change)
 
-    def _match(self, names: Iterable[str]) -> None:
+    def _match(self, names: Iterable[str]) -> ColumnPlan:
         """Find the column of each label, and the clock. Raises ValueError where a column is missing."""
         names = list(names)
         plan = ColumnPlan(names, self.spec)
         doubled = [name for name in plan.columns if names.count(name) > 1]
         if doubled:
             raise ValueError(f"it has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
+        self._clock = next((c for c in clocks_among(names) if not set(plan.columns) & set(c.columns)), None)
         self._plan = plan
-        read = set(self._plan.columns)
-        self._clock = next((clock for clock in clocks_among(names) if not read & set(clock.columns)), None)
+        return plan
 
-    def _numbers(self, line: str) -> tuple[NDArray[np.float64], float | None]:
-        """The numbers of a row (D,), and its time [s] where it has one."""
+    def _numbers(self, line: str) -> tuple[NDArray[np.float64], float | None] | None:
+        """The numbers of a row (D,), and its time [s] where it has one; None where more joints are to come."""
         if self._header is not None:
             cells = self._dialect.cells(line)
             check_cells(cells, len(self._header), "it has")
@@ -191,26 +188,48 @@ class RowReader:
 
     def _by_name(
         self, row: Mapping[str, Any], number: Callable[[Any], float]
-    ) -> tuple[NDArray[np.float64], float | None]:
+    ) -> tuple[NDArray[np.float64], float | None] | None:
         """The numbers and the time of a row by name; a number that the row lacks is NaN."""
         row = named_row(row, self._named) if self._named else row
         if self._plan is None:
-            self._match(row)
-        assert self._plan is not None
-        numbers = self._plan.row({name: number(row[name]) for name in self._plan.columns if name in row})
-        return numbers, self._moment(row)
+            joints = {label.rpartition("[")[2].rstrip("]") for label in self.spec.labels if "[" in label}
+            self._joint = next((n for n in row if is_key(n) and str(row[n]).strip() in joints), "")
+        whole = self._gather(row) if self._joint else row
+        if whole is None:
+            return None
+        plan = self._plan or self._match(whole)
+        return plan.row({name: number(whole[name]) for name in plan.columns if name in whole}), self._moment(whole)
+
+    def _gather(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
+        """The row of all joints, once it is complete, or one of a later moment comes; None before."""
+        joint, before = str(row[self._joint]).strip(), self._gathered
+        own = {n if is_clock(n) else element_name(n, joint): v for n, v in row.items() if n != self._joint}
+        stamps = [clock.moment(each) for clock in clocks_among(row)[:1] for each in (before, row)]
+        later = bool(stamps) and None not in stamps and stamps[1] - stamps[0] > 0.5 * self.spec.dt  # type: ignore[operator]
+        if later or any(n in before and not is_clock(n) for n in own):
+            self._gathered = own
+            return before
+        self._gathered = own | before  # the time is that of the first
+        if not set(self.spec.labels) <= {split_unit(n)[0] for n in self._gathered}:
+            return None
+        whole, self._gathered = self._gathered, {}
+        return whole
 
     def _moment(self, row: Mapping[str, Any]) -> float | None:
         """The time of a row [s]; the unit of a clock that says none is the one that fits the memory's rate best."""
         if self._clock is None or (stamp := self._clock.moment(row)) is None:
             return None
         first, self._first = self._first, stamp if self._first is None else self._first
-        if first is not None and self._clock.units == (None,) and stamp < EPOCHS[-1][0]:
-            step = stamp - first
-            fits = min(UNITS, key=lambda unit: abs(np.log(step * unit / self.spec.dt))) if step > 0 else 1.0
-            unit = fits if step >= SLOWEST_WITHOUT_UNIT else 1.0
-            self._clock, stamp = Clock(self._clock.columns, (unit,)), stamp * unit
-            if unit != 1.0:
-                self._pace = Pace(self.spec.dt)
-                self._pace.lost(first * unit)
-        return stamp
+        if first is None or self._clock.units != (None,) or stamp >= EPOCHS[-1][0]:
+            return stamp
+        step = stamp - first
+        unit = (
+            min(UNITS, key=lambda unit: abs(np.log(step * unit / self.spec.dt)))
+            if step >= SLOWEST_WITHOUT_UNIT
+            else 1.0
+        )
+        self._clock = Clock(self._clock.columns, (unit,))
+        if unit != 1.0:
+            self.begin()
+            self._pace.lost(first * unit)
+        return stamp * unit

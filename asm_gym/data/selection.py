@@ -28,7 +28,7 @@ class NormalEpisodes(NamedTuple):
 
 
 def normal_episodes(
-    logs: Iterable[Log], between_marks: bool = False, progress: Callable[[int, int], object] | None = None
+    logs: Iterable[Log], between_marks: bool = False, progress: Callable[[int, int], object] = lambda *_: None
 ) -> NormalEpisodes:
     """Return the normal episodes among logs; ``progress`` is called with the number of logs so far.
 
@@ -36,27 +36,21 @@ def normal_episodes(
     """
     kept = NormalEpisodes([], Counter())
     for n, (_, episode) in enumerate(logs, 1):
-        if progress is not None:
-            progress(n, n)  # how many there are is known at the end
+        progress(n, n)  # how many there are is known at the end
+        role = episode.label.role if episode.label is not None else ""
         if between_marks and episode.spec.source == "table" and episode.faults.any():
             near = round(AROUND_S / episode.spec.dt)
             close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
             kept.episodes.extend(_parts(episode, ~close))
-        elif why := _abnormal(episode):
-            kept.left_out[why] += 1
+        elif episode.faults.any() or role == "faulty":
+            kept.left_out["with a fault"] += 1
+        elif role == "harmless":
+            kept.left_out["under a harmless variation"] += 1
+        elif not episode.success:
+            kept.left_out["failed"] += 1
         else:
             kept.episodes.append(episode)
     return kept
-
-
-def _abnormal(episode: Episode) -> str:
-    """Why an episode is not normal; empty where it is."""
-    role = episode.label.role if episode.label is not None else ""
-    if episode.faults.any() or role == "faulty":
-        return "with a fault"
-    if role == "harmless":
-        return "under a harmless variation"
-    return "" if episode.success else "failed"
 
 
 def complete_parts(episode: Episode) -> list[Episode]:

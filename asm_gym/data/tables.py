@@ -9,7 +9,6 @@ lists            (T, k)                         q[0], …, q[k-1]
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import is_clock, split_unit
+from asm_gym.data.names import element_name, is_clock
 from asm_gym.data.reader_notes import note
 from asm_gym.validation import short_repr
 
@@ -46,8 +45,7 @@ def table_of(frame: Any) -> Columns:
         if values.ndim > 2:
             note(f"{name}: of {values.ndim} dimensions, left out")
         elif values.ndim == 2:
-            bare, unit = split_unit(str(name))
-            made |= {f"{bare}[{k}]" + (f" [{unit}]" if unit else ""): v for k, v in enumerate(values.T)}
+            made |= {element_name(str(name), k): v for k, v in enumerate(values.T)}
         else:
             made[str(name)] = values
     return made
@@ -108,28 +106,32 @@ def _pivoted(table: Columns) -> Columns:
     """A long table as a wide one; others as they are."""
     import pandas as pd
 
-    key = next((name for name in table if _is_key(name, table[name])), None)
+    key = next((name for name in table if is_key(name) and _goes_round(table[name])), None)
     values = [name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)]
     if key is None or not values:
         return table
-    clock = next((name for name in table if is_clock(name) and len(table[name]) > 1), None)
+    clock = next(filter(is_clock, table), None)
     frame = pd.DataFrame(table)
     round_of = frame.groupby(key, sort=False).cumcount()
-    new = frame[clock] != frame[clock].shift() if clock is not None else None
-    if new is not None and not new.all():  # joints of a moment share a stamp
-        round_of = new.cumsum()
+    if clock is not None and frame[clock].duplicated().any():  # joints of a moment share a stamp
+        round_of = (frame[clock] != frame[clock].shift()).cumsum()
     wide = frame.assign(_round=round_of).pivot_table(values, "_round", key, aggfunc="last", sort=False)
     made: Columns = {} if clock is None else {clock: frame.groupby(round_of.to_numpy())[clock].first().to_numpy()}
-    made |= {f"{name}[{word}]": wide[name, word].to_numpy() for name, word in wide.columns}
+    made |= {element_name(name, word): wide[name, word].to_numpy() for name, word in wide.columns}
     note(f"a row a joint: put side by side by {key!r}, as {next(reversed(made))} and {len(made) - 1} others")
     return made
 
 
-def _is_key(name: str, values: NDArray[Any]) -> bool:
-    """Whether a column says whose row it is: it is called so, and goes round the same few words or numbers."""
+def is_key(name: str) -> bool:
+    """Tell whether a column is called as if it said whose row it is."""
+    return _KEY.fullmatch(name) is not None and _NAMES.fullmatch(name) is None
+
+
+def _goes_round(values: NDArray[Any]) -> bool:
+    """Whether a column goes round the same few words or numbers."""
     import pandas as pd
 
-    if len(values) < 4 or values.dtype.kind == "f" or not _KEY.fullmatch(name) or _NAMES.fullmatch(name):
+    if len(values) < 4 or values.dtype.kind == "f":
         return False
     words = pd.factorize(values)[0]
     size = int(words.max()) + 1
@@ -144,23 +146,15 @@ def _joined(table: Columns) -> Columns:
     import pandas as pd
 
     filled = {n: np.isfinite(v) for n, v in table.items() if is_numeric(v) and v.dtype.kind == "f" and not is_clock(n)}
-    filled = {name: mask for name, mask in filled.items() if mask.any()}
-    groups = defaultdict[bytes, list[str]](list)
-    for name, mask in filled.items():
-        groups[mask.tobytes()].append(name)
-    masks = {names[0]: filled[names[0]] for names in groups.values()}
-    apart = len(masks) > 1 and bool(
-        np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY
-    )  # a row has one of them
-    fastest = max(masks, key=lambda name: masks[name].sum()) if apart else ""
-    rows = masks[fastest] if apart else np.ones(len(next(iter(table.values()), ())), np.bool_)
-    of_fastest = groups[rows.tobytes()] if apart else []
-    most = 1.0 if apart else SPARSE
-    slower = {n: m for n, m in filled.items() if n not in of_fastest and m.mean() <= most and _regular(m)}
+    masks = {mask.tobytes(): mask for mask in filled.values() if mask.any()}
+    rows, most = np.ones(len(next(iter(table.values()), ())), np.bool_), SPARSE
+    if len(masks) > 1 and np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY:  # a row has one of them
+        rows, most = max(masks.values(), key=np.count_nonzero), 1.0
+    slower = {n: m for n, m in filled.items() if not np.array_equal(m, rows) and m.mean() <= most and _regular(m)}
     if not slower:
         return table
-    rate = f"of {fastest!r}" if fastest else "of the table"
-    note(f"columns come at several rates: rows are those {rate}, {', '.join(slower)[:120]} keep their newest value")
+    names = ", ".join(slower)[:120]
+    note(f"columns come at several rates: rows are those of the fastest, {names} keep their newest value")
     held = pd.DataFrame({n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()})[rows]
     start = int(held.notna().to_numpy().argmax(axis=0).max())  # before that the slower ones said nothing
     return {n: (held[n].to_numpy() if n in slower else values[rows])[start:] for n, values in table.items()}

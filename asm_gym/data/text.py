@@ -10,12 +10,11 @@ last line   cut off in the middle: left out, with a note
 
 from __future__ import annotations
 
-import codecs
 import csv
 import io
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,10 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import split_unit
+from asm_gym.data.names import element_name
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import Columns
-from asm_gym.files import regular_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +35,6 @@ MOST_COLUMNS = 8192  # every number is weighed against every other later on: see
 LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
 SEPARATORS = ";\t,|"
 FLAGS = {"true": 1.0, "false": 0.0}
-WINDOWS = "asm_gym.windows"  # how bytes that are no UTF-8 are read
 DOUBLED = " #"  # stands, with a number, behind the name of a column that another has
 MOST_PREAMBLE, AGREE = 50, 5  # lines above a header; lines below it that must have as many cells
 LONGEST_UNIT = 12  # characters of a unit
@@ -61,10 +58,8 @@ class Dialect(NamedTuple):
         """Return the cells of a line. Raises ValueError where it cannot be cut."""
         if self.separator == " ":
             return line.split()
-        if '"' not in line:
-            return line.rstrip("\r\n").split(self.separator)
         try:
-            return next(csv.reader([line], delimiter=self.separator), [])
+            return next(csv.reader([line.rstrip("\r\n")], delimiter=self.separator), [])
         except csv.Error as error:
             raise ValueError(f"it is no table of text: {error}") from error
 
@@ -82,6 +77,10 @@ class Dialect(NamedTuple):
             return True
         return False
 
+    def numbers_among(self, cells: Sequence[str]) -> list[bool]:
+        """Tell of the cells that are not empty which are numbers."""
+        return [self.is_number(cell) for cell in cells if cell.strip()]
+
 
 def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     """Return the columns of a table of text; an empty cell is NaN, true and false are 1 and 0, words stay words.
@@ -92,50 +91,46 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     import pandas as pd
 
     lines, complete = _lines(path)
-    if lines.empty:
-        raise ValueError("it needs a header and at least one row, got 0 lines")
     at = 0 if columns else _header_at(lines.iloc[: MOST_PREAMBLE + AGREE].tolist())
     if at:
         note(f"{path}: its first {at} lines are no part of the table, and are left out")
-    first, rows = lines.iloc[at].strip(), lines.iloc[at + 1 :]
-    dialect = Dialect.of(lines.iloc[at])
-    names, has_header = _header(dialect, lines.iloc[at], columns)
+    first, rows = lines.iloc[at] if len(lines) else "", lines.iloc[at + 1 :]
+    dialect = Dialect.of(first)
+    names, has_header = _header(dialect, first, columns)
     if not has_header:
         rows = lines
-    elif len(rows) > 1 and rows.iloc[0].strip() != first and _are_units(dialect, *rows.iloc[:2]):
-        units = [cell.strip() for cell in dialect.cells(rows.iloc[0])]
-        names = [f"{n} [{u.strip('[]()')}]" if u and n else n for n, u in zip(names, units, strict=False)]
+    elif len(rows) > 1 and rows.iloc[0].strip() != first.strip() and _are_units(dialect, *rows.iloc[:2]):
+        units = [cell.strip().strip("[]()") for cell in dialect.cells(rows.iloc[0])]
+        names = [f"{n} [{u}]" if u and n else n for n, u in zip(names, units, strict=False)]
         rows = rows.iloc[1:]
     for what, left_out in (
-        ("its header once more", (rows.str.strip() == first) & has_header),
+        ("its header once more", (rows.str.strip() == first.strip()) & has_header),
         ("behind a #", rows.str.lstrip().str.startswith("#")),
     ):
         if left_out.any():
             note(f"{path}: {left_out.sum()} lines are left out, {what}")
             rows = rows[~left_out]
-    if not complete and len(rows) > 1 and _cut_off(dialect, rows.iloc[-2], rows.iloc[-1], len(names)):
+    cells = rows.map(dialect.cells)
+    if not complete and len(rows) > 1 and _cut_off(dialect, *cells.iloc[-2:], len(names)):
         note(f"{path}: its last line was cut off, and is left out")
-        rows = rows.iloc[:-1]
+        rows, cells = rows.iloc[:-1], cells.iloc[:-1]
     if rows.empty:
         raise ValueError(f"it needs a header and at least one row, got {len(lines)} lines")
-    widest = len(names)
-    for n, line in rows.items():
-        cells = dialect.cells(line)
-        widest = max(widest, len(cells))
-        check_cells(cells, len(names), f"line {n} has")
+    for n, found in cells.items():
+        check_cells(found, len(names), f"line {n} has")
     try:
         frame = pd.read_csv(
             io.StringIO("\n".join(rows)),
             sep=r"\s+" if dialect.separator == " " else dialect.separator,
             header=None,
-            names=list(range(widest)),
+            names=list(range(cells.str.len().max())),
             na_values=["-", "--"],
             float_precision="round_trip",
             low_memory=False,
         )
     except ValueError as error:
         raise ValueError(f"it is no table of text: {' '.join(str(error).split())}") from error
-    return _merged((name, _column(frame[k], dialect.comma)) for k, name in enumerate(names))
+    return _merged(names, [_column(frame[k], dialect.comma) for k in range(len(names))])
 
 
 def _header_at(lines: Sequence[str]) -> int:
@@ -146,10 +141,10 @@ def _header_at(lines: Sequence[str]) -> int:
         with suppress(ValueError):
             size = len(dialect.cells(_uncommented(line)))
             below = [dialect.cells(other) for other in lines[at + 1 :] if not other.lstrip().startswith("#")][:AGREE]
-            agree = [len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below]
-            numbers = [sum(dialect.is_number(c) for c in cells[:size] if c.strip()) for cells in below]
-            if below and all(agree) and max(numbers) > 0 and numbers[-1] > 0:
-                if not at or not any(dialect.is_number(cell) for cell in dialect.cells(line) if cell.strip()):
+            agree = all(len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below)
+            numbers = [sum(dialect.numbers_among(cells[:size])) for cells in below]
+            if below and agree and max(numbers) > 0 and numbers[-1] > 0:
+                if not at or not any(dialect.numbers_among(dialect.cells(line))):
                     return at
                 first_row = first_row or at
     return first_row
@@ -157,22 +152,21 @@ def _header_at(lines: Sequence[str]) -> int:
 
 def _are_units(dialect: Dialect, line: str, below: str) -> bool:
     """Whether the line below a header holds units: short words where the next line has numbers."""
-    cells = [cell.strip() for cell in dialect.cells(line)]
-    given = [cell for cell in cells if cell]
-    words = given and all(len(c) <= LONGEST_UNIT and not dialect.is_number(c) for c in given)
-    return bool(words) and any(dialect.is_number(c) for c in dialect.cells(below) if c.strip())
+    given = [cell.strip() for cell in dialect.cells(line) if cell.strip()]
+    words = all(len(cell) <= LONGEST_UNIT and not dialect.is_number(cell) for cell in given)
+    return bool(given) and words and any(dialect.numbers_among(dialect.cells(below)))
 
 
-def _merged(columns: Iterable[tuple[str, NDArray[Any]]]) -> Columns:
+def _merged(names: Sequence[str], columns: Sequence[NDArray[Any]]) -> Columns:
     """The columns by name, but for empty ones without a name; of one name, equal ones are one, others get a number."""
-    import pandas as pd
-
     made: Columns = {}
-    for name, values in columns:
+    for name, values in zip(names, columns, strict=True):
         if not name and values.dtype.kind != "O" and not np.isfinite(values).any():
             continue
         others = [other for other in made if other.partition(DOUBLED)[0] == name]
-        if any(pd.Series(made[other]).equals(pd.Series(values)) for other in others):
+        if any(
+            np.array_equal(made[o], values, equal_nan=made[o].dtype.kind == values.dtype.kind == "f") for o in others
+        ):
             note(f"columns of the same name are equal, and read as one: {name}")
         else:
             made[f"{name}{DOUBLED}{len(others) + 1}" if others else name] = values
@@ -183,35 +177,29 @@ def _lines(path: Path) -> tuple[pd.Series[str], bool]:
     """The lines that are not empty by their numbers, from 1, and whether the last one has an end."""
     import pandas as pd
 
-    regular_file(path)
     raw = path.read_bytes()
-    wide = raw[:2] in (b"\xff\xfe", b"\xfe\xff") or raw[1:200:2].count(0) > 80  # UTF-16 of Windows
-    if b"\x00" in raw[:LONGEST_LINE] and not wide:
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff") or raw[1:200:2].count(0) > 80:  # UTF-16 of Windows
+        with suppress(UnicodeDecodeError):
+            raw = raw.decode("utf-16").encode()
+    if b"\x00" in raw[:LONGEST_LINE]:
         raise ValueError("it is no text")
-    try:
-        text = raw.decode("utf-16" if wide else "utf-8-sig")
-    except UnicodeDecodeError:
-        if wide:
-            raise ValueError("it is no text") from None
-        text = raw.decode("utf-8-sig", WINDOWS)
+    found = [_decoded(line) for line in re.split(rb"\r\n?|\n", raw.removeprefix(b"\xef\xbb\xbf"))]
+    if any(other for _, other in found):
         note(f"{path} is not in UTF-8 throughout: other characters are read as Windows-1252")
-    lines = pd.Series(re.split(r"\r\n?|\n", text), dtype=object)
-    lines.index += 1
+    lines = pd.Series([line for line, _ in found], range(1, len(found) + 1), dtype=object)
     lines = lines[lines.str.strip(" ") != ""]
     sizes = lines.str.len()
     if sizes.max() > LONGEST_LINE:
         n, size = sizes.idxmax(), sizes.max()
         raise ValueError(f"line {n} has {size} characters: at most {MOST_COLUMNS} columns can be watched")
-    return lines, text.endswith(("\n", "\r"))
+    return lines, raw.endswith((b"\n", b"\r"))
 
 
-def _as_windows(error: UnicodeError) -> tuple[str, int]:
-    """The characters that are no UTF-8, as Windows-1252."""
-    assert isinstance(error, UnicodeDecodeError)
-    return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
-
-
-codecs.register_error(WINDOWS, _as_windows)
+def _decoded(line: bytes) -> tuple[str, bool]:
+    """A line as text, and whether it is not in UTF-8 but in Windows-1252."""
+    with suppress(UnicodeDecodeError):
+        return line.decode(), False
+    return line.decode("cp1252", "replace"), True
 
 
 def check_cells(cells: Sequence[str], size: int, where: str) -> None:
@@ -220,9 +208,9 @@ def check_cells(cells: Sequence[str], size: int, where: str) -> None:
         raise ValueError(f"{where} {len(cells)} cells, its header {size}: mend it, or cut the file there")
 
 
-def _cut_off(dialect: Dialect, before: str, last: str, size: int) -> bool:
+def _cut_off(dialect: Dialect, before: Sequence[str], last: Sequence[str], size: int) -> bool:
     """Whether the last line lacks cells, or has a word where the one before it has a number."""
-    cells = list(zip(dialect.cells(before), dialect.cells(last), strict=False))
+    cells = list(zip(before, last, strict=False))
     return len(cells) < size or any(dialect.is_number(was) and not dialect.is_number(now) for was, now in cells)
 
 
@@ -234,34 +222,35 @@ def _uncommented(line: str) -> str:
 def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
     """Names of the columns, and whether the first line holds them."""
     cells = dialect.cells(_uncommented(line))
-    numbers = [dialect.is_number(cell) for cell in cells if cell.strip()]
+    numbers = dialect.numbers_among(cells)
+    size = len(cells) - (bool(cells) and not cells[0].strip())
     if columns:
-        columns = ["", *columns] if cells and not cells[0].strip() and len(columns) == len(cells) - 1 else columns
+        columns = ["", *columns] if len(columns) == size < len(cells) else columns
         if len(columns) != len(cells):
             raise ValueError(
                 f"{len(columns)} columns are named, and its first line has {len(cells)} cells: cut off what is no row"
             )
-        return header_of(columns, "it"), not any(numbers)
-    if numbers and sum(numbers) > len(numbers) / 2:
+        return header_of(columns), not any(numbers)
+    if sum(numbers) > len(numbers) / 2:
         said = f"is of {len(numbers)} numbers" if all(numbers) else f"holds {sum(numbers)} numbers"
-        size = len(cells) - (not cells[0].strip())
         example = " ".join(f"x{k}" for k in range(size))
         raise ValueError(f"its first line {said} and no header: name its {size} columns, --columns {example[:60]}")
-    return header_of(cells, "it"), True
+    return header_of(cells), True
 
 
-def header_of(cells: Sequence[str], where: str) -> list[str]:
+def header_of(cells: Sequence[str]) -> list[str]:
     """Return the names of columns. Raises ValueError where there are none or too many."""
     names = [cell.strip().lstrip("#%-").strip() for cell in cells]
     while names and not names[-1]:  # ;;; at the end of every line
         names.pop()
     if not names:
-        raise ValueError(f"{where} needs a header and at least one row, got 0 lines")
-    _check_width(len(names))
+        raise ValueError("it needs a header and at least one row, got 0 lines")
+    check_width(len(names))
     return names
 
 
-def _check_width(size: int) -> None:
+def check_width(size: int) -> None:
+    """Raise ValueError where a table has more columns than can be watched."""
     if size > MOST_COLUMNS:
         raise ValueError(f"it has {size} columns, and at most {MOST_COLUMNS} can be watched")
 
@@ -281,33 +270,33 @@ def _column(cells: pd.Series[Any], comma: bool) -> NDArray[Any]:
     """A column of numbers, or of words where it holds one."""
     if cells.dtype.kind in "biuf":
         return np.asarray(cells)
-    text = cells.astype("string").str.strip()
+    text = cells.astype("string").str.strip().fillna("")
     values = numbers_in(text, comma)
-    if not np.isnan(values[(text.notna() & (text != "")).to_numpy(bool)]).any():
+    if not np.isnan(values[(text != "").to_numpy(bool)]).any():
         return values
-    return np.asarray(text.fillna("").str[:LONGEST_WORD], object)
+    return np.asarray(text.str[:LONGEST_WORD], object)
 
 
 def read_json_lines(path: Path, columns: Sequence[str] = ()) -> Columns:
     """Return the columns of a file with an object, or a list of numbers, on each line; a missing number is NaN."""
     import pandas as pd
 
-    rows: list[dict[str, Any]] = []
+    rows, lost = list[dict[str, Any]](), list[str]()
     lines, complete = _lines(path)
     for n, line in lines.items():
         try:
-            rows.append(flat_row(json.loads(line), columns))
-            _check_width(len(rows[-1]))
+            row = json.loads(line)
+            rows.append(flat_row(row, columns))
+            check_width(len(rows[-1]))
         except (ValueError, RecursionError) as error:
             if rows and isinstance(error, json.JSONDecodeError) and n == lines.index[-1] and not complete:
                 note(f"{path}: its last line was cut off, and is left out")
                 continue
             raise ValueError(f"line {n} is no row: {error}") from error
+        if isinstance(row, dict) and len(rows) == 1:
+            lost = [k for k, v in row.items() if isinstance(v, list) and v and isinstance(v[0], dict | list)]
     if not rows:
         raise ValueError("it needs at least one row, got none")
-    within = json.loads(lines.iloc[0])
-    within = within if isinstance(within, dict) else {}
-    lost = [k for k, v in within.items() if isinstance(v, list) and v and isinstance(v[0], dict | list)]
     if lost:
         note(f"left out: {', '.join(lost)}: lists of objects; a row is to be a line of its own")
     frame = pd.DataFrame(rows)
@@ -322,22 +311,15 @@ def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
         row = dict(zip(columns, row, strict=True))
     if not isinstance(row, dict):
         raise ValueError(f"it must be an object or a list, got {str(row)[:40]}")
-    named = next((key for key in ("name", "names", "joint_names") if _is_words(row.get(key))), None)
-    words = row[named] if named else []
+    words = next((row[key] for key in ("name", "names", "joint_names") if isinstance(row.get(key), list)), [])
     found: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, dict):
             found |= {f"{name}.{part}": v for part, v in flat_row(value).items()}
         elif isinstance(value, list):
-            bare, unit = split_unit(name)
             elements = words if len(words) == len(value) else range(len(value))
-            names = (f"{bare}[{k}] [{unit}]" if unit else f"{bare}[{k}]" for k in elements)
-            found |= {n: v for n, v in zip(names, value, strict=True) if isinstance(v, int | float) or v is None}
+            numbers = zip(elements, value, strict=True)
+            found |= {element_name(name, k): v for k, v in numbers if isinstance(v, int | float) or v is None}
         else:
             found[name] = value
     return found
-
-
-def _is_words(value: Any) -> bool:
-    """Whether a value is a list of names, as messages of ROS have one of their joints."""
-    return isinstance(value, list) and bool(value) and all(isinstance(word, str) for word in value)

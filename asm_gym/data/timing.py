@@ -1,8 +1,10 @@
-"""Put the rows of a log where they belong in time.
+"""Put the rows of a log where they belong in time, and bridge numbers that are missing for a moment.
 
 step       n_i = (t_i - t_{i-1})/dt, dt being the mean step, gaps left out
 near whole numbers   a row keeps its values and stands n_i places after the one before; places between are NaN
 elsewhere            values between two stamps are interpolated; where these are far apart, NaN
+spent_i    + dt while number i is missing, - 0.1 dt while it is there, at least 0     [s]
+bridged    spent_i <= ``seconds`` for all that are missing in a row: it is not judged; for longer they are an alarm
 """
 
 from __future__ import annotations
@@ -16,8 +18,11 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import MOST_DOUBLED, Clock
 from asm_gym.data.reader_notes import note
+from asm_gym.readings import spans
+from asm_gym.validation import check_number
 
 Floats = NDArray[np.float64]
+Rows = NDArray[np.floating[Any]]
 
 JITTER = 0.35  # by what share of a step a stamp may be off, and its row still be the one that was due
 DRIFT = 0.011  # how far a clock may be off the rate that is read, as a share, and no row be moved for it
@@ -25,6 +30,9 @@ NEARLY, MOSTLY = 0.15, 0.95  # rows were lost where MOSTLY steps are NEARLY whol
 MOST_CUTS = 0.02  # share of rows at which time may go back or leap, and the log be cut there
 FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in it is known
 MOST_LOST = 4  # a log may have lost so many times its rows, or ten minutes; more is a clock that was set
+BRIDGED_ROWS = 2  # rows that are bridged where nobody says for how long
+PAID_BACK = 0.1  # of a second that is whole, how much may be missing for good: a tenth of all rows
+SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"  # why there is an alarm
 
 
 class Timing(NamedTuple):
@@ -105,3 +113,54 @@ def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
     interpolated = np.column_stack([np.interp(due, times, column) for column in rows.T])
     interpolated[unknown] = np.nan
     return interpolated
+
+
+def bridge_of(seconds: float | None, dt: float) -> float:
+    """Return for how long something may be missing [s]: two rows of ``dt`` [s], where nobody says it."""
+    return BRIDGED_ROWS * dt if seconds is None else seconds
+
+
+class Bridge:
+    """Tell which rows (D,), ``dt`` [s] apart, are bridged: those with numbers missing for at most ``seconds``."""
+
+    def __init__(self, seconds: float, dt: float, size: int) -> None:
+        self.seconds, self.dt = check_number("bridge", seconds, low=0.0), dt
+        self._spent = np.zeros(size)
+
+    def over(self, missing: NDArray[np.bool_]) -> bool:
+        """Tell whether the next row (D,) lacks a number, and none for longer than it may be missing."""
+        paid = np.maximum(self._spent - PAID_BACK * self.dt, 0.0)
+        self._spent = np.where(missing, self._spent + self.dt, paid)
+        return bool(missing.any() and (self._spent[missing] <= self.seconds * (1 + 1e-9)).all())
+
+
+def bridged(stream: Rows, dt: float, seconds: float) -> NDArray[np.bool_]:
+    """Return which rows (T,) of a recording (T, D) a bridge of so many seconds goes over."""
+    bridge = Bridge(seconds, dt, stream.shape[1])
+    return np.array([bridge.over(missing) for missing in np.isnan(stream)], np.bool_)
+
+
+def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np.float32]:
+    """Return a recording (T, D) with gaps of at most so many seconds interpolated between their neighbours."""
+    most, out = int(seconds / dt + 1e-9), stream.copy()
+    for column in out.T:
+        for start, stop in spans(np.isnan(column)):
+            if start and stop < len(column) and stop - start <= most:
+                ends = [start - 1, stop]
+                column[start:stop] = np.interp(np.arange(start, stop), ends, column[ends])
+    return out
+
+
+def reason(row: Rows) -> str:
+    """Say why a row (D,) whose surprise is over the threshold is an alarm."""
+    if np.isnan(row).any():
+        return MISSING
+    return SURPRISING if np.isfinite(row).all() else NOT_FINITE
+
+
+def blamed(row: Rows, shares: Rows) -> int | None:
+    """Return the number of a row (D,) that an alarm points to, by their shares (D,); None where all are missing."""
+    if np.isnan(row).all():
+        return None
+    broken = ~np.isfinite(row)
+    return int(np.argmax(broken)) if broken.any() else int(np.argmax(shares))

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.data.episode import spans
-from asm_gym.data.gaps import blamed, bridged, reason
 from asm_gym.data.logs import Log
+from asm_gym.data.timing import blamed, bridged, reason
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.extras import require
 from asm_gym.spec import StreamSpec

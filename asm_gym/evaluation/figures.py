@@ -20,8 +20,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from asm_gym.data.behaviour import is_constant
-from asm_gym.data.columns import Column
+from asm_gym.data.columns import Column, is_constant
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
 from asm_gym.evaluation.metrics import DetectionMetrics, placements
@@ -208,23 +207,23 @@ def log_figure(found: Inspection) -> Figure:
         for ax in panels[len(drawn) :]:
             ax.set_visible(False)
         fig.suptitle(f"{found.caption()}{more}", fontsize=10)
-        fig.supxlabel("time [s]" if found.clock.rate else "row", fontsize=9)
+        fig.supxlabel("time [s]" if found.rate else "row", fontsize=9)
     return fig
 
 
 def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:
-    values, clock = column.values, found.clock
+    values = column.values
     every = max(1, len(values) // MOST_POINTS)
-    times, shown = clock.times[::every], values[::every].astype(np.float64)
-    after_gap = np.searchsorted(times, clock.gaps[:, 1])  # no line is drawn across a gap
+    times, shown = found.times[::every], values[::every].astype(np.float64)
+    after_gap = np.searchsorted(times, found.gaps[:, 1])  # no line is drawn across a gap
     still = is_constant(values)
     colour = GREY if still else LOG_COLOURS[column.role]
     ax.plot(np.insert(times, after_gap, np.nan), np.insert(shown, after_gap, np.nan), color=colour, linewidth=0.7)
-    for start, stop in clock.gaps[:200]:
+    for start, stop in found.gaps[:200]:
         ax.axvspan(start, stop, color=ORANGE, alpha=0.35, linewidth=0)
     lost = ~np.isfinite(values)
     if lost.any():
-        ax.plot(clock.times[lost], np.full(lost.sum(), np.nanmin(shown, initial=0.0)), "|", color=ORANGE, markersize=4)
+        ax.plot(found.times[lost], np.full(lost.sum(), np.nanmin(shown, initial=0.0)), "|", color=ORANGE, markersize=4)
     name = column.name if len(column.name) < 30 else "…" + column.name[-29:]
     unit = f" [{column.unit}]" if column.unit else ""
     ax.set_title(f"{name}{unit}, {column.role}{', never moves' * still}")

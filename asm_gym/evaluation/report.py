@@ -54,8 +54,7 @@ def write_report(
     if details:
         items = "\n".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items())
         parts.append(f"<section><h2>How this was made</h2>\n<dl>{items}</dl></section>")
-    with written_whole(path) as file:
-        file.write(_PAGE.substitute(title=escape(title), body="\n".join(parts)).encode())
+    write_text(path, _PAGE.substitute(title=escape(title), body="\n".join(parts)))
     return path
 
 

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from asm_gym.data.gaps import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.data.rows import Row, RowReader, SourceDied
+from asm_gym.data.timing import LATE, SURPRISING, Bridge, blamed, reason
 from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions

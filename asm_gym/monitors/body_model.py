@@ -12,7 +12,6 @@ import re
 from collections import Counter
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any, Self
 from xml.etree import ElementTree
@@ -29,7 +28,7 @@ Floats = NDArray[np.float64]
 LARGEST = 10_000_000  # characters of a file: no arm has more
 
 SHOWN = 300  # rows by which orders of joints are compared
-TINY = 1e-12
+TINY, SHORTER = 1e-12, 1e-3
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -77,37 +76,19 @@ class BodyModel:
         return cls(tuple(order), np.array([place[name] for name in order], np.intp), by_name, model)
 
     def in_best_order(self, q: Floats, speed: Floats, acceleration: Floats, torque: Floats) -> Self:
-        """Return it with the order of columns by which it explains measured torques (N, J) best.
-
-        Starts are the order of the chain and the alphabet, as ROS publishes joints; pairs are swapped while that helps.
-        """
+        """Return it with the order of columns that explains measured torques (N, J) best: of the chain, or ABC."""
         rows = np.linspace(0, len(q) - 1, min(len(q), SHOWN)).astype(np.intp)
         q, speed, acceleration, torque = (a[rows] for a in (q, speed, acceleration, torque))
         friction = np.stack([speed, np.tanh(10 * speed / np.maximum(speed.std(axis=0), TINY)), np.ones_like(speed)])
 
-        def unexplained(columns: tuple[int, ...]) -> float:
-            told = [*replace(self, columns=np.array(columns, np.intp)).torques(q, speed, acceleration), *friction]
-            total = 0.0
-            for j in columns:
-                inputs = np.stack([part[:, j] for part in told], axis=1)
-                solved = np.linalg.lstsq(inputs, torque[:, j], rcond=None)[0]
-                total += float(np.var(torque[:, j] - inputs @ solved) / max(np.var(torque[:, j]), TINY))
-            return total
+        def unexplained(model: Self) -> float:
+            inputs = np.stack([*model.torques(q, speed, acceleration), *friction], axis=-1)  # (N, J, 5)
+            solved = [np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in range(torque.shape[1])]
+            left = torque - np.einsum("njk,jk->nj", inputs, solved)
+            return float((left.var(axis=0) / np.maximum(torque.var(axis=0), TINY)).sum())
 
-        columns, by_alphabet = tuple(self.columns.tolist()), tuple(np.argsort(np.argsort(self.names)).tolist())
-        tried = {order: unexplained(order) for order in (columns, by_alphabet)}
-        for order in tuple(tried):
-            better: tuple[int, ...] | None = order
-            while better is not None:
-                order, near = better, []
-                for a, b in combinations(range(len(order)), 2):
-                    swapped = np.array(order)
-                    swapped[[a, b]] = swapped[[b, a]]
-                    near.append(tuple(swapped.tolist()))
-                tried |= {other: unexplained(other) for other in near if other not in tried}
-                best = min(near, key=tried.__getitem__, default=order)
-                better = best if tried[best] < tried[order] else None
-        return replace(self, columns=np.array(min(tried, key=tried.__getitem__), np.intp))
+        by_alphabet = replace(self, columns=np.argsort(np.argsort(self.names)))
+        return min(self, by_alphabet, key=unexplained)
 
     def torques(self, q: Floats, speed: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
         """Return the torques (N, J) of weight and of motion [N m; N where a joint slides].
@@ -140,7 +121,8 @@ def read_urdf(path: str | Path) -> str:
 def _matched(names: Sequence[str], labels: Sequence[str]) -> dict[str, int]:
     """Return the place of the label that means each joint, by the words that the two share.
 
-    A word counts the less, the more joints have it; a name that stands in a label as it is counts most.
+    A word counts the less, the more joints have it; a name that stands in a label as it is counts most. Of two that
+    share as much with a label, as a joint of the arm and one of its fingers may, the shorter one is meant.
     """
     words = [_words(name) for name in names]
     common = Counter(word for own in words for word in own)
@@ -148,7 +130,7 @@ def _matched(names: Sequence[str], labels: Sequence[str]) -> dict[str, int]:
     for k, label in enumerate(labels):
         for j, name in enumerate(names):
             score[k, j] = sum(1.0 / common[word] for word in _words(label) & words[j])
-            score[k, j] += len(name) if name in label else 0.0
+            score[k, j] += (len(name) if name in label else 0.0) - SHORTER * len(words[j])
     found = {}
     for k, j in zip(*linear_sum_assignment(-score), strict=True):
         if score[k, j] > np.delete(score[k], j).max(initial=0.0):  # no other joint is meant as much
@@ -173,7 +155,7 @@ def _parsed(urdf: str) -> Element:
     pared = Element("robot", name=root.get("name", ""))
     pared.extend(_pared(element) for element in root if element.tag in ("link", "joint"))
     for inertial in pared.iter("inertial"):
-        _align(inertial)
+        _mend(inertial)
     return pared
 
 
@@ -208,21 +190,22 @@ def _compiled(root: Element, asked: Container[str] | None) -> tuple[Any, list[st
     return model, [model.joint(j).name for j in range(model.njnt)]
 
 
-def _align(inertial: Element) -> None:
-    """Turn a tensor into its link's axes, for MuJoCo leaves ``rpy`` of an inertial out."""
+def _mend(inertial: Element) -> None:
+    """Turn a tensor into its link's axes, for MuJoCo leaves ``rpy`` of an inertial out, and make it positive."""
     origin, tensor = inertial.find("origin"), inertial.find("inertia")
-    if origin is None or tensor is None or not (rpy := origin.attrib.pop("rpy", "")):
+    if tensor is None:
         return
     from scipy.spatial.transform import Rotation  # takes a while to import
 
-    turn = Rotation.from_euler("xyz", [float(word) for word in rpy.split()]).as_matrix()
-    pairs = [(i, j, f"i{'xyz'[i]}{'xyz'[j]}") for i in range(3) for j in range(i, 3)]
-    inertia = np.zeros((3, 3))
-    for i, j, name in pairs:
-        inertia[i, j] = inertia[j, i] = float(tensor.get(name, 0.0))
-    inertia = turn @ inertia @ turn.T
-    for i, j, name in pairs:
-        tensor.set(name, repr(float(inertia[i, j])))
+    rpy = "" if origin is None else origin.attrib.pop("rpy", "")
+    turn = Rotation.from_euler("xyz", [float(word) for word in (rpy or "0 0 0").split()]).as_matrix()
+    names = [[f"i{'xyz'[min(i, j)]}{'xyz'[max(i, j)]}" for j in range(3)] for i in range(3)]
+    inertia = turn @ np.array([[float(tensor.get(name, 0.0)) for name in row] for row in names]) @ turn.T
+    if np.isfinite(inertia).all():
+        moments, axes = np.linalg.eigh(inertia)
+        inertia = axes * np.maximum(moments, TINY) @ axes.T
+    for name, value in zip(np.ravel(names), inertia.ravel(), strict=True):
+        tensor.set(str(name), repr(float(value)))
 
 
 def _longest_chain(model: Any) -> list[int]:

@@ -77,16 +77,9 @@ class Averaged(NamedTuple):
 class ValueAssociation(ScaledModel):
     """Ridge regression of values; it has no context. Where nothing predicts a value, all are judged.
 
-    A body model is used where it explains held-out torques better than sines of angles do. Where columns do not name
+    A body model, the text ``urdf`` as ``read_urdf`` reads it, takes the place of sines where it explains held-out
+    torques better: ``left_by_body`` is what it leaves, as a share of what is left without it. Where columns do not name
     its joints, they are taken in the order that explains the torques best.
-
-    Args:
-        spec: the stream it is to expect.
-        urdf: text of a body model, as ``read_urdf`` reads it: what links weigh, and their inertia, in place of sines.
-
-    Attributes:
-        left_by_body: what the body model leaves of held-out torques, as a share of what is left without it; the body is
-            not used where that is 1 or more. NaN before ``fit``, and without a body model.
     """
 
     kind = "association_values"

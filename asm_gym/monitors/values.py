@@ -36,28 +36,17 @@ PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
 
 
 class Values(NamedTuple):
-    """The monitor of values, and how it counts beside that of changes.
+    """The monitor of values, and how it counts beside that of changes."""
 
-    Attributes:
-        monitor: of values alone.
-        leverage: (I + 1, I + 1) of which zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs.
-        usual: 1 / (1 + τ h̃).
-        balance: b, 1 before ``calibrate``.
-        power: p, 2 before ``calibrate``: changes are judged by squares.
-    """
-
-    monitor: CalibratedMonitor
-    leverage: NDArray[np.float64] = np.zeros((0, 0))
-    usual: float = 1.0
-    balance: float = 1.0
-    power: float = 2.0
+    monitor: CalibratedMonitor  # of values alone
+    leverage: NDArray[np.float64] = np.zeros((0, 0))  # zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs
+    usual: float = 1.0  # 1 / (1 + τ h̃)
+    balance: float = 1.0  # b, before ``calibrate``
+    power: float = 2.0  # p, before ``calibrate``: changes are judged by squares
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self | None:
-        """Fit it to nominal episodes; None where no value can be predicted.
-
-        ``urdf`` is the text of a body model, or empty.
-        """
+        """Fit it to nominal episodes; None where no value can be predicted. ``urdf`` is the text of a body model."""
         monitor = _monitor(episodes[0].spec, seed, urdf).fit(episodes)
         assert isinstance(monitor.model, ValueAssociation)
         if not len(monitor.model.judged(monitor.learned_["R2_values"])):

@@ -5,23 +5,20 @@ that did nothing wrong, cut into pieces. A quarter of them is tested, in turn; o
 from, and the greatest surprise of the rest is the threshold. Each tested piece is watched as it is, and with each fault
 from its middle on. Pieces are of one trajectory: no table says how a monitor fares on another.
 
-    push, payload    τ + Jᵀ F      J of the arm's own kinematics, by the tables of Denavit and Hartenberg (1955) that
-                                   Franka and Universal Robots publish; efforts of both recordings are in N m
+    push, payload    τ + Jᵀ F      J of the outermost link, by the arm's own URDF; where efforts are torques in N m
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product, starmap
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode
@@ -29,9 +26,10 @@ from asm_gym.data.selection import complete_parts, pieces
 from asm_gym.detection.conformal import alarms_in
 from asm_gym.detection.scores import Largest
 from asm_gym.evaluation.tables import Table
+from asm_gym.extras import require
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
 from asm_gym.monitors.baselines.linear import FrictionRule
-from asm_gym.monitors.body_model import read_urdf
+from asm_gym.monitors.body_model import BodyModel, read_urdf
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
@@ -47,13 +45,45 @@ WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "asso
 PIECE_S, FOLDS = 1.0, 4  # length of a piece [s], and folds of which one is tested at a time
 
 
-class Kinematics(NamedTuple):
-    """Denavit-Hartenberg parameters (J,) of an arm."""
+def read_joint_states(path: Path) -> Columns:
+    """Return time, position [rad], velocity and effort of each joint of a ROS 2 bag."""
+    return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
 
-    a: tuple[float, ...]  # [m]
-    d: tuple[float, ...]  # [m]
-    alpha: tuple[float, ...]  # [rad]
-    modified: bool  # as Craig has them: α and a of the link before
+
+def read_tiago(path: Path) -> Columns:
+    """Return the joints of the TIAGo's arm from its three tables; efforts are motor currents."""
+    import pandas as pd
+
+    made: Columns = {}
+    for kind in ("position", "velocity", "effort"):
+        table = pd.read_csv(path.with_name(f"tiago_{kind}.csv"))
+        arm = {name: name.removeprefix("- ").removesuffix(f"_{kind}") for name in table if "arm" in name}
+        made |= {"time": table["t"].to_numpy()} | {f"{kind}[{arm[name]}]": table[name].to_numpy() for name in arm}
+    return made
+
+
+TX40_HZ, TX40_MEAN = 5000.0, 40  # rows a second, and rows that are averaged into one
+TX40_RATIOS = (32.0, 32.0, 45.0, -48.0, 45.0, 32.0)  # angle of each motor by that of its joint
+
+
+def read_tx40(path: Path) -> Columns:
+    """Return time, angles [rad], speeds and motor currents [A] of the TX40, whose sixth motor turns with joint 5."""
+    motors, currents = (
+        np.loadtxt(path.with_name(name), delimiter=",", skiprows=1) for name in ("pos_read_data.csv", "curr_data.csv")
+    )
+    ratios = np.diag(TX40_RATIOS)
+    ratios[5, 4] = TX40_RATIOS[5]
+    angles = np.linalg.solve(ratios, motors.T).T
+    q, effort = (
+        a[: len(a) // TX40_MEAN * TX40_MEAN].reshape(-1, TX40_MEAN, 6).mean(axis=1) for a in (angles, currents)
+    )
+    dt = TX40_MEAN / TX40_HZ
+    return {
+        "time": dt * np.arange(len(q)),
+        "position": q,
+        "velocity": np.diff(q, axis=0, prepend=q[:1]) / dt,
+        "effort": effort,
+    }
 
 
 class RealArm(NamedTuple):
@@ -61,35 +91,21 @@ class RealArm(NamedTuple):
 
     robot: str
     place: str  # file below the folder of all recordings
-    urdf: str  # file of its body model, in the folder ``urdf`` of that of all recordings
-    links: Kinematics  # up to between the fingers, or to the flange
+    source: str  # where it is published: repository at a commit, licence
+    read: Callable[[Path], Columns]
+    urdf: str = ""  # file of its body model, in the folder ``urdf`` of that of all recordings
+    torques: bool = False  # its efforts are in N m
 
 
-SOURCE = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-"""Where the recordings are published: repository at a commit, licence."""
-RIGHT = np.pi / 2
-PANDA = Kinematics(
-    (0, 0, 0, 0.0825, -0.0825, 0, 0.088),
-    (0.333, 0, 0.316, 0, 0.384, 0, 0.107 + 0.1034),
-    (0, -RIGHT, RIGHT, RIGHT, -RIGHT, RIGHT, RIGHT),
-    True,
-)
-UR10 = Kinematics(
-    (0, -0.612, -0.5723, 0, 0, 0), (0.1273, 0, 0, 0.163941, 0.1157, 0.0922), (RIGHT, 0, 0, RIGHT, -RIGHT, 0), False
-)
+UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
+FIGAROH = "thanhndv212/figaroh-examples @ c0b5c7f0 (Apache-2.0)"
+PANDA_BAG, UR10_BAG = "unisa_acg/panda_exciting_trajectory.db3", "unisa_acg/ur10_exciting_trajectory.db3"
 ARMS = {
-    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", "panda.urdf", PANDA),
-    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", "ur10_robot.urdf", UR10),
+    "panda": RealArm("Franka Panda", PANDA_BAG, UNISA, read_joint_states, "panda.urdf", torques=True),
+    "ur10": RealArm("UR10", UR10_BAG, UNISA, read_joint_states, "ur10_robot.urdf", torques=True),
+    "tiago": RealArm("PAL TIAGo", "tiago_figaroh/tiago_position.csv", FIGAROH, read_tiago, "tiago.urdf"),
+    "tx40": RealArm("Stäubli TX40", "staubli_tx40_figaroh/pos_read_data.csv", FIGAROH, read_tx40),
 }
-
-
-def read_joint_states(path: Path) -> Columns:
-    """Return time, position [rad], velocity and effort (T, J) of a ROS 2 bag of joint states."""
-    columns = read_bag(path)
-    made: Columns = {"time": columns["time"]}
-    for kind in ("position", "velocity", "effort"):
-        made[kind] = np.column_stack([v for n, v in columns.items() if re.fullmatch(rf".*\.{kind}\[.*\]", n)])
-    return made
 
 
 # ------------------------------------------------------------------ faults added to recordings
@@ -101,7 +117,7 @@ class Piece(NamedTuple):
     episode: Episode
     onset: int  # row
     ranges: Floats  # (J,) of each effort in the whole recording
-    links: Kinematics  # of the arm
+    body: BodyModel | None  # of an arm with torques in N m
 
     def column(self, name: str) -> Floats:
         """Return position or effort (T, J)."""
@@ -118,24 +134,19 @@ effort range; an encoder that freezes or slips by 0.05 rad; an effort that comes
 every table that counts them says so."""
 
 
-def jacobian(links: Kinematics, q: Floats) -> Floats:
-    """Return the velocity of the hand [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
-    pose, axes, places = np.eye(4), [], []
-    for a, d, alpha, angle in zip(links.a, links.d, links.alpha, q, strict=True):
-        turn, link = _screw("z", angle, d), _screw("x", alpha, a)
-        pose = pose @ link if links.modified else pose
-        axes.append(pose[:3, 2])
-        places.append(pose[:3, 3])
-        pose = pose @ turn if links.modified else pose @ turn @ link
-    return np.stack([np.cross(z, pose[:3, 3] - p) for z, p in zip(axes, places, strict=True)], axis=1)
-
-
-def _screw(axis: str, angle: float, along: float) -> Floats:
-    """Return the pose (4, 4) after a turn about an axis and a shift along it."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
-    pose["xyz".index(axis), 3] = along
-    return pose
+def jacobian(body: BodyModel, q: Floats) -> Floats:
+    """Return the velocity of the outermost link [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
+    mujoco: Any = require("mujoco", what="a push at a hand")
+    model, data = body.model, mujoco.MjData(body.model)
+    data.qpos[:] = q[body.columns]
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    depth, moved, found = np.zeros(model.nbody), np.zeros((3, model.nv)), np.zeros((3, len(q)))
+    for n in range(1, model.nbody):  # parents come first
+        depth[n] = depth[model.body_parentid[n]] + 1
+    mujoco.mj_jacBody(model, data, moved, None, int(depth.argmax()))
+    found[:, body.columns] = moved
+    return found
 
 
 def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
@@ -146,11 +157,13 @@ def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | N
     rise = np.minimum(1.0, (1 + np.arange(len(q) - onset)) * dt / RISE_S)
     added = np.zeros_like(q[after])  # (T - onset, J)
     if kind in ("push", "payload"):
+        if piece.body is None:
+            return None
         force = np.array([0.0, 0.0, -GRAVITY])
         if kind == "push":
             angle = rng.uniform(0, 2 * np.pi)
             force = NEWTONS * np.array([np.cos(angle), np.sin(angle), 0.0])
-        added[:] = np.array([jacobian(piece.links, row).T @ force for row in q[after]]) * rise[:, None]
+        added[:] = np.array([jacobian(piece.body, row).T @ force for row in q[after]]) * rise[:, None]
     elif kind == "step":
         j = int(rng.choice(strong))
         added[:, j] = rng.choice([-1, 1]) * STEP_SHARE * piece.ranges[j] * rise
@@ -208,13 +221,14 @@ class Job(NamedTuple):
 def run(config: Config) -> Findings:
     """Run the experiments whose recordings are in the folder."""
     places = {name: config.folder / ARMS[name].place for name in config.experiments}
-    missing = [f"{place} is missing: it is {SOURCE}" for place in places.values() if not place.exists()]
+    missing = [f"{place} is missing: it is {ARMS[n].source}" for n, place in places.items() if not place.exists()]
     found = [name for name, place in places.items() if place.exists()]
     if not found:
         raise FileNotFoundError("; ".join(missing))
-    jobs = list(starmap(Job, product(found, config.monitors, config.repetitions, range(FOLDS))))
+    each = product(found, config.monitors, config.repetitions, range(FOLDS))
+    jobs = [job for job in (Job(*one) for one in each) if job.monitor not in WITH_BODY or ARMS[job.experiment].urdf]
     records = kit.together(kit.each("watching", partial(examined, folder=config.folder), jobs, config))
-    first, *others = (table(where(records, experiment=name), ARMS[name], config.monitors) for name in found)
+    first, *others = (table(where(records, experiment=name), ARMS[name]) for name in found)
     left_out = "".join(f" Left out: {why}." for why in missing)
     return Findings(records, [replace(first, caption=first.caption + left_out), *others])
 
@@ -222,7 +236,7 @@ def run(config: Config) -> Findings:
 def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, and for each fault in it."""
     arm = ARMS[job.experiment]
-    whole = Episode.from_table(read_joint_states(folder / arm.place), success=True)
+    whole = Episode.from_table(arm.read(folder / arm.place), success=True)
     effort = whole.stream[:, whole.spec.slices["effort"]].astype(np.float64)
     ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
     cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
@@ -231,26 +245,32 @@ def examined(job: Job, folder: Path) -> list[Record]:
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
     learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
-    monitor = fitted(job, learned, folder / "urdf" / arm.urdf)
+    urdf = body_of(folder / "urdf" / arm.urdf) if arm.torques or job.monitor in WITH_BODY else ""
+    angles = whole.spec.labels[whole.spec.slices["position"]]
+    body = BodyModel.of(urdf, angles) if arm.torques else None
+    monitor = fitted(job, learned, urdf)
     threshold = monitor.calibrate(calibration, 1.0 / (len(calibration) + 1)).threshold
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
     watched = [("", cut[i]) for i in tested]
     for i, kind in ((i, kind) for i in tested for kind in FAULTS):
-        faulty = with_fault(kind, Piece(cut[i], len(cut[i]) // 2, ranges, arm.links), rng)
+        faulty = with_fault(kind, Piece(cut[i], len(cut[i]) // 2, ranges, body), rng)
         watched += [] if faulty is None else [(kind, faulty)]
     scores = monitor.score_episodes([episode for _, episode in watched])
     ratios = [s.value / threshold for s in scores]
     return [job._asdict() | judged(kind, v, whole.spec.dt) for (kind, _), v in zip(watched, ratios, strict=True)]
 
 
-def fitted(job: Job, episodes: Sequence[Episode], urdf: Path) -> Any:
-    """Return the monitor of a job, fitted."""
+def body_of(urdf: Path) -> str:
+    """Return the text of a body model. Raises FileNotFoundError that says where it is published."""
+    if not urdf.is_file():
+        raise FileNotFoundError(f"{urdf} is missing: it is in example-robot-data 6.0.0 (PyPI)")
+    return read_urdf(urdf)
+
+
+def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
+    """Return the monitor of a job, fitted; one that is named with a body reads the text of ``urdf``."""
     spec, name = episodes[0].spec, WITH_BODY.get(job.monitor, job.monitor)
-    settings = SETTINGS.get(name, {})
-    if job.monitor in WITH_BODY:
-        if not urdf.is_file():
-            raise FileNotFoundError(f"{urdf} is missing: it is in example-robot-data 6.0.0 (PyPI)")
-        settings = settings | {"urdf": read_urdf(urdf)}
+    settings = SETTINGS.get(name, {}) | ({"urdf": urdf} if job.monitor in WITH_BODY else {})
     if name == RULE:
         return CalibratedMonitor(FrictionRule(spec, **settings), Largest(spec), seed=job.seed).fit(list(episodes))
     return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
@@ -267,12 +287,11 @@ def judged(kind: str, value: Floats, dt: float) -> Record:
     return {"kind": kind, "found": found, "delay": dt * (over[0] + 1) if found else None, "excess": float(after.max())}
 
 
-def table(records: Sequence[Record], arm: RealArm, monitors: Sequence[str]) -> Table:
+def table(records: Sequence[Record], arm: RealArm) -> Table:
     """Return the table of a recording, a row for each monitor."""
     kinds = [kind for kind in FAULTS if where(records, kind=kind)]
-    healthy = {
-        name: sorted((r["excess"] for r in where(records, monitor=name, kind="")), reverse=True) for name in monitors
-    }
+    monitors = list(dict.fromkeys(r["monitor"] for r in records))
+    healthy = {n: sorted((r["excess"] for r in where(records, monitor=n, kind="")), reverse=True) for n in monitors}
     fewest = min(sum(excess > 1 for excess in own) for own in healthy.values())
     rows = []
     for name in monitors:
@@ -280,15 +299,16 @@ def table(records: Sequence[Record], arm: RealArm, monitors: Sequence[str]) -> T
         quiet, faulty = where(own, kind=""), [r for r in own if r["kind"]]
         found = [[r["found"] for r in where(faulty, kind=kind)] for kind in kinds]
         delays = [r["delay"] for r in faulty if r["found"]]
-        pressed = [r["excess"] > healthy[name][fewest] for r in faulty if r["kind"] in ("push", "payload")]
+        told = [r for r in faulty if r["kind"] in ("push", "payload") or not arm.torques]
         seconds, alarms, alarm_s = (sum(r[value] for r in quiet) for value in ("seconds", "alarms", "alarm_s"))
-        shares = [f"{sum(f)} of {len(f)}" for f in (*found, pressed)]
+        shares = [f"{sum(f)} of {len(f)}" for f in (*found, [r["excess"] > healthy[name][fewest] for r in told])]
         delay = f"{np.median(delays):.3g}" if delays else ""
         healthily = f"{3600 * alarms / seconds:.0f}", f"{100 * alarm_s / seconds:.1f} %"
         rows.append((name, *shares[:-1], delay, shares[-1], *healthily))
+    counted = "pushes and payloads" if arm.torques else "faults"
     caption = (
         f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. * added to the recording, found within half a piece. "
-        f"At {fewest}: pushes and payloads found by the threshold that {fewest} healthy pieces pass."
+        f"At {fewest}: {counted} found by the threshold that {fewest} healthy pieces pass."
     )
     headings = ("Monitor", *(f"{kind} *" for kind in kinds), "delay [s]", f"at {fewest}")
     return Table(caption, (*headings, "false alarms an hour", "healthy time in alarm"), rows)
