@@ -92,13 +92,9 @@ def test_joints_are_those_that_columns_name_or_the_longest_chain():
     assert not by_order.by_name
     in_part = BodyModel.of(arm(), ["q.elb.elbow_left", "q[lift]", "q[finger]", "q.the_shoulder"])
     assert (in_part.by_name, in_part.columns.tolist()) == (True, [1, 3, 0])
-    finger = (
-        '<link name="tip"/><joint name="panda_finger_joint1" type="prismatic"><parent link="{}"/><child link="tip"/>'
-    )
-    finger = (
-        finger.format(re.findall('link name="([^"]*)"', arm())[-1])
-        + '<child link="tip"/><axis xyz="1 0 0"/></joint></robot>'
-    )
+    tip = re.findall('link name="([^"]*)"', arm())[-1]
+    finger = f'<link name="tip"/><joint name="panda_finger_joint1" type="prismatic"><parent link="{tip}"/>'
+    finger += '<child link="tip"/><axis xyz="1 0 0"/></joint></robot>'
     numbered = arm().replace('"lift"', '"panda_joint1"').replace('"shoulder"', '"panda_joint2"')
     numbered = numbered.replace("</robot>", finger)
     numbered = numbered.replace('"elbow"', '"panda_joint3"')
