@@ -43,11 +43,12 @@ from asm_gym.evaluation.metrics import (
     placements,
     time_matched_auroc,
 )
-from asm_gym.evaluation.resampling import Calibration, Windows, by_episode, interval, resample
+from asm_gym.evaluation.resampling import Calibration, Windows, interval, resample
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.scoring import fitted
 from asm_gym.evaluation.statistics import Rate, Share, auroc
 from asm_gym.evaluation.tables import Table, tabulate
+from asm_gym.monitors.calibration import AlarmRate
 from tests.streams import sine_episodes
 
 
@@ -126,9 +127,9 @@ def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
 
 def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
     traces = [a_trace([1] * k + [20] + [1] * 30, onset=0) for k in range(20)]  # 100, 200, … 2000 ms
-    assert Delays.of(delays_ms(traces, window_s=5.0)) == pytest.approx(Delays(1000.0, 1900.0, 20, 0))
-    assert Delays.of(delays_ms(traces, window_s=1.5)) == pytest.approx(Delays(1000.0, math.inf, 15, 5))
-    assert Delays.of([]) is None
+    assert Delays.of(delays_ms(traces, window_s=5.0)) == pytest.approx(Delays(1000.0, 1900.0))
+    assert Delays.of(delays_ms(traces, window_s=1.5)) == pytest.approx(Delays(1000.0, math.inf))
+    assert Delays.of([]) == Delays(math.inf, math.inf)
 
 
 def test_alarms_an_hour_count_only_the_time_before_the_fault_and_one_a_minute():
@@ -156,10 +157,10 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
         a_trace([1, 2, 30, 4]),
     ]
     nominal, push = by_condition(traces, window_s=0.2)
-    assert (nominal.name, len(nominal.watched), nominal.delays) == ("nominal", 2, None)
+    assert (nominal.name, len(nominal.watched), nominal.delays) == ("nominal", 2, Delays())
     assert (false_alarms(nominal.watched), nominal.detected) == (Share(1, 2), Share(0, 0))
     assert (push.name, len(push.watched), push.detected) == ("push", 3, Share(1, 3))  # the third alarm is late
-    assert push.delays == pytest.approx(Delays(math.inf, math.inf, 1, 2))
+    assert push.delays == Delays(math.inf, math.inf)
     assert push.auroc == pytest.approx(1 / 6)  # maxima 20, 1, 1 against 3, 30
     alone, held = push.outcomes
     assert (alone.acting, alone.success, alone.peak_force) == ("policy alone", Share(1, 3), 70.0)
@@ -250,7 +251,7 @@ FAULTY = [
     judged(2.5, "push", "mild", onset=5),
     judged(0.0, "noise", "mild", onset=5),
 ]
-ONE, FIVE = by_episode(0.01), by_episode(0.05)
+ONE, FIVE = AlarmRate(0.01, "episode"), AlarmRate(0.05, "episode")
 RESULT = DetectionMetrics("asm", FAULTY, NOMINAL, 1.0, Calibration({ONE: 3.5, FIVE: 2.2}))
 
 

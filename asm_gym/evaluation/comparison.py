@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from asm_gym.data.episode import Episode
+from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import RATES, REPORTED_RATE
 from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Kind
-from asm_gym.evaluation.resampling import by_episode
 from asm_gym.evaluation.scored_episode import onset_row, window_steps
 from asm_gym.evaluation.statistics import Share
 from asm_gym.monitors.calibration import AlarmRate
@@ -36,6 +36,7 @@ RESOLUTION = 1e-3
 """Noise of a channel without any, as a share of its spread: commands are exact, but nobody predicts them exactly."""
 VISIBLE = 0.5
 """A kind counts where the ideal observer finds at least this share of its faults at a false-alarm rate of 1 %."""
+SURE = 0.95  # power of detection from which the ideal observer is sure
 IDEAL = "ideal observer"
 
 
@@ -55,11 +56,10 @@ class Detectability(NamedTuple):
     delay: float | None
 
 
-def noise_floor(noise: Array, streams: list[Array]) -> NDArray[np.float64]:
+def noise_floor(noise: Array, streams: list[Array]) -> Any:
     """Return (D,) noise: the sensors' own ``noise`` (D,), at least ``RESOLUTION`` of the spread of ``streams``."""
     spread = np.concatenate(streams).astype(np.float64).std(axis=0)
-    floor: NDArray[np.float64] = np.maximum(np.maximum(noise, RESOLUTION * spread), 1e-9)
-    return floor
+    return np.maximum(np.maximum(noise, RESOLUTION * spread), 1e-9)
 
 
 def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[np.float64]:
@@ -80,25 +80,22 @@ def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[
     difference = np.asarray(faulty[onset:length], np.float64) - twin[onset:length]
     # A reading that is not finite is seen at once.
     gain = np.where(np.isfinite(difference), (difference / noise) ** 2, np.inf).sum(axis=1)
-    summed: NDArray[np.float64] = np.cumsum(gain)
-    return summed
+    return np.cumsum(gain)
 
 
-def auroc_bound(separation: Array | float) -> NDArray[np.float64]:
+def auroc_bound(separation: Array | float) -> Any:
     """Return the largest AUROC of any detector at this S."""
-    bound: NDArray[np.float64] = norm.cdf(np.sqrt(np.asarray(separation, np.float64) / 2))
-    return bound
+    return norm.cdf(np.sqrt(np.asarray(separation, np.float64) / 2))
 
 
-def power_bound(separation: Array | float, rate: float) -> NDArray[np.float64]:
+def power_bound(separation: Array | float, rate: float) -> Any:
     """Return the largest probability of detection at this S and false-alarm ``rate``."""
-    bound: NDArray[np.float64] = norm.cdf(np.sqrt(np.asarray(separation, np.float64)) - norm.isf(rate))
-    return bound
+    return norm.cdf(np.sqrt(np.asarray(separation, np.float64)) - norm.isf(rate))
 
 
-def earliest(separation: Array, rate: float = REPORTED_RATE, power: float = 0.95) -> int | None:
-    """Return the first step since the onset at which the power reaches ``power``; None if never."""
-    enough = np.flatnonzero(power_bound(separation, rate) >= power)
+def earliest(separation: Array) -> int | None:
+    """Return the first step since the onset at which the power at ``REPORTED_RATE`` reaches ``SURE``; None if never."""
+    enough = np.flatnonzero(power_bound(separation, REPORTED_RATE) >= SURE)
     return int(enough[0]) if enough.size else None
 
 
@@ -127,7 +124,7 @@ def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], wind
 
 def visible_kinds(detectability: Sequence[Detectability]) -> dict[tuple[str, str], bool]:
     """Return whether an ideal observer could detect each kind and severity, in order of appearance."""
-    kinds: dict[tuple[str, str], list[Detectability]] = {}
+    kinds: dict[Kind, list[Detectability]] = {}
     for one in detectability:
         kinds.setdefault((one.kind, one.severity), []).append(one)
     return {kind: mean_power(own, REPORTED_RATE) >= VISIBLE for kind, own in kinds.items()}
@@ -138,7 +135,7 @@ class Bound(NamedTuple):
 
     auroc: float
     found: Mapping[AlarmRate, Share]
-    delays: Delays | None
+    delays: Delays
 
     @classmethod
     def of(cls, faults: Sequence[Detectability], rate: float) -> Bound:
@@ -146,7 +143,7 @@ class Bound(NamedTuple):
         n = len(faults)
         return cls(
             auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults])))) if n else math.nan,
-            found={by_episode(r): Share(round(n * mean_power(faults, r)), n) for r in {*RATES, rate} if n},
+            found={AlarmRate(r, EPISODE): Share(round(n * mean_power(faults, r)), n) for r in {*RATES, rate} if n},
             delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in faults]),
         )
 
@@ -172,7 +169,7 @@ class BenchmarkResult:
     @property
     def promise(self) -> AlarmRate:
         """The run's own false-alarm rate as a promise."""
-        return by_episode(self.rate)
+        return AlarmRate(self.rate, EPISODE)
 
     @cached_property
     def visible(self) -> dict[Kind, bool]:

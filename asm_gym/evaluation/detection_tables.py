@@ -9,12 +9,12 @@ from functools import partial
 from scipy import stats
 
 from asm_gym.detection import conformal_episodes
-from asm_gym.detection.conformal import HOUR
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult, Bound
 from asm_gym.evaluation.defaults import PER_HOUR, RATES, TRANSIENT
-from asm_gym.evaluation.metrics import Delays, DetectionMetrics, Outcomes, in_words
-from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour, interval, rate_text
+from asm_gym.evaluation.metrics import DetectionMetrics, Kind, Outcomes
+from asm_gym.evaluation.resampling import Calibration, interval
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Estimate, Rate, Share
 from asm_gym.evaluation.tables import Table, count, percent, tabulate
@@ -23,15 +23,13 @@ from asm_gym.monitors.calibration import AlarmRate
 UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely than this
 
 
-def milliseconds(delays: Delays | None, which: str = "median_ms", otherwise: str = "missed") -> str:
-    """Format the ``median_ms`` or ``p95_ms``; ``otherwise`` where it is infinite."""
-    delay = math.inf if delays is None else getattr(delays, which)
+def milliseconds(delay: float, otherwise: str = "missed") -> str:
+    """Format a delay [ms]; ``otherwise`` where it is infinite."""
     return f"{delay:.0f}" if math.isfinite(delay) else otherwise
 
 
 def _delays(m: DetectionMetrics) -> str:
-    longest = f">{1e3 * m.window_s:.0f}"
-    return ", ".join(milliseconds(m.delays, q, longest) for q in ("median_ms", "p95_ms")) if m.delays else ""
+    return ", ".join(milliseconds(delay, f">{1e3 * m.window_s:.0f}") for delay in m.delays) if m.faulty else ""
 
 
 def _before_and_after(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetrics], str]:
@@ -64,12 +62,17 @@ def monitor_columns(promises: Sequence[AlarmRate]) -> dict[str, Callable[[Detect
     return {
         "Monitor": lambda m: m.name,
         "AUROC, same steps": lambda m: "{:.3f} ({:.3f}–{:.3f})".format(*interval(m.auroc, m.draws.auroc)),
-        **{f"Found at {rate_text(promise)}": partial(_found, promise=promise) for promise in promises},
-        "Median delay [ms]": lambda m: milliseconds(m.delays),
+        **{f"Found at {_rate(promise)}": partial(_found, promise=promise) for promise in promises},
+        "Median delay [ms]": lambda m: milliseconds(m.delays.median_ms),
         "False alarms": _false_alarms,
         "Alarms/h": lambda m: metrics.hourly_alarms(m.nominal).text,
         "Right channel": lambda m: percent(metrics.attribution_accuracy(m.faulty)),
     }
+
+
+def _rate(promise: AlarmRate) -> str:
+    """Format such as ``1 %`` or ``10/h``."""
+    return f"{promise.rate:g}/h" if promise.per == HOUR else f"{100 * promise.rate:g} %"
 
 
 BRIEF = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right channel")
@@ -78,7 +81,7 @@ BRIEF = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right
 
 def monitors_table(result: BenchmarkResult) -> Table:
     """Return the monitors side by side, the ideal observer on top."""
-    hidden = [in_words(kind) for kind, seen in result.visible.items() if not seen]
+    hidden = [_in_words(kind) for kind, seen in result.visible.items() if not seen]
     failed, crashed = result.left_out
     caption = (
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds and severities of fault that an "
@@ -89,18 +92,18 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"crashed ({crashed}), and faults in such scenes."
         + (f" Kinds that cannot be detected: {', '.join(hidden)}." if hidden else "")
     )
-    promises = [by_episode(rate) for rate in sorted({*RATES, result.rate})] + [by_hour(rate) for rate in PER_HOUR]
+    promises = [AlarmRate(r, EPISODE) for r in sorted({*RATES, result.rate})] + [AlarmRate(r, HOUR) for r in PER_HOUR]
     monitors = tabulate(caption, monitor_columns(promises), result.on_visible)
     ideal = result.bound([kind for kind, seen in result.visible.items() if seen])
     found = [percent(ideal.found.get(promise)) for promise in promises]
-    first = (IDEAL, f"{ideal.auroc:.3f}", *found, milliseconds(ideal.delays), "", "", "")
+    first = (IDEAL, f"{ideal.auroc:.3f}", *found, milliseconds(ideal.delays.median_ms), "", "", "")
     return Table(caption, monitors.headings, [first, *monitors.rows])
 
 
 def brief_monitors_table(result: BenchmarkResult) -> Table:
     """Return the chief columns without their intervals, narrow enough for a terminal."""
     table = monitors_table(result)
-    headings = [h for h in table.headings if h in BRIEF or h == f"Found at {rate_text(result.promise)}"]
+    headings = [h for h in table.headings if h in BRIEF or h == f"Found at {_rate(result.promise)}"]
     columns = [table.headings.index(heading) for heading in headings]
     rows = [[str(row[n]).partition(" (")[0] for n in columns] for row in table.rows]
     return Table(f"found within {result.window_s:g} s of the onset", headings, rows)
@@ -115,13 +118,17 @@ def kinds_table(result: BenchmarkResult) -> Table:
             *(m.only([kind]) for m in result.monitors.values()),
         ]
         found = (f"{m.auroc:.2f} / {percent(m.found.get(result.promise))}" for m in own)
-        rows.append((in_words(kind) if seen else f"({in_words(kind)})", *found))
+        rows.append((_in_words(kind) if seen else f"({_in_words(kind)})", *found))
     return Table(
         f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no observer could "
         "detect it.",
         ("Fault", IDEAL, *result.monitors),
         rows,
     )
+
+
+def _in_words(kind: Kind) -> str:
+    return " ".join(part.replace("_", " ") for part in kind if part)
 
 
 def lead_table(result: BenchmarkResult) -> Table:
@@ -142,7 +149,7 @@ def lead_table(result: BenchmarkResult) -> Table:
     return Table(
         f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference, which decide "
         "between ahead, behind and within chance.",
-        ("Monitor", "AUROC", *(f"Found at {rate_text(promise)} [points]" for promise in promises)),
+        ("Monitor", "AUROC", *(f"Found at {_rate(promise)} [points]" for promise in promises)),
         rows,
     )
 
@@ -167,7 +174,7 @@ def kept_table(result: BenchmarkResult) -> Table:
         f"False alarms in {len(every[0].nominal)} nominal test episodes of {hours:.2f} hours, by the promise of the "
         "threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in 40 (beta-binomial); by the hour, "
         f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N.",
-        ("Monitor", *(f"promised {rate_text(promise)}" for promise in promises)),
+        ("Monitor", *(f"promised {_rate(promise)}" for promise in promises)),
         rows,
     )
 

@@ -132,7 +132,8 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
         ax.plot(ends, [0.96, 0.96], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=top)
     late = "" if trace.delay is None else f": alarm {1e3 * trace.delay:.0f} ms after the onset"
     missed = ": missed" if trace.onset is not None and trace.delay is None else ""
-    ax.set_title(f"{trace.title}{late}{missed}")
+    place = f" in {trace.task}" if trace.task else ""
+    ax.set_title(f"{trace.condition}{place}{late}{missed}")
     ax.grid(axis="y")
 
 

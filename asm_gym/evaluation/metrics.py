@@ -30,11 +30,6 @@ Kind = tuple[str, str]
 """Kind and severity of a fault."""
 
 
-def in_words(kind: Kind) -> str:
-    """Format such as ``weak joint mild``."""
-    return " ".join(part.replace("_", " ") for part in kind if part)
-
-
 def placements(
     faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
 ) -> NDArray[np.float64]:
@@ -58,21 +53,15 @@ def time_matched_auroc(faulty: Sequence[ScoredEpisode], nominal: Sequence[Scored
 class Delays(NamedTuple):
     """Detection delays; a miss counts as infinitely late."""
 
-    median_ms: float  # half of all faults were detected within this; inf where fewer were
-    p95_ms: float
-    detected: int
-    missed: int
+    median_ms: float = math.inf  # half of all faults were detected within this; inf where fewer were
+    p95_ms: float = math.inf
 
     @classmethod
-    def of(cls, delays_ms: Sequence[float] | Floats) -> Delays | None:
-        """Summarise one delay per fault [ms], ``inf`` for a miss; None without faults."""
+    def of(cls, delays_ms: Sequence[float] | Floats) -> Delays:
+        """Summarise one delay per fault [ms], ``inf`` for a miss."""
         late = sorted(map(float, delays_ms))
-        if not late:
-            return None
         # Observed values, not interpolated ones: between a number and a miss there is nothing.
-        median, p95 = (late[math.ceil(q * len(late)) - 1] for q in (0.5, 0.95))
-        detected = int(np.isfinite(late).sum())
-        return cls(median, p95, detected, len(late) - detected)
+        return cls(*(late[math.ceil(q * len(late)) - 1] for q in (0.5, 0.95))) if late else cls()
 
 
 def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.float64]:
@@ -186,7 +175,7 @@ class DetectionMetrics:
         return {promise: Share.of(windows.detected(q)) for promise, q in self.calibration.thresholds.items()}
 
     @cached_property
-    def delays(self) -> Delays | None:
+    def delays(self) -> Delays:
         """Delays of all faults."""
         return Delays.of(delays_ms(self.faulty, self.window_s))
 

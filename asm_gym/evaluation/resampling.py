@@ -16,27 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import Blocks
-from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.conformal import HOUR
 from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
 from asm_gym.monitors.calibration import AlarmRate
 
 DRAWS = 400  # bootstrap resamples
-
-
-def by_episode(rate: float) -> AlarmRate:
-    """Return the promise that this share of nominal episodes has an alarm."""
-    return AlarmRate(rate, EPISODE)
-
-
-def by_hour(rate: float) -> AlarmRate:
-    """Return the promise of so many false alarms per hour."""
-    return AlarmRate(rate, HOUR)
-
-
-def rate_text(promise: AlarmRate) -> str:
-    """Format such as ``1 %`` or ``10/h``."""
-    return f"{promise.rate:g}/h" if promise.per == HOUR else f"{100 * promise.rate:g} %"
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,11 +92,6 @@ class ScoredEpisode:
         return " ".join(part.replace("_", " ") for part in (self.severity, self.kind) if part)
 
     @property
-    def title(self) -> str:
-        """The condition and the task."""
-        return f"{self.condition} in {self.task}" if self.task else self.condition
-
-    @property
     def missing(self) -> NDArray[np.bool_]:
         """(T,) the rows that lack a number; none where the stream was not kept."""
         return np.zeros(len(self), np.bool_) if self.stream is None else np.isnan(self.stream).any(axis=1)

@@ -15,12 +15,14 @@ import numpy as np
 from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection import conformal_episodes
+from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
-from asm_gym.evaluation.resampling import Calibration, by_episode, by_hour
+from asm_gym.evaluation.resampling import Calibration
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
+from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.version import __version__
 
 NOMINAL_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
@@ -110,13 +112,13 @@ def judged(
     monitor.calibrate(by_role["calibration"], rate)
     rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
     hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
-    promises = [by_episode(r) for r in rates] + [by_hour(r) for r in PER_HOUR if r * hours >= 1.0]
+    promises = [AlarmRate(r, EPISODE) for r in rates] + [AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0]
     calibration = Calibration(
         {promise: monitor.threshold_at(**promise.named) for promise in promises},
         np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
         monitor.blocks_,
     )
-    threshold = calibration.thresholds[by_episode(rate)]
+    threshold = calibration.thresholds[AlarmRate(rate, EPISODE)]
     nominal, faulty = (traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty"))
     return DetectionMetrics(name, faulty, nominal, window_s, calibration)
 

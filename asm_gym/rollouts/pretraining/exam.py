@@ -102,7 +102,7 @@ COLUMNS: dict[str, Callable[[Marks], str]] = {
     "failed, alarm": lambda m: count(false_alarms(m.failed)) if m.failed else "",
     "AUROC": lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else "",
     "found": lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else "",
-    "median [ms]": lambda m: milliseconds(m.metrics.delays) if m.metrics.faulty else "",
+    "median [ms]": lambda m: milliseconds(m.metrics.delays.median_ms) if m.metrics.faulty else "",
 }
 
 
