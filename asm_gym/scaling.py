@@ -201,5 +201,4 @@ def _least_change(streams: Sequence[NDArray[np.float32]], noise: NDArray[np.floa
     """
     shown = [s[:MOST_SHOWN] for s in streams[: max(1, MOST_SHOWN // max(1, len(streams[0])))]]
     rounded = [[resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown]  # (N, D)
-    least: NDArray[np.float64] = np.sqrt(2.0) * np.maximum(noise / 2, np.max(rounded, axis=0) / np.sqrt(12.0))
-    return least
+    return np.sqrt(2.0) * np.maximum(noise / 2, np.max(rounded, axis=0) / np.sqrt(12.0))

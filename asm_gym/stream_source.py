@@ -31,8 +31,7 @@ class StreamSource:
     @property
     def spec(self) -> StreamSpec:
         """Names the numbers of a row; whoever makes the stream run faster changes it."""
-        spec: StreamSpec = self._env.get_wrapper_attr("stream_spec") if self.own else self._spaces
-        return spec
+        return self._env.get_wrapper_attr("stream_spec") if self.own else self._spaces
 
     @property
     def rows_per_step(self) -> int:
@@ -44,8 +43,7 @@ class StreamSource:
         if self.own:
             if "stream" not in info:
                 raise KeyError('info has no "stream"')
-            row: NDArray[np.float32] = info["stream"]
-            return row
+            return info["stream"]
         spaces = self._env.observation_space, self._env.action_space
         parts = [flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)]
         return as_float32(np.concatenate(parts))
@@ -59,8 +57,7 @@ class StreamSource:
 
     def rows(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""
-        found: NDArray[np.float32] = info["streams"] if "streams" in info else self.row(observation, action, info)[None]
-        return found
+        return info["streams"] if "streams" in info else self.row(observation, action, info)[None]
 
 
 def stepped(env: gym.Env[Any, Any], action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:

@@ -27,8 +27,7 @@ COUPLING = 0.15  # between neighbouring joints, as a share of the geometric mean
 @compiled
 def _gravity(position: Floats) -> Floats:
     """Return the torques (7,) that hold the arm with a load of 1."""
-    held: Floats = GRAVITY * np.sin(np.cumsum(position) + 0.5)
-    return held
+    return GRAVITY * np.sin(np.cumsum(position) + 0.5)
 
 
 @compiled

@@ -51,8 +51,7 @@ class Hold:
         if not space.contains(self._rest):
             raise ValueError(f"safe_action {self._rest} is not in {space}")
         self._grip = np.asarray(getattr(inner, "gripper_actions", ()), dtype=int)
-        if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
-            self._grip = self._grip[:0]
+        self._grip = self._grip[self._grip < self._rest.size]  # a wrapper inside may take other numbers
 
     def begin(self, executed: NDArray[np.float32]) -> NDArray[np.float32]:
         """The state to start from, after ``executed`` (A,), whose grip is kept."""
@@ -92,8 +91,7 @@ def _zero_that_rests(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
 
 def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
     """Return the action (A,) of a space that is nearest to zero."""
-    nearest: NDArray[np.float32] = np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
-    return nearest
+    return np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
 
 
 def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:

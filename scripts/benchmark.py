@@ -86,17 +86,6 @@ def ratio(seconds: NDArray[np.float64], others: NDArray[np.float64]) -> Spread:
     return Spread.of((one / other).tolist())
 
 
-def compared(caption: str, unit: str, seconds: dict[str, NDArray[np.float64]], rival: dict[str, str]) -> Table:
-    """Return a row for each name: median and 99th percentile of its calls, and the ratio to its rival's."""
-    scale = {"µs": 1e6, "ms": 1e3}[unit]
-    rows = []
-    for name, other in rival.items():
-        median, slow = np.quantile(seconds[name], (0.5, 0.99)) * scale
-        against = f"{ratio(seconds[name], seconds[other]).text(digits=2)}× {other}"
-        rows.append((name, f"{median:.3g}", f"{slow:.3g}", against))
-    return Table(caption, ("", unit, "p99", "against"), rows)
-
-
 def measure_monitor(args: Args, console: Console) -> Table:
     """Compare one call of ``observe`` with that of a GRU under the same detection, on one thread."""
     senses = (Channel(f"sense_{k}", 12, noise=0.01, group=f"group_{k}") for k in range(5))
@@ -119,28 +108,21 @@ def measure_monitor(args: Args, console: Console) -> Table:
     with threadpool_limits(1):
         seconds = take_turns(rivals, 5 * args.steps, args.seed, console)
     seconds[many] /= 64
-    return compared("observe(), 256 hidden units, 60 channels", "µs", seconds, dict.fromkeys(rivals, rival))
+    rows = []
+    for name, taken in seconds.items():
+        median, slow = np.quantile(taken, (0.5, 0.99)) * 1e6
+        against = f"{ratio(taken, seconds[rival]).text(digits=2)}× {rival}"
+        rows.append((name, f"{median:.3g}", f"{slow:.3g}", against))
+    return Table("observe(), 256 hidden units, 60 channels", ("", "µs", "p99", "against"), rows)
 
 
 def _made(task: str, rate: int | None = None) -> gym.Env[Any, Any]:
     return gym.make(env_id(task), horizon=10**9, stream_freq=rate, disable_env_checker=True)
 
 
-class Members:
-    """Environments, and vectors of the first few of them, which share them."""
-
-    def __init__(self, task: str, count: int) -> None:
-        self.envs = [_made(task) for _ in range(count)]
-        self._vectors: list[ThreadedVectorEnv] = []
-
-    def first(self, count: int) -> ThreadedVectorEnv:
-        """Return a vector of the first ``count``; kept, since one that is collected closes its members."""
-        self._vectors.append(ThreadedVectorEnv([partial(self.envs.__getitem__, i) for i in range(count)]))
-        return self._vectors[-1]
-
-    def close(self) -> None:
-        for vector in self._vectors:
-            vector.close()
+def vectors_of(envs: Sequence[gym.Env[Any, Any]], counts: Iterable[int]) -> dict[int, ThreadedVectorEnv]:
+    """Return vectors of the first few environments, which share them and close them when they are collected."""
+    return {n: ThreadedVectorEnv([partial(envs.__getitem__, i) for i in range(n)]) for n in counts}
 
 
 def stepping(step: Callable[[Any], Any], actions: Iterable[Any]) -> Callable[[], None]:
@@ -154,13 +136,11 @@ def stepping(step: Callable[[Any], Any], actions: Iterable[Any]) -> Callable[[],
     return second
 
 
-def speeds(
-    name: object, members: int, seconds: dict[str, NDArray[np.float64]], rivals: Sequence[str]
-) -> tuple[str, ...]:
-    """Return a row: steps a second of all members together, and the first's as a share of each rival's."""
-    ours, *_ = seconds
+def speeds(name: object, members: int, seconds: dict[str, NDArray[np.float64]]) -> tuple[str, ...]:
+    """Return a row: steps a second of all members together, and the first's as a share of each other's."""
+    ours, *others = seconds.values()
     numbers = (f"{SECOND * members / np.median(taken):,.0f}" for taken in seconds.values())
-    return str(name), *numbers, *(ratio(seconds[rival], seconds[ours]).text(digits=2) for rival in rivals)
+    return str(name), *numbers, *(ratio(other, ours).text(digits=2) for other in others)
 
 
 def measure_safety(args: Args, console: Console) -> Table:
@@ -172,7 +152,7 @@ def measure_safety(args: Args, console: Console) -> Table:
         for each, env in (("guarded", guarded), ("bare", bare)):
             env.reset(seed=args.seed)
             rivals[each] = stepping(env.step, repeat(np.zeros(env.action_space.shape, np.float32)))
-        rows.append(speeds(name, count, take_turns(rivals, turns, args.seed, console), ["bare"]))
+        rows.append(speeds(name, count, take_turns(rivals, turns, args.seed, console)))
 
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
         bare, inner = _made(args.task, rate), _made(args.task, rate)
@@ -181,13 +161,11 @@ def measure_safety(args: Args, console: Console) -> Table:
         compare(name, 1, bare, guarded)
         bare.close()
         guarded.close()
-    alone, watched = (Members(args.task, max(args.members)) for _ in range(2))
-    for n in args.members:
-        within = watched.first(n)
+    envs = [[_made(args.task) for _ in range(max(args.members))] for _ in range(2)]
+    alone, watched = (vectors_of(own, args.members) for own in envs)
+    for n, within in watched.items():
         memory = body_memory(within, within.get_attr("stream_spec")[0]).with_threshold(1e300)
-        compare(f"vector of {n}", n, alone.first(n), VectorNeuralASMSafety(within, memory))
-    alone.close()
-    watched.close()
+        compare(f"vector of {n}", n, alone[n], VectorNeuralASMSafety(within, memory))
     headings = "", "guarded", "bare", "guarded / bare"
     return Table(f"Control steps of {args.task} a second, shipped memory", headings, rows)
 
@@ -228,20 +206,21 @@ def physics_alone(envs: Sequence[gym.Env[Any, Any]], actions: NDArray[np.float32
 
 def measure_env(args: Args, console: Console) -> Table:
     """Compare vectors with MuJoCo's own threads, which simulate the same motion alone, and with robosuite's step."""
-    members, rows, turns = Members(args.task, max(args.members)), [], max(1, args.steps // SECOND)
+    rows, turns = [], max(1, args.steps // SECOND)
+    envs = [_made(args.task) for _ in range(max(args.members))]
     robosuite, robots = import_robosuite(), ["Panda"] * task_spec(args.task).arms
     control = [robosuite.load_composite_controller_config(robot=robot) for robot in robots]
     blind = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
     theirs = robosuite.make(
         args.task, robots, controller_configs=control, reward_shaping=True, ignore_done=True, **blind
     )
-    for n in args.members:
-        ours, rng = members.first(n), np.random.default_rng(args.seed)
+    for n, ours in vectors_of(envs, args.members).items():
+        rng = np.random.default_rng(args.seed)
         # Each action is held for a second, as a policy's are: noise alone would keep the arm in place.
         held = rng.uniform(-0.3, 0.3, (turns + 1, *(ours.action_space.shape or ())))
         actions = np.repeat(held, SECOND, axis=0).astype(np.float32)
         ours.reset(seed=args.seed)
-        physics = physics_alone(members.envs[:n], actions)
+        physics = physics_alone(envs[:n], actions)
         ours.reset(seed=args.seed)
         theirs.reset()
         rivals: Rivals = {
@@ -251,26 +230,21 @@ def measure_env(args: Args, console: Console) -> Table:
         }
         seconds = take_turns(rivals, turns, args.seed, console)
         seconds["robosuite"] *= n  # which has no vectors
-        rows.append(speeds(n, n, seconds, ["mujoco.rollout", "robosuite"]))
-    members.close()
+        rows.append(speeds(n, n, seconds))
     headings = "members", "asm_gym", "mujoco.rollout", "robosuite", "asm_gym / mujoco.rollout", "asm_gym / robosuite"
     return Table(f"Control steps of {args.task} a second, at 20 Hz", headings, rows)
 
 
-BENCHMARKS: dict[str, Callable[[Args, Console], Table]] = {
-    "monitor": measure_monitor,
-    "safety": measure_safety,
-    "env": measure_env,
-}
+BENCHMARKS = {"monitor": measure_monitor, "safety": measure_safety, "env": measure_env}
 
 
 def measure(args: Args, console: Console) -> None:
     """Print a table for each benchmark and write them to a file."""
     args.out.mkdir(parents=True, exist_ok=True)
     texts = []
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
     for name in args.what:
         table = BENCHMARKS[name](args, console)
-        machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
         table = replace(table, caption=f"{table.caption}. {machine}; ±: spread over {PARTS} parts.")
         console.print(table)
         texts.append(markdown(table))

@@ -50,7 +50,6 @@ def main(argv: list[str] | None = None) -> int:
         check_choice("command", name, COMMANDS)
         with needed_for("this command"):
             module: Any = import_module("asm_gym.scripts." + ("inspect_log" if name == "inspect" else name))
-        code: int = module.main(rest)
-        return code
+        return module.main(rest)
 
     return exit_code(name if name in COMMANDS else "", work)

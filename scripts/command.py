@@ -72,8 +72,7 @@ def option(
         positional: whether the option is given without its name.
     """
     about = {"quick": quick, "least": least, "known": known, "check": check}
-    made: T = field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
-    return made
+    return field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
 
 
 @dataclass(frozen=True)

@@ -180,12 +180,12 @@ def test_a_task_has_the_faults_that_it_can_have(task):
     ("fault", "message"),
     [
         (Push(body="robot0_tail"), "'robot0_tail'.*robot0_link5"),
-        (WeakJoint(joint=7), "0 to 6.*7"),
-        (FrozenEncoder(joint=-1), "0 to 6.*-1"),
+        (WeakJoint(joint=7), "0, 6.*7"),
+        (FrozenEncoder(joint=-1), "0, 6.*-1"),
         (Push(onset=100), "horizon of 100"),
         (Bias(channel="smell"), "'smell'.*joint_position"),
-        (Bias(element=9), "0 to 6, got 9"),
-        (faults.ActionBias(axis=6), "0 to 5, got 6"),
+        (Bias(element=9), "0, 6.*got 9"),
+        (faults.ActionBias(axis=6), "0, 5.*got 6"),
         (faults.Slip(object="anvil"), "'anvil'.*cube"),
     ],
 )

@@ -46,8 +46,7 @@ class Actions:
 
     def scaled(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action (A,) in the units of robosuite's controllers, which for most are the same."""
-        units: NDArray[np.float64] = self._middle + self._half * action
-        return units
+        return self._middle + self._half * action
 
     def slowed(self, simulation: Simulation, action: NDArray[np.float32], limits: ContactLimits) -> NDArray[np.float32]:
         """Return the action (A,) scaled along its own direction so that no point of a hand goes faster than it may.

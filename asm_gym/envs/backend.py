@@ -118,8 +118,7 @@ def _configuration(controller: str, robot: str) -> dict[str, Any]:
     from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
 
     part = load_part_controller_config(default_controller=controller)
-    configuration: dict[str, Any] = refactor_composite_controller_config(part, robot, ["right"])
-    return configuration
+    return refactor_composite_controller_config(part, robot, ["right"])
 
 
 def reseed(env: Any, rng: np.random.Generator) -> None:

@@ -36,8 +36,7 @@ def within(value: float, least: float, most: float) -> float:
 def scaled(action: float, scaling: Floats, a: int, i: int) -> float:
     """Return input ``i`` of controller ``a`` in its own units; scaling is (A, 5, N)."""
     x = within(action, scaling[a, LEAST, i], scaling[a, MOST, i])
-    found: float = (x - scaling[a, MIDDLE, i]) * scaling[a, SCALE, i] + scaling[a, OFFSET, i]
-    return found
+    return (x - scaling[a, MIDDLE, i]) * scaling[a, SCALE, i] + scaling[a, OFFSET, i]
 
 
 @inner

@@ -197,8 +197,7 @@ class Simulation:
     def contact_forces(self) -> NDArray[np.float64]:
         """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
         forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
-        found: NDArray[np.float64] = np.linalg.norm(forces, axis=2).max(axis=0)
-        return found
+        return np.linalg.norm(forces, axis=2).max(axis=0)
 
     def sense(self, beside: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
         """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began; see

@@ -13,7 +13,6 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 UNITS = {"_cos": "1", "_sin": "1", "joint_pos": "rad", "joint_vel": "rad/s", "joint_acc": "rad/s2", "_pos": "m"}
 """Of what robosuite senses, by what its name holds; the first that fits."""
-HEADLESS = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
 
 
 class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -28,7 +27,8 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __init__(self, make: type[Any], **arguments: Any) -> None:
         import_robosuite()  # which fits it to MuJoCo
-        self.robosuite_env: Any = make(**{"ignore_done": True, "control_freq": 20, **HEADLESS, **arguments})
+        headless = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
+        self.robosuite_env: Any = make(**{"ignore_done": True, "control_freq": 20, **headless, **arguments})
         self.dt = 1.0 / self.robosuite_env.control_freq
         self._seeded = False
         sensed = self.robosuite_env._get_observations(force_update=True)

@@ -102,8 +102,7 @@ class Windows:
     def detected(self, threshold: float) -> NDArray[np.bool_]:
         """Return (F,) which faults are detected at a threshold."""
         over = self._surprise > threshold
-        found: NDArray[np.bool_] = (over[:, 1:] & ~over[:, :-1]).any(axis=1)
-        return found
+        return (over[:, 1:] & ~over[:, :-1]).any(axis=1)
 
 
 def resample(

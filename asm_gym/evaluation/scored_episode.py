@@ -99,8 +99,7 @@ class ScoredEpisode:
     @cached_property
     def alarm(self) -> NDArray[np.bool_]:
         """(T,) the rows in alarm."""
-        over: NDArray[np.bool_] = self.surprise > self.threshold
-        return over
+        return self.surprise > self.threshold
 
     @cached_property
     def alarms(self) -> tuple[int, ...]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.faults.base import LONGEST, Clock, HookedFault, Interface, within
+from asm_gym.validation import check_number
 
 Action = NDArray[np.float32]
 
@@ -27,9 +28,7 @@ class ActionFault(HookedFault):
     grippers_too: ClassVar[bool] = False  # whether it acts on the numbers that command grippers as well
 
     def check(self, env: Interface) -> None:
-        axis = getattr(self, "axis", 0)
-        if not 0 <= axis < len(_arm_axes(env)):
-            raise ValueError(f"axis must be 0 to {len(_arm_axes(env)) - 1}, got {axis}")
+        check_number("axis", getattr(self, "axis", 0), low=0, high=len(_arm_axes(env)) - 1, whole=True)
 
     @abstractmethod
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
@@ -81,7 +80,7 @@ class ActionBias(ActionFault):
     amount: float = within(0.3, low=-2, high=2)
 
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
-        commanded[self.axis] = commanded[self.axis] + self.amount
+        commanded[self.axis] += self.amount
         return commanded
 
 

@@ -105,14 +105,7 @@ class WeakGripper(GripperFault, EditingFault):
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
         model, loss = env.simulation.model, 1.0 - self.strength
-        motors = [
-            int(m)
-            for robot in env.robosuite_env.robots
-            for arm in robot.arms
-            for m in robot._ref_joint_gripper_actuator_indexes[arm] or ()
-        ]
-
-        def weaken(parameters: Floats) -> Floats:
-            return parameters * (1.0 - loss)
-
-        return [(model.actuator_gainprm, motors, weaken), (model.actuator_biasprm, motors, weaken)]
+        arms = [robot._ref_joint_gripper_actuator_indexes[arm] or () for robot, arm in env.simulation.parts]
+        motors = [int(motor) for arm in arms for motor in arm]
+        parameters = model.actuator_gainprm, model.actuator_biasprm
+        return [(array, motors, lambda nominal: nominal * (1.0 - loss)) for array in parameters]

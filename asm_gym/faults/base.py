@@ -145,9 +145,7 @@ class JointFault(Fault):
     channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")  # those in which it shows first
 
     def check(self, env: RobosuiteEnv) -> None:
-        count = len(env.motors)
-        if not 0 <= self.joint < count:
-            raise ValueError(f"joint must be 0 to {count - 1} for {env.measured_spec.source}, got {self.joint}")
+        check_number(f"joint of {env.measured_spec.source}", self.joint, low=0, high=len(env.motors) - 1, whole=True)
 
     def labels(self, env: Interface) -> frozenset[str]:
         return frozenset(env.measured_spec.labels[self.element(env, name)] for name in self.channels)
@@ -179,8 +177,7 @@ def _check(parameter: Field[Any], value: Any) -> None:
 def along(direction: Vector3) -> Floats:
     """Return a direction (3,) at length 1."""
     way = np.asarray(direction, np.float64)
-    unit: Floats = way / float(np.linalg.norm(way))
-    return unit
+    return way / float(np.linalg.norm(way))
 
 
 def body_id(env: RobosuiteEnv, name: str) -> int:

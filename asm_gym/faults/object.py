@@ -10,6 +10,7 @@ import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, Vector3, along, within
+from asm_gym.validation import check_choice
 
 _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
 
@@ -37,8 +38,7 @@ class ObjectFault(Fault):
         if not found:
             raise ValueError(f"{env.task.name} has no loose object that {self.name} could act on")
         if self.object:
-            if self.object not in found:
-                raise ValueError(f"unknown object {self.object!r}; known: {', '.join(found)}")
+            check_choice("object", self.object, found)
             return found[self.object]
         # Those out of play lie metres away.
         near = [j for j in found.values() if np.abs(_position(env, j)[:2]).max() < 2.0]
@@ -47,13 +47,6 @@ class ObjectFault(Fault):
     def body_of(self, env: RobosuiteEnv) -> int:
         """Return the object's body."""
         return int(env.simulation.model.jnt_bodyid[self.joint_of(env)])
-
-    def friction_of(self, env: RobosuiteEnv) -> list[tuple[int, slice]]:
-        """Return the indices in ``geom_friction`` of the shapes that the object touches others with."""
-        model = env.simulation.model
-        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.body_of(env)]
-        touching = (model.geom_contype | model.geom_conaffinity) != 0
-        return [(int(g), slice(0, 1)) for g in np.flatnonzero(own & touching)]
 
     def move(self, env: RobosuiteEnv, position: Floats) -> None:
         """Put the object elsewhere, at rest."""
@@ -68,8 +61,7 @@ class ObjectFault(Fault):
 def _position(env: RobosuiteEnv, joint: int) -> Floats:
     """Return a view of the position (3,) of a free joint [m]."""
     start = env.simulation.model.jnt_qposadr[joint]
-    position: Floats = env.simulation.data.qpos[start : start + 3]
-    return position
+    return env.simulation.data.qpos[start : start + 3]
 
 
 class Slip(ObjectFault, EditingFault):
@@ -78,11 +70,14 @@ class Slip(ObjectFault, EditingFault):
     friction: float = within(0.05, above=0, high=10)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        model, entries = env.simulation.model, self.friction_of(env)
+        model = env.simulation.model
+        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.body_of(env)]
+        touching = (model.geom_contype | model.geom_conaffinity) != 0
+        geoms = np.flatnonzero(own & touching).tolist()
         return [
-            (model.geom_friction, list(entries), lambda mu: mu * (self.friction / mu)),
+            (model.geom_friction, [(geom, slice(0, 1)) for geom in geoms], lambda mu: mu * (self.friction / mu)),
             # Between two surfaces the higher friction counts, unless one has priority.
-            (model.geom_priority, [geom for geom, _ in entries], lambda priority: priority + 1),
+            (model.geom_priority, geoms, lambda priority: priority + 1),
         ]
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.base import LONGEST, Clock, Floats, HookedFault, Interface, JointFault, within
+from asm_gym.validation import check_choice, check_number
 
 
 class SensorFault(HookedFault):
@@ -33,14 +34,12 @@ class SensorFault(HookedFault):
 
     def where(self, env: Interface) -> NDArray[np.intp]:
         """Return the indices of the channel's numbers in a measured row."""
-        slices = env.measured_spec.slices
-        if self.channel not in slices:
-            raise ValueError(f"unknown channel {self.channel!r}; known: {', '.join(slices)}")
-        span = np.arange(slices[self.channel].start, slices[self.channel].stop)
+        spec = env.measured_spec
+        check_choice("channel", self.channel, spec.slices)
+        span = np.arange(spec.size)[spec.slices[self.channel]]
         if self.element is None:
             return span
-        if not 0 <= self.element < len(span):
-            raise ValueError(f"element of {self.channel} must be 0 to {len(span) - 1}, got {self.element}")
+        check_number(f"element of {self.channel}", self.element, low=0, high=len(span) - 1, whole=True)
         return span[[self.element]]
 
     def labels(self, env: Interface) -> frozenset[str]:
@@ -108,8 +107,7 @@ class Spikes(SensorFault):
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
         rng = self.rng(2 + k)
         hit = rng.random(len(true)) < self.probability
-        off: Floats = self.amount * hit * rng.choice([-1.0, 1.0], len(true))
-        return true + off
+        return true + self.amount * hit * rng.choice([-1.0, 1.0], len(true))
 
 
 class Dropout(SensorFault):

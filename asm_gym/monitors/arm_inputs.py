@@ -120,5 +120,4 @@ def judged_by_values(spec: StreamSpec) -> bool:
 
 def motion(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of positions and speeds, by their names."""
-    found: NDArray[np.intp] = np.union1d(_named(spec, POSITION), _named(spec, SPEED)).astype(np.intp)
-    return found
+    return np.union1d(_named(spec, POSITION), _named(spec, SPEED)).astype(np.intp)

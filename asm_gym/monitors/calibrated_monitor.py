@@ -380,8 +380,7 @@ class CalibratedMonitor:
 
     def _placed(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share of each number (B, D) from that of each error (B, X)."""
-        shares: NDArray[np.float64] = parts @ self._places
-        return shares
+        return parts @ self._places
 
     def _place_errors(self) -> None:
         """Find the columns of errors, once the model knows them."""

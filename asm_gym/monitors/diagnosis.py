@@ -95,8 +95,7 @@ class Readout:
 
     def __call__(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the probabilities (N, C) of ``CLASSES`` for evidence (N, F)."""
-        p: NDArray[np.float64] = softmax((evidence - self.mean) / self.spread @ self.weights.T + self.bias, axis=-1)
-        return p
+        return softmax((evidence - self.mean) / self.spread @ self.weights.T + self.bias, axis=-1)
 
     @classmethod
     def shipped(cls) -> Self:

@@ -140,8 +140,7 @@ class NeuralASM(CalibratedMonitor):
     @typed
     def load(cls, path: str | Path) -> Self:
         """Read what ``save`` wrote. Raises FileNotFoundError, or ValueError for a file that is damaged or foreign."""
-        memory: Self = restored(path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how))
-        return memory
+        return restored(path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how))
 
     @classmethod
     @typed

@@ -69,13 +69,11 @@ class MonitorKind:
         if not self._whole:
             return CalibratedMonitor(own, *map(part, self.detection_classes), seed=hyperparameters.get("seed", 0))
         used = self.detection if self.detection in own.detections else part(self.detection_classes[0])
-        monitor: CalibratedMonitor = own if used == own.detection.name else own.with_detection(used)
-        return monitor
+        return own if used == own.detection.name else own.with_detection(used)
 
     def load(self, path: str | Path) -> CalibratedMonitor:
         """Read what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
-        monitor: CalibratedMonitor = restored(path, read_checkpoint(path, self.model_class.kind), self)
-        return monitor
+        return restored(path, read_checkpoint(path, self.model_class.kind), self)
 
     @property
     def _whole(self) -> bool:
@@ -206,7 +204,4 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(str(read_header(path).get("kind")))
     saved = read_checkpoint(path, kind.model_class.kind)
-    monitor: CalibratedMonitor = restored(
-        path, saved, replace(kind, detection=saved.header.get("detection", kind.detection))
-    )
-    return monitor
+    return restored(path, saved, replace(kind, detection=saved.header.get("detection", kind.detection)))

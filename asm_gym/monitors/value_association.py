@@ -98,8 +98,7 @@ class ValueAssociation(ScaledModel):
     def error_columns(self) -> NDArray[np.intp]:
         if not self.learned_:
             return self.spec.sensory
-        columns: NDArray[np.intp] = self.spec.sensory[self._values]
-        return columns
+        return self.spec.sensory[self._values]
 
     @property
     def links(self) -> BodyModel | None:
@@ -209,8 +208,7 @@ class ValueAssociation(ScaledModel):
 
         def solved(f: int, used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
             gram = grams[f][np.ix_(used, used)] + penalty * np.eye(len(used))
-            found: Floats = np.linalg.solve(gram, crosses[f][np.ix_(used, mine)])  # (U, M)
-            return found
+            return np.linalg.solve(gram, crosses[f][np.ix_(used, mine)])  # (U, M)
 
         def unseen(used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
             errors = x[:, mine].copy()  # (N, M)
@@ -280,8 +278,7 @@ def _folds(lengths: Sequence[int]) -> NDArray[np.intp]:
     """Return the fold (N,) of each row: whole episodes, or blocks where they are few."""
     if len(lengths) >= FOLDS:
         return np.repeat(np.arange(len(lengths)) % FOLDS, lengths)
-    blocks: NDArray[np.intp] = np.arange(sum(lengths), dtype=np.intp) * FOLDS // max(sum(lengths), 1)
-    return blocks
+    return np.arange(sum(lengths), dtype=np.intp) * FOLDS // max(sum(lengths), 1)
 
 
 def _equations(z: Floats, x: Floats, fold: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -297,8 +294,7 @@ def _equations(z: Floats, x: Floats, fold: NDArray[np.intp]) -> tuple[Floats, Fl
 def averaged(left: Floats, window: int) -> Floats:
     """Return the mean (T, V) of the last rows of errors (T, V) of an episode; before the first they are 0."""
     total = np.cumsum(np.vstack([np.zeros((window, left.shape[1])), left]), axis=0)
-    mean: Floats = (total[window:] - total[:-window]) / window
-    return mean
+    return (total[window:] - total[:-window]) / window
 
 
 def _far(given: _Fitted, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> tuple[Floats, Floats]:
@@ -314,11 +310,9 @@ def _far(given: _Fitted, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> 
 
 def inverse(gram: Floats) -> Floats:
     """Return (ZᵀZ/N + λ)⁻¹ of ZᵀZ/N (I, I)."""
-    found: Floats = np.linalg.inv(gram + STIFFNESS * np.eye(len(gram)))
-    return found
+    return np.linalg.inv(gram + STIFFNESS * np.eye(len(gram)))
 
 
 def squares(z: Floats, matrix: Floats) -> Floats:
     """Return zᵀ M z of each row (N,)."""
-    found: Floats = ((z @ matrix) * z).sum(axis=1)
-    return found
+    return ((z @ matrix) * z).sum(axis=1)

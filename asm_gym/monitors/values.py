@@ -115,8 +115,7 @@ class Values(NamedTuple):
             return np.ones(len(rows))
         _, read, known = read_next(_senses(self.monitor), state.model.history, rows)
         f = self.usual + squares(_with_one(read.inputs), self.leverage)
-        root: NDArray[np.float64] = np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
-        return root
+        return np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
 
 
 def _monitor(spec: StreamSpec, seed: int, urdf: str) -> CalibratedMonitor:

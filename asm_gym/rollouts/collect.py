@@ -51,8 +51,7 @@ def _latest(name: str, key: object, make: Callable[[], Any]) -> Any:
 
 def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
     """Return this process's environment: making one costs as much as an episode, and a seeded reset restores it."""
-    made: gym.Env[Any, Any] = _latest("environment", (env_id, settings), lambda: gym.make(env_id, **dict(settings)))
-    return made
+    return _latest("environment", (env_id, settings), lambda: gym.make(env_id, **dict(settings)))
 
 
 def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tuple[Fault, ...]:
@@ -116,8 +115,7 @@ def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Polic
     policy: Any = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
     if hasattr(policy, "set_random_seed"):
         policy.set_random_seed(seed)
-    made: Policy = policy
-    return made
+    return policy
 
 
 def record_stream(trial: Trial, config: RolloutConfig) -> Episode:

@@ -41,8 +41,7 @@ class Style:
     def drifted(self, drift: Vector, rng: np.random.Generator) -> Vector:
         """Return the next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
         rho = 0.78
-        step: Vector = rho * drift + self.noise * np.sqrt(1 - rho**2) * rng.standard_normal(len(drift))
-        return step
+        return rho * drift + self.noise * np.sqrt(1 - rho**2) * rng.standard_normal(len(drift))
 
 
 class ObservationReader:

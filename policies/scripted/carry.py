@@ -199,8 +199,7 @@ class CarryExpert(Expert):
             return target
         wrist = self._wrist(observation)
         left = wrist - wrapped(wrist - left)
-        first: Vector = about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
-        return first
+        return about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
 
     def _wrist(self, observation: Any) -> float:
         """Return the angle of the arm's last joint [rad]."""

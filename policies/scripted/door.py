@@ -30,14 +30,12 @@ class _Hardware(NamedTuple):
     def grip_at(self, turned: float, opened: float) -> Vector:
         """Return where (3,) to hold the handle, when it is pressed and the door is open by these angles [rad]."""
         held = self.pivot + about(self.axis, turned) @ (self.grip - self.pivot)
-        grip: Vector = self.hinge + about(UP, opened) @ (held - self.hinge)
-        return grip
+        return self.hinge + about(UP, opened) @ (held - self.hinge)
 
     def held(self, turned: float) -> Vector:
         """Return the hand (3, 3) on the handle of the closed door, its y axis down: else a joint meets its stop."""
         z, y = -self.normal, np.array([0.0, 0.0, -1.0])
-        held: Vector = about(self.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
-        return held
+        return about(self.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
 
 
 class _Scene(NamedTuple):
@@ -117,16 +115,14 @@ class DoorExpert(Expert):
     def _facing(state: State, scene: _Scene) -> Vector:
         """Return the hand (3, 3) before the door, fingers above and below the handle; it turns with what it holds."""
         held = state.plan.held(state.plan.sign * scene.turned if state.phase >= TURN else 0.0)
-        facing: Vector = about(UP, scene.opened) @ held
-        return facing
+        return about(UP, scene.opened) @ held
 
     @staticmethod
     def _rolling(hardware: _Hardware, hand: Vector, facing: Vector) -> Vector:
         """Return where (3, 3) to turn first on the way to ``facing``, whose shortest way may lead any way round."""
         pressed = hardware.held(_TURNED)
         left = _roll(hand, pressed) + _roll(pressed, facing)
-        first: Vector = facing @ about(UP, left - np.clip(left, -_ROLL, _ROLL))
-        return first
+        return facing @ about(UP, left - np.clip(left, -_ROLL, _ROLL))
 
 
 def _roll(hand: Vector, to: Vector) -> float:

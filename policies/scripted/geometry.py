@@ -47,8 +47,7 @@ def about(axis: Any, angle: float) -> Vector:
     """Return the rotation (3, 3) about a unit ``axis`` by ``angle`` [rad] (Rodrigues)."""
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn: Vector = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
-    return turn
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
 
 
 def about_vertical(angle: float) -> Vector:
@@ -74,8 +73,7 @@ def angle_between(a: Vector, b: Vector) -> float:
 
 def flattest_side(turned: Vector) -> Vector:
     """Return the axis (3,) of an orientation (3, 3) that lies flattest."""
-    side: Vector = turned[:, int(np.abs(turned[2]).argmin())]
-    return side
+    return turned[:, int(np.abs(turned[2]).argmin())]
 
 
 def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:

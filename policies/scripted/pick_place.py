@@ -96,8 +96,7 @@ class PickPlaceExpert(CarryExpert):
         body = model.body(f"{name}_main").id
         (geom,) = (g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 0)
         turn = matrix(model.geom_quat[geom][[1, 2, 3, 0]])
-        half: Vector = np.abs(turn) @ model.geom_aabb[geom, 3:]
-        return half
+        return np.abs(turn) @ model.geom_aabb[geom, 3:]
 
 
 def _closing(half: Vector, turned: Vector, to_walls: Vector, round_: bool) -> Vector:

@@ -43,13 +43,11 @@ class Swaying(StatefulPolicy):
 
     def intended(self, observation: Any) -> Floats:
         """Return the action (A,) before noise."""
-        wave: Floats = self.middle + self.half * self.width * self.sine()
-        return wave
+        return self.middle + self.half * self.width * self.sine()
 
     def sine(self) -> Floats:
         """Return the present sines (A,)."""
-        now: Floats = np.sin(2 * np.pi * self.frequency * self.t + self.phase)
-        return now
+        return np.sin(2 * np.pi * self.frequency * self.t + self.phase)
 
     def begin(self, observation: Any) -> None:
         return None

@@ -86,5 +86,4 @@ class WipeExpert(Expert):
 
 def _left(state: State, scene: _Scene) -> Vector:
     """Return the marks (M, 3) that are still on the table, in the order of the trace [m]."""
-    left: Vector = state.plan.dirt[scene.dirty[state.plan.order]]
-    return left
+    return state.plan.dirt[scene.dirty[state.plan.order]]

@@ -204,8 +204,7 @@ class GRU(TorchModel):
             mean, log_variance, _ = module(x)
             off = (padded([readings[i].changes for i in chosen])[0] - mean) * torch.exp(-0.5 * log_variance)
             huber = nn.functional.huber_loss(off, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR)
-            likely: Tensor = ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
-            return likely
+            return ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
 
         train_on_episodes(module, loss, len(readings), rng, progress)
 
