@@ -59,13 +59,9 @@ class Checkpoint(NamedTuple):
 def write_checkpoint(
     path: str | Path, kind: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Write a checkpoint; a reader sees the old file or the new one, never half of it.
+    """Write a checkpoint of a ``kind``, such as ``neural_asm``; ``header`` is JSON-serialisable.
 
-    Args:
-        path: of the file; missing folders are made.
-        kind: what it is a checkpoint of, for example ``neural_asm``.
-        header: JSON-serialisable.
-        arrays: of numbers.
+    A reader sees the old file or the new one, never half of it.
     """
     held = {name: np.asarray(array) for name, array in arrays.items()}
     declared = {name: [array.dtype.str, *array.shape] for name, array in held.items()}
@@ -126,10 +122,7 @@ def _opened(
 ) -> Iterator[zipfile.ZipFile]:
     """Open a zip whose members are checked before anything is read; its errors become one line that names it.
 
-    Args:
-        path: of a regular file.
-        what: is wrong with it, in the message.
-        expanded: largest size of its content, in sizes of the file; 1 where nothing may be compressed.
+    Its content is at most ``expanded`` sizes of the file; at 1 nothing may be compressed.
     """
     try:
         size = regular_file(path)

@@ -26,13 +26,7 @@ _REGISTRIES: dict[str, Registry[Any]] = {}
 
 
 class Registry(dict[str, Row]):
-    """Rows by name.
-
-    Args:
-        what: a row is called, in messages.
-        where: ``module:name`` of the registry, by which other processes find it.
-        rows: rows of the package itself.
-    """
+    """Rows by name, called ``what`` in messages; ``where`` is ``module:name`` of the registry itself."""
 
     def __init__(self, what: str, where: str, rows: Mapping[str, Row] | None = None) -> None:
         super().__init__(rows or {})

@@ -19,21 +19,13 @@ ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")  # arms that the
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """One task.
+    """One task."""
 
-    Args:
-        name: robosuite's name; the Gymnasium id is ``asm_gym/<name>-v0``.
-        horizon: control steps before an episode is truncated, at the default 20 Hz.
-        success: meaning of ``info["success"]``.
-        arms: number of robots.
-        draws_shapes: robosuite draws the shapes of its objects when it loads the model; see ``asm_gym.envs.shapes``.
-    """
-
-    name: str
-    horizon: int
-    success: str
-    arms: int = 1
-    draws_shapes: bool = False
+    name: str  # robosuite's; the Gymnasium id is ``asm_gym/<name>-v0``
+    horizon: int  # control steps before an episode is truncated, at the default 20 Hz
+    success: str  # meaning of ``info["success"]``
+    arms: int = 1  # number of robots
+    draws_shapes: bool = False  # of its objects, when robosuite loads the model; see ``asm_gym.envs.shapes``
 
     @property
     def id(self) -> str:

@@ -168,13 +168,9 @@ def _hint(about: Any) -> Callable[[str], str]:
 def run(
     name: str, kind: type[Args], work: Callable[[Args, Console], int | None], argv: Sequence[str] | None = None
 ) -> int:
-    """Run one command and return its exit code.
+    """Run one command and return its exit code, which ``work`` returns; None is 0.
 
-    Args:
-        name: command, as typed after ``asm-gym``.
-        kind: dataclass of its options; the docstring of its module is the help text above them.
-        work: function of the options and a console; returns the exit code, None is 0.
-        argv: options as typed; those of this process by default.
+    The docstring of the module of ``kind``, the dataclass of options, is the help text above them.
     """
     from rich.console import Console
 

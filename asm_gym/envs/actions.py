@@ -15,13 +15,7 @@ from asm_gym.validation import as_float32
 
 
 class Actions:
-    """The actions of one environment.
-
-    Args:
-        env: robosuite's environment.
-        task: its name.
-        controller: of the arms, by name.
-    """
+    """The actions of robosuite's environment of a task, under a controller by name."""
 
     def __init__(self, env: Any, task: str, controller: str) -> None:
         self._task, self._controller = task, controller

@@ -188,11 +188,7 @@ def _joints_between(model: mujoco.MjModel, body: int) -> list[int]:
 class NominalDynamics:
     """The robot's own model of its dynamics, frozen when the model was loaded.
 
-    Whoever edits masses in the live model edits the world, and not the robot's knowledge of itself.
-
-    Args:
-        model, views: the live one, and its arrays.
-        robots: (R,) the bodies of the robots.
+    Whoever edits masses in the live model edits the world, and not the knowledge of the robots of bodies (R,).
     """
 
     _INERTIA = ("body_mass", "body_inertia", "body_ipos", "body_iquat")

@@ -76,12 +76,7 @@ _TURNING = {"m": "rad", "m/s": "rad/s", "N": "N m"}  # units of a gripper whose 
 
 
 class Proprioception:
-    """Everything that the arms of one loaded model measure.
-
-    Args:
-        parts: robosuite's robots, and which arm of each.
-        views: of the model and its data.
-    """
+    """Everything that the arms of one loaded model measure."""
 
     def __init__(self, parts: list[tuple[Any, str]], views: Views, data: mujoco.MjData) -> None:
         shape = (len(parts), kernels.SAMPLE)
@@ -162,26 +157,17 @@ class Reading(NamedTuple):
 
 
 class Senses:
-    """Reads the sensors of one environment.
-
-    Args:
-        channels: of the arms and objects.
-        actions: size of an action.
-        dt, source: of the stream's spec.
-        groups: the channel groups that the stream carries.
-        noise: scale of the sensors' noise; at 0 readings are exact, without resolution.
-        flat: observations are one array, not a dict of named ones.
-    """
+    """Reads the sensors of one environment."""
 
     def __init__(
         self,
-        channels: Sequence[Channel],
-        actions: int,
+        channels: Sequence[Channel],  # of the arms and objects
+        actions: int,  # size of an action
         dt: float,
         source: str,
-        groups: Sequence[str],
-        noise: float,
-        flat: bool,
+        groups: Sequence[str],  # of the channels that the stream carries
+        noise: float,  # scale of the sensors' noise; at 0 readings are exact, without resolution
+        flat: bool,  # observations are one array, not a dict of named ones
     ) -> None:
         spec = self.measured_spec = StreamSpec((*channels, Channel("action", actions, "1", 0.0, MOTOR)), dt, source)
         """Everything that is measured, whether or not the stream carries it."""

@@ -38,11 +38,7 @@ class Simulation:
     """Runs control steps of one loaded model.
 
     robosuite's OSC_POSE and JOINT_POSITION controllers on one-armed robots run compiled; every other controller is
-    robosuite's own code, between the same physics substeps.
-
-    Args:
-        env: robosuite's environment, its episode just reset.
-        substeps: physics substeps of a control step.
+    robosuite's own code, between the same physics substeps. ``env`` is robosuite's, just reset.
     """
 
     def __init__(self, env: Any, substeps: int) -> None:

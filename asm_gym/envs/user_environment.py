@@ -16,12 +16,7 @@ UNITS = {"_cos": "1", "_sin": "1", "joint_pos": "rad", "joint_vel": "rad/s", "jo
 
 
 class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """``make(robots=…, …)``, observed by all that it senses; what the robots sense, and the action, are its stream.
-
-    Args:
-        make: a class derived from ``robosuite.environments.manipulation.manipulation_env.ManipulationEnv``.
-        arguments: of the class, such as ``robots``, ``controller_configs`` and ``control_freq``.
-    """
+    """``make(robots=…, …)``, observed by all that it senses; what the robots sense, and the action, are its stream."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
 

@@ -41,19 +41,14 @@ IDEAL = "ideal observer"
 
 
 class Detectability(NamedTuple):
-    """What the ideal observer could detect of one faulty episode.
-
-    Attributes:
-        separation: S at the end of the window.
-        delay: time from the onset until the observer is sure [s]; None if never.
-    """
+    """What the ideal observer could detect of one faulty episode."""
 
     task: str
     kind: str
     severity: str
     seed: int
-    separation: float
-    delay: float | None
+    separation: float  # S at the end of the window
+    delay: float | None  # time from the onset until the observer is sure [s]; None if never
 
 
 def noise_floor(noise: Array, streams: list[Array]) -> Any:
@@ -63,13 +58,7 @@ def noise_floor(noise: Array, streams: list[Array]) -> Any:
 
 
 def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[np.float64]:
-    """Return (T - onset,) S from the onset up to each step; the shorter episode decides T.
-
-    Args:
-        faulty: (T, D).
-        twin: (T', D), of the same seed.
-        noise: (D,) standard deviations, all positive.
-        onset: the first step with the fault.
+    """Return (T - onset,) S of a faulty episode (T, D) and its twin, from the onset up to each step, in noise (D,).
 
     Raises:
         ValueError: the two differ before the onset, so they are no twins.
@@ -150,21 +139,13 @@ class Bound(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkResult:
-    """The scores of monitors on a run's episodes, and the bound of the ideal observer.
+    """The scores of monitors on a run's episodes, and the bound of the ideal observer."""
 
-    Args:
-        monitors: by name, on all kinds of fault, judged at the run's own false-alarm rate.
-        detectability: of every faulty episode.
-        rate: the run's own false-alarm rate.
-        window_s: an alarm within this time of the onset is a detection [s].
-        left_out: numbers of nominal episodes in which the policy failed, and crashed.
-    """
-
-    monitors: Mapping[str, DetectionMetrics]
-    detectability: Sequence[Detectability]
-    rate: float
-    window_s: float
-    left_out: tuple[int, int] = (0, 0)
+    monitors: Mapping[str, DetectionMetrics]  # by name, on all kinds of fault
+    detectability: Sequence[Detectability]  # of every faulty episode
+    rate: float  # false-alarm rate at which monitors are judged
+    window_s: float  # an alarm within this time of the onset is a detection [s]
+    left_out: tuple[int, int] = (0, 0)  # numbers of nominal episodes in which the policy failed, and crashed
 
     @property
     def promise(self) -> AlarmRate:

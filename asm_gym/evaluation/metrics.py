@@ -124,21 +124,13 @@ class Outcomes(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DetectionMetrics:
-    """Scored episodes of one monitor summed up: a row of a table, a curve of a figure.
+    """Scored episodes of one monitor summed up: a row of a table, a curve of a figure."""
 
-    Args:
-        name: of a condition, or of a monitor.
-        traces: of any kind of fault and response.
-        nominal: episodes that the faulty ones are compared with.
-        window_s: an alarm within this time of the onset is a detection [s].
-        calibration: other thresholds to detect by.
-    """
-
-    name: str
-    traces: Sequence[ScoredEpisode]
-    nominal: Sequence[ScoredEpisode]
-    window_s: float
-    calibration: Calibration = field(default_factory=Calibration)
+    name: str  # of a condition, or of a monitor
+    traces: Sequence[ScoredEpisode]  # of any kind of fault and response
+    nominal: Sequence[ScoredEpisode]  # episodes that the faulty ones are compared with
+    window_s: float  # an alarm within this time of the onset is a detection [s]
+    calibration: Calibration = field(default_factory=Calibration)  # other thresholds to detect by
 
     def only(self, kinds: Collection[Kind]) -> DetectionMetrics:
         """Return the same of these kinds and severities of fault."""

@@ -34,13 +34,10 @@ def write_report(
     drawn: Mapping[str, Figure],
     details: Mapping[str, object] | None = None,
 ) -> Path:
-    """Write the report; the file appears when it is complete.
+    """Write an HTML file, which appears when it is complete.
 
     Args:
-        path: the HTML file.
-        title: one line.
         intro: plain text; an empty line starts a new paragraph.
-        tables: in order.
         drawn: figures by caption.
         details: how to make the report again: arguments, seed, versions.
     """

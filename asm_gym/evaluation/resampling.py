@@ -26,17 +26,11 @@ DRAWS = 400  # bootstrap resamples
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The thresholds of a monitor, and the scores that they were set on.
-
-    Attributes:
-        thresholds: by the promised rate of false alarms.
-        maxima: (n,) the greatest surprise of each calibration episode.
-        blocks: the maxima by the hour; None if not calibrated by the hour.
-    """
+    """The thresholds of a monitor, and the scores that they were set on."""
 
     thresholds: Mapping[AlarmRate, float] = field(default_factory=dict)
-    maxima: Floats = field(default_factory=lambda: np.zeros(0))
-    blocks: Blocks | None = None
+    maxima: Floats = field(default_factory=lambda: np.zeros(0))  # (n,) the greatest surprise of each episode
+    blocks: Blocks | None = None  # the maxima by the hour; None if not calibrated by the hour
 
     def resampled(self, rng: np.random.Generator) -> dict[AlarmRate, float]:
         """Return the thresholds from resampled episodes and blocks; the hours stay as they were."""
@@ -50,15 +44,10 @@ class Calibration:
 
 
 class Draws(NamedTuple):
-    """Results of one monitor in each of R resamples.
+    """Results of one monitor in each of R resamples."""
 
-    Attributes:
-        auroc: (R,) over matched steps, the mean over kinds.
-        found: (R,) share of faults detected within the window, by the promised rate.
-    """
-
-    auroc: Floats
-    found: Mapping[AlarmRate, Floats]
+    auroc: Floats  # (R,) over matched steps, the mean over kinds
+    found: Mapping[AlarmRate, Floats]  # (R,) share of faults detected within the window, by the promised rate
 
 
 def interval(value: float, draws: Floats) -> Estimate:

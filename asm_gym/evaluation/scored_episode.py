@@ -41,41 +41,26 @@ class ScoredEpisode:
 
     Row t was sensed from ``t * dt`` to ``(t + 1) * dt``. A fault first active in row t began at ``t * dt``; an alarm in
     row t was raised at ``(t + 1) * dt``.
-
-    Attributes:
-        kind: ``"nominal"``, or the name of the fault; ``severity`` of the fault.
-        seed: of ``reset``; twins share it.
-        dt: period of the rows [s].
-        threshold: surprise above it is an alarm.
-        surprise: (T,) ``inf`` where the stream was not finite, never NaN.
-        onset: the first row with a fault; None without one.
-        acting: ``"policy alone"`` where the monitor only watched, else the response, such as ``"hold"``.
-        affected_channels: those in which the fault shows first.
-        top_channel: the channel with the greatest share of surprise at ``first_alarm``; empty without an alarm.
-        excused: by event (knock, stop), (T,) the surprise that it excused; 0 in other rows.
-        attribution, channels: (T, D) the shares of D channels in the surprise, and their names; kept for figures alone.
-        fault: (T,) the ground truth, for figures alone.
-        stream: (T, D) sensed values, where they are drawn.
     """
 
-    kind: str
-    seed: int
-    dt: float
-    threshold: float
-    surprise: Floats
-    onset: int | None = None
+    kind: str  # ``"nominal"``, or the name of the fault
+    seed: int  # of ``reset``; twins share it
+    dt: float  # period of the rows [s]
+    threshold: float  # surprise above it is an alarm
+    surprise: Floats  # (T,) ``inf`` where the stream was not finite, never NaN
+    onset: int | None = None  # the first row with a fault; None without one
     severity: str = ""
     task: str = ""
     monitor: str = ""
-    acting: str = POLICY_ALONE
-    affected_channels: frozenset[str] = frozenset()
-    top_channel: str = ""
+    acting: str = POLICY_ALONE  # else the response to an alarm, such as ``"hold"``
+    affected_channels: frozenset[str] = frozenset()  # those in which the fault shows first
+    top_channel: str = ""  # with the greatest share of surprise at ``first_alarm``; empty without an alarm
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
-    excused: Mapping[str, Floats] = field(default_factory=dict)
-    attribution: Floats | None = None
-    channels: tuple[str, ...] = ()
-    fault: NDArray[np.bool_] | None = None
-    stream: Floats | None = None
+    excused: Mapping[str, Floats] = field(default_factory=dict)  # (T,) surprise that a knock, or a stop, excused
+    attribution: Floats | None = None  # (T, D) shares of the channels in the surprise, for figures alone
+    channels: tuple[str, ...] = ()  # D names
+    fault: NDArray[np.bool_] | None = None  # (T,) the ground truth, for figures alone
+    stream: Floats | None = None  # (T, D) sensed values, where they are drawn
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):

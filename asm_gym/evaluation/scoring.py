@@ -37,17 +37,11 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 
 
 class Recordings(NamedTuple):
-    """The recordings of a run.
+    """The recordings of a run."""
 
-    Attributes:
-        roles: recordings by role, without failed nominal episodes, and without scenes in which the robot crashes.
-        left_out: numbers of nominal episodes that failed, and of scenes with a crash.
-        twins: every episode of the role nominal: a faulty one equals its twin until the onset.
-    """
-
-    roles: dict[str, list[Episode]]
-    left_out: tuple[int, int]
-    twins: list[Episode]
+    roles: dict[str, list[Episode]]  # without failed nominal episodes, and without scenes in which the robot crashes
+    left_out: tuple[int, int]  # numbers of nominal episodes that failed, and of scenes with a crash
+    twins: list[Episode]  # all of the role nominal: a faulty episode equals its twin until the onset
 
     @classmethod
     def of(cls, recordings: Sequence[Episode]) -> Recordings:

@@ -59,25 +59,17 @@ REPEATS = 3  # equal readings of a noisy sensor after which it is stuck
 
 
 class Cause(NamedTuple):
-    """The likely cause of a surprise.
+    """The likely cause of a surprise."""
 
-    Attributes:
-        family: one of ``FAMILIES``.
-        part: such as ``encoder[3]`` or ``joint[3]``; may be empty.
-        probability: of the family, calibrated.
-        probabilities: of all families.
-        columns: (n,) of the stream, where the cause is a sensor.
-    """
-
-    family: str
-    part: str
-    probability: float
-    probabilities: dict[str, float]
-    columns: NDArray[np.intp]
+    family: str  # one of ``FAMILIES``
+    part: str  # such as ``encoder[3]`` or ``joint[3]``; may be empty
+    probability: float  # of the family, calibrated
+    probabilities: dict[str, float]  # of all families
+    columns: NDArray[np.intp]  # (n,) of the stream, where the cause is a sensor
 
 
 class Hypothesis(NamedTuple):
-    """Senses that may be wrong together."""
+    """Columns of the stream that may be wrong together."""
 
     evidence: str  # which of ``EVIDENCE`` it counts for
     part: str
@@ -132,11 +124,6 @@ class Diagnosis:
         return _hypotheses(self.completion)
 
     @cached_property
-    def _groups(self) -> list[NDArray[np.intp]]:
-        names = np.array([c.group for c in self.completion.spec.channels for _ in range(c.size)])
-        return [np.flatnonzero(names == group) for group in GROUPS]
-
-    @cached_property
     def _freed(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
         """Of each hypothesis the columns of y in it, and the inverse of their precision."""
         found = []
@@ -150,13 +137,7 @@ class Diagnosis:
     def evidence(
         self, lifted: NDArray[np.float64], attribution: NDArray[np.float64], missing: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, int]]:
-        """Return the evidence (F,), and the best hypothesis of each kind.
-
-        Args:
-            lifted: (T, Y) y of the last rows.
-            attribution: (D,) where the surprise is, of the last row.
-            missing: (D,) senses that are completed already, and so explain nothing.
-        """
+        """Return the evidence (F,) in y (T, Y), and the best hypothesis of each kind; see ``__call__``."""
         energy, left = self._explained(lifted[-WINDOW:])
         usual = len(self.completion.covariance)
         total, rest = energy.mean() + 1.0, np.maximum(left.mean(axis=0), 0.0) + 1.0
@@ -170,7 +151,8 @@ class Diagnosis:
         found = [explains[best[name]] if name in best else 0.0 for name in KINDS]
         shares = np.nan_to_num(attribution) / max(float(np.nan_to_num(attribution).sum()), 1e-12)
         alone = max(float(shares[columns].sum()) for _, columns in self.completion.sensors)
-        groups = [float(shares[columns].sum()) for columns in self._groups]
+        names = np.array([c.group for c in self.completion.spec.channels for _ in range(c.size)])
+        groups = [float(shares[names == group].sum()) for group in GROUPS]
         return np.array([*found, np.log(total / usual), alone, *groups]), best
 
     def _explained(self, lifted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -205,15 +187,11 @@ class Diagnosis:
             probabilities[family] += float(q)
         family = max(probabilities, key=lambda name: probabilities[name])
         which = max((q, name) for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True) if own == family)[1]
-        named = self._named(which, evidence, best)
-        columns = named.columns if named is not None and family == "sensor" else np.zeros(0, np.intp)
-        return Cause(family, named.part if named else "", probabilities[family], probabilities, columns)
-
-    def _named(self, which: str, evidence: NDArray[np.float64], best: dict[str, int]) -> Hypothesis | None:
-        """Return the hypothesis that explains most, of those of a class."""
         able = [kind for kind in CLASSES[which][1] if kind in best]
         most = max(able, key=lambda kind: evidence[EVIDENCE.index(kind)], default="")
-        return self.hypotheses[best[most]] if most else None
+        named = self.hypotheses[best[most]] if most else Hypothesis("", "", np.zeros(0, np.intp))
+        columns = named.columns if family == "sensor" else np.zeros(0, np.intp)
+        return Cause(family, named.part, probabilities[family], probabilities, columns)
 
     def _stuck(
         self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
@@ -260,7 +238,5 @@ def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
 
 def as_info(cause: Cause | None) -> dict[str, Any]:
     """Return ``info["asm"]["cause"]``; all empty where there is none."""
-    if cause is None:
-        return {"family": "", "part": "", "probability": 0.0, "probabilities": {}}
-    named = {"family": cause.family, "part": cause.part, "probability": cause.probability}
-    return {**named, "probabilities": cause.probabilities}
+    family, part, probability, probabilities, _ = cause or ("", "", 0.0, {}, None)
+    return {"family": family, "part": part, "probability": probability, "probabilities": probabilities}

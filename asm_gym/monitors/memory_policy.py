@@ -63,14 +63,6 @@ class CommandReadout:
         return action, grip
 
 
-class ActingState(NamedTuple):
-    """Where the policy is: a value."""
-
-    memory: State
-    action: NDArray[np.float32]  # (A,) commanded last
-    grip: Grip | None = None  # what grippers are told; None before the first step
-
-
 class NeuralASMPolicy(StatefulPolicy):
     """Drives an environment by a memory's motor prediction.
 
@@ -111,18 +103,19 @@ class NeuralASMPolicy(StatefulPolicy):
         self._readout = CommandReadout(env)
         memory.initial_state()
 
-    def begin(self, observation: Any) -> ActingState:
-        return ActingState(self.memory.initial_state(), np.zeros(len(self.memory.spec.motor), np.float32))
+    def begin(self, observation: Any) -> tuple[State, NDArray[np.float32], Grip | None]:
+        """Return the memory's state, the last command (A,), and what grippers are told."""
+        return self.memory.initial_state(), np.zeros(len(self.memory.spec.motor), np.float32), None
 
-    def act(self, observation: Any, state: ActingState, deterministic: bool) -> tuple[NDArray[np.float32], ActingState]:
+    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the action (A,) that the memory expects, and the next state; nothing is drawn at random."""
-        sensed = [np.ravel(observation), np.ravel(state.action)]
-        measured = self._measures.measured if self._measures else np.concatenate(sensed)
+        memory, last, grip = state
+        measured = self._measures.measured if self._measures else np.concatenate([np.ravel(observation), last])
         row = np.zeros((1, self.memory.spec.size), np.float32)
         row[0, self._to] = measured[self._from]
-        memory, _ = self.memory.observe(state.memory, row)
-        action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
-        return action, ActingState(memory, action, grip)
+        memory, _ = self.memory.observe(memory, row)
+        action, grip = self._readout(self.memory.expected_action(memory)[0], grip)
+        return action, (memory, action, grip)
 
 
 def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
@@ -131,12 +124,8 @@ def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
     Further channels, another order, and objects of other tasks do not matter.
     """
     objects = [c.name for c in spec.channels if c.group == "object"]
-    harmless = {f"{name}: missing" for name in objects}
-    lines = [
-        line
-        for line in spec.difference(theirs)
-        if line not in harmless and not line.endswith(": new") and not line.startswith(("order: ", "dt: "))
-    ]
+    harmless = ("order: ", "dt: ", *(f"{name}: missing" for name in objects))
+    lines = [line for line in spec.difference(theirs) if not line.startswith(harmless) and not line.endswith(": new")]
     if spec.source and theirs.source and spec.source != theirs.source:
         lines.append(f"robot: {spec.source} against {theirs.source}")
     if objects and not any(name in theirs.slices for name in objects):

@@ -34,14 +34,13 @@ def rounded(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 def packed(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """Return the arrays as they are stored: weights in 8 bits where nothing is lost by it."""
-    found: Arrays = {}
-    for name, array in arrays.items():
-        if name in WEIGHTS and np.isfinite(array).all():
-            k, scale = _quantised(array)
-            if _weights(k, scale).tobytes() == array.tobytes():
+    found: Arrays = dict(arrays)
+    for name in WEIGHTS:
+        if name in arrays and np.isfinite(arrays[name]).all():
+            k, scale = _quantised(arrays[name])
+            if _weights(k, scale).tobytes() == arrays[name].tobytes():
+                del found[name]
                 found |= {name + BITS: k, name + SCALE: scale}
-                continue
-        found[name] = array
     return found
 
 

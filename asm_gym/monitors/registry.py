@@ -30,21 +30,14 @@ DETECTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class MonitorKind:
-    """How the monitors of one name are made and loaded.
+    """How the monitors of one name are made and loaded."""
 
-    Args:
-        model: the class of its model, or of the whole monitor; or ``module:class``, imported when it is needed.
-        own: the detection that its authors judged it by; fitted whichever is in use, so that one fit serves both.
-        detection: the one in use.
-    """
-
-    model: Any
-    own: str = "evidence"
-    detection: str = "evidence"
+    model: Any  # class of its model, or of the whole monitor; or ``module:class``, imported when it is needed
+    own: str = "evidence"  # detection that its authors judged it by; always fitted, so that one fit serves both
+    detection: str = "evidence"  # the one in use
 
     @property
     def model_class(self) -> Any:
-        """Of its model, or of the whole monitor."""
         return target(self.model)
 
     @property
@@ -56,7 +49,7 @@ class MonitorKind:
     @property
     def hyperparameters(self) -> tuple[str, ...]:
         """Names that ``make_monitor`` takes beside the spec."""
-        parts = [self.model_class] if self._whole else [self.model_class, *self.detection_classes]
+        parts = [self.model_class, *(() if self._whole else self.detection_classes)]
         return tuple(dict.fromkeys([*(n for part in parts for n in parameter_names(part)), "seed"]))
 
     def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:

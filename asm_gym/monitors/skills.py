@@ -25,22 +25,15 @@ def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
 
     ``info["skill"]`` is the skill of an episode. Only ``Surprise.skill`` depends on it.
 
-    Args:
-        memory: fitted; it is changed.
-        episodes: nominal ones.
-
     Raises:
         ValueError: an episode names none, or all name the same.
     """
     memory._require_fitted()
     check_nominal(episodes, memory.spec, memory.model.shortest)
-    names, model = [], memory.model
-    for n, episode in enumerate(episodes):
-        name = str(episode.info.get("skill", ""))
-        if not name:
-            raise ValueError(f"episode {n} does not say its skill: set info['skill']")
-        names.append(np.repeat(name, len(episode)))
-    known, skills = np.unique(np.concatenate(names), return_inverse=True)
+    names, model = [str(episode.info.get("skill", "")) for episode in episodes], memory.model
+    if not all(names):
+        raise ValueError(f"episode {names.index('')} does not say its skill: set info['skill']")
+    known, skills = np.unique(np.repeat(names, [len(e) for e in episodes]), return_inverse=True)
     if len(known) < 2:
         raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
     inputs = np.concatenate([model.senses_.read_episode(e.stream).inputs for e in episodes])

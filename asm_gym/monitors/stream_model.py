@@ -168,11 +168,11 @@ def _predicted(model: StreamModel, state: State, rows: NDArray[np.float64]) -> t
     errors, contexts = found[1]
     if np.shape(errors) != wanted:
         raise ValueError(f"{asked} errors {wanted}, got {np.shape(errors)}")
-    if np.ndim(contexts) != 2 or len(contexts) != len(rows):
-        raise ValueError(f"{asked} contexts ({len(rows)}, C), got {np.shape(contexts)}")
     if not np.isfinite(errors).all():
         raise ValueError(f"{asked} errors that are finite where the rows are")
-    return found[0], found[1]
+    if np.ndim(contexts) != 2 or len(contexts) != len(rows):
+        raise ValueError(f"{asked} contexts ({len(rows)}, C), got {np.shape(contexts)}")
+    return found
 
 
 def side_by_side(

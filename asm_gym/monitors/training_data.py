@@ -32,11 +32,9 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
         spec.require(episode.spec, f"episode {n}")
         if len(episode) < shortest:
             raise ValueError(f"episode {n} must be at least {shortest} steps long, got {len(episode)}")
-        bad = np.argwhere(~np.isfinite(episode.stream))
-        if len(bad):
-            step, column = bad[0]
-            label, value = spec.labels[column], episode.stream[step, column]
-            raise ValueError(f"episode {n}, step {step}, {label} must be finite, got {value}")
+        for step, column in np.argwhere(~np.isfinite(episode.stream)):
+            value = episode.stream[step, column]
+            raise ValueError(f"episode {n}, step {step}, {spec.labels[column]} must be finite, got {value}")
     # Beside a number out of all proportion its channel would look constant.
     if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
         return
@@ -44,13 +42,11 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
     low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
     reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
     for n, episode in enumerate(episodes):
-        wild = np.argwhere(np.abs(episode.stream - middle) > reach)
-        if len(wild):
-            step, column = wild[0]
-            label, value = episode.spec.labels[column], episode.stream[step, column]
+        for step, column in np.argwhere(np.abs(episode.stream - middle) > reach):
+            value = episode.stream[step, column]
             raise ValueError(
-                f"episode {n}, step {step}, {label} is {value:g}, where 98 % of all lie between {low[column]:g} and "
-                f"{high[column]:g}: leave the episode out"
+                f"episode {n}, step {step}, {spec.labels[column]} is {value:g}, where 98 % of all lie between "
+                f"{low[column]:g} and {high[column]:g}: leave the episode out"
             )
 
 
@@ -73,12 +69,7 @@ def hashes_of(episodes: Sequence[Episode]) -> Hashes:
 
 
 def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
-    """Raise ValueError for an episode that is given twice or was learned from.
-
-    Args:
-        episodes: to calibrate on.
-        learned: hashes of episodes that were learned from; None knows nothing.
-    """
+    """Raise ValueError for an episode that is given twice or whose hash is among those ``learned`` from."""
     known = [hashes for hashes in learned if hashes is not None]
     first: dict[float, int] = {}
     for n, own in enumerate(hashes_of(episodes)):

@@ -81,13 +81,7 @@ class State(NamedTuple):
 
 
 class Expert(StatefulPolicy):
-    """A scripted expert: phases of a plan, each with the command it gives and the condition that ends it.
-
-    Args:
-        env: one of the expert's task.
-        seed: of the noise and of the style drawn for each episode.
-        style: how much it varies.
-    """
+    """A scripted expert: phases of a plan, each with the command it gives and the condition that ends it."""
 
     pace: ClassVar[float]  # usual hand speed [action units]
 

@@ -30,33 +30,19 @@ _HANDLE = {"SquareNut": 0.054, "RoundNut": 0.06}  # from a nut's middle to that 
 
 
 class CarryTask(NamedTuple):
-    """What to carry where.
+    """What to carry where."""
 
-    Args:
-        name: of the object, as observations call it.
-        grip: (3,) where to hold it, in its own frame [m].
-        closing: (3,) along which of its own axes the fingers close; None where every direction does.
-        turns: after how much of a turn about the vertical the grasp is the same again [rad].
-        clearance: how far above its grip to come from [m].
-        place: (3,) where its origin is to go [m].
-        over: how far above ``place`` to carry it [m].
-        headings: those of its x axis that fit the place [rad]; empty where every one does.
-        heading_fit: how exactly it must have one of them before it is lowered [rad].
-        fit: how exactly it must stand over its place before it is lowered [m].
-        haste: with which share of the usual speed the hand comes down.
-    """
-
-    name: str
-    grip: Vector
-    closing: Vector | None
-    turns: float
-    clearance: float
-    place: Vector
-    over: float
-    headings: tuple[float, ...] = ()
-    heading_fit: float = 0.06
-    fit: float = 0.02
-    haste: float = 1.0
+    name: str  # of the object, as observations call it
+    grip: Vector  # (3,) where to hold it, in its own frame [m]
+    closing: Vector | None  # (3,) along which of its own axes the fingers close; None where every direction does
+    turns: float  # after how much of a turn about the vertical the grasp is the same again [rad]
+    clearance: float  # how far above its grip to come from [m]
+    place: Vector  # (3,) where its origin is to go [m]
+    over: float  # how far above ``place`` to carry it [m]
+    headings: tuple[float, ...] = ()  # those of its x axis that fit the place [rad]; empty where every one does
+    heading_fit: float = 0.06  # how exactly it must have one of them before it is lowered [rad]
+    fit: float = 0.02  # how exactly it must stand over its place before it is lowered [m]
+    haste: float = 1.0  # with which share of the usual speed the hand comes down
 
 
 class CarryScene(NamedTuple):

@@ -111,10 +111,7 @@ def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> tuple[Vector
     """Return along which direction (3,) to close, in the object's frame, and the palm's room by the walls then [m].
 
     Square to the object where there is room, else as far askew as it takes; square in corners, where nothing helps.
-
-    Args:
-        half, turned: half the object's size (3,) [m], and its orientation (3, 3).
-        to_walls: (2,) from its middle to the nearer walls of the bin [m].
+    ``half`` (3,) is half its size [m], ``to_walls`` (2,) the way from its middle to the nearer walls of the bin [m].
     """
     narrow = _narrow(half)
 

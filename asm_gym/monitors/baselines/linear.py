@@ -47,12 +47,7 @@ class _Filtered(NamedTuple):
 
 
 class Kalman(StreamModel):
-    """A steady-state Kalman filter; its errors are innovations in standard deviations.
-
-    Args:
-        spec: the stream it is to expect.
-        ridge: penalty on A, B and c, of the standardised inputs.
-    """
+    """A steady-state Kalman filter; ``ridge`` is the penalty on A, B and c, of the standardised inputs."""
 
     kind = "kalman"
 
@@ -135,14 +130,10 @@ class _Averaged(NamedTuple):
 
 
 class FrictionRule(StreamModel):
-    """Torque beyond friction; it needs channels of torque or current, and of speed or position.
-
-    Args:
-        spec: the stream it is to expect.
-        urdf: text of a body model, whose weight and inertia are no push either.
+    """Torque beyond friction, and beyond weight and inertia by the text of a body model, ``urdf``.
 
     Raises:
-        ValueError: the stream has none of them.
+        ValueError: the stream has no channels of torque or current, or none of speed or position.
     """
 
     kind = "friction_rule"
@@ -208,14 +199,7 @@ class FrictionRule(StreamModel):
 
 
 class _Limit(StreamModel):
-    """A constant prediction for some channels.
-
-    Args:
-        spec: of a stream that has them.
-
-    Raises:
-        ValueError: it has none of them.
-    """
+    """A constant prediction for some channels. Raises ValueError where the stream has none of them."""
 
     shortest = 1
     held_out = 0  # so few numbers are not learned by heart

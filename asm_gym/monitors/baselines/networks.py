@@ -108,11 +108,8 @@ def train_on_episodes(
     """Train by Adam, slowed down at every plateau of the fresh loss, until no gain is left; keep the best weights.
 
     Args:
-        module: the network.
         loss: of some episodes, by their numbers, while training or not.
         episodes: how many there are. A fifth is not trained on; with fewer than five all are trained on.
-        rng: of the order of episodes.
-        progress: called with the epochs done, and the most there can be.
     """
     order = rng.permutation(episodes).astype(np.intp)
     kept = episodes // FRESH
@@ -177,12 +174,7 @@ class _GRUModule(nn.Module):
 
 
 class GRU(TorchModel):
-    """A gated recurrent network; its context is its hidden state.
-
-    Args:
-        spec: the stream it is to expect.
-        hidden_size: H, hidden units.
-    """
+    """A gated recurrent network of ``hidden_size`` H; its context is its hidden state."""
 
     kind = "gru"
 
@@ -224,13 +216,7 @@ class GRU(TorchModel):
 
 
 class LogpZO(TorchModel):
-    """A flow from rows to noise: values, changes and the command.
-
-    Args:
-        spec: the stream it is to expect.
-        width: of each hidden layer.
-        updates: of the weights.
-    """
+    """A flow from rows to noise: values, changes and the command; ``width`` is that of each hidden layer."""
 
     kind = "logpzo"
 
