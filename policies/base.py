@@ -33,9 +33,9 @@ class Policy(Protocol):
 class StatefulPolicy(ABC):
     """A policy whose state begins anew in every episode."""
 
-    @abstractmethod
     def begin(self, observation: Any) -> Any:
-        """Return the first state of an episode."""
+        """Return the first state of an episode; here none."""
+        return None
 
     @abstractmethod
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:

@@ -76,9 +76,6 @@ class NetworkPolicy(StatefulPolicy):
         self._low, self._high = env.action_space.low, env.action_space.high
         return self
 
-    def begin(self, observation: Any) -> None:
-        return None
-
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[Array, Any]:
         """Return the action (A,), or (n, A) for n observations; and the state as it was."""
         x = (np.asarray(observation, np.float32) - self.mean) / self.scale

@@ -31,9 +31,23 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
 }
 """The scripted expert of each task."""
 
-POLICIES = ("scripted", "hold", "sway")  # names that ``make_policy`` knows, besides agents
-REGISTERED: Registry[Callable[..., Policy]] = Registry("policy", "asm_gym.policies.registry:REGISTERED")
-"""Policies that ``register_policy`` added."""
+
+def scripted(env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
+    """Return the expert of an environment's task; raise ValueError where there is none."""
+    experts = {**EXPERTS, "asm_gym/SyntheticArm-v0": Arm}
+    task = getattr(env.unwrapped, "task", None)
+    key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
+    if key not in experts:
+        raise ValueError(f"{key or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}")
+    return experts[key](env, seed=seed, **kwargs)
+
+
+POLICIES: Registry[Callable[..., Policy]] = Registry(
+    "policy",
+    "asm_gym.policies.registry:POLICIES",
+    {"scripted": scripted, "hold": lambda env, seed=None: Hold(env), "sway": Swaying},
+)
+"""Policies besides agents, by name."""
 
 ALGORITHMS = ("SAC", "TD3", "DDPG", "PPO", "A2C")
 """Algorithms of stable-baselines3 whose archives ``make_policy`` loads."""
@@ -51,9 +65,9 @@ def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
         >>> from asm_gym import make_policy, register_policy
         >>> register_policy("waving", lambda env, seed=None: make_policy("sway", env, seed=seed))
     """
-    if name in (*POLICIES, *agents()):
+    if name in agents():
         raise ValueError(f"there is a policy {name!r} already")
-    REGISTERED.register(name, target(make))
+    POLICIES.register(name, target(make))
 
 
 def agents() -> tuple[str, ...]:
@@ -96,19 +110,8 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         >>> env.action_space.contains(action)
         True
     """
-    if name in REGISTERED:
-        return REGISTERED[name](env, seed=seed, **kwargs)
-    if name == "scripted":
-        experts = {**EXPERTS, "asm_gym/SyntheticArm-v0": Arm}
-        task = getattr(env.unwrapped, "task", None)
-        key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
-        if key not in experts:
-            raise ValueError(f"{key or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}")
-        return experts[key](env, seed=seed, **kwargs)
-    if name == "sway":
-        return Swaying(env, seed=seed)
-    if name == "hold":
-        return Hold(env)
+    if name in POLICIES:
+        return POLICIES[name](env, seed=seed, **kwargs)
     if name.endswith(".zip"):
         algorithm, _, file = name.partition(":")
         check_choice("algorithm", algorithm, ALGORITHMS)
@@ -118,5 +121,5 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
         return cast(Policy, target("asm_gym.monitors.memory_policy:NeuralASMPolicy")(memory, env))
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
-    known = ", ".join((*POLICIES, *REGISTERED, *agents()))
+    known = ", ".join((*POLICIES, *agents()))
     raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .asm, SAC:….zip)")

@@ -22,7 +22,7 @@ import pytest
 import asm_gym
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
-from asm_gym.policies.registry import REGISTERED
+from asm_gym.policies.registry import POLICIES
 from asm_gym.scripts import command as command_of
 from asm_gym.scripts.cli import COMMANDS, main
 from asm_gym.scripts.reproduce import STUDIES
@@ -94,7 +94,7 @@ def python_page(page: Path) -> Any:
 @pytest.fixture(autouse=True)
 def registries():
     """Undo what an example registers."""
-    kept = [(registry, dict(registry)) for registry in (KINDS, MONITORS, OWN, REGISTERED)]
+    kept = [(registry, dict(registry)) for registry in (KINDS, MONITORS, OWN, POLICIES)]
     yield
     for registry, before in kept:
         registry.clear()

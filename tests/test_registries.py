@@ -10,7 +10,7 @@ from asm_gym import collect, register_fault, register_policy, register_task
 from asm_gym.faults import Push
 from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
-from asm_gym.policies.registry import REGISTERED
+from asm_gym.policies.registry import POLICIES
 from asm_gym.registries import added
 from asm_gym.rollouts import parallel_map
 from asm_gym.synthetic_arm import SyntheticArm
@@ -30,7 +30,7 @@ class Still:
 
 @pytest.fixture(autouse=True)
 def registries():
-    kept = [(rows, dict(rows)) for rows in (KINDS, MONITORS, OWN, REGISTERED)]
+    kept = [(rows, dict(rows)) for rows in (KINDS, MONITORS, OWN, POLICIES)]
     yield
     for rows, before in kept:
         rows.clear()
@@ -39,7 +39,7 @@ def registries():
 
 def known(name: str) -> list[bool]:
     """What a process knows of a name."""
-    return [name in rows for rows in (KINDS, MONITORS, OWN, REGISTERED)]
+    return [name in rows for rows in (KINDS, MONITORS, OWN, POLICIES)]
 
 
 def test_what_is_registered_is_known_in_worker_processes_and_what_is_forgotten_is_not_sent():

@@ -40,18 +40,14 @@ COLUMNS = ("policy", *_LABEL, "seconds")
 
 
 class Source(NamedTuple):
-    """A policy in a task, and its number of episodes of each role.
-
-    Attributes:
-        faults: whether each kind and severity happens once per round.
-    """
+    """A policy in a task, and its number of episodes of each role."""
 
     task: str
     policy: str = "scripted"
     fit: int = 0
     calibration: int = 0
     nominal: int = 0
-    faults: bool = False
+    faults: bool = False  # whether each kind and severity happens once per round
 
 
 PARTS: dict[str, tuple[Source, ...]] = {

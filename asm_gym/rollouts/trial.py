@@ -47,26 +47,17 @@ class RolloutConfig:
 
 @dataclass(frozen=True)
 class Trial:
-    """One episode to run.
-
-    Attributes:
-        seed: of the environment and of the policy: trials that share it are twins.
-        kind: ``"nominal"``, ``"passing_push"``, a fault of the suite (of this ``severity``); with ``faults``, a name.
-        onset: when it begins [steps]; by default drawn from the seed, in the first half of the episode.
-        acting: ``"policy alone"``, or a value of ``on_alarm``.
-        after_s: the episode ends so long after the onset [s]; by default it runs to its end.
-        role: what it is recorded for: ``"fit"``, ``"calibration"``, ``"nominal"``, ``"faulty"`` or ``"babble"``.
-    """
+    """One episode to run."""
 
     env_id: str
-    seed: int
-    kind: str = NOMINAL
+    seed: int  # of the environment and of the policy: trials that share it are twins
+    kind: str = NOMINAL  # else ``"passing_push"``, a fault of the suite of this ``severity``; with ``faults``, a name
     severity: str = ""
-    onset: int | None = None
+    onset: int | None = None  # [steps]; by default drawn from the seed, in the first half of the episode
     faults: tuple[Fault, ...] | None = None
-    acting: str = POLICY_ALONE
-    after_s: float | None = None
-    role: str = "nominal"
+    acting: str = POLICY_ALONE  # or a value of ``on_alarm``
+    after_s: float | None = None  # the episode ends so long after the onset [s]; by default it runs to its end
+    role: str = "nominal"  # or ``"fit"``, ``"calibration"``, ``"faulty"``, ``"babble"``
 
     @property
     def task(self) -> str:

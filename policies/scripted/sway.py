@@ -49,9 +49,6 @@ class Swaying(StatefulPolicy):
         """Return the present sines (A,)."""
         return np.sin(2 * np.pi * self.frequency * self.t + self.phase)
 
-    def begin(self, observation: Any) -> None:
-        return None
-
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the action and the state as it was."""
         self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(self.size)

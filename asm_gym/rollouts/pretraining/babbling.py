@@ -59,26 +59,19 @@ ARRIVED, GIVEN_UP = 0.02, 60  # the hand goes on to the next place this near to 
 
 
 class Lesson(NamedTuple):
-    """How the arm moves in one episode: the ``number``-th of its task.
-
-    Attributes:
-        guide: ``"scripted"`` or ``"reaching"``; empty for noise alone.
-        noise, smoothness: s [action units] and ρ of the noise.
-        speed, weight: of the guide, and of the task's object, relative to what is usual.
-        pause, drift, press: probabilities per step that the arm stops, drifts, or presses what it holds for a while.
-    """
+    """How the arm moves in one episode: the ``number``-th of its task."""
 
     task: str
     number: int
     seed: int
-    guide: str = "scripted"
-    noise: float = 0.0
-    smoothness: float = 0.0
-    speed: float = 1.0
-    pause: float = 0.0
-    weight: float = 1.0
-    drift: float = 0.0
-    press: float = 0.0
+    guide: str = "scripted"  # or ``"reaching"``; empty for noise alone
+    noise: float = 0.0  # s [action units]
+    smoothness: float = 0.0  # ρ of the noise
+    speed: float = 1.0  # of the guide, relative to what is usual
+    pause: float = 0.0  # probability per step that the arm stops for a while
+    weight: float = 1.0  # of the task's object, relative to what is usual
+    drift: float = 0.0  # probability per step that the arm drifts for a while
+    press: float = 0.0  # probability per step that it presses what it holds for a while
 
     @property
     def trial(self) -> Trial:

@@ -30,15 +30,10 @@ policy."""
 
 
 class Gentle(NamedTuple):
-    """Limits of harmless contact.
+    """Limits of harmless contact."""
 
-    Attributes:
-        force: external, on an arm as a whole [N].
-        torque: external, on a joint [N m]; it shows what cancels in the force, such as an arm that hits itself.
-    """
-
-    force: float
-    torque: float
+    force: float  # external, on an arm as a whole [N]
+    torque: float  # external, on a joint [N m]; it shows what cancels in the force, such as an arm that hits itself
 
 
 KNOWN = Gentle(30.0, 15.0)  # learned in any case: an arm whose experts touch little meets contact all the same
@@ -50,17 +45,11 @@ def held_out(number: int) -> bool:
 
 
 class Lessons(NamedTuple):
-    """Healthy recordings of babbling.
+    """Healthy recordings of babbling."""
 
-    Attributes:
-        fit: to learn from.
-        calibration: held-out lessons in which the expert alone solved its task, without crashes.
-        whole: the same with crashes.
-    """
-
-    fit: list[Episode]
-    calibration: list[Episode]
-    whole: list[Episode]
+    fit: list[Episode]  # to learn from
+    calibration: list[Episode]  # held-out lessons in which the expert alone solved its task, without crashes
+    whole: list[Episode]  # the same with crashes
 
 
 def healthy(recordings: Sequence[Episode]) -> Lessons:
