@@ -53,24 +53,14 @@ class Terminated(KeyboardInterrupt):
 def option(
     default: T = MISSING,  # type: ignore[assignment]
     *,
-    quick: T = _SAME,
-    least: float | None = None,
-    known: Iterable[str] = (),
-    check: Callable[[Any], object] | None = None,
-    metavar: str = "",
-    positional: bool = False,
+    quick: T = _SAME,  # default with ``--quick``
+    least: float | None = None,  # lowest number, or the least length of a tuple
+    known: Iterable[str] = (),  # names that the help lists; no others are accepted, unless ``check`` decides
+    check: Callable[[Any], object] | None = None,  # raises for a value, or an element of a tuple, that is not accepted
+    metavar: str = "",  # placeholder of the value in the help
+    positional: bool = False,  # whether the option is given without its name
 ) -> T:
-    """Return a dataclass field that is an option of a command.
-
-    Args:
-        default: value; without one the option is required.
-        quick: default with ``--quick``.
-        least: lowest number, or the least length of a tuple.
-        known: names that the help lists; no others are accepted, unless ``check`` decides.
-        check: function that raises for a value, or for an element of a tuple, that is not accepted.
-        metavar: placeholder of the value in the help.
-        positional: whether the option is given without its name.
-    """
+    """Return a dataclass field that is an option of a command; without a default it is required."""
     about = {"quick": quick, "least": least, "known": known, "check": check}
     return field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
 
@@ -150,9 +140,9 @@ def _hint(about: Any) -> Callable[[str], str]:
     """Return what the help says after an option's text: known names, its default and its quick value."""
 
     def hint(default: str) -> str:
-        names, quick = about.get("known", ()), about.get("quick", _SAME)
+        names, quick = [*about.get("known", ())], about.get("quick", _SAME)
         more = ", …" if len(names) > MOST_NAMES else ""
-        parts = [f"known: {', '.join([*names][:MOST_NAMES])}{more}"] if names else []
+        parts = [f"known: {', '.join(names[:MOST_NAMES])}{more}"] if names else []
         if default not in ("", "None", "True", "False"):
             parts.append("required" if default == "(required)" else f"default: {default}")
         if quick is not _SAME:

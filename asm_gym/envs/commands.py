@@ -63,12 +63,9 @@ def rotation(turn: Floats, at: int, matrix: Floats) -> None:
 
 @compiled
 def move_gripper(asked: Floats, scaling: Floats, ranges: Floats, motors: Ints, ctrl: Floats) -> None:
-    """Command a gripper's motors (G,).
+    """Command a gripper's motors (G,) as ``asked`` (G,) in [-1, 1], with the scaling (1, 5, G) of its controller.
 
-    Args:
-        asked: (G,) in [-1, 1].
-        scaling: (1, 5, G) of robosuite's controller.
-        ranges: (4, G) the middle and half of what it commands, and the motors' own bounds.
+    ``ranges`` (4, G) are the middle and half of what it commands, and the motors' own bounds.
     """
     for i in range(len(motors)):
         command = ranges[0, i] + ranges[1, i] * scaled(asked[i], scaling, 0, i)

@@ -152,12 +152,9 @@ class RobosuiteEnv(SteppedEnv):
         return PHYSICS_FREQ // self._row_substeps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode.
+        """Start an episode; a ``seed`` makes it exact, to the last bit and whatever ran before.
 
-        Args:
-            seed: makes the episode exact, to the last bit and whatever ran before. Without one the generator goes on,
-                and objects keep the shapes that some tasks draw.
-            options: none are known.
+        Without one the generator goes on, and objects keep the shapes that some tasks draw.
 
         Raises:
             ValueError: options are given.
@@ -193,10 +190,7 @@ class RobosuiteEnv(SteppedEnv):
         return self._senses.observation(self._reading), self._info(bool(env._check_success()))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Run one control step.
-
-        Args:
-            action: (A,) in [-1, 1]; clipped to it.
+        """Run one control step by an action (A,), which is clipped to [-1, 1].
 
         Raises:
             ValueError: a wrong shape, or an action that is not finite.

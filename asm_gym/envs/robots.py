@@ -48,12 +48,10 @@ def free_first_joints(env: Any) -> None:
 
 def gripper_actions(robots: list[Any]) -> tuple[int, ...]:
     """Return the indices of an action that command grippers."""
-    found: list[int] = []
-    start = 0
+    found, start = list[int](), 0
     for robot in robots:
         for part, (low, high) in robot._action_split_indexes.items():
-            if "gripper" in part:
-                found += range(start + low, start + high)
+            found += range(start + low, start + high) if "gripper" in part else ()
         start += robot.action_dim
     return tuple(found)
 
@@ -82,7 +80,18 @@ def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
         **fields,
     )
     for a, (robot, arm) in enumerate(parts):
-        _fill_indices(arms, a, model, robot, arm)
+        joints = slice(len(robot._ref_joint_pos_indexes))
+        arms.joints[a] = joints.stop
+        arms.qpos[a, joints] = robot._ref_joint_pos_indexes
+        arms.dofs[a, joints] = robot._ref_joint_vel_indexes
+        arms.motors[a, joints] = robot._ref_actuators_indexes_dict[arm]
+        arms.site[a] = robot.eef_site_id[arm]
+        arms.site_body[a] = model.site_bodyid[arms.site[a]]
+        arms.root[a] = model.body_rootid[arms.site_body[a]]
+        sensors = robot.gripper[arm].important_sensors
+        arms.wrench[a], torque = (model.sensor(sensors[k]).adr[0] for k in ("force_ee", "torque_ee"))
+        if torque != arms.wrench[a] + 3:
+            raise RuntimeError("the wrist's force and torque sensors are expected side by side")
         if is_compilable(robot, arm):
             _fill_settings(arms, a, model, robot.composite_controller.part_controllers[arm])
     return arms
@@ -100,22 +109,6 @@ def _links(model: mujoco.MjModel, hand: int) -> Ints:
     while model.body_weldid[model.body_parentid[found[-1]]] != 0:
         found.append(int(model.body_parentid[found[-1]]))
     return np.array(found, np.int64)
-
-
-def _fill_indices(arms: Arms, a: int, model: mujoco.MjModel, robot: Any, arm: str) -> None:
-    joints = slice(len(robot._ref_joint_pos_indexes))
-    arms.joints[a] = joints.stop
-    arms.qpos[a, joints] = robot._ref_joint_pos_indexes
-    arms.dofs[a, joints] = robot._ref_joint_vel_indexes
-    arms.motors[a, joints] = robot._ref_actuators_indexes_dict[arm]
-    arms.site[a] = robot.eef_site_id[arm]
-    arms.site_body[a] = model.site_bodyid[arms.site[a]]
-    arms.root[a] = model.body_rootid[arms.site_body[a]]
-    sensors = robot.gripper[arm].important_sensors
-    force, torque = (model.sensor(sensors[k]).adr[0] for k in ("force_ee", "torque_ee"))
-    if torque != force + 3:
-        raise RuntimeError("the wrist's force and torque sensors are expected side by side")
-    arms.wrench[a] = force
 
 
 def _fill_settings(arms: Arms, a: int, model: mujoco.MjModel, controller: Any) -> None:

@@ -29,9 +29,7 @@ def draw(env: Any) -> bool:
     """Draw the shape that Lift draws when it is loaded, into its cube and its loaded model.
 
     Generator, object and every number of the model are then as loading would leave them; the data must be reset.
-
-    Returns:
-        Whether it was done: not in other tasks, nor where others edit the model's text.
+    False where it was not done: in other tasks, or where others edit the model's text.
     """
     if type(env).__name__ != "Lift" or env._xml_processors != [env.edit_model_xml]:
         return False

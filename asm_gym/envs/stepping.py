@@ -131,11 +131,6 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         rest = self._action, self.corruptions, self.np_random
         return self._senses.read(self.simulation.sense, self._objects, *rest, within_step=within_step)
 
-    @property
-    def motors(self) -> NDArray[np.intp]:
-        """The actuators of the arms' joints, from the base on."""
-        return self.simulation.motors
-
     def _forces(self, unstable: bool) -> dict[str, Any]:
         """Return what ``info`` says of contact; NaN, or infinite, where the simulation diverged."""
         sim = self.simulation

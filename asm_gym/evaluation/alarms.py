@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,17 +74,10 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
     traces = []
     for (name, episode), surprise in zip(logs, monitor.score_episodes([log.episode for log in logs]), strict=True):
         fault = episode.faults if len(episode.faults) == len(episode) else np.zeros(len(episode), np.bool_)
-        over = bridged(episode.stream, spec.dt, bridge)
-        shares = np.where(over[:, None], 0.0, surprise.attribution)
-        value = np.where(over, 0.0, surprise.value)
-        excused = {event: np.where(over, 0.0, raw) for event, raw in surprise.excused_by_event.items()}
-        kept: dict[str, Any] = {
-            "attribution": shares,
-            "channels": spec.labels,
-            "fault": fault,
-            "stream": episode.stream,
-        }
-        traces.append(ScoredEpisode(name, 0, spec.dt, monitor.threshold, value, excused=excused, **kept))
+        judged = surprise.silenced(bridged(episode.stream, spec.dt, bridge))
+        trace = ScoredEpisode(name, 0, spec.dt, monitor.threshold, judged.value, excused=judged.excused_by_event)
+        shares, labels = judged.attribution, spec.labels
+        traces.append(replace(trace, attribution=shares, channels=labels, fault=fault, stream=episode.stream))
     return traces
 
 

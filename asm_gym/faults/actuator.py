@@ -22,7 +22,7 @@ class MotorFault(JointFault, EditingFault):
     def dof(self, env: RobosuiteEnv) -> int:
         """Return the joint's index among the velocities."""
         model = env.simulation.model
-        return int(model.jnt_dofadr[model.actuator_trnid[env.motors[self.joint], 0]])
+        return int(model.jnt_dofadr[model.actuator_trnid[env.simulation.motors[self.joint], 0]])
 
 
 class WeakJoint(MotorFault):
@@ -31,7 +31,7 @@ class WeakJoint(MotorFault):
     strength: float = within(0.5, low=0, high=1)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        motor, loss = (int(env.motors[self.joint]), 0), 1.0 - self.strength
+        motor, loss = (int(env.simulation.motors[self.joint]), 0), 1.0 - self.strength
         return [(env.simulation.model.actuator_gear, [motor], lambda gear: gear * (1.0 - loss))]
 
 

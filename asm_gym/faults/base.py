@@ -145,7 +145,9 @@ class JointFault(Fault):
     channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")  # those in which it shows first
 
     def check(self, env: RobosuiteEnv) -> None:
-        check_number(f"joint of {env.measured_spec.source}", self.joint, low=0, high=len(env.motors) - 1, whole=True)
+        check_number(
+            f"joint of {env.measured_spec.source}", self.joint, low=0, high=len(env.simulation.motors) - 1, whole=True
+        )
 
     def labels(self, env: Interface) -> frozenset[str]:
         return frozenset(env.measured_spec.labels[self.element(env, name)] for name in self.channels)

@@ -134,7 +134,7 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
     axes = env.action_space.shape[0] - len(env.gripper_actions)  # type: ignore[index]
     direction = rng.standard_normal(3)
     x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
-    elbow = model.jnt_bodyid[model.actuator_trnid[env.motors[4], 0]]
+    elbow = model.jnt_bodyid[model.actuator_trnid[env.simulation.motors[4], 0]]
     joint = int(rng.integers(len(robot._ref_joint_vel_indexes)))
     axis, translation = int(rng.integers(axes)), int(rng.integers(3))
     prefix, hand = "robot0_" if len(env.robots) > 1 else "", robot.robot_model.eef_name["right"]

@@ -27,28 +27,18 @@ class StreamModel:
     """Base class of models: predicts each row of a stream, and returns its errors; a detection makes surprise of them.
 
     Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
-
-    Args:
-        spec: the stream to predict.
-
-    Attributes:
-        kind: its name, in ``make_monitor`` and in checkpoints.
-        shortest: fewest steps of an episode to learn from.
-        held_out: one in so many episodes is not learned, but shows how large errors usually are; 0 for none.
-        learned_: arrays that ``fit`` has found, by name; empty before.
-        skills_: names of the skills it knows; empty where it was given none.
-        crossfitted: errors (T, X) of learned episodes by what was learned without them, by id, while it is fitted.
     """
 
-    kind: str
-    shortest: int = 2
-    held_out: int = 5
+    kind: str  # its name, in ``make_monitor`` and in checkpoints
+    shortest: int = 2  # fewest steps of an episode to learn from
+    held_out: int = 5  # one in so many episodes is not learned, but shows how large errors usually are; 0 for none
 
     def __init__(self, spec: StreamSpec) -> None:
         self.spec = spec
-        self.learned_: Arrays = {}
-        self.skills_: tuple[str, ...] = ()
+        self.learned_: Arrays = {}  # by name, once it is fitted
+        self.skills_: tuple[str, ...] = ()  # names of the skills it knows
         self.crossfitted: dict[int, NDArray[np.floating[Any]]] = {}
+        """Errors (T, X) of learned episodes by what was learned without them, by id, while it is fitted."""
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -74,13 +64,9 @@ class StreamModel:
 
 
 class ScaledModel(StreamModel):
-    """Base class of models that read rows as the memory does: values, and their changes over ``lag`` rows.
+    """Base class of models that read rows as the memory does: values, and their changes over ``lag`` rows."""
 
-    Attributes:
-        senses_: how it reads a row.
-    """
-
-    senses_: StreamScaler
+    senses_: StreamScaler  # how it reads a row
 
     def __init__(self, spec: StreamSpec, lag: int = 1) -> None:
         super().__init__(spec)

@@ -77,11 +77,9 @@ def flattest_side(turned: Vector) -> Vector:
 
 
 def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:
-    """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing``.
+    """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing`` (3,) or as now.
 
-    Args:
-        closing: (3,) in the world; the hand's own direction where None.
-        turns: after how much of a turn the direction is as good again [rad].
+    After a turn by ``turns`` [rad] the direction is as good again.
     """
     angle = yaw(hand[:, 1])  # fingers move along the hand's y axis
     if closing is not None:

@@ -203,8 +203,7 @@ class _Limit(StreamModel):
 
     shortest = 1
     held_out = 0  # so few numbers are not learned by heart
-    channel = ""
-    """End of their names."""
+    channel = ""  # end of their names
     scaled = False
 
     def __init__(self, spec: StreamSpec) -> None:

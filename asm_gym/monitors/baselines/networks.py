@@ -53,13 +53,9 @@ FARTHEST = 30.0  # where standardised numbers are cut off: networks of this kind
 
 
 class TorchModel(ScaledModel):
-    """A model that is a torch module.
+    """A model that is a torch module."""
 
-    Attributes:
-        module_: the network, once it is fitted.
-    """
-
-    module_: nn.Module
+    module_: nn.Module  # once it is fitted
 
     @abstractmethod
     def module(self, senses: StreamScaler) -> nn.Module:
