@@ -10,7 +10,7 @@ import pytest
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.packing import unpacked
+from asm_gym.monitors.files import unpacked
 from tests.memories import learned_bytes, sine_memory
 from tests.streams import sine_episodes
 

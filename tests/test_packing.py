@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asm_gym import NeuralASM
-from asm_gym.monitors.packing import packed, rounded, unpacked
+from asm_gym.monitors.files import packed, rounded, unpacked
 from tests.streams import sine_episodes, sine_spec
 
 

@@ -26,10 +26,9 @@ from asm_gym.monitors.arm_inputs import Derived
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.files import restored
+from asm_gym.monitors.files import restored, rounded
 from asm_gym.monitors.memory_config import MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
-from asm_gym.monitors.packing import rounded
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names

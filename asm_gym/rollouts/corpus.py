@@ -88,27 +88,23 @@ class Corpus:
             )
         return cls(folder, files)
 
-    def select(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> pd.DataFrame:
-        """Select files by role, policy and task; all where none is named."""
+    def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
+        """Load episodes by role, policy and task; all where none is named."""
         chosen = self.files
         for name, values in (("role", roles), ("policy", policies), ("task", tasks)):
             chosen = chosen[chosen[name].isin(values)] if values else chosen
-        return chosen
-
-    def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
-        """Load episodes by role, policy and task; all where none is named."""
-        return [load_episode(self.folder / p) for p in self.select(*roles, policies=policies, tasks=tasks).index]
+        return [load_episode(self.folder / path) for path in chosen.index]
 
 
-def skill_files(folder: Path, tasks: Sequence[str] = SKILLS, fit: int | None = None) -> list[Path]:
+def skill_files(folder: Path, fit: int | None = None) -> list[Path]:
     """Return the files of the experts' skills, by kind and severity; of each task at most ``fit`` to learn from."""
-    corpus = Corpus.open(folder)
+    files = Corpus.open(folder).files
     order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
-    chosen = corpus.select(policies=("scripted",), tasks=tasks)
+    chosen = files[(files.policy == "scripted") & files.task.isin(SKILLS)]
     if fit is not None:
         chosen = chosen[(chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)]
     chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
-    return [corpus.folder / path for path in chosen.index]
+    return [folder / path for path in chosen.index]
 
 
 def place(policy: str, label: EpisodeLabel) -> str:

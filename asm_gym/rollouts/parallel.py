@@ -68,13 +68,12 @@ def parallel_map(
 def _pickled(task: Callable[[Any], Any]) -> bytes:
     try:
         rows = added()
-        made: bytes = cloudpickle.dumps(partial(knowing, rows, task) if rows else task)
+        return cloudpickle.dumps(partial(knowing, rows, task) if rows else task)
     except Exception as error:  # whatever a foreign __reduce__ raises
         raise TypeError(
             f"the work cannot be sent to another process ({type(error).__name__}: {error}): make what it needs in the "
             "worker, by a name, a path or a factory, or set workers to 1"
         ) from error
-    return made
 
 
 def _call(task: bytes, item: Any) -> Any:

@@ -36,10 +36,7 @@ def versions(*more: str) -> dict[str, str]:
 def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]:
     """Make ``folder`` a run's own, or continue it, and keep others out while the block runs.
 
-    Args:
-        folder: is made where missing.
-        name: of the file in it that holds the settings.
-        settings: that decide over the recordings; versions are added.
+    The file ``name`` in it holds the ``settings`` that decide over the recordings, and versions.
 
     Raises:
         ValueError: it holds a run of other settings; the message names them.

@@ -13,24 +13,21 @@ MOST_EPISODES = 10**6
 
 def episode_seeds(seed: int, episodes: int, stage: int = 0) -> list[int]:
     """Return one seed per episode; lists of different ``stage`` have nothing in common."""
-    return _draw([_natural("seed", seed), _natural("stage", stage)], episodes)
+    return _draw(seed, check_number("stage", stage, low=0, whole=True), episodes)
 
 
 def role_seeds(seed: int, task: str, role: str, episodes: int) -> list[int]:
     """Return one seed per episode; those of different tasks and roles have nothing in common."""
-    return _draw([_natural("seed", seed), zlib.crc32(f"{task}/{role}".encode())], episodes)
+    return _draw(seed, zlib.crc32(f"{task}/{role}".encode()), episodes)
 
 
 def draw_onset(seed: int, horizon: int) -> int:
     """Return when a fault begins in the episode of ``seed`` [steps]: after step 10, in the first half."""
     latest = max(11, check_number("horizon", horizon, low=0, high=1e9, whole=True) // 2)
-    return int(np.random.default_rng([_natural("seed", seed), 1]).integers(10, latest))
+    return int(np.random.default_rng([check_number("seed", seed, low=0, whole=True), 1]).integers(10, latest))
 
 
-def _natural(name: str, value: int) -> int:
-    return check_number(name, value, low=0, whole=True)
-
-
-def _draw(entropy: list[int], episodes: int) -> list[int]:
+def _draw(seed: int, which: int, episodes: int) -> list[int]:
     check_number("episodes", episodes, low=0, high=MOST_EPISODES, whole=True)
+    entropy = [check_number("seed", seed, low=0, whole=True), which]
     return [int(s) for s in np.random.SeedSequence(entropy).generate_state(episodes, np.uint32) // 2]

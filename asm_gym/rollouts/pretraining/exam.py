@@ -36,9 +36,8 @@ class Exam(NamedTuple):
     @property
     def name(self) -> str:
         """Name for tables."""
-        return f"{self.task}, {'expert' if self.policy == 'scripted' else self.policy}" + " (left out)" * (
-            not self.known
-        )
+        policy = "expert" if self.policy == "scripted" else self.policy
+        return f"{self.task}, {policy}{'' if self.known else ' (left out)'}"
 
     def trials(self, episodes: int, kinds: Sequence[str], seed: int) -> list[Trial]:
         """Return nominal episodes, and in the first scenes a twin for each of ``kinds`` and severity."""
@@ -73,14 +72,9 @@ def usual_force(recordings: Sequence[Episode]) -> float:
 
 
 def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], window: float, usual: float) -> Marks:
-    """Score the recordings of an exam.
+    """Score the nominal and faulty recordings of an exam, detected within a ``window`` [s] of the onset.
 
-    Args:
-        memory: calibrated.
-        name: of the exam.
-        recordings: nominal and faulty.
-        window: an alarm within this time of the onset is a detection [s].
-        usual: the usual greatest force of the task's expert [N]; that of an agent that often crashes is no reference.
+    ``usual`` is the usual greatest force of the task's expert [N]; that of an agent that often crashes is no reference.
     """
     traces = traces_of(name, memory, recordings, memory.threshold)
     crashed = {e.labelled.seed for e in recordings if CRASH * usual < usual_force([e]) < np.inf}
