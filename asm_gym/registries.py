@@ -19,8 +19,7 @@ from asm_gym.validation import check_choice, check_text
 Row = TypeVar("Row")
 Result = TypeVar("Result")
 
-Added = dict[str, dict[str, Any]]
-"""Added rows by name, by the place of their registry."""
+Added = dict[str, dict[str, Any]]  # added rows by name, by the place of their registry
 
 _REGISTRIES: dict[str, Registry[Any]] = {}
 
@@ -35,21 +34,13 @@ class Registry(dict[str, Row]):
         _REGISTRIES[where] = self
 
     def register(self, name: str, row: Row) -> None:
-        """Add a row.
-
-        Raises:
-            ValueError: the name is taken or no name.
-        """
+        """Add a row; raise ValueError where the name is taken or no name."""
         if check_text(f"the name of a {self.what}", name) in self:
             raise ValueError(f"there is a {self.what} {name!r} already")
         self[name] = row
 
     def find(self, name: str) -> Row:
-        """Return the row of a name.
-
-        Raises:
-            ValueError: there is none; the message lists the known names.
-        """
+        """Return the row of a name; raise ValueError, listing the known names, where there is none."""
         check_choice(self.what, name, self)
         return self[name]
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, typed
 
-PolicyState = Any
-"""What a policy carries from step to step: a value, passed in and handed back. None starts an episode."""
+PolicyState = Any  # what a policy carries from step to step, a value: passed in and handed back, None at the start
 
 
 @runtime_checkable

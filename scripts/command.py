@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Args = TypeVar("Args")
 DONE, BAD_NEWS, REFUSED = 0, 1, 2
-USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
-"""Errors that a user can put right."""
+USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)  # errors that a user can put right
 MOST_NAMES = 7  # that the help of an option lists; a wrong name lists all
 _SAME: Any = object()
 _ANNOTATED: Any = Annotated

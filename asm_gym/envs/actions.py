@@ -26,11 +26,7 @@ class Actions:
         self.grippers = gripper_actions(env.robots)  # indices of the numbers that command grippers
 
     def checked(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the action (A,) clipped to [-1, 1].
-
-        Raises:
-            ValueError: a wrong shape, or an action that is not finite.
-        """
+        """Return the action (A,) clipped to [-1, 1]; raise ValueError for another shape, or one that is not finite."""
         action = as_float32(action, "the action")
         if action.shape != self.space.shape:
             raise ValueError(f"{self._task} takes an action of shape {self.space.shape}, got {action.shape}")
@@ -69,11 +65,7 @@ class Actions:
         return slow
 
     def turning(self, simulation: Simulation, turns: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.
-
-        Raises:
-            ValueError: the controller takes no changes.
-        """
+        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can."""
         if self._controller not in CHANGES:
             raise ValueError(f"actions of {' and '.join(CHANGES)} are changes, those of {self._controller} are not")
         action, joint = np.zeros(self.size, np.float32), 0

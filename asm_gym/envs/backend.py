@@ -79,11 +79,7 @@ def _compile_less() -> None:
 
 
 def row_substeps(rate: int, control_freq: int) -> int:
-    """Return the physics substeps between two rows of a stream of ``rate`` rows a second.
-
-    Raises:
-        ValueError: a rate that does not fit physics or control; the message lists those that do.
-    """
+    """Return the physics substeps between two rows at ``rate`` [Hz]; raise ValueError, listing those that fit."""
     possible = [f for f in range(control_freq, PHYSICS_FREQ + 1) if not (PHYSICS_FREQ % f or f % control_freq)]
     if rate not in possible:
         raise ValueError(

@@ -138,11 +138,7 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
 
 
 def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
-    """Draw the ``top`` channels that surprised most; faults and alarms are shaded.
-
-    Raises:
-        ValueError: the episode has no stream.
-    """
+    """Draw the ``top`` channels that surprised most, faults and alarms shaded; raise ValueError without a stream."""
     if trace.stream is None or trace.attribution is None:
         raise ValueError("this trace was kept without its stream")
     share = np.nan_to_num(trace.attribution[trace.onset or 0 :], posinf=1e30)

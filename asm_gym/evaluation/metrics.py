@@ -26,8 +26,7 @@ from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpiso
 from asm_gym.evaluation.statistics import Floats, Rate, Share
 from asm_gym.monitors.calibration import AlarmRate
 
-Kind = tuple[str, str]
-"""Kind and severity of a fault."""
+Kind = tuple[str, str]  # kind and severity of a fault
 
 
 def placements(

@@ -14,11 +14,9 @@ from asm_gym.detection.events import EVENTS, KNOCK, STOP
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 
-Progress = Callable[[int, int], object]
-"""Called as ``progress(done, total)``."""
+Progress = Callable[[int, int], object]  # called as ``progress(done, total)``
 
-State = Any
-"""A monitor's running state: a value, passed in and returned, never kept in the monitor."""
+State = Any  # a monitor's running state: a value, passed in and returned, never kept in the monitor
 
 
 class Surprise(NamedTuple):

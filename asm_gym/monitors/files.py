@@ -102,11 +102,7 @@ RETIRED = "feedback"  # a hyperparameter of older files that made no difference 
 
 
 def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> Any:
-    """Return the monitor of a checkpoint, as ``make(spec, **hyperparameters)`` makes it before it is fitted.
-
-    Raises:
-        ValueError: the file is damaged, or of an older format.
-    """
+    """Return a checkpoint's monitor, as ``make(spec, **hyperparameters)`` makes it; raise ValueError for a bad file."""
     try:
         how = {n: value for n, value in saved.header["hyperparameters"].items() if n != RETIRED}
         return make(StreamSpec.from_json(saved.header["spec"]), **how).restore(saved)

@@ -18,8 +18,7 @@ WILD = 1e6  # largest distance of a number from its channel's median, in ranges 
 
 ALIKE = 1.0 - 1e-9  # correlation of copies
 
-Hashes = NDArray[np.float64]
-"""One of each episode, of 52 bits, which a double holds exactly."""
+Hashes = NDArray[np.float64]  # one of each episode, of 52 bits, which a double holds exactly
 
 
 def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) -> None:

@@ -35,8 +35,7 @@ SKILLS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblyRound", "PickPlac
 """Tasks with episodes to learn from, to calibrate on and to test on."""
 MANIFEST = "manifest.json"
 _LABEL = ("task", "role", "kind", "severity", "seed", "onset")
-COLUMNS = ("policy", *_LABEL, "seconds")
-"""Of the manifest: the policy, the episode's label, and its length [s]."""
+COLUMNS = ("policy", *_LABEL, "seconds")  # of the manifest: the policy, the episode's label, and its length [s]
 
 
 class Source(NamedTuple):

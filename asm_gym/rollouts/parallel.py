@@ -22,8 +22,7 @@ from asm_gym.validation import check_number, typed
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-Progress = Callable[[int, int], None]
-"""Is called as (done, total)."""
+Progress = Callable[[int, int], None]  # is called as (done, total)
 
 MOST_WORKERS = 1000
 IDLE_S = 300.0  # a process without work ends after this time [s]

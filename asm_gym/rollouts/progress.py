@@ -17,11 +17,7 @@ EVERY_S = 10.0  # least time between two lines [s]
 
 @contextmanager
 def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Progress]:
-    """Show the progress of ``name`` while the block runs, and store its duration in ``seconds``.
-
-    Yields:
-        A function of (done, total), for the block to call.
-    """
+    """Show the progress of ``name`` while the block runs, by a function of (done, total); store its ``seconds``."""
     start = printed = time.perf_counter()
     reached = ""
 

@@ -18,8 +18,7 @@ class SafetyCallback(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self.ended: list[dict[str, float]] = []
-        """The numbers of all episodes that have ended."""
+        self.ended: list[dict[str, float]] = []  # the numbers of all episodes that have ended
 
     def _on_training_start(self) -> None:
         self._steps: list[list[tuple[float, bool, float, bool, float]]] = [

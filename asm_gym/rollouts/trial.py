@@ -20,8 +20,7 @@ from asm_gym.policies import Policy, make_policy
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
 from asm_gym.spec import control_period
 
-Settings = tuple[tuple[str, Any], ...]
-"""Arguments by name, in a fixed order."""
+Settings = tuple[tuple[str, Any], ...]  # arguments by name, in a fixed order
 PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]
 """What ``make_policy`` takes, any object with ``predict``, or a factory for an environment."""
 
@@ -121,11 +120,7 @@ def evaluation_trials(
     severities: Sequence[str],
     seed: int,
 ) -> list[Trial]:
-    """Return the trials of one task: nominal episodes by role, and faulty twins of some.
-
-    Raises:
-        ValueError: the policy cannot act in the environment.
-    """
+    """Return nominal episodes of a task by role, and faulty twins of some; raise ValueError for an unfit policy."""
     with closing(gym.make(env_id, **dict(config.settings))) as env:
         make_policy(str(config.policy), env, seed=0)
         kinds, horizon = kinds_in(env, faults), horizon_of(env)
