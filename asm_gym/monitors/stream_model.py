@@ -132,7 +132,7 @@ def made(kind: Callable[..., Any], spec: StreamSpec, parameters: Mapping[str, An
 
 
 def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[ModelOutput]:
-    """Return errors (T, X) and contexts (T, C) of each episode; raise ValueError where the model gives anything else."""
+    """Return errors (T, X) and contexts (T, C) of each episode; raise ValueError where the model gives others."""
     outputs: dict[int, ModelOutput] = {}
     for group, steps in side_by_side(episodes, model.start, partial(_predicted, model)):
         for n, i in enumerate(group):
