@@ -7,6 +7,7 @@ The action is scaled from [-1, 1] to the action space.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.policies.base import StatefulPolicy
-from asm_gym.validation import check_numbers
 
 Array = NDArray[np.float32]
 
@@ -52,13 +52,16 @@ class NetworkPolicy(StatefulPolicy):
             raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {shapes[:1]}")
         size = inputs = self.observation_size = int(shapes[0][1])
         for n, (W, b) in enumerate(self.layers):
-            check_numbers(f"weights of layer {n}", W, len(W), size)
-            check_numbers(f"biases of layer {n}", b, len(W))
+            if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
+                raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
             size = len(W)
         self.action_size = size
-        self.mean = check_numbers("mean", np.zeros(inputs) if mean is None else mean, inputs).astype(np.float32)
-        scale = np.ones(inputs, np.float32) if scale is None else scale
-        self.scale = check_numbers("scale", scale, inputs, above=0).astype(np.float32)
+        self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
+        self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
+        if self.mean.shape != (inputs,) or self.scale.shape != (inputs,) or not (self.scale > 0).all():
+            raise ValueError(f"mean and scale must be {inputs} numbers, and scale positive")
+        if not all(np.isfinite(a).all() for a in (self.mean, self.scale, *itertools.chain(*self.layers))):
+            raise ValueError("weights, biases, mean and scale must be finite")
         self.trained_in = dict(trained_in or {})
         self._low, self._high = np.full(size, -1.0, np.float32), np.ones(size, np.float32)
 

@@ -51,7 +51,8 @@ class Hold:
         if not space.contains(self._rest):
             raise ValueError(f"safe_action {self._rest} is not in {space}")
         self._grip = np.asarray(getattr(inner, "gripper_actions", ()), dtype=int)
-        self._grip = self._grip[self._grip < self._rest.size]  # a wrapper inside may take other numbers
+        if self._grip.size and self._grip.max() >= self._rest.size:  # a wrapper inside takes other numbers
+            self._grip = self._grip[:0]
 
     def begin(self, executed: NDArray[np.float32]) -> NDArray[np.float32]:
         """The state to start from, after ``executed`` (A,), whose grip is kept."""

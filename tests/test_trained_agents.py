@@ -93,7 +93,7 @@ def test_an_agent_is_the_same_after_saving(tmp_path):
     ("layers", "message"),
     [
         ([], "at least one layer"),
-        ([(np.zeros((3, 2)), np.zeros(3)), (np.zeros((1, 4)), np.zeros(1))], r"layer 1 must be .*\(1, 3\)"),
+        ([(np.zeros((3, 2)), np.zeros(3)), (np.zeros((1, 4)), np.zeros(1))], "layer 1 takes 3"),
         ([(np.zeros((3, 2)), np.zeros(2))], "layer 0"),
         ([(np.full((3, 2), np.nan), np.zeros(3))], "finite"),
         ([(np.zeros(3), np.zeros(3))], r"two dimensions, got \[\(3,\)\]"),
