@@ -51,7 +51,7 @@ class Detectability(NamedTuple):
     delay: float | None  # time from the onset until the observer is sure [s]; None if never
 
 
-def noise_floor(noise: Array, streams: list[Array]) -> Any:
+def noise_floor(noise: Array, streams: list[Array]) -> NDArray[np.float64]:
     """Return (D,) noise: the sensors' own ``noise`` (D,), at least ``RESOLUTION`` of the spread of ``streams``."""
     spread = np.concatenate(streams).astype(np.float64).std(axis=0)
     return np.maximum(np.maximum(noise, RESOLUTION * spread), 1e-9)
@@ -72,12 +72,12 @@ def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[
     return np.cumsum(gain)
 
 
-def auroc_bound(separation: Array | float) -> Any:
+def auroc_bound(separation: Array | float) -> NDArray[np.float64]:
     """Return the largest AUROC of any detector at this S."""
     return norm.cdf(np.sqrt(np.asarray(separation, np.float64) / 2))
 
 
-def power_bound(separation: Array | float, rate: float) -> Any:
+def power_bound(separation: Array | float, rate: float) -> NDArray[np.float64]:
     """Return the largest probability of detection at this S and false-alarm ``rate``."""
     return norm.cdf(np.sqrt(np.asarray(separation, np.float64)) - norm.isf(rate))
 
