@@ -15,12 +15,9 @@ Leverage is the distance of the inputs from those learned from, for each group w
 
     l_g = a_gᵀ (E[a_g a_gᵀ] + λ I)⁻¹ a_g = ‖z‖² - ‖Q_g z_Δ‖²    a_g: a without Δ_g;  z = R a;  Rᵀ R = (E[a aᵀ] + λ I)⁻¹
 
-R is a lower triangle, the changes last, and Q_g an orthonormal basis of what Δ_g adds to their part z_Δ of z.
-
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
 2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Nagumo and Noda 1967
-(IEEE Trans. Automatic Control 12(3)) for the normalised delta rule; Bishop 2006, section 3.3.2, for the variance of a
-prediction far from the data.
+(IEEE Trans. Automatic Control 12(3)) for the normalised delta rule; Bishop 2006, section 3.3.2, for leverage.
 """
 
 from __future__ import annotations
@@ -46,7 +43,7 @@ class Association(NamedTuple):
     span_S: Array  # noqa: N815 (2, X) limits of log σ²
     remainder: Array  # (X,) s
     R: Array  # (I, I) lower triangle, or (0, I) where leverage is not known; the changes come last
-    Q: Array  # (X, X)
+    Q: Array  # (X, X) rows Q_g: an orthonormal basis of what Δ_g adds to z_Δ, the changes' part of z
     doubt: Array  # (2, X) of g²: its value at leverage 0, and its slope
 
 
@@ -126,8 +123,7 @@ def unbounded(size: int) -> Array:
 @kernel
 def leverage(a: Array, R: Array, Q: Array, groups: NDArray[np.intp], first: int) -> Array:
     """Return l (B, X) of inputs (B, I), of which the X changes begin at ``first``; ``groups`` (X,) are numbered."""
-    B, X = len(a), len(groups)
-    past = a.shape[1] - X
+    B, X, past = len(a), len(groups), a.shape[1] - len(groups)
     b, z, squares = np.empty_like(a), np.empty_like(a), np.empty(X, a.dtype)  # squares of a group, at its number
     b[:, :first], b[:, first:past], b[:, past:] = a[:, :first], a[:, first + X :], a[:, first : first + X]
     if B > 1:

@@ -12,8 +12,8 @@ each row is predicted by what was learned from the two thirds of the episodes th
 D reads the past and the command only, and U, W_S and τ are 0.
 
 Sources: Huber 1964 for ψ; Kolen and Pollack 1994 and Akrout et al. 2019 (NeurIPS) for learned feedback; Stone 1974 and
-Chernozhukov et al. 2018 (Econometrics Journal) for cross-fitting; Friston 2005 (Phil. Trans. R. Soc. B) for the
-maximum-likelihood precision; Lange et al. 1989 for the t distribution of 4 degrees of freedom.
+Chernozhukov et al. 2018 (Econometrics Journal) for cross-fitting; Friston 2005 (Phil. Trans. R. Soc. B) for learned
+precision; Lange et al. 1989 for t_4.
 """
 
 from __future__ import annotations

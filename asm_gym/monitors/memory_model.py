@@ -113,8 +113,7 @@ class MemoryModel(ScaledModel):
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
-        if not learned["R"].size:
-            shapes["R"] = (0, senses.inputs)
+        shapes["R"] = (senses.inputs if len(learned["R"]) else 0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         if missing := [name for name in shapes if name not in learned]:
