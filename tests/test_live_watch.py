@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import shlex
+import socket
 import sys
 import time
 from functools import partial
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from asm_gym.data.episode import Episode
+from asm_gym.data.gaps import bridge_of
 from asm_gym.data.logs import Log
 from asm_gym.data.rows import SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK
@@ -68,6 +70,23 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
     assert "0.260 s  2 rows lost: an alarm (late)" in said
     assert said.splitlines()[-1].startswith("30 rows, ")
     assert watched(lines(rows[kept], DT * kept), monitor, 0.05)[0] == 0
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3, 30])
+def test_up_to_two_lost_rows_are_bridged_and_more_are_one_alarm(lost, monitor):
+    kept = np.delete(np.arange(80), np.arange(20, 20 + lost))
+    count, said = watched(lines(episode(500).stream[kept], DT * kept), monitor, bridge_of(None, DT))
+    assert count == (lost > 2)
+    assert said.count("(late)") == (lost > 2)
+
+
+def test_a_port_to_which_nobody_sends_is_watched_no_longer_than_asked(monitor, tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    start = time.monotonic()
+    assert live(monitor, tmp_path, f"udp:{port}", "--wait", "0.3", "--silence", "0.3") == 2
+    assert time.monotonic() - start < 20.0  # it ran on
 
 
 @pytest.mark.parametrize("bad", ["an empty datagram", "[1, 2", "[1]", "[" * 100_000, "\x00\ufffd"])

@@ -3,9 +3,11 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from asm_gym.guard.repair import Repair
 from asm_gym.guard.responses import CAUSES, DEFAULT, RESPONSES, responses_from
+from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.wrappers import NeuralASMSafety
 from tests.arms import ACT, MEMORY, SPEC, Acting, Judge, infos, offset
@@ -224,3 +226,15 @@ def test_a_completion_that_raises_loses_the_row_and_not_the_guard(monkeypatch):
     with pytest.warns(UserWarning, match="completion: ZeroDivisionError"):
         said = infos(env, 4)
     assert said[1]["alarm"]
+
+
+def test_a_cause_is_the_same_on_any_number_of_threads():
+    known = NeuralASM.pretrained("panda").diagnosis_
+    senses, causes = known.completion.senses, []
+    for threads in (1, 2, 4):
+        rng = np.random.default_rng(0)
+        with threadpool_limits(threads):
+            diagnosis = Diagnosis(known.completion, known.readout)
+            rows = senses.mean + senses.spread * rng.normal(size=(3, 12, len(senses.mean)))
+            causes.append([diagnosis(own, np.ones(len(senses.mean))).probabilities for own in rows])
+    assert causes[0] == causes[1] == causes[2]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+from asm_gym.blas import ONE_THREAD
 from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, bounded, pool, strength
 from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps
@@ -18,7 +19,6 @@ from asm_gym.memory.temporal import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.memory_model import MemoryModel
-from asm_gym.monitors.row_kernel import _ONE_THREAD
 from asm_gym.monitors.skills import name_skills, recall
 from tests.streams import sine_episodes, sine_spec
 
@@ -181,7 +181,7 @@ def test_what_was_learned_since_counts():
 def test_many_streams_leave_the_threads_of_blas_as_they_were():
     before = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     inside = []
-    with _ONE_THREAD, _ONE_THREAD:
+    with ONE_THREAD, ONE_THREAD:
         inside = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     assert set(inside) == {1}
     assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == before

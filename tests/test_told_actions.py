@@ -177,3 +177,21 @@ def test_actions_of_a_wrong_shape_end_no_episode(actions):
     with pytest.raises((ValueError, TypeError)):
         one.step(actions[:2] if np.shape(actions) == (3,) else actions)
     one.step(np.zeros(3, np.float32))
+
+
+def test_an_action_at_the_limit_exactly_is_not_slowed_and_one_beyond_is_and_none_ends_the_episode():
+    env = lift(limits=ContactLimits(hand_speed=0.1))
+    env.reset(seed=0)
+    kept = 1.0 - env.step(np.float32([0, 0, 1, 0, 0, 0, 0]))[4]["asm"]["slowed"]
+    at = np.float32([0, 0, kept * (1 - 1e-6), 0, 0, 0, 0])
+    assert env.step(at)[4]["asm"]["slowed"] == 0.0
+    assert env.step(1.01 * at)[4]["asm"]["slowed"] > 0.0
+    for wild in (np.full(7, 1e30), np.array([0, 0, 0, 0, 0, 0, np.inf]), [0, "up", 0, 0, 0, 0, 0], None):
+        try:
+            info = env.step(wild)[4]
+        except (ValueError, TypeError):
+            env.step(np.zeros(7, np.float32))
+        else:
+            assert np.isfinite(info["asm"]["executed_action"]).all()
+            assert env.action_space.contains(info["asm"]["executed_action"].astype(np.float32))
+    env.close()

@@ -16,7 +16,7 @@ import re
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
+from asm_gym.guard.preview import Foretold
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.watchdog import Watchdog
@@ -100,6 +101,7 @@ class LeRobotGuard:
     def reset(self) -> None:
         """Begin a new episode; a stop is over."""
         self._engine: Engine | None = None  # made once the names of the actions are known
+        self._sent: Floats32 = np.zeros((1, 0), np.float32)  # (1, A) last
         self._pace = Pace(self._spec.dt)
         self._lately: deque[tuple[Mapping[str, Any], Mapping[str, float]]] = deque(maxlen=self._rows_lately)
         self.alarm = self.intervened = False
@@ -114,14 +116,21 @@ class LeRobotGuard:
         asm = {"alarm": self.alarm, "intervened": self.intervened, **self.last_alarm}
         return {**transition, "action": sent, "info": {**(transition.get("info") or {}), "asm": asm}}
 
+    def preview(self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]) -> Foretold:
+        """Say of a chunk of actions, before the first is done, which leaves the range of healthy commands, and why.
+
+        Do ``actions[:at]``, and ask the policy anew. Raises ValueError for a chunk without an action.
+        """
+        if not len(actions):
+            raise ValueError("a chunk has an action at least, got none")
+        engine = self._begun(actions[0])
+        chunk = np.array([[_number(action, name) for name in self._names] for action in actions], np.float32)
+        return engine.preview(0, chunk, self._row(observation, self._sent[0]), self._sent[0])
+
     def guarded(self, observation: Mapping[str, Any], action: Mapping[str, Any]) -> dict[str, Any]:
         """Return what is to be sent in place of an action: finite numbers only, and nothing while no place is known."""
         self._follow_clock()
-        if self._engine is None:
-            commanded = [name for is_command, name in self._motors if is_command]
-            self._names = tuple(dict.fromkeys([*commanded, *action]))
-            self._engine, self._sent = self._guard(), np.full((1, len(self._names)), np.nan, np.float32)
-        engine, acts = self._engine, self.on_alarm != "monitor"
+        engine, acts = self._begun(action), self.on_alarm != "monitor"
         asked = np.array([_number(action, name) for name in self._names], np.float32)[None]
 
         row = self._row(observation, asked[0])
@@ -147,6 +156,14 @@ class LeRobotGuard:
             return {}  # a place that is not known
         self._sent = executed
         return dict(zip(self._names, executed[0].tolist(), strict=True))
+
+    def _begun(self, action: Mapping[str, Any]) -> Engine:
+        """Return the engine, which is made once the names of the actions are known."""
+        if self._engine is None:
+            commanded = [name for is_command, name in self._motors if is_command]
+            self._names = tuple(dict.fromkeys([*commanded, *action]))
+            self._engine, self._sent = self._guard(), np.full((1, len(self._names)), np.nan, np.float32)
+        return self._engine
 
     def _follow_clock(self) -> None:
         """Say where rows come at another rate than the memory reads."""

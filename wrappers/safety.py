@@ -16,6 +16,7 @@ from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
 from asm_gym.guard.options import GuardOptions, OnAlarm
+from asm_gym.guard.preview import Foretold, checked_chunk
 from asm_gym.guard.report import LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself, changed_by, outside
@@ -155,12 +156,29 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         nothing = self._engine.begin()
         self._limit_contact(anew=True)
         self._observation, self._alarms, self._solved = observation, 0, False
+        self._row: NDArray[np.float32] | None = None  # (D,) sensed last in this episode
+        self._begun, self._foretold, self._announced = info, Foretold(None), 0
         if self._robots.meaning is not None:
             self._engine.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
         self._executed = np.zeros(0, np.float32)
         self._report(info, [nothing], None)
         return observation, info
+
+    def preview(self, actions: Any) -> Foretold:
+        """Say of a chunk of actions (k, A), before the first is done, which should not be, and why.
+
+        ``kept`` are those before it, all of them under ``"monitor"``: do these, and ask the policy anew. Until it
+        is done ``info["asm"]["preview"]`` counts down to that action. A chunk of another shape is a ValueError.
+        """
+        if self._ended or self._box is None:
+            raise gym.error.ResetNeeded("preview() needs an episode that runs, and a Box action space")
+        chunk = checked_chunk(actions, self._box.shape)
+        row = self._source.first(self._observation, self._begun) if self._row is None else self._row
+        last = self._executed.ravel() if self._executed.size else self._robots.rest
+        found = self._engine.preview(0, chunk.reshape(len(chunk), -1), row, last)
+        self._foretold, self._announced = found._replace(kept=chunk[: len(found.kept)]), len(chunk)
+        return self._foretold
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
@@ -181,6 +199,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         done = self._executed
         if self._box is not None:
             done = self._robots.executed_in(row[None], done.reshape(1, -1))[0].reshape(done.shape)
+        self._row = row
         self._judge(row, failure, info)
         self._limit_contact()
         if repaired := self._engine.repaired:
@@ -254,14 +273,20 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         alarm = True in [bool(row.alarm[0]) for row in rows] or bool(info.get("asm_alarm"))  # of a guard inside
         intervened = True in [bool(row.intervened[0]) for row in rows] or bool(info.get("asm_intervened"))
         self._alarms += alarm
-        robots, asked = self._robots, self._executed
+        robots, asked, ahead = self._robots, self._executed, None
+        if self._announced > 0:
+            at = None if self._foretold.at is None else self._foretold.at - 1
+            self._announced = 0 if at == -1 else self._announced - 1
+            self._foretold = self._foretold._replace(at=at)
+            ahead = {"at": at, "reason": self._foretold.reason, "known": self._foretold.known}
+            ahead = ahead if self._announced else None
         more: dict[str, float] = {"alarms": self._alarms}
         if (running := self._engine.running) is not None:
             more = more | {"ceiling": running.ceiling, "level": running.level}
 
         def told() -> dict[str, Any]:
             slowed = 0.0 if executed is None or self._box is None else robots.slowed(asked, executed)
-            return report(rows, 0, self._spec, executed) | more | {"slowed": slowed}
+            return report(rows, 0, self._spec, executed) | more | {"slowed": slowed, "preview": ahead}
 
         info["asm"] = LazyInfo(told)
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)

@@ -71,11 +71,15 @@ class Pace:
             found.append(np.column_stack((np.full(len(places), arm), places, seen)))
         return np.concatenate(found).astype(np.float32) if found else None
 
-    def share(self, arm: int, place: Floats, twist: Floats, speed: float, usual: float) -> float:
-        """Return the share of its motion that a hand may have; see ``ContactLimits.share``. ``usual``: its limit."""
+    def seen(self, arm: int, place: Floats) -> NDArray[np.floating[Any]]:
+        """Return (2, 6) the greatest twist near a place (3,), along the axes of the world and against them; else 0."""
         cell = (arm, *np.floor(place / CELL).astype(np.intp)) - self._low
         there = (cell >= 0).all() and (cell < self._seen.shape[:4]).all()
-        seen = self._seen[tuple(cell)].reshape(2, 6) if there else np.zeros((2, 6))
+        return self._seen[tuple(cell)].reshape(2, 6) if there else np.zeros((2, 6))
+
+    def share(self, arm: int, place: Floats, twist: Floats, speed: float, usual: float) -> float:
+        """Return the share of its motion that a hand may have; see ``ContactLimits.share``. ``usual``: its limit."""
+        seen = self.seen(arm, place)
         along = FASTER * np.where(twist > 0.0, seen[0], seen[1])
         with np.errstate(divide="ignore"):
             share = max(usual / speed, float(((along + SLACK) / np.abs(twist)).min()))

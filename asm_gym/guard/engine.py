@@ -23,6 +23,7 @@ from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import STALE, Fitted, Observation, Observer, diagnosis_of, joined
 from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.preview import Foretold, foretell
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
 from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from
@@ -82,7 +83,7 @@ class Engine:
             raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
         self.fitted = Fitted.of(monitor, spec)
         self.options, self.ends_on_alarm = options, name == "terminate"
-        self._count, self._spec, self._name, self._graded = n, spec, name, graded
+        self._count, self._spec, self._name, self._graded, self._robots = n, spec, name, graded, robots
         reflexes = Reflexes(robots, spec, name) if acts and not policies else None
         rule = options.rule(graded, robots.dt, rows_per_step) if acts else None
         self._arbiter = Arbiter(n, rule, self.fitted.threshold, options.adaptive_threshold)
@@ -144,6 +145,16 @@ class Engine:
     def nothing(self) -> RowReport:
         """Return that there is nothing to say of any robot."""
         return RowReport.nothing(self._count, self._spec.size, self.threshold)
+
+    def preview(
+        self, robot: int, chunk: NDArray[np.float32], row: NDArray[np.float32], last: NDArray[np.float32]
+    ) -> Foretold:
+        """Return what becomes of a robot's chunk of actions (k, A), after a row (D,) and the action (A,) done last."""
+        robots, limits = self._robots, self.limits[robot]
+        within = np.where(np.isfinite(chunk), np.clip(chunk, robots.low, robots.high), chunk)
+        slows = limits is not None and np.isfinite(limits.hand_speed) and robots.limits_contact
+        found = foretell(within, row, last, self.fitted.monitor, robots.dt, limits if slows else None)
+        return found._replace(kept=chunk if self._name == "monitor" else chunk[: found.at])
 
     def act(self, actions: NDArray[np.float32], seen: Callable[[int], Any], idle: Mask | None = None) -> Command:
         """Return what is to be done.

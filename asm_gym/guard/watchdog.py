@@ -81,8 +81,8 @@ def _watch(hold: Hold, patience: float, processes: Sequence[int], beat: Any, rea
     signal.signal(signal.SIGTERM, lambda *_: hold("the guard has ended without closing its watchdog") or os._exit(0))
     parent = multiprocessing.parent_process()
     assert parent is not None
-    others = {os.pidfd_open(process): process for process in processes}
-    watched: list[Any] = [parent.sentinel, *others]
+    others: dict[Any, int] = {os.pidfd_open(process): process for process in processes}
+    watched = [parent.sentinel, *others]
     ready.set()
     silent = False
     while beat.value != OVER:
@@ -94,7 +94,7 @@ def _watch(hold: Hold, patience: float, processes: Sequence[int], beat: Any, rea
             return
         for one in ended:
             watched.remove(one)
-            hold(f"process {others[int(one)]} has died")  # type: ignore[call-overload]
+            hold(f"process {others[one]} has died")
         late = beat.value > 0.0 and time.monotonic() - beat.value > patience
         if late and not silent:
             hold(f"the guard has judged no row for {patience:g} s")

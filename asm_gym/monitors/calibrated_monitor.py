@@ -16,6 +16,7 @@ from asm_gym.data.action_meaning import ACTIONS, found_meaning
 from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.detection import Blocks, Detection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
+from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import Pace, healthy_forces
 from asm_gym.monitors.base import Progress, State, Surprise
@@ -68,6 +69,8 @@ class CalibratedMonitor:
     blocks_: Blocks | None
     healthy_: tuple[float, ...]
     pace_: NDArray[np.float32] | None
+    motion_: NDArray[np.floating[Any]] | None
+    commands_: NDArray[np.floating[Any]] | None
 
     def __init__(self, model: StreamModel, *detections: Detection, seed: int = 0) -> None:
         if not detections:
@@ -229,6 +232,7 @@ class CalibratedMonitor:
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
         streams = [episode.stream for episode in episodes]
         self.healthy_, self.pace_ = healthy_forces(streams, self.spec), Pace.learned(streams, self.spec)
+        self.motion_, self.commands_ = learned_motion(streams, self.spec), healthy_commands(streams, self.spec)
         return self
 
     @property
@@ -346,7 +350,8 @@ class CalibratedMonitor:
 
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = None
-        self.promised_, self.healthy_, self.pace_ = EPISODE, (), None
+        self.promised_, self.healthy_ = EPISODE, ()
+        self.pace_ = self.motion_ = self.commands_ = None
 
     @property
     def _name(self) -> str:

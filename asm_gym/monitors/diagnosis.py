@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
+from asm_gym.blas import ONE_THREAD
 from asm_gym.memory.completion import Completion
 from asm_gym.spec import MOTOR
 
@@ -116,7 +117,8 @@ class Diagnosis:
 
     def __post_init__(self) -> None:
         """Invert what there is to invert now: an alarm does not wait for it."""
-        _ = self._freed
+        with ONE_THREAD:
+            _ = self._freed
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
@@ -180,8 +182,9 @@ class Diagnosis:
         if stuck is not None:
             certain = {name: float(name == "sensor") for name in FAMILIES}
             return Cause("sensor", stuck[0], 1.0, certain, stuck[1])
-        evidence, best = self.evidence(self.completion.lift(rows), attribution, missing)
-        p = self.readout(evidence[None])[0]
+        with ONE_THREAD:  # the same to the last bit on any machine with these libraries
+            evidence, best = self.evidence(self.completion.lift(rows), attribution, missing)
+            p = self.readout(evidence[None])[0]
         probabilities = dict.fromkeys(FAMILIES, 0.0)
         for (family, _), q in zip(CLASSES.values(), p, strict=True):
             probabilities[family] += float(q)

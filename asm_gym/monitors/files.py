@@ -22,7 +22,7 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
 MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks", "learned_from", "ceilings_from"
-PACE = "pace"
+PACE, MOTION, COMMANDS = "pace", "motion", "commands"
 """Names of the arrays that ``calibrate``, ``fit`` and ``learn_ceilings`` keep in a checkpoint."""
 BITS, SCALE, ROOT = ".bits", ".scale", ".root"
 """Ends of the names of packed arrays; shipped memories also hold covariances C = s² K Kᵀ, by a root K of 16 bits."""
@@ -57,6 +57,8 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
         "learned_from_": arrays.pop(LEARNED_FROM, None),
         "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
         "pace_": arrays.pop(PACE, None),
+        "motion_": arrays.pop(MOTION, None),
+        "commands_": arrays.pop(COMMANDS, None),
         "about": dict(header["about"]),
         "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
     }
@@ -82,6 +84,8 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
         LEARNED_FROM: monitor.learned_from_,
         CEILINGS_FROM: monitor.ceilings_from_,
         PACE: monitor.pace_,
+        MOTION: monitor.motion_,
+        COMMANDS: monitor.commands_,
     }
     arrays: dict[str, NDArray[Any]] = learned | {name: array for name, array in kept.items() if array is not None}
     header = {

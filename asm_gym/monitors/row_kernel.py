@@ -11,13 +11,12 @@ import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
-from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
 
+from asm_gym.blas import ONE_THREAD
 from asm_gym.compilation import compiled, inner, must_compile
 from asm_gym.detection.detector import _step
 from asm_gym.detection.events import Excuses
@@ -94,7 +93,7 @@ class RowKernel:
         new = [empty(array.shape, array.dtype) for array in old] if out is None else _arrays(out)
         value, attribution, raw, excuse, divisor = empty(B), empty(rows.shape), empty(B), empty(B, np.int8), empty(B)
         found: tuple[Any, ...] = value, attribution, raw, excuse, divisor
-        with _ONE_THREAD if B > 1 else nullcontext():  # one row calls no BLAS
+        with ONE_THREAD if B > 1 else nullcontext():  # one row calls no BLAS
             error, finite = expect_rows(rows, *old[:6], *new[:6], *self._memory)
             judge_rows(rows, error, finite, new[1], *old[6:], *new[6:], *found, *self._judges)
         excused = (raw, excuse) if self._excuses is not None else (None, None)
@@ -110,41 +109,6 @@ def _arrays(state: MonitorState) -> list[Any]:
     """Return the arrays of a state, in the order in which the compiled functions take them."""
     (traces, expected, history, skill), (evidence, repetition) = state.model, state.detection
     return [traces, expected, *history, skill, *evidence, *repetition, state.excuses]
-
-
-class _OneThread:
-    """Limit BLAS to one thread: several are slower at products this small, above all where they share cores.
-
-    Only where it has several: ``threadpoolctl.limit`` takes as long as a row.
-    """
-
-    def __init__(self) -> None:
-        self._lock, self._inside = Lock(), 0
-        self._libraries: list[Any] = []
-        self._limited: list[tuple[Any, int]] = []
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._inside == 0:
-                # Looks through all libraries, once.
-                self._libraries = self._libraries or ThreadpoolController().select(user_api="blas").lib_controllers
-                self._limited = [(library, n) for library in self._libraries if (n := library.num_threads) != 1]
-                self._set([(library, 1) for library, _ in self._limited])
-            self._inside += 1
-
-    def __exit__(self, *error: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
-                self._set(self._limited)
-
-    @staticmethod
-    def _set(threads: list[tuple[Any, int]]) -> None:
-        for library, n in threads:
-            library.set_num_threads(n)
-
-
-_ONE_THREAD = _OneThread()
 
 
 def uninitialised(state: Any) -> Any:

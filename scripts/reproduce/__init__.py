@@ -17,6 +17,7 @@ INDEPENDENT = {
     "local_learning": "local updates against backpropagation through time",
     "speed_accuracy": "more inference, or slower movements, for more accuracy",
     "harm": "harm avoided against success kept, under any policy",
+    "chunks": "blows foretold from chunks of actions, and false verdicts",
 }
 STUDIES = {
     **INDEPENDENT,

@@ -1,0 +1,95 @@
+"""Say of a chunk of actions, before the first is done, which of them would leave what healthy motion did.
+
+    v_j = [v_{j-1}, u_j] M,    p_j = p_{j-1} + Δt v_j        of all hands, after action u_j (``detection.commands``)
+
+p_j and v_j are looked up in the places of healthy hands. Where no hand is sensed each action is held against the range
+of healthy commands. How hard a contact will be nothing here tells, nor what surprises: the memory's own rows, rolled
+forward, surprise it more in healthy chunks than in hostile ones.
+"""
+
+from __future__ import annotations
+
+from itertools import count
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.detection.commands import PACE, PLACE, hands_of, out_of_range
+from asm_gym.detection.contact_limits import ContactLimits, Pace
+from asm_gym.validation import as_float32
+
+NO_ACTION = "no action"  # a number of it is not finite
+SLACK = 0.05  # a hand may be faster than healthy ones by so much [m/s]
+
+Floats32 = NDArray[np.float32]
+
+
+class Foretold(NamedTuple):
+    """What a chunk of actions will lead to."""
+
+    at: int | None  # the first action that is not to be done, from 0 on; None where all may be
+    reason: str = ""  # ``"place"``, ``"pace"``, ``"no action"``; empty where all may be
+    seconds: float = np.inf  # until then
+    known: bool = True  # the monitor was calibrated on streams that tell
+    kept: Floats32 = np.zeros((0, 0), np.float32)  # (k', A) the actions that are to be done
+
+
+def checked_chunk(actions: Any, shape: tuple[int, ...]) -> Floats32:
+    """Return a chunk (k, *shape). Raises ValueError for another shape, or no action."""
+    chunk = np.array(as_float32(actions, "a chunk of actions"))
+    if chunk.shape[1:] != shape or not len(chunk):
+        raise ValueError(f"a chunk has actions of the shape {shape}, one at least, got the shape {chunk.shape}")
+    return chunk
+
+
+def foretell(
+    chunk: Floats32,
+    row: NDArray[np.floating[Any]],
+    last: NDArray[np.floating[Any]],
+    monitor: Any,
+    dt: float,
+    limits: ContactLimits | None = None,
+) -> Foretold:
+    """Return what becomes of a chunk.
+
+    Args:
+        chunk: (k, A).
+        row: (D,) sensed before it.
+        last: (A,) what was done before it.
+        monitor: holds the chunk against what it was calibrated on.
+        dt: control period [s].
+        limits: slow hands down; None for no limits.
+    """
+    cells, motion, commands = (getattr(monitor, name, None) for name in ("pace_", "motion_", "commands_"))
+    pace = None if cells is None or motion is None else Pace(cells)
+    place, velocity = row.astype(np.float64)[hands_of(monitor.spec)].swapaxes(0, 1)  # (H, 3)
+    known, rows = pace is not None or commands is not None, max(1, round(dt / monitor.spec.dt))
+    for j, action in enumerate(chunk):
+        reason = "" if np.isfinite(action).all() else NO_ACTION
+        if pace is not None and not reason:
+            for _ in range(rows):
+                velocity = (np.concatenate([velocity.ravel(), action]) @ motion).reshape(place.shape)
+                if limits is not None:
+                    velocity *= [[_share(limits, *hand)] for hand in zip(count(), place, velocity, strict=False)]
+                place = place + dt / rows * velocity
+            reason = next(filter(None, (_beyond(pace, *hand) for hand in zip(count(), place, velocity))), "")
+        elif commands is not None and not reason:
+            reason = out_of_range(commands, last, action)
+        if reason:
+            return Foretold(j, reason, j * dt, known)
+        last = action
+    return Foretold(None, known=known)
+
+
+def _share(limits: ContactLimits, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
+    """Return the share of a velocity (3,) that limits leave to a hand at a place (3,)."""
+    return min(1.0, limits.share(hand, place, np.append(velocity, np.zeros(3)), float(np.linalg.norm(velocity))))
+
+
+def _beyond(pace: Pace, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> str:
+    """Return what no healthy hand did near a place (3,): be there, or have the velocity (3,); else empty."""
+    seen = pace.seen(hand, place)[:, :3]
+    if not seen.any():
+        return PLACE
+    return PACE if (np.abs(velocity) > np.where(velocity > 0.0, *seen) + SLACK).any() else ""
