@@ -7,7 +7,7 @@ import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection.commands import healthy_commands, learned_motion
-from asm_gym.detection.contact_limits import Pace
+from asm_gym.detection.contact_limits import ContactLimits, Pace
 from asm_gym.guard.preview import foretell
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -18,7 +18,8 @@ from tests.test_lerobot import MOTORS, LeRobotGuard, recorded
 HAND = StreamSpec(
     (Channel("hand_position", 3, "m"), Channel("hand_velocity", 3, "m/s"), Channel("action", 2, group=MOTOR)), dt=0.05
 )
-DOWN, UP = np.tile([0, 0, -1, 0, 0, 0, 0], (16, 1)), np.tile([0, 0, 0.5, 0, 0, 0, 0], (16, 1))
+UP = np.tile([0, 0, 0.5, 0, 0, 0, 0], (16, 1))
+DOWN = -UP
 
 
 def path(speed, commands=(0.0, 0.5)):
@@ -89,7 +90,7 @@ def test_the_limit_of_speed_counts_in_what_is_foretold(memory, lift):
     free = NeuralASMSafety(lift, memory, contact_limits=None)
     free.reset(seed=0)
     early = free.preview(DOWN).at
-    slow = NeuralASMSafety(lift, memory)
+    slow = NeuralASMSafety(lift, memory, contact_limits=ContactLimits(hand_speed=0.05))
     slow.reset(seed=0)
     assert slow.preview(DOWN).at > early
 
