@@ -16,9 +16,9 @@ from importlib.metadata import version
 
 import numpy as np
 import pytest
+from asm_gym.data.gaps import bridge_of
 
 from asm_gym.data.episode import Episode
-from asm_gym.data.gaps import bridge_of
 from asm_gym.data.logs import Log
 from asm_gym.data.rows import SourceDied
 from asm_gym.detection.events import EVENTS, KNOCK
