@@ -90,7 +90,7 @@ def test_the_limit_of_speed_counts_in_what_is_foretold(memory, lift):
     free = NeuralASMSafety(lift, memory, contact_limits=None)
     free.reset(seed=0)
     early = free.preview(DOWN).at
-    slow = NeuralASMSafety(lift, memory, contact_limits=ContactLimits(hand_speed=0.05))
+    slow = NeuralASMSafety(lift, memory, contact_limits=ContactLimits(hand_speed=0.08))
     slow.reset(seed=0)
     assert slow.preview(DOWN).at > early
 
