@@ -12,7 +12,7 @@ import pytest
 
 from asm_gym.data.episode import save_episode
 from asm_gym.rollouts import corpus as module
-from asm_gym.rollouts.corpus import MANIFEST, ROUNDS, VERSION, Corpus, Source, record_corpus, trials
+from asm_gym.rollouts.corpus import MANIFEST, ROUNDS, VERSION, Corpus, Source, record_corpus, skill_files, trials
 from asm_gym.rollouts.trial import faulty_trial
 from asm_gym.scripts.evaluate import main as evaluate
 from tests.streams import sine_episodes
@@ -130,3 +130,8 @@ def test_monitors_are_judged_by_a_corpus(pushed, tmp_path):
     assert re.search(r"\| kalman\+evidence \| 1.000 \(1.000–1.000\) \|.* 100 % \(100–100\)", text)
     assert "within chance" in text
     assert not (pushed / "scripted/monitors").exists()
+
+
+def test_fewer_episodes_to_learn_from_leave_all_others_as_they_are(pushed):
+    roles = [file.parent.name for file in skill_files(pushed, fit=2)]
+    assert [roles.count(role) for role in ("fit", "calibration", "nominal", "faulty")] == [2, 24, 8, 4]
