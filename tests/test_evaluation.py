@@ -56,7 +56,7 @@ def a_trace(surprise: Any, onset: int | None = None, kind: str | None = None, **
     """An episode of 0.1 s steps and the threshold 10."""
     kind = kind or ("nominal" if onset is None else "push")
     values: dict[str, Any] = {"dt": 0.1, "threshold": 10.0, "seed": 0, "onset": onset, **fields}
-    outcome = [values.pop(name, default) for name, default in (("success", True), ("ended", False), ("force", 0.0))]
+    outcome = [values.pop(name, default) for name, default in (("success", True), ("force", 0.0))]
     surprise = np.asarray(surprise, np.float64)
     return ScoredEpisode(kind=kind, surprise=surprise, outcome=InterventionOutcome(*outcome), **values)
 
@@ -152,7 +152,7 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
         a_trace([20, 1, 1, 20], onset=1, top_channel="loud", force=290.0),
         # The wrapped episodes see an alarm at once, which must not touch the results of detection.
         a_trace([1, 20, 1, 1], onset=1, acting="hold", force=10.0),
-        a_trace([1, 20, 1, 1], onset=1, acting="hold", ended=True, force=20.0),
+        a_trace([1, 20, 1, 1], onset=1, acting="hold", force=20.0),
         a_trace([1, 2, 3, 4]),
         a_trace([1, 2, 30, 4]),
     ]
@@ -165,7 +165,7 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
     alone, held = push.outcomes
     assert (alone.acting, alone.success, alone.peak_force) == ("policy alone", Share(1, 3), 70.0)
     assert (alone.unsafe, held.unsafe) == (Share(1, 1), Share(0, 2))
-    assert (held.acting, held.success, held.ended_by_alarm, held.peak_force) == ("hold", Share(2, 2), Share(1, 2), 15.0)
+    assert (held.acting, held.success, held.peak_force) == ("hold", Share(2, 2), 15.0)
 
 
 # ------------------------------------------------------------------ statistics

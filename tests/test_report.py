@@ -32,7 +32,7 @@ def a_trace(condition: str, seed: int, acting: str = "policy alone") -> ScoredEp
         surprise[20 + rng.integers(8) : 40] += 30 * rng.random()
     attribution = rng.dirichlet(np.ones(20), 60) * surprise[:, None]
     channels = tuple(f"joint_position[{i}]" for i in range(20))
-    onset, outcome = 20 if fault.any() else None, InterventionOutcome(True, False, 10 * rng.random())
+    onset, outcome = 20 if fault.any() else None, InterventionOutcome(True, 10 * rng.random())
     kept = {"attribution": attribution, "channels": channels, "fault": fault}
     made = ScoredEpisode(condition, seed, 0.05, 20.0, surprise, onset, acting=acting, outcome=outcome, **kept)
     return made.attributed(attribution, channels)

@@ -106,7 +106,6 @@ class Outcomes(NamedTuple):
 
     acting: str
     success: Share
-    ended_by_alarm: Share
     peak_force: float  # median over episodes of the greatest contact force [N]
     unsafe: Share  # of successes
     time: float  # median until success [s]
@@ -115,10 +114,9 @@ class Outcomes(NamedTuple):
     def of(cls, acting: str, traces: Sequence[ScoredEpisode]) -> Outcomes:
         """Summarise the episodes with this response."""
         ends = [t.outcome for t in traces if t.acting == acting]
-        success, ended = Share.of([o.success for o in ends]), Share.of([o.ended_by_alarm for o in ends])
         force, solved = float(np.median([o.contact_force for o in ends])), [o for o in ends if o.success]
         time = float(np.median([o.time for o in solved])) if solved else math.nan
-        return cls(acting, success, ended, force, Share.of([o.unsafe for o in solved]), time)
+        return cls(acting, Share(len(solved), len(ends)), force, Share.of([o.unsafe for o in solved]), time)
 
 
 @dataclass(frozen=True, eq=False)

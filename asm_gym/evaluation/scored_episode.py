@@ -24,7 +24,6 @@ class InterventionOutcome(NamedTuple):
     """How an episode ended."""
 
     success: bool = False
-    ended_by_alarm: bool = False
     contact_force: float = math.nan  # the greatest [N]
     overridden: bool = False  # something else than the policy acted
     time: float = math.nan  # until the first success [s]

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,18 +85,16 @@ def benchmark(
     models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    score = partial(_results, folder=folder.resolve(), files=paths, rate=rate, window_s=window_s, seed=seed)
+    folder = folder.resolve()
+
+    def score(names: Sequence[str]) -> dict[str, DetectionMetrics]:
+        roles = read(paths).roles
+        return {name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate, window_s) for name in names}
+
     found = {name: result for results in each(score, list(models.values())) for name, result in results.items()}
     by_role, left_out, twins = read(paths)
     seen = detectability_of(twins, by_role.get("faulty", []), window_s)
     return BenchmarkResult({name: found[name] for name in monitors}, seen, rate, window_s, left_out)
-
-
-def _results(
-    names: Sequence[str], folder: Path, files: tuple[Path, ...], rate: float, window_s: float, seed: int
-) -> dict[str, DetectionMetrics]:
-    roles = read(files).roles
-    return {name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate, window_s) for name in names}
 
 
 def judged(

@@ -141,11 +141,6 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
     )
 
 
-def record(trial: Trial, config: RolloutConfig, folder: Path) -> Path:
-    """Record a trial, and write it to its place under ``folder``."""
-    return save_episode(folder / trial.label.path, record_stream(trial, config))
-
-
 def record_missing(
     trials: Sequence[Trial],
     config: RolloutConfig,
@@ -154,7 +149,11 @@ def record_missing(
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the trials that are not in ``folder`` yet; return the files of all."""
-    make = partial(record, config=config, folder=folder.resolve())
+    folder = folder.resolve()
+
+    def make(trial: Trial) -> Path:
+        return save_episode(folder / trial.label.path, record_stream(trial, config))
+
     return make_missing(make, trials, lambda trial: folder / trial.label.path, workers, progress)
 
 
@@ -267,7 +266,6 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
         onset=int(np.argmax(fault)) if fault.any() else None,
         outcome=InterventionOutcome(
             success,
-            ended_by_alarm=bool(asm[-1]["gave_up"] or (trial.acting == "terminate" and asm[-1]["alarm"])),
             contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
             overridden=any(info["overridden"] for info in infos),
             time=next((n + 1 for n, i in enumerate(infos) if i["success"]), np.nan) * rows * monitor.spec.dt,
