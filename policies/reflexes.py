@@ -96,11 +96,7 @@ def nearest_to_rest(space: spaces.Box) -> NDArray[np.float32]:
 
 
 def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
-    """Return (A,) the action that reaches the innermost environment as zero.
-
-    Raises:
-        ValueError: a wrapper inside changes actions so that none is known.
-    """
+    """Return (A,) the action that reaches the innermost environment as zero; raise ValueError where none is known."""
     space: Any = env.action_space
     bounded = np.isfinite(space.low) & np.isfinite(space.high)
     middle = 0.5 * (np.where(bounded, space.low, 0.0) + np.where(bounded, space.high, 0.0))

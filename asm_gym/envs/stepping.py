@@ -116,11 +116,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._actions.scaled(action)
 
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can.
-
-        Raises:
-            ValueError: the controller is neither OSC_POSE nor JOINT_POSITION.
-        """
+        """Return the action (A,) that turns joints by ``turns`` (J,) [rad]; raise ValueError where none is a change."""
         return self._actions.turning(self.simulation, np.asarray(turns, np.float64))
 
     def measure(self) -> NDArray[np.float64]:

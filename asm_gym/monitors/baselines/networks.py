@@ -103,9 +103,7 @@ def train_on_episodes(
 ) -> None:
     """Train by Adam, slowed down at every plateau of the fresh loss, until no gain is left; keep the best weights.
 
-    Args:
-        loss: of some episodes, by their numbers, while training or not.
-        episodes: how many there are. A fifth is not trained on; with fewer than five all are trained on.
+    A fifth of the ``episodes`` is not trained on, none of fewer than five; ``loss`` is that of some, training or not.
     """
     order = rng.permutation(episodes).astype(np.intp)
     kept = episodes // FRESH

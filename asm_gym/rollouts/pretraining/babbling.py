@@ -85,13 +85,9 @@ class Lesson(NamedTuple):
 
 
 def curriculum(tasks: Sequence[str], episodes: int, seed: int, reaching: bool = False) -> list[Lesson]:
-    """Return the lessons, task by task; all follow from ``seed``, and fewer ``episodes`` are the first of more.
+    """Return ``episodes`` of each task; all follow from ``seed``, and fewer are the first of more.
 
-    Args:
-        tasks: their names.
-        episodes: of each task.
-        seed: of the curriculum.
-        reaching: the hand reaches for places where noise alone would lead, and one lesson more for each three presses.
+    ``reaching``: the hand reaches for places where noise alone would lead, and one lesson more for each three presses.
     """
     check_number("episodes", episodes, low=1, whole=True)
     lessons = []
