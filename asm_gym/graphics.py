@@ -29,15 +29,12 @@ assert frame.min() < frame.max(), "the frame is one colour"
 
 @cache
 def rendering_backend() -> str | None:
-    """Return the first backend with which MuJoCo draws a frame here; None where none does.
-
-    Tried in other processes: a choice of backend cannot be undone within one.
-    """
+    """Return the first backend with which MuJoCo draws a frame here; None where none does."""
     return next((backend for backend in BACKENDS if draws_a_frame(backend)), None)
 
 
 def draws_a_frame(backend: str) -> bool:
-    """Return whether MuJoCo draws one frame with ``MUJOCO_GL=backend``, in a process of its own."""
+    """Return whether MuJoCo draws one frame with ``MUJOCO_GL=backend``, in another process: no choice can be undone."""
     env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
     command = [sys.executable, "-c", ONE_FRAME]
     try:  # a driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds

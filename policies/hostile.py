@@ -22,10 +22,7 @@ Rule = Callable[[int, np.random.Generator, int], Floats]
 
 
 class Hostile(StatefulPolicy):
-    """Acts by a ``rule``, whatever it observes, at a share ``speed`` of the full action.
-
-    The environment's actions are changes of the hand's pose, the grip last.
-    """
+    """Acts by a ``rule``, whatever it observes, at a share ``speed`` of the full change of the hand's pose."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, rule: Rule) -> None:
         self._space: Any = env.action_space

@@ -21,9 +21,7 @@ class SafetyCallback(BaseCallback):
         self.ended: list[dict[str, float]] = []  # the numbers of all episodes that have ended
 
     def _on_training_start(self) -> None:
-        self._steps: list[list[tuple[float, bool, float, bool, float]]] = [
-            [] for _ in range(self.training_env.num_envs)
-        ]
+        self._steps: list[list[tuple[float, ...]]] = [[] for _ in range(self.training_env.num_envs)]
 
     def _on_step(self) -> bool:
         for steps, info, done in zip(self._steps, self.locals["infos"], self.locals["dones"], strict=True):
