@@ -58,11 +58,7 @@ def noise_floor(noise: Array, streams: list[Array]) -> NDArray[np.float64]:
 
 
 def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[np.float64]:
-    """Return (T - onset,) S of a faulty episode (T, D) and its twin, from the onset up to each step, in noise (D,).
-
-    Raises:
-        ValueError: the two differ before the onset, so they are no twins.
-    """
+    """Return (T - onset,) S up to each step of an episode (T, D) and its twin in noise (D,); ValueError: no twins."""
     length = min(len(faulty), len(twin))
     if not np.array_equal(faulty[: min(onset, length)], twin[: min(onset, length)]):
         raise ValueError(f"the episodes differ before the onset at step {onset}: they are not twins")
