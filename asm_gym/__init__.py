@@ -40,9 +40,10 @@ if TYPE_CHECKING:
 _HOME = {
     **dict.fromkeys(("NeuralASM", "make_monitor", "register_monitor"), "monitors"),
     **dict.fromkeys(("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"),
-    **dict.fromkeys(("collect", "harmless"), "rollouts"),
     **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
     "Episode": "data.episode",
+    "collect": "rollouts.collect",
+    "harmless": "rollouts.pretraining.healthy",
     "make_policy": "policies",
     "register_fault": "faults.suite",
     "register_policy": "policies.registry",

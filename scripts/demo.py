@@ -130,7 +130,6 @@ def demonstrate(args: Args, console: Console) -> None:
     details = asdict(args) | versions("numba") | {"window_s": WINDOW_S}
     drawn = {
         "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
-        "Faults against nominal episodes at the same time": figures.roc_figure(rows),
     }
     intro = (
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "

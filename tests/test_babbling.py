@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from asm_gym import harmless
 from asm_gym.data.episode import Episode, EpisodeLabel, load_episode
 from asm_gym.evaluation.comparison import detectability_of
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.scripted.base import ObservationReader
-from asm_gym.rollouts import harmless
 from asm_gym.rollouts.pretraining.babbling import (
     ALONE,
     AROUND,

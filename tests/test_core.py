@@ -80,8 +80,10 @@ ONE_IMPORT = {
     **dict.fromkeys(("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy"), None),
     **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
     "FaultInjection": SAID[0],
-    "register_fault": SAID[0].replace("a robosuite environment or a fault in one", "register_fault"),
-    **dict.fromkeys(("collect", "harmless"), SAID[0]),
+    **{
+        n: SAID[0].replace("a robosuite environment or a fault in one", n)
+        for n in ("register_fault", "collect", "harmless")
+    },
 }
 """What a core install answers for each name of the package."""
 

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import NormalizeObservation
 
-from asm_gym import register_task
+from asm_gym import collect, register_task
 from asm_gym.data.datasets import read_dataset
 from asm_gym.faults import (
     ActionDelay,
@@ -24,7 +24,6 @@ from asm_gym.faults import (
 from asm_gym.faults.anywhere import KINDS, FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import SEVERITIES
 from asm_gym.policies import make_policy
-from asm_gym.rollouts import collect
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec, flat, flat_rows
 from asm_gym.tasks import OWN

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from asm_gym.rollouts import parallel_map
+from asm_gym.rollouts.parallel import parallel_map
 
 PARENT = """
 import os, signal, sys, threading, time

@@ -12,7 +12,7 @@ from asm_gym.faults.suite import KINDS
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import POLICIES
 from asm_gym.registries import added
-from asm_gym.rollouts import parallel_map
+from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.synthetic_arm import SyntheticArm
 from asm_gym.tasks import OWN, env_id
 from tests.models import Persistence

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
-from asm_gym.evaluation.metrics import by_condition, false_alarms, time_matched_auroc
+from asm_gym.evaluation.metrics import by_condition, false_alarms
 from asm_gym.evaluation.report import write_report
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.tables import Table, tabulate
@@ -48,7 +48,6 @@ def figures_of(traces: list[ScoredEpisode]) -> dict[str, Figure]:
     faulty = next(t for t in traces if t.delay is not None)
     return {
         "surprise": figures.surprise_figure([traces[0], faulty]),
-        "roc": figures.roc_figure(by_condition(traces, 1.0)),
     }
 
 
@@ -60,18 +59,6 @@ def test_figures_are_the_same_bytes_whatever_the_users_style_and_leave_it_alone(
     for name, figure in again.items():
         assert figures.save(figure, tmp_path / "again.png").read_bytes() == before[name], name
     assert plt.get_fignums() == []
-
-
-def test_the_roc_curve_encloses_the_auroc_it_names(traces):
-    ax = figures.roc_figure(by_condition(traces, 1.0)).axes[0]
-    alone = [t for t in traces if t.acting == "policy alone"]
-    nominal = [t for t in alone if t.condition == "nominal"]
-    for line, condition in zip(ax.lines[1:], ("push", "weak joint"), strict=True):
-        x, y = (np.append(np.asarray(v, float), 1.0) for v in line.get_data())
-        area = float(np.sum(np.diff(x) * y[:-1]))  # steps hold their value to the right
-        auroc = time_matched_auroc([t for t in alone if t.condition == condition], nominal, 1.0)
-        assert area == pytest.approx(auroc)
-        assert line.get_label() == f"{condition}: {auroc:.3f}"
 
 
 def test_infinite_and_zero_surprise_can_be_drawn(traces, tmp_path: Path):

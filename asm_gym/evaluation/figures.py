@@ -23,7 +23,6 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from asm_gym.data.columns import Column, is_constant
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
-from asm_gym.evaluation.metrics import DetectionMetrics, placements
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.files import written_whole
 
@@ -71,27 +70,6 @@ def look(i: int) -> tuple[str, Any, str]:
 def _require_some(traces: Sized) -> None:
     if not len(traces):
         raise ValueError("there are no traces to draw")
-
-
-def roc_figure(groups: Sequence[DetectionMetrics]) -> Figure:
-    """Draw the ROC of each group over all its faults, against nominal episodes of the task in the same steps."""
-    faulty = [g for g in groups if g.faulty]
-    _require_some(faulty)
-    if not all(g.nominal for g in faulty):
-        raise ValueError("a ROC curve needs nominal traces")
-    with figure(height=4.6, width=8.4) as fig:
-        ax = fig.subplots()
-        ax.plot([0, 1], [0, 1], color=GREY, linewidth=1)
-        for i, group in enumerate(faulty):
-            u = placements(group.faulty, group.nominal, group.window_s)
-            if u.size:
-                colour, line, _ = look(i)
-                ax.ecdf(u, color=colour, linestyle=line, linewidth=2, label=f"{group.name}: {1 - u.mean():.3f}")
-        ax.set(xlim=(0, 1), ylim=(0, 1), box_aspect=1)
-        ax.set(xlabel="share of nominal episodes above", ylabel="share of faulty episodes above")
-        ax.grid()
-        fig.legend(loc="outside right upper", handlelength=3.5, title="AUROC")
-    return fig
 
 
 def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:

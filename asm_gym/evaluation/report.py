@@ -15,7 +15,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from asm_gym.evaluation import figures
 from asm_gym.evaluation.comparison import BenchmarkResult
 from asm_gym.evaluation.detection_tables import kept_table, kinds_table, lead_table, monitors_table
 from asm_gym.evaluation.scored_episode import window_steps
@@ -87,12 +86,7 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
         "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."
     )
-    drawn = {
-        "ROC over all faults, each against nominal episodes of its task in the same steps.": figures.roc_figure(
-            list(result.monitors.values())
-        ),
-    }
-    write_report(folder / "report.html", "Who notices what", intro, tables, drawn, details=details)
+    write_report(folder / "report.html", "Who notices what", intro, tables, {}, details=details)
 
 
 def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:

@@ -11,7 +11,6 @@ from asm_gym.faults.action import SignFlip as SignFlip
 from asm_gym.faults.actuator import Backlash as Backlash
 from asm_gym.faults.actuator import GripperOpens as GripperOpens
 from asm_gym.faults.actuator import JointFriction as JointFriction
-from asm_gym.faults.actuator import StuckJoint as StuckJoint
 from asm_gym.faults.actuator import WeakGripper as WeakGripper
 from asm_gym.faults.actuator import WeakJoint as WeakJoint
 from asm_gym.faults.base import Fault as Fault

@@ -35,15 +35,11 @@ class WeakJoint(MotorFault):
         return [(env.simulation.model.actuator_gear, [motor], lambda gear: gear * (1.0 - loss))]
 
 
-class StuckJoint(MotorFault):
-    """A ``joint`` that is blocked, by friction beyond what its motor can overcome."""
-
-    def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(env.simulation.model.dof_frictionloss, [self.dof(env)], lambda friction: friction + 1000.0)]
-
-
 class JointFriction(MotorFault):
-    """A ``joint`` that moves stiffly: dry friction in ``newton_metres``, and ``viscous`` friction [N m s/rad]."""
+    """A ``joint`` that moves stiffly: dry friction in ``newton_metres``, and ``viscous`` friction [N m s/rad].
+
+    A thousand newton metres are beyond every motor: the joint is blocked.
+    """
 
     newton_metres: float = within(4.0, low=0, high=1e4)
     viscous: float = within(2.0, low=0, high=1e4)

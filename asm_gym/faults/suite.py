@@ -66,7 +66,9 @@ KINDS: Registry[Kind] = Registry(
         "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=(50, 150, 400)[s]),
         "held_by_person": lambda d, s: body.HeldByPerson(body=d.link, stiffness=(100, 300, 800)[s], duration=30),
         "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=(0.9, 0.7, 0.4)[s]),
-        "stuck_joint": lambda d, s: actuator.StuckJoint(joint=d.joint, duration=(4, 12, None)[s]),
+        "stuck_joint": lambda d, s: actuator.JointFriction(
+            joint=d.joint, newton_metres=1000.0, viscous=0.0, duration=(4, 12, None)[s]
+        ),
         "joint_friction": lambda d, s: actuator.JointFriction(
             joint=d.joint, newton_metres=(0.5, 2, 6)[s], viscous=(0.5, 2, 6)[s]
         ),

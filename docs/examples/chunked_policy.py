@@ -10,13 +10,10 @@ CHUNK = 8
 
 
 class Chunked:
-    """Ask for a chunk, and play it action by action; the state is what is left of it.
-
-    After a step that was not the policy's, the rest of the chunk is of no use any more: a new one is asked for.
-    """
+    """Ask ``model`` for a chunk (CHUNK, A) and play it; the state is what is left of it."""
 
     def __init__(self, model):
-        self.model = model  # (observation) -> (CHUNK, A)
+        self.model = model
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         chunk = self.model(observation) if state is None or not len(state) else state
@@ -24,14 +21,14 @@ class Chunked:
 
 
 env = NeuralASMSafety(FaultInjection(gym.make("asm_gym/Lift-v0"), [Push(newtons=60, onset=20, duration=10)]))
-agent = make_policy("lift_sac", env)  # stands for a network with an action head of CHUNK actions
+agent = make_policy("lift_sac", env)  # stands for a network that predicts CHUNK actions
 policy = Chunked(lambda observation: np.repeat(agent.predict(observation)[0][None], CHUNK, axis=0))
 observation, info = env.reset(seed=0)
-state, done, thrown_away = None, False, 0
+state, done = None, False
 while not done:
     action, state = policy.predict(observation, state)
     observation, reward, terminated, truncated, info = env.step(action)
     if info["overridden"]:
-        thrown_away, state = thrown_away + len(state), None
+        state = None  # the arm is elsewhere than the chunk expects: ask for a new one
     done = terminated or truncated
-print(f"{thrown_away} planned actions were thrown away, success {info['success']}")
+print(f"{info['asm']['alarms']} steps in alarm, success {info['success']}")

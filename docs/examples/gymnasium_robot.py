@@ -1,4 +1,4 @@
-"""Guard a robot of another package: MuJoCo's Pusher, Fetch (gymnasium_robotics) or dm_control (through Shimmy)."""
+"""Guard a robot of another package: MuJoCo's, Fetch (gymnasium_robotics) or dm_control (through Shimmy)."""
 
 import sys
 
@@ -8,17 +8,16 @@ from asm_gym import FaultInjection, NeuralASMSafety, collect, make_monitor, make
 from asm_gym.faults import Freeze
 
 # Or gymnasium_robotics:FetchReach-v4, or shimmy:dm_control/reacher-easy-v0: pip install 'asm-gym[environments]'
-TASK = sys.argv[1] if len(sys.argv) > 1 else "Pusher-v5"
+TASK = [*sys.argv, "HalfCheetah-v5"][1]
 
-episodes = collect(TASK, policy="sway", episodes=40, workers=1)  # "sway" stands for your policy
+episodes = collect(TASK, policy="sway", episodes=40, workers=1, max_episode_steps=100)  # "sway" stands for your policy
 monitor = make_monitor("association_linear+evidence", episodes[0].spec).fit(episodes[:20])
 monitor.calibrate(episodes[20:], false_alarm_rate=0.05)
 
 channel = episodes[0].spec.channels[0].name  # of observations in a dict: a key
 env = FaultInjection(gym.make(TASK), [Freeze(channel=channel, element=0, onset=20)])
 env = NeuralASMSafety(env, monitor, on_alarm="monitor")  # torques have no hold: "terminate", or a policy of yours
-policy = make_policy("sway", env, seed=1)
-observation, info = env.reset(seed=1)
+policy, (observation, info) = make_policy("sway", env, seed=1), env.reset(seed=1)
 for step in range(40):
     observation, reward, terminated, truncated, info = env.step(policy.predict(observation)[0])
     if info["asm"]["alarm"]:

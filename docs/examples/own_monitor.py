@@ -9,10 +9,8 @@ from asm_gym.detection import ModelOutput
 from asm_gym.monitors import StreamModel
 
 
-class Before(NamedTuple):
-    """The state: the senses of the last row of B streams, (B, S)."""
-
-    senses: np.ndarray
+class State(NamedTuple):
+    senses: np.ndarray  # (B, S) of the last row of B streams
 
 
 class Persistence(StreamModel):
@@ -25,12 +23,12 @@ class Persistence(StreamModel):
         return self.restore({"spread": np.maximum(changes.std(axis=0, dtype=np.float64), 1e-6)})
 
     def start(self, batch):
-        return Before(np.full((batch, len(self.spec.sensory)), np.nan))
+        return State(np.full((batch, len(self.spec.sensory)), np.nan))
 
     def predict(self, state, rows):
         senses = rows[:, self.spec.sensory]
         errors = np.nan_to_num((senses - state.senses) / self.learned_["spread"])  # (B, S)
-        return Before(senses), ModelOutput(errors, np.zeros((len(rows), 0)))
+        return State(senses), ModelOutput(errors, np.zeros((len(rows), 0)))
 
 
 register_monitor("persistence", Persistence)  # `asm-gym evaluate --monitors package:Persistence` compares it

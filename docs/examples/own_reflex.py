@@ -25,5 +25,5 @@ env = NeuralASMSafety(pushed, on_alarm=BackOff)  # the class: the wrapper makes 
 env.reset(seed=0)
 for step in range(60):
     info = env.step(np.array([0.2, 0, 0, 0, 0, 0, -1], np.float32))[-1]
-    if info["asm"]["intervened"]:
+    if info["overridden"]:
         print(step, info["asm"]["transition"], info["asm"]["executed_action"].round(2))
