@@ -103,7 +103,7 @@ def test_a_servo_that_stalls_or_overheats_is_named(monitor, hot, fault):
 
 def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):
     for response, over in (("hold", True), ("stop", False)):
-        guard, arm = LeRobotGuard(monitor, response, quiet_s=0.5), Arm(202)
+        guard, arm = LeRobotGuard(monitor, response, release_s=0.5), Arm(202)
         run(guard, arm, rows=115)
         assert guard.intervened
         arm.jammed[:] = False
@@ -114,6 +114,11 @@ def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):
         guard.reset()
         arm.send_action(guard({"observation": arm.get_observation(), "action": dict(still)})["action"])
         assert not guard.intervened
+
+
+def test_the_former_name_of_an_argument_is_taken_for_one_release(monitor):
+    with pytest.warns(DeprecationWarning, match="release_s"):
+        assert LeRobotGuard(monitor, quiet_s=0.5).release_s == 0.5
 
 
 def test_monitor_only_says_so(monitor):

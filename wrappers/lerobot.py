@@ -2,7 +2,7 @@
 
     row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before it is sent
 
-From an alarm on, until surprise has been low for ``quiet_s``, a hold is sent and judged in place of the policy's
+From an alarm on, until surprise has been low for ``release_s``, a hold is sent and judged in place of the policy's
 action. A memory that was fitted without rests is surprised by a hold, which then does not end. Only finite numbers are
 sent; until every joint has been sensed or commanded once, an alarm sends nothing.
 
@@ -15,6 +15,7 @@ import logging
 import re
 import sys
 import time
+import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -57,7 +58,7 @@ class LeRobotGuard:
     Args:
         monitor: calibrated, on a LeRobot dataset of this robot (``asm-gym fit DATASET``); or its file.
         on_alarm: one of ``ON_ALARM``.
-        quiet_s: for how long surprise must be under 80 % of the threshold until the policy acts again [s].
+        release_s: for how long surprise must be under 80 % of the threshold until the policy acts again [s].
         action_means: as in ``NeuralASMSafety``, by the order of the memory's actions. By default ``.pos`` is a target
             and ``.vel`` a velocity.
         watchdog: told of every row; where it has died, that is an alarm.
@@ -76,13 +77,17 @@ class LeRobotGuard:
         self,
         monitor: Monitor | str | Path,
         on_alarm: str = "hold",
-        quiet_s: float = 1.0,
+        release_s: float = 1.0,
         action_means: ActionMeans | None = None,
         watchdog: Watchdog | None = None,
+        quiet_s: float | None = None,
     ) -> None:
+        if quiet_s is not None:  # until 0.3
+            warnings.warn("quiet_s is called release_s", DeprecationWarning, stacklevel=2)
+            release_s = quiet_s
         check_choice("on_alarm", on_alarm, ON_ALARM)
         self.on_alarm = on_alarm
-        self.quiet_s = check_number("quiet_s", quiet_s, low=0.0)
+        self.release_s = check_number("release_s", release_s, low=0.0)
         self.path = str(monitor) if isinstance(monitor, str | Path) else ""
         self.monitor: Any = load_monitor(Path(monitor)) if isinstance(monitor, str | Path) else monitor
         self._spec = self.monitor.spec
@@ -181,9 +186,9 @@ class LeRobotGuard:
         low, high, unknown = (np.full(size, value, np.float32) for value in (-np.inf, np.inf, np.nan))
         grip = np.flatnonzero([bool(_GRIPPER.fullmatch(name.lower())) for name in self._names])
         robots = Robots(1, low, high, rest=unknown, grip=grip, dt=dt, meaning=self._meaning())
-        quiet_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.quiet_s / dt)))
+        release_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.release_s / dt)))
         reaction: OnAlarmName = "hold" if self.on_alarm != "monitor" else "monitor"
-        return Engine(robots, self.monitor, GuardOptions(reaction, quiet_rows, contact_limits=None))
+        return Engine(robots, self.monitor, GuardOptions(reaction, release_rows, contact_limits=None))
 
     def _meaning(self) -> ActionMeaning:
         """Return what the actions mean: what is told, or what LeRobot's names say.
@@ -237,7 +242,7 @@ class LeRobotGuard:
 
     def get_config(self) -> dict[str, Any]:
         """Return what LeRobot saves of this step."""
-        return {"monitor": self.path, "on_alarm": self.on_alarm, "quiet_s": self.quiet_s}
+        return {"monitor": self.path, "on_alarm": self.on_alarm, "release_s": self.release_s}
 
     def state_dict(self) -> dict[str, Any]:
         """Return no tensors: the memory has a file of its own."""
