@@ -17,15 +17,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 import asm_gym
 from asm_gym.faults.suite import KINDS
+from asm_gym.guard.report import RowReport, report
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import POLICIES
 from asm_gym.scripts import command as command_of
 from asm_gym.scripts.cli import COMMANDS, main
 from asm_gym.scripts.reproduce import STUDIES
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.tasks import OWN
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -208,6 +211,13 @@ def test_code_of_a_notebook_runs_and_no_output_is_kept(path: Path, tmp_path: Pat
         if cell["cell_type"] == "code":
             assert not cell["outputs"]
             exec(compile("".join(cell["source"]), str(path), "exec", dont_inherit=True), names)
+
+
+def test_the_page_on_info_names_every_field():
+    spec = StreamSpec((Channel("q", 1),), dt=0.1)
+    said = report([RowReport.nothing(1, 1, np.ones(1))], 0, spec)
+    page = (DOCS / "reference" / "info.md").read_text(encoding="utf-8")
+    assert [name for name in (*said, *said["severity"], "alarms", "slowed") if f"`{name}`" not in page] == []
 
 
 SLOW = ("film_an_alarm", "guard_a_vector", "guard_sb3_agent", "live_udp", "own_task")
