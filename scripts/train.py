@@ -14,17 +14,19 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import torch
 from rich.console import Console
 
 from asm_gym.data.datasets import read_dataset
 from asm_gym.data.episode import load_episode
 from asm_gym.files import write_text
+from asm_gym.policies import rollout
 from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.training import success_rate, train
+from asm_gym.rollouts.training import train
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import ROBOTS, TASKS, env_id
@@ -83,7 +85,7 @@ def train_agent(args: Args, console: Console) -> None:
             agent = train(make, args.out, solved, tick, **{name: getattr(args, name) for name in names})
         with stage("judging", console, {}), closing(make()) as env:
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
-            success = success_rate(agent.fit_to(env, "the agent"), env, seeds)
+            success = float(np.mean([rollout(env, agent.fit_to(env, "the agent"), seed) for seed in seeds]))
         minutes = round((time.perf_counter() - start) / 60, 1)
         result = {"success": success, "episodes": args.final_episodes, "minutes": minutes}
         agent.save(args.out / "agent.npz", **result)

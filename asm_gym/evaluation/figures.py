@@ -7,7 +7,7 @@ markers differ too.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence, Sized
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -67,14 +67,10 @@ def look(i: int) -> tuple[str, Any, str]:
     return _COLOURS[i % n], _LINES[(i + i // n) % n], _MARKERS[(i + i // n) % n]
 
 
-def _require_some(traces: Sized) -> None:
-    if not len(traces):
-        raise ValueError("there are no traces to draw")
-
-
 def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
     """Draw surprise over time, one panel per episode: the threshold, the fault's span, the alarms."""
-    _require_some(traces)
+    if not traces:
+        raise ValueError("there are no traces to draw")
     floor, ceiling = _limits(traces)
     with figure(height=0.9 + 1.35 * len(traces)) as fig:
         panels = fig.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]

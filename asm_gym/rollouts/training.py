@@ -23,7 +23,6 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 
 from asm_gym.data.episode import Episode
-from asm_gym.policies import rollout
 from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.rollouts.parallel import Progress
 
@@ -184,8 +183,3 @@ def export(learner: SAC, view: Standardised) -> NetworkPolicy:
     layers = [tuple(t.detach().cpu().numpy().copy() for t in (part.weight, part.bias)) for part in parts]
     how = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
     return NetworkPolicy(layers, **how).fit_to(view.env, "the agent")
-
-
-def success_rate(agent: NetworkPolicy, env: gym.Env[Any, Any], seeds: Sequence[int]) -> float:
-    """Return the share of successes over one episode from each seed."""
-    return float(np.mean([rollout(env, agent, seed) for seed in seeds]))
