@@ -12,7 +12,7 @@ from asm_gym import FaultInjection, NeuralASMSafety, make_policy
 from asm_gym.faults import FrozenEncoder, Push
 
 lift = gym.make("asm_gym/Lift-v0", render_mode="rgb_array")
-env = NeuralASMSafety(FaultInjection(lift, [Push(newtons=60, onset=12, duration=10), FrozenEncoder(onset=60)]))
+env = NeuralASMSafety(FaultInjection(lift, [Push(newtons=60, onset=12, duration=10), FrozenEncoder(onset=32)]))
 policy, (observation, info) = make_policy("lift_sac", env), env.reset(seed=0)
 pictures = []
 for step in range(100):
