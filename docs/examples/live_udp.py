@@ -8,15 +8,16 @@ import time
 
 from asm_gym import collect, make_monitor
 
-episodes = collect("asm_gym/SyntheticArm-v0", "scripted", episodes=41, workers=1)  # stands for your robot, at 100 Hz
+ARM = "asm_gym/SyntheticArm-v0"  # stands for your robot, at 100 Hz
+episodes = collect(ARM, "scripted", episodes=40, workers=1, horizon=1000)
 monitor = make_monitor("kalman+evidence", episodes[0].spec).fit(episodes[:20])
-monitor.calibrate(episodes[20:40], false_alarm_rate=0.05).save("arm.asm")
+monitor.calibrate(episodes[20:], false_alarm_rate=0.05).save("arm.asm")
+(live,) = collect(ARM, "scripted", episodes=1, seed=1, workers=1, horizon=6000)  # a minute
 
 command = "-m asm_gym watch udp:9870 --monitor arm.asm --json --until-alarm"
 watching = subprocess.Popen([sys.executable, *command.split()], stdout=subprocess.PIPE, text=True)
 sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-for step in range(6000):
-    row = episodes[40].stream[step % 400].astype(float)
+for step, row in enumerate(live.stream.astype(float)):
     if step > 3000:
         row[3] = 0.5  # an encoder is stuck
     message = {"time": 0.01 * step} | dict(zip(episodes[0].spec.labels, row.tolist()))

@@ -14,10 +14,10 @@ class HeavyLift(Lift):
 
 
 register_task("HeavyLift", HeavyLift, horizon=20, robots="Sawyer", control_freq=20)
-episodes = collect("asm_gym/HeavyLift-v0", "hold", episodes=24, workers=1)  # "hold" stands for your policy
+episodes = collect("asm_gym/HeavyLift-v0", "sway", episodes=24, workers=1)  # "sway" stands for your policy
 monitor = make_monitor("kalman+evidence", episodes[0].spec).fit(episodes[:12])
 monitor.calibrate(episodes[12:], false_alarm_rate=0.1)
 env = NeuralASMSafety(gym.make("asm_gym/HeavyLift-v0"), monitor, on_alarm="terminate")
 env.reset(seed=0)
 info = env.step(env.action_space.sample())[-1]
-print(env.stream_spec, info["asm"]["surprise"], info["asm"]["threshold"])
+print(monitor.spec.labels[:3], info["asm"]["surprise"], info["asm"]["threshold"])
