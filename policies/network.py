@@ -35,7 +35,7 @@ class NetworkPolicy(StatefulPolicy):
         trained_in: the agent's environment, by name: see ``describe``.
 
     Raises:
-        ValueError: numbers that are not finite.
+        ValueError: layers that do not fit one another, or numbers that are not finite.
     """
 
     def __init__(
@@ -47,10 +47,19 @@ class NetworkPolicy(StatefulPolicy):
         trained_in: dict[str, Any] | None = None,
     ) -> None:
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
-        inputs = self.observation_size = self.layers[0][0].shape[1]
-        size = self.action_size = len(self.layers[-1][1])
+        shapes = [W.shape for W, _ in self.layers]
+        if not shapes or len(shapes[0]) != 2:
+            raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {shapes[:1]}")
+        size = inputs = self.observation_size = int(shapes[0][1])
+        for n, (W, b) in enumerate(self.layers):
+            if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
+                raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
+            size = len(W)
+        self.action_size = size
         self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
         self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
+        if self.mean.shape != (inputs,) or self.scale.shape != (inputs,) or not (self.scale > 0).all():
+            raise ValueError(f"mean and scale must be {inputs} numbers, and scale positive")
         if not all(np.isfinite(a).all() for a in (self.mean, self.scale, *itertools.chain(*self.layers))):
             raise ValueError("weights, biases, mean and scale must be finite")
         self.trained_in = dict(trained_in or {})

@@ -89,9 +89,19 @@ def test_an_agent_is_the_same_after_saving(tmp_path):
     np.testing.assert_allclose(agent.predict(observations)[0], by_hand, atol=1e-5)
 
 
-def test_a_network_of_numbers_that_are_not_finite_is_refused():
-    with pytest.raises(ValueError, match="finite"):
-        NetworkPolicy([(np.full((3, 2), np.nan), np.zeros(3))])
+@pytest.mark.parametrize(
+    ("layers", "message"),
+    [
+        ([], "at least one layer"),
+        ([(np.zeros((3, 2)), np.zeros(3)), (np.zeros((1, 4)), np.zeros(1))], "layer 1 takes 3"),
+        ([(np.zeros((3, 2)), np.zeros(2))], "layer 0"),
+        ([(np.full((3, 2), np.nan), np.zeros(3))], "finite"),
+        ([(np.zeros(3), np.zeros(3))], r"two dimensions, got \[\(3,\)\]"),
+    ],
+)
+def test_networks_that_do_not_hang_together_are_refused(layers, message):
+    with pytest.raises(ValueError, match=message):
+        NetworkPolicy(layers)
 
 
 CHANCE = 0.05

@@ -11,20 +11,14 @@ import sys
 import rclpy
 from controller_manager_msgs.srv import SwitchController
 
-
-def main() -> None:
-    rclpy.init()
-    node = rclpy.create_node("asm_gym_stop")
-    switch = node.create_client(SwitchController, "/controller_manager/switch_controller")
-    switch.wait_for_service()
-    for line in sys.stdin:
-        print(line, end="", flush=True)
-        if '"kind": "note"' not in line:
-            break
-    request = SwitchController.Request(strictness=SwitchController.Request.BEST_EFFORT)
-    request.deactivate_controllers = sys.argv[1:]
-    rclpy.spin_until_future_complete(node, switch.call_async(request))
-
-
-if __name__ == "__main__":
-    main()
+rclpy.init()
+node = rclpy.create_node("asm_gym_stop")
+switch = node.create_client(SwitchController, "/controller_manager/switch_controller")
+switch.wait_for_service()
+for line in sys.stdin:
+    print(line, end="", flush=True)
+    if '"kind": "note"' not in line:
+        break
+request = SwitchController.Request(strictness=SwitchController.Request.BEST_EFFORT)
+request.deactivate_controllers = sys.argv[1:]
+rclpy.spin_until_future_complete(node, switch.call_async(request))
