@@ -103,7 +103,7 @@ class _Page(HTMLParser):
 
 def test_a_report_holds_everything_and_fetches_nothing(traces, tmp_path: Path):
     table = tabulate("Detection", CONDITION_COLUMNS, by_condition(traces, 1.0))
-    drawn = {"A figure": figures_of(traces)["roc"]}
+    drawn = {"A figure": figures_of(traces)["surprise"]}
     out = write_report(tmp_path / "report.html", "Lift", "First.\n\nSecond.", [table], drawn, {"seed": 0})
     source = out.read_text(encoding="utf-8")
     page = _Page(source)
