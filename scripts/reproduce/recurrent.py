@@ -1,4 +1,4 @@
-"""The rival of the memory: a GRU, trained by backpropagation through time.
+"""The rivals of the memory: a GRU or an LSTM, trained by backpropagation through time.
 
     h_t = GRU(h_{t-1}, [x_{t-1}, a_{t-1}])     â_t = A h_t     x̂_t = F h_t + G a_t + b       Σ ‖x - x̂‖² + ‖a - â‖²
 
@@ -11,7 +11,7 @@ Sources: Cho et al. 2014 (EMNLP); Jaeger 2001 (GMD Report 148) for the noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,8 +33,13 @@ class Batch(NamedTuple):
 
 
 def side_by_side(trajectories: Sequence[Trajectory]) -> Batch:
-    """Stack episodes along a new second axis."""
-    return Batch(*(np.stack([getattr(t, name) for t in trajectories], axis=1) for name in Batch._fields))
+    """Stack episodes along a new second axis; those that end before the longest are NaN from then on."""
+    longest = max(len(t.senses) for t in trajectories)
+
+    def whole(rows: Array) -> Array:
+        return np.pad(rows, ((0, longest - len(rows)), (0, 0)), constant_values=np.nan)
+
+    return Batch(*(np.stack([whole(getattr(t, name)) for t in trajectories], axis=1) for name in Batch._fields))
 
 
 def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> list[Batch]:
@@ -45,15 +50,15 @@ def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> lis
 
 
 class Recurrent(nn.Module):
-    """A GRU of ``hidden`` units, and its readouts of the numbers sensed and commanded."""
+    """A GRU or an LSTM of ``hidden`` units, and its readouts of the numbers sensed and commanded."""
 
-    def __init__(self, hidden: int, sensory: int, motor: int) -> None:
+    def __init__(self, hidden: int, sensory: int, motor: int, cell: str = "GRU") -> None:
         super().__init__()
-        self.cell = nn.GRU(sensory + motor, hidden)
+        self.cell = getattr(nn, cell)(sensory + motor, hidden)
         self.act = nn.Linear(hidden, motor)
         self.sense = nn.Linear(hidden + motor, sensory)
 
-    def forward(self, rows: Tensor, commands: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, rows: Tensor, commands: Tensor) -> tuple[Tensor, Tensor, Any]:
         """Return x̂ (T, B, S), â (T, B, A) and the last state.
 
         Args:
@@ -63,7 +68,7 @@ class Recurrent(nn.Module):
         h, state = self.cell(rows)
         return self.sense(torch.cat([h, commands], dim=-1)), self.act(h), state
 
-    def run_on(self, row: Tensor, state: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    def run_on(self, row: Tensor, state: Any, steps: int) -> tuple[Tensor, Tensor]:
         """Return x̂ (T, B, S) and â (T, B, A) of ``steps`` rows from memory, after the last row read (B, S + A)."""
         sensed, acted = [], []
         for _ in range(steps):
@@ -81,32 +86,35 @@ def train(
     rng: np.random.Generator,
     noise: float = 0.3,
     rate: float = 1e-2,
+    cell: str = "GRU",
 ) -> Recurrent:
     """Return a network that has learned from whole episodes.
 
     Args:
-        trajectories: the episodes, of one length.
+        trajectories: the episodes.
         hidden: units.
         updates: number of batches.
         rng: draws everything random.
         noise: standard deviation of the noise on the rows it reads.
         rate: of Adam, with a cosine decay.
+        cell: ``"GRU"`` or ``"LSTM"``.
     """
     torch.set_num_threads(1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         own = torch.Generator().manual_seed(int(rng.integers(2**31)))
         sensory, motor = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1] - 1
-        network = Recurrent(hidden, sensory, motor)
+        network = Recurrent(hidden, sensory, motor, cell)
     optimiser, schedule = adam(network, updates, rate)
     done = 0
     while done < updates:
         for batch in batches(trajectories, rng)[: updates - done]:
-            x, a = torch.from_numpy(batch.senses), torch.from_numpy(batch.commands[:, :, :-1])
+            real = torch.from_numpy(np.isfinite(batch.commands[:, :, 0]))
+            x, a = torch.from_numpy(batch.senses).nan_to_num(), torch.from_numpy(batch.commands[:, :, :-1]).nan_to_num()
             rows = shifted(x, a)
             sensed, acted, _ = network(rows + noise * torch.randn(rows.shape, generator=own), a)
             error = ((x - sensed) ** 2).sum(-1) + ((a - acted) ** 2).sum(-1)
-            descend(error.mean(), optimiser, schedule)
+            descend(error[real].mean(), optimiser, schedule)
             done += 1
     return network.eval().requires_grad_(False)
 
