@@ -74,7 +74,13 @@ SPEC = StreamSpec(
     "Panda",
 )
 JOINTS, HAND, SEEN = slice(0, 7), slice(7, 10), slice(18, 32)  # columns of the encoders, the hand, the objects
-GROUPS = {"joint": JOINTS, "hand": slice(7, 16), "gripper": slice(16, 18), "object": SEEN, "action": SPEC.slices["action"]}
+GROUPS = {
+    "joint": JOINTS,
+    "hand": slice(7, 16),
+    "gripper": slice(16, 18),
+    "object": SEEN,
+    "action": SPEC.slices["action"],
+}
 NEAR = 0.02  # the second sense of a distance resolves less than this [m]
 HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
@@ -149,7 +155,9 @@ class Workspace:
             return np.asarray(self.read("cubeB_pos") + [0.0, 0.0, 0.045])
         if self.skill == "NutAssemblySquare":
             return np.array(env.sim.data.body_xpos[env.peg1_body_id])
-        return self.start + [0.0, 0.0, 0.1] if self.skill == "Lift" else np.array(env.target_bin_placements[env.object_id])
+        return (
+            self.start + [0.0, 0.0, 0.1] if self.skill == "Lift" else np.array(env.target_bin_placements[env.object_id])
+        )
 
     def row(self) -> Floats:
         """Return what is sensed now, and what was commanded (D,)."""
@@ -382,7 +390,9 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
     ours = Settling(reader, network, train)
     highest = np.array([ours.felt(e.stream)[2][3:].max(axis=0) for e in held])  # (N, G)
     ours.ceilings = dict(zip(GROUPS, np.quantile(highest, 1.0 - RATE / len(GROUPS), axis=0), strict=True))
-    recurrent = {c: Backpropagated.learned(train, UNITS[c], rng, config.updates, cell=c, rate=1e-2) for c in ("GRU", "LSTM")}
+    recurrent = {
+        c: Backpropagated.learned(train, UNITS[c], rng, config.updates, cell=c, rate=1e-2) for c in ("GRU", "LSTM")
+    }
     models: dict[str, Any] = {"settling": ours, **{c: Recurrent(m) for c, m in recurrent.items()}}
     models["association"] = Associated(reader, train, rng)
     for model, measure, values in (*predicted(ours, recurrent, tests), *named(ours, train, tests, rng)):
@@ -421,7 +431,9 @@ Noted = tuple[str, str, Record]
 def predicted(ours: Settling, recurrent: dict[str, Backpropagated], tests: Sequence[Episode]) -> list[Noted]:
     """Measure the error of the next row, and of a second from memory after ``EVENT`` rows."""
     X, network, found = len(SPEC.sensory), ours.network, list[Noted]()
-    streams = np.stack([e.stream[: EVENT + SECOND] for e in tests if len(e) >= EVENT + SECOND], axis=1).astype(np.float64)
+    streams = np.stack([e.stream[: EVENT + SECOND] for e in tests if len(e) >= EVENT + SECOND], axis=1).astype(
+        np.float64
+    )
     senses, commands = read(ours.reader, streams)
     still = np.mean((senses[2:, :, :X] - senses[1:-1, :, :X]) ** 2)
 
@@ -431,12 +443,16 @@ def predicted(ours: Settling, recurrent: dict[str, Backpropagated], tests: Seque
     rest = network.at_rest(streams.shape[1])
     for steps in (1, 5, network.iterations):
         online = follow(network.with_iterations(steps), rest, senses, commands).senses[2:, :, :X]
-        found.append(("settling", f"next row, {steps}", {"error": float(np.mean((online - senses[2:, :, :X]) ** 2) / still)}))
+        found.append(
+            ("settling", f"next row, {steps}", {"error": float(np.mean((online - senses[2:, :, :X]) ** 2) / still)})
+        )
     cued = follow(network, rest, senses[:EVENT], commands[:EVENT]).traces
     found.append(("settling", "from memory", {"cm": off(to_rows(ours.reader, run_on(network, cued, SECOND)))}))
     for cell, model in recurrent.items():
         online, _ = expected(model.network, senses, commands, len(senses))
-        found.append((cell, "next row", {"error": float(np.mean((online[2:, :, :X] - senses[2:, :, :X]) ** 2) / still)}))
+        found.append(
+            (cell, "next row", {"error": float(np.mean((online[2:, :, :X] - senses[2:, :, :X]) ** 2) / still)})
+        )
         found.append((cell, "from memory", {"cm": off(model.express(streams, EVENT)[EVENT:])}))
     found.append(("stands still", "from memory", {"cm": off(np.repeat(streams[EVENT - 1 : EVENT], SECOND, axis=0))}))
     return found
@@ -484,7 +500,13 @@ def named(ours: Settling, train: Sequence[Episode], tests: Sequence[Episode], rn
                 found.append((teller, "named", values))
             if "PickPlace" in SKILLS[kind]:
                 alike = "PickPlace" in SKILLS[late[SECOND - 1]]
-                found.append((teller, "two fit", {"alike": alike, "right": bool(late[SECOND - 1] == kind), "rows": until(late[SECOND:] == kind)}))
+                found.append(
+                    (
+                        teller,
+                        "two fit",
+                        {"alike": alike, "right": bool(late[SECOND - 1] == kind), "rows": until(late[SECOND:] == kind)},
+                    )
+                )
             n = int(rng.choice(np.flatnonzero(np.array(kinds) != kind)))
             changed = said(np.concatenate([tests[n].stream[:40], stream[:60]]).astype(np.float64))[40:] == kind
             found.append((teller, "changed", {"rows": until(changed), "right": bool(changed[SECOND - 1])}))
@@ -509,9 +531,21 @@ def surprised(ours: Settling, tests: Sequence[Episode], files: dict[str, list[Pa
     twins = [over(load_episode(f), around) for f in files["twins"]]
     for kind in FAULTS:
         faulty = [over(load_episode(f), around) for f in files[kind]]
-        found.append(("settling", "faults", {"kind": kind, "auroc": auroc(faulty, twins), "found": float(np.mean(np.array(faulty) > 1.0))}))
+        found.append(
+            (
+                "settling",
+                "faults",
+                {"kind": kind, "auroc": auroc(faulty, twins), "found": float(np.mean(np.array(faulty) > 1.0))},
+            )
+        )
     for skill in UNKNOWN:
         unknown = [over(load_episode(f)) for f in files[skill]]
-        found.append(("settling", "unknown", {"kind": skill, "auroc": auroc(unknown, healthy), "found": float(np.mean(np.array(unknown) > 1.0))}))
+        found.append(
+            (
+                "settling",
+                "unknown",
+                {"kind": skill, "auroc": auroc(unknown, healthy), "found": float(np.mean(np.array(unknown) > 1.0))},
+            )
+        )
     found.append(("settling", "healthy", {"found": float(np.mean(np.array(healthy) > 1.0))}))
     return found
