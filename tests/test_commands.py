@@ -85,7 +85,7 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
 
 
 @pytest.mark.parametrize(
-    ("typed", "near"), [("docter", "doctor"), ("reproduce abstrac", "abstract"), ("watch --monitr x", "--monitor")]
+    ("typed", "near"), [("docter", "doctor"), ("reproduce pandas", "panda"), ("watch --monitr x", "--monitor")]
 )
 def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2
@@ -93,12 +93,12 @@ def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, ne
 
 
 def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("abstract", "harm"))
+    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("panda", "harm"))
     ran: list[str] = []
     for module in (first, last):
         monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
     monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", ("abstract", "harm"))
+    monkeypatch.setattr(reproduce, "INDEPENDENT", ("panda", "harm"))
     assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
     assert "--seeds" in capsys.readouterr().err
     assert not ran

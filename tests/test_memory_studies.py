@@ -7,14 +7,18 @@ import itertools
 import numpy as np
 import pytest
 
-from asm_gym import NeuralASM
+from asm_gym.data.episode import Episode
+from asm_gym.memory.learning import Schedule, Trajectory
+from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
-from asm_gym.scripts.reproduce import speed_accuracy
+from asm_gym.scaling import StreamScaler
+from asm_gym.scripts.reproduce import panda, speed_accuracy, workspace
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
     mean_demonstrations,
     recalled,
+    trajectories,
 )
 from asm_gym.scripts.reproduce.handwriting import (
     DT,
@@ -25,22 +29,8 @@ from asm_gym.scripts.reproduce.handwriting import (
     written,
 )
 from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
-from asm_gym.scripts.reproduce.recurrent import Batch
-from asm_gym.scripts.reproduce.two_links import (
-    COMMAND,
-    CUE,
-    ENCODERS,
-    EVENT,
-    HAND,
-    PUSH,
-    SPEC,
-    MemoryDriver,
-    closed_loop,
-    demonstrations,
-    hand,
-    joints,
-)
-from asm_gym.scripts.reproduce.two_links import DT as ARM_DT
+from asm_gym.scripts.reproduce.recurrent import Batch, expected, side_by_side
+from asm_gym.scripts.reproduce.recurrent import train as train_recurrent
 
 
 def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
@@ -133,58 +123,64 @@ def test_the_local_change_is_the_gradient_of_the_energy_and_of_the_error_for_a_f
     assert angles[1] > 0.999
 
 
-@pytest.fixture(scope="module")
-def arm():
+def test_the_rival_learns_from_episodes_of_different_lengths():
+    train, _ = letters_of(2)
+    reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
+    taught = trajectories(reader, train)
+    cut = [Trajectory(t.senses[:n], t.commands[:n], t.inputs) for t, n in zip(taught, (40, 60) * 6, strict=True)]
+    batch = side_by_side(cut)
+    assert batch.senses.shape[0] == 60
+    assert np.isnan(batch.senses[40:, 0]).all()
+    assert np.isfinite(batch.senses[:, 1]).all()
+    for cell in ("GRU", "LSTM"):
+        few, many = (train_recurrent(cut, 16, n, np.random.default_rng(0), cell=cell) for n in (1, 60))
+        errors = [
+            np.mean((expected(network, *side_by_side(taught), STEPS)[0] - side_by_side(taught).senses) ** 2)
+            for network in (few, many)
+        ]
+        assert errors[1] < 0.7 * errors[0]
+
+
+def wandering(seed: int, rows: int = 80) -> Episode:
+    """A stream of the Panda's senses in which each wanders on its own way round."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi) + 0.1 * np.arange(rows)[:, None] + np.arange(workspace.SPEC.size)
+    return Episode.from_stream(np.sin(angle) + 0.01 * rng.normal(size=angle.shape), workspace.SPEC)
+
+
+def test_a_sense_that_sticks_is_alone_over_its_ceiling_and_counts_no_more_once_left_out():
+    train = [wandering(n, 60) for n in range(8)]
+    reader = StreamScaler.fit(workspace.SPEC, [e.stream for e in train])
+    schedule = Schedule(25, 16, 6e-3, 8, 1.0, 1.0, 0.0)
     rng = np.random.default_rng(0)
-    two = repertoire(2, rng)
-    return demonstrations(two, 12, rng), demonstrations(two, 4, rng)
+    trained = learn_settling(trajectories(reader, train), 64, schedule, rng, lambda: None)
+    model = workspace.Settling(reader, trained.network, train)
+    assert np.mean([model.felt(e.stream)[1] ** 2 for e in train]) == pytest.approx(1.0, abs=0.1)
+    model.ceilings = 1.5 * np.max([model.felt(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0)
+    stuck = wandering(30).stream.astype(np.float64)
+    stuck[40:, workspace.JOINTS] = stuck[40, workspace.JOINTS]
+    energies = model.felt(stuck)[2][42:48].max(axis=0)
+    assert energies.argmax() == list(workspace.GROUPS).index("joint")
+    assert energies[0] > 1.0
+    stuck[40:, workspace.JOINTS] = np.nan
+    assert model.felt(stuck)[2][50:, 0].max() < 1e-3
 
 
-def test_the_arm_is_where_its_joints_and_its_commands_say(arm):
-    for e in arm[1]:
-        rows = e.stream.astype(np.float64)
-        assert np.abs(hand(rows[:, ENCODERS]) - rows[:, HAND]).max() < 0.25  # the noise of both
-        moved = rows[0, ENCODERS] + ARM_DT * np.cumsum(rows[1:, COMMAND], axis=0)
-        assert np.abs(moved - rows[1:, ENCODERS]).max() < 0.01
-        np.testing.assert_allclose(hand(joints(rows[:, HAND])), rows[:, HAND], atol=1e-9)
+def test_every_task_is_seen_by_the_same_senses(lift):
+    work = workspace.Workspace(lift)
+    work.reset(3)
+    _, row, _ = work.step(np.zeros(7))  # in which the cube comes to lie on the table
+    command = np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+    _, after, solved = work.step(command)
+    thing, goal = (workspace.SPEC.slices[name] for name in ("hand_to_thing", "thing_to_goal"))
+    np.testing.assert_allclose(row[goal], [0.0, 0.0, 0.11], atol=5e-3)
+    np.testing.assert_allclose(after[workspace.SPEC.motor], command, atol=1e-6)
+    moved = after[workspace.HAND] - row[workspace.HAND]
+    np.testing.assert_allclose(after[thing] - row[thing], -moved, atol=2e-3)
+    assert not solved
 
 
-class Replay:
-    """Commands what was commanded in the demonstrations."""
-
-    def __init__(self, cues):
-        self.cues, self.t, self.attribution = cues, 0, np.zeros(cues.shape[1:])
-
-    def command(self):
-        return self.cues[self.t][:, COMMAND]
-
-    def read(self, rows):
-        self.t, self.last = self.t + 1, rows
-        return np.zeros(len(rows))
-
-
-def test_replayed_commands_write_the_letter_unless_something_happens(arm):
-    cues = np.stack([e.stream for e in arm[1]], axis=1).astype(np.float64)
-    drivers = {way: Replay(cues) for way in ("left alone", "pushed", "stuck")}
-    paths = {way: closed_loop(driver, cues, way, 0).path for way, driver in drivers.items()}
-    assert np.linalg.norm(paths["left alone"] - cues[:, :, HAND], axis=2).max() < 0.3
-    np.testing.assert_array_equal(paths["pushed"][:EVENT], paths["left alone"][:EVENT])
-    moved = np.abs(joints(paths["pushed"][EVENT + 2 :]) - joints(paths["left alone"][EVENT + 2 :]))
-    np.testing.assert_allclose(moved, PUSH, atol=1e-6)
-    np.testing.assert_allclose(drivers["stuck"].last[:, 0], joints(cues[EVENT - 1, :, HAND])[:, 0], atol=0.02)
-
-
-def test_a_memory_writes_its_letters_and_is_surprised_by_a_push(arm):
-    asm = NeuralASM(SPEC, 32, 32, epochs=400, free_running_probability=0.6).fit(arm[0]).calibrate(arm[0], 0.1)
-    cues = np.stack([e.stream for e in arm[1]], axis=1).astype(np.float64)
-    energy = asm.model.free_energy(arm[1])
-    alone, pushed = (
-        closed_loop(MemoryDriver(asm, 8), cues, way, 0, energy, asm.threshold) for way in ("left alone", "pushed")
-    )
-    truth = cues[CUE:, :, HAND]
-    off = np.linalg.norm(alone.path[CUE:] - truth, axis=2).mean()
-    assert off < 0.5 * np.linalg.norm(truth - truth[0], axis=2).mean()
-    assert (pushed.alarm < EVENT + 10).all()
-    for what in ("surprise", "energy"):
-        nominal, found = (getattr(c, what)[EVENT : EVENT + 5].max(axis=0) for c in (alone, pushed))
-        assert found.min() > nominal.max()
+def test_a_name_counts_from_when_it_is_right_for_good():
+    assert panda.rows_until(np.array([False, True, False, True, True])) == 4
+    assert panda.rows_until(np.ones(5, np.bool_)) == 1
+    assert panda.rows_until(np.zeros(5, np.bool_)) == 6

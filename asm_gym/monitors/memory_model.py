@@ -17,7 +17,6 @@ from asm_gym.detection.base import Arrays
 from asm_gym.memory.association import Association, association_shapes, no_doubt
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
-from asm_gym.memory.free_energy import FreeEnergy
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
@@ -146,10 +145,6 @@ class MemoryModel(ScaledModel):
         motor, senses = self.spec.motor, self.senses_
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
-
-    def free_energy(self, healthy: Sequence[Episode]) -> FreeEnergy:
-        """Return F of all that it predicts, in the spreads that fresh ``healthy`` episodes leave."""
-        return FreeEnergy.of(self.network, self.senses_, [e.stream for e in healthy])
 
     def _units_each(self, senses: StreamScaler) -> int:
         """Return the hidden units of association for each group."""

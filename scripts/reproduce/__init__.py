@@ -13,7 +13,7 @@ from asm_gym.validation import check_choice
 
 INDEPENDENT = {
     "memorise_and_recall": "one network learns skills, recalls each from a cue",
-    "abstract": "one network, six skills, no label: the abstract",
+    "panda": "one network, six skills of the Panda, no label",
     "local_learning": "local updates against backpropagation through time",
     "speed_accuracy": "more inference, or slower movements, for more accuracy",
     "harm": "harm avoided against success kept, under any policy",
