@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 from scipy.signal import lfilter
 from scipy.stats import t as student
 from sklearn.ensemble import RandomForestClassifier
@@ -47,6 +48,7 @@ from asm_gym.scripts.reproduce.workspace import (
     EVENT,
     FAULTS,
     HAND,
+    LONGEST,
     SECOND,
     SEEN,
     SKILLS,
@@ -85,7 +87,7 @@ Note = Callable[[str, str, object, float], None]
 class Config(kit.Config):
     """The papers' network on the Panda: six skills."""
 
-    seeds: int = option(10, quick=1, least=1)
+    seeds: int = option(10, quick=2, least=1)
     """Number of repetitions; they take the seeds that follow."""
     episodes: int = option(28, quick=4, least=4)
     """Episodes of each skill that are recorded; a seed learns from most of them."""
@@ -97,6 +99,10 @@ class Config(kit.Config):
     """Episodes of each skill with each kind of fault, and of each unknown skill."""
     trials: int = option(2, quick=1, least=1)
     """Times that each skill is expressed."""
+    steps: int = option(LONGEST, quick=45, least=1)
+    """Rows after which an expression is left."""
+    film: bool = False
+    """Also film the first seed: skills that change without notice, a push, and a sense that is lost."""
 
 
 def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[Record], dict[str, Floats]]:
@@ -126,26 +132,28 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
     named(note, ours, train, tests, rng)
     surprised(note, ours, tests, files)
     actors = {OURS: ours, **{c: Recurrent(m) for c, m in rivals.items()}, ACTS: Associated(reader, train, rng)}
-    return records, acted(note, actors, config.trials, seed, rng)
+    if config.film and seed == config.seed:
+        film(ours, config.out / "panda.gif", seed)
+    return records, acted(note, actors, config, seed, rng)
 
 
-def acted(note: Note, actors: dict[str, Any], trials: int, seed: int, rng: np.random.Generator) -> dict[str, Floats]:
+def acted(note: Note, actors: dict[str, Any], config: Config, seed: int, rng: np.random.Generator) -> dict[str, Floats]:
     """Measure the share solved in closed loop; return the largest energy of a group over time, of the first courses."""
-    ours, drawn = actors[OURS], dict[str, Floats]()
-    for skill, trial in product(SKILLS, range(trials)):
+    ours, drawn, act = actors[OURS], dict[str, Floats](), partial(express, steps=config.steps)
+    for skill, trial in product(SKILLS, range(config.trials)):
         env, scene = environment(skill), 10_000 + 100 * seed + trial
         push = Push(newtons=20.0, direction=tuple(rng.standard_normal(3)), onset=EVENT, duration=10)
         pushed = FaultInjection(env, [push])
         before = environment(SKILLS[SKILLS.index(skill) - 1])
-        courses = {name: express(model, env, scene) for name, model in actors.items()}
+        courses = {name: act(model, env, scene) for name, model in actors.items()}
         courses |= {
-            f"{OURS}, {event}{', reacts' * reacts}": express(ours, around, scene, event == STUCK, reacts)
+            f"{OURS}, {event}{', reacts' * reacts}": act(ours, around, scene, event == STUCK, reacts)
             for (event, around), reacts in product(((STUCK, env), (PUSHED, pushed)), (False, True))
         }
         pushed.undo_faults()
-        courses[f"{OURS}, guarded"] = express(ours, NeuralASMSafety(env), scene)
+        courses[f"{OURS}, guarded"] = act(ours, NeuralASMSafety(env), scene)
         express(ours, before, scene, steps=40)
-        courses[f"{OURS}, after another"] = express(ours, env, scene, goes_on=True)
+        courses[f"{OURS}, after another"] = act(ours, env, scene, goes_on=True)
         for name, course in courses.items():
             note("solved", name, skill, course.solved)
             if OURS in name and name not in drawn:
@@ -154,6 +162,32 @@ def acted(note: Note, actors: dict[str, Any], trials: int, seed: int, rng: np.ra
         note("reacted rightly", STUCK, skill, stuck.left_out == "joint")
         note("reacted rightly", PUSHED, skill, thrust.yielded and not thrust.left_out)
     return drawn
+
+
+def film(ours: Settling, path: Path, seed: int) -> None:
+    """Film the network while skills change without notice, the arm is pushed, and its encoders stick."""
+    push = Push(newtons=20.0, direction=(0.0, 1.0, 0.0), onset=EVENT, duration=10)
+    pictures: list[Image.Image] = []
+    for n, (skill, happens) in enumerate(
+        (("PickPlaceCan", "interrupted"), ("Lift", ""), ("Stack", PUSHED), ("Door", STUCK))
+    ):
+        env, steps = environment(skill), count()
+
+        def watch(
+            doing: str, env: Any = env, steps: Any = steps, what: str = f"{skill}, {happens}".rstrip(", ")
+        ) -> None:
+            if next(steps) % 4 == 0:
+                picture = Image.fromarray(env.render())
+                ImageDraw.Draw(picture).multiline_text(
+                    (6, 4), f"{what}\n{doing}", fill="white", stroke_width=1, stroke_fill="black"
+                )
+                pictures.append(picture)
+
+        around = FaultInjection(env, [push] if happens == PUSHED else [])
+        length = 40 if happens == "interrupted" else LONGEST
+        express(ours, around, 10_000 + 100 * seed, happens == STUCK, True, n > 0, length, watch)
+        around.undo_faults()
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=100, loop=0)
 
 
 def predicted(note: Note, ours: Settling, rivals: dict[str, Backpropagated], tests: Sequence[Episode]) -> None:

@@ -6,7 +6,7 @@ names the task. Distances have a second sense that resolves millimetres and satu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,6 +65,7 @@ HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
 EVENT, SECOND, YIELD = 30, 20, 12  # row of an event; rows of a second; rows for which a pushed arm yields
 SMOOTH = 0.5  # gain of energies
+LONGEST = 300  # rows of an expression
 
 
 class Workspace:
@@ -139,7 +140,7 @@ _MADE: dict[str, gym.Env[Any, Any]] = {}
 def environment(skill: str) -> gym.Env[Any, Any]:
     """Return this process's environment of a skill."""
     if skill not in _MADE:
-        _MADE[skill] = gym.make(f"asm_gym/{skill}-v0")
+        _MADE[skill] = gym.make(f"asm_gym/{skill}-v0", render_mode="rgb_array", render_size=(200, 200))
     return _MADE[skill]
 
 
@@ -287,7 +288,8 @@ def express(
     stuck: bool = False,
     reacts: bool = False,
     goes_on: bool = False,
-    steps: int | None = None,
+    steps: int = LONGEST,
+    watch: Callable[[str], None] = lambda doing: None,
 ) -> Course:
     """Let a model act until the task is solved.
 
@@ -298,14 +300,15 @@ def express(
         stuck: all encoders of the joints stick from row ``EVENT`` on.
         reacts: a group that alone is over its ceiling is left out; where several are, the arm yields for a while.
         goes_on: the state is carried on from what went before, without notice.
-        steps: after which it is left; at the task's horizon where None.
+        steps: after which it is left, if the task has not ended before.
+        watch: is told after every step what the network does.
     """
     work, readout, energies, grip, out, yields, yielded = Workspace(env), CommandReadout(env), [], None, "", 0, False
     if not goes_on:
         model.begin()
     (_, row), solved = work.reset(seed), False
     encoders = row[JOINTS].copy()
-    for t in range(steps or work.inner.horizon):
+    for t in range(min(steps, work.inner.horizon)):
         encoders = encoders if stuck and t >= EVENT else row[JOINTS].copy()
         row[JOINTS] = encoders
         if out:
@@ -320,6 +323,7 @@ def express(
                 elif over and not out:
                     out = over[0]
         action, grip = readout(model.command().astype(np.float32), grip)
+        watch("yields" if yields else f"without the {out} sense" if out else "goes on" if yielded else "")
         if yields:
             action[:6], yields = 0.0, yields - 1
         _, row, solved = work.step(action)
