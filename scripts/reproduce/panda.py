@@ -91,13 +91,13 @@ class Config(kit.Config):
     """Number of repetitions; they take the seeds that follow."""
     episodes: int = option(28, quick=4, least=4)
     """Episodes of each skill that are recorded; a seed learns from most of them."""
-    epochs: int = option(60, quick=4, least=1)
+    epochs: int = option(30, quick=4, least=1)
     """Passes of the network over its episodes."""
-    updates: int = option(900, quick=20, least=1)
+    updates: int = option(300, quick=20, least=1)
     """Batches of the recurrent networks."""
     faulty: int = option(2, quick=1, least=1)
     """Episodes of each skill with each kind of fault, and of each unknown skill."""
-    trials: int = option(2, quick=1, least=1)
+    trials: int = option(1, least=1)
     """Times that each skill is expressed."""
     steps: int = option(LONGEST, quick=45, least=1)
     """Rows after which an expression is left."""

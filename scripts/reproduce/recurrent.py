@@ -43,8 +43,9 @@ def side_by_side(trajectories: Sequence[Trajectory]) -> Batch:
 
 
 def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> list[Batch]:
-    """Return all episodes in batches, in random order."""
+    """Return all episodes in batches of about one length, in random order."""
     order = rng.permutation(len(trajectories))
+    order = order[np.argsort([len(trajectories[i].senses) for i in order], kind="stable")]
     groups = [order[i : i + BATCH] for i in range(0, len(order), BATCH)]
     return [side_by_side([trajectories[i] for i in groups[g]]) for g in rng.permutation(len(groups))]
 

@@ -65,7 +65,7 @@ HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
 EVENT, SECOND, YIELD = 30, 20, 12  # row of an event; rows of a second; rows for which a pushed arm yields
 SMOOTH = 0.5  # gain of energies
-LONGEST = 300  # rows of an expression
+LONGEST = 250  # rows of an expression
 
 
 class Workspace:
