@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ class Backpropagated:
 
     @classmethod
     def learned(
-        cls, episodes: Sequence[Episode], hidden: int, rng: np.random.Generator, updates: int, **how: float
+        cls, episodes: Sequence[Episode], hidden: int, rng: np.random.Generator, updates: int, **how: Any
     ) -> Backpropagated:
         """Learn from whole episodes; the arguments are those of ``recurrent.train``."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])

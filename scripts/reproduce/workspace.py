@@ -72,9 +72,8 @@ class Workspace:
     """A task, seen by the senses that all have."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self.env = env
-        self.inner: Any = env.unwrapped
-        self.skill: str = self.inner.task.name
+        inner: Any = env.unwrapped
+        self.env, self.inner, self.skill = env, inner, str(inner.task.name)
 
     def reset(self, seed: int) -> tuple[Any, Floats]:
         """Return the observation and the first row (D,)."""
@@ -159,8 +158,10 @@ class Demonstration(NamedTuple):
 def demonstrate(asked: Demonstration, folder: Path) -> Path:
     """Record an expert whose commands are shaken, so that it shows how to return, with a fault for two seconds."""
     env, rng = environment("Lift" if asked.skill == "sway" else asked.skill), np.random.default_rng([asked.seed, 1])
-    faults = [suite_fault(asked.fault, env.unwrapped, "medium", EVENT, asked.seed)] if asked.fault else []
-    work = Workspace(FaultInjection(env, faults))
+    inner: Any = env.unwrapped
+    faults = [suite_fault(asked.fault, inner, "medium", EVENT, asked.seed)] if asked.fault else []
+    faulty = FaultInjection(env, faults)
+    work = Workspace(faulty)
     how: dict[str, Any] = {} if asked.skill == "sway" else {"style": Style(noise=0.0)}
     expert = make_policy("sway" if asked.skill == "sway" else "scripted", work.env, seed=asked.seed, **how)
     (observation, row), state, after, shake = work.reset(asked.seed), None, 0, rng.uniform(0.0, SHAKE)
@@ -171,7 +172,7 @@ def demonstrate(asked: Demonstration, folder: Path) -> Path:
         observation, row, solved = work.step(action)
         rows.append(row)
         after += solved
-    work.env.undo_faults()
+    faulty.undo_faults()
     told = Episode.from_stream(np.array(rows), SPEC, success=after > 0, seed=asked.seed, info={"skill": asked.skill})
     return save_episode(folder / asked.name, told)
 
@@ -263,7 +264,7 @@ class Associated:
 
     def command(self) -> Floats:
         """Return the next action (A,)."""
-        return self.motor.command(situation(self.reader, self.row[None]))[0].astype(np.float64)
+        return np.asarray(self.motor.command(situation(self.reader, self.row[None]))[0], np.float64)
 
 
 def rescaled(reader: StreamScaler, action: NDArray[Any]) -> Floats:
