@@ -68,6 +68,7 @@ from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 OURS, CELLS, ACTS, FOREST = "settling", ("GRU", "LSTM"), "association", "random forest"
 UNITS = {OURS: 160, "GRU": 80, "LSTM": 68}
 """All have about as many weights: 36,000 to 38,000."""
+DEAF, GRIPPER = "settling, does not hear its gripper", (6,)
 HOW = 64, 6e-3, 8, 1.0, 1.0, 0.0  # of ``Schedule``: the best of five in a pilot
 STEPS = 1, 20  # of inference a row, of which speed and accuracy are compared
 ROWS = 2, 5, 10, 20, 40  # after which names are judged
@@ -122,7 +123,8 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
 
     reader = StreamScaler.fit(SPEC, [e.stream for e in train])
     schedule = Schedule(config.epochs, *HOW)
-    network: Any = learn_settling(trajectories(reader, train), UNITS["settling"], schedule, rng, lambda: None).network
+    asked = trajectories(reader, train), UNITS[OURS], schedule
+    network: Any = learn_settling(*asked, rng, lambda: None).network
     ours = Settling(reader, network, train)
     highest = np.array([ours.felt(e.stream)[2][WARM:].max(axis=0) for e in held])  # (N, G)
     ours.ceilings = np.quantile(highest, 1.0 - RATE / highest.shape[1], axis=0)
@@ -133,6 +135,8 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
     named(note, ours, train, tests, rng)
     surprised(note, ours, tests, files)
     actors = {OURS: ours, **{c: Recurrent(m) for c, m in rivals.items()}, ACTS: Associated(reader, train, rng)}
+    network = learn_settling(*asked, np.random.default_rng([seed, 2]), lambda: None, GRIPPER).network
+    actors[DEAF] = Settling(reader, network, train)
     if config.film and seed == config.seed:
         film(ours, config.out / "panda.gif", seed)
     return records, acted(note, actors, config, seed, rng)
@@ -157,7 +161,7 @@ def acted(note: Note, actors: dict[str, Any], config: Config, seed: int, rng: np
         courses[f"{OURS}, after another"] = act(ours, env, scene, goes_on=True)
         for name, course in courses.items():
             note("solved", name, skill, course.solved)
-            if OURS in name and name not in drawn:
+            if len(course.energies) and name not in drawn:
                 drawn[name] = course.energies.max(axis=1)
         stuck, thrust = (courses[f"{OURS}, {event}, reacts"] for event in (STUCK, PUSHED))
         note("reacted rightly", STUCK, skill, stuck.left_out == "joint")
@@ -166,27 +170,25 @@ def acted(note: Note, actors: dict[str, Any], config: Config, seed: int, rng: np
 
 
 def film(ours: Settling, path: Path, seed: int) -> None:
-    """Film the network while skills change without notice, the arm is pushed, and its encoders stick."""
+    """Film the network: another skill begins without notice, the arm is pushed, and its encoders stick."""
     push = Push(newtons=20.0, direction=(0.0, 1.0, 0.0), onset=EVENT, duration=10)
     pictures: list[Image.Image] = []
-    for n, (skill, happens) in enumerate(
-        (("PickPlaceCan", "interrupted"), ("Lift", ""), ("Stack", PUSHED), ("Door", STUCK))
+    for skill, happens, anew, steps in (
+        ("PickPlaceCan", "interrupted", True, 40),
+        ("Lift", PUSHED, False, LONGEST),
+        ("Door", STUCK, True, LONGEST),
     ):
-        env, steps = environment(skill), count()
+        env, every = environment(skill), count()
+        around = FaultInjection(env, [push] if happens == PUSHED else [])
 
-        def watch(
-            doing: str, env: Any = env, steps: Any = steps, what: str = f"{skill}, {happens}".rstrip(", ")
-        ) -> None:
-            if next(steps) % 4 == 0:
+        def watch(doing: str, env: Any = around, every: Any = every, what: str = f"{skill}, {happens}") -> None:
+            if next(every) % 4 == 0:
                 picture = Image.fromarray(env.render())
-                ImageDraw.Draw(picture).multiline_text(
-                    (6, 4), f"{what}\n{doing}", fill="white", stroke_width=1, stroke_fill="black"
-                )
+                text = ImageDraw.Draw(picture)
+                text.multiline_text((6, 4), f"{what}\n{doing}", fill="white", stroke_width=1, stroke_fill="black")
                 pictures.append(picture)
 
-        around = FaultInjection(env, [push] if happens == PUSHED else [])
-        length = 40 if happens == "interrupted" else LONGEST
-        express(ours, around, 10_000 + 100 * seed, happens == STUCK, True, n > 0, length, watch)
+        express(ours, around, 10_000 + 100 * seed, happens == STUCK, True, not anew, steps, watch)
         around.undo_faults()
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=100, loop=0)
 
@@ -342,7 +344,7 @@ def tables(records: Sequence[Record]) -> list[Table]:
 
 def drawn(records: Sequence[Record], energies: dict[str, Floats]) -> Figure:
     """Draw who solves what, how soon names are right, and the energy over time."""
-    with figure(height=3.2, width=11) as fig:
+    with figure(height=3.5, width=11) as fig:
         first, second, third = fig.subplots(1, 3)
         for n, model in enumerate((OURS, *CELLS, ACTS)):
             solved = [kit.over_seeds(records, "value", measure="solved", model=model, at=s).mean for s in SKILLS]
@@ -361,7 +363,7 @@ def drawn(records: Sequence[Record], energies: dict[str, Floats]) -> Figure:
         second.set(xlabel="time [s]", ylabel="share of right names", ylim=(0, 1.02))
         third.set(xlabel="time [s]", ylabel="energy, in its ceiling", yscale="log")
         for ax in (first, second, third):
-            ax.legend(fontsize=6)
+            ax.legend(fontsize=6, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     return fig
 
 
