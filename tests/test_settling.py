@@ -8,14 +8,13 @@ import pytest
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.memory.energy import infer
-from asm_gym.memory.learning import Moment, Schedule, Trajectory
+from asm_gym.memory.learning import Moment, Schedule
 from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.settling import (
     SettlingLearner,
     SettlingNetwork,
     SettlingWeights,
     initial_settling_weights,
-    learn_settling,
     settling_change,
 )
 from asm_gym.memory.temporal import unassociated
@@ -207,27 +206,6 @@ def test_learning_is_that_of_the_published_equations(seed):
     np.testing.assert_allclose(ours, z, atol=1e-6)
     for name, W in theirs.W.items():
         np.testing.assert_allclose(getattr(w, name), W, atol=1e-6, err_msg=name)
-
-
-def test_a_command_to_which_the_state_is_deaf_moves_nothing_and_is_predicted_all_the_same():
-    rng = np.random.default_rng(0)
-    commands = np.repeat(rng.choice([-1.0, 1.0], (6, 1, A)), 40, axis=1)
-    taught = [some_trajectory(np.float32(c), rng) for c in commands]
-    trained = learn_settling(taught, 16, SCHEDULE._replace(epochs=60), rng, lambda: None, deaf=(1,))
-    net, state = trained.network, np.zeros((1, 16), np.float32)
-    x, seen = np.zeros((1, S), np.float32), np.ones((1, S), np.float32)
-    told = [net.follow(state, np.array([[a, b, 1.0]], np.float32), x, seen).mu for a, b in ((0, 0), (0, 5), (5, 0))]
-    np.testing.assert_array_equal(told[0], told[1])
-    assert np.abs(told[0] - told[2]).max() > 0.1
-    for t in taught:
-        recalled = follow(net, net.at_rest(1), t.senses[:, None], t.commands[:, None])
-        assert np.sign(recalled.commands[20:, 0, 1]).mean() * t.commands[0, 1] > 0.9
-
-
-def some_trajectory(commands: np.ndarray, rng: np.random.Generator) -> Trajectory:
-    """Senses (T, S) that show the commands (T, A)."""
-    senses = np.float32(np.hstack([commands, commands]) + 0.1 * rng.normal(size=(len(commands), S)))
-    return Trajectory(senses, np.hstack([commands, np.ones((len(commands), 1), np.float32)]), senses)
 
 
 def test_few_of_our_steps_of_inference_go_at_least_as_far_as_a_hundred_published_ones():

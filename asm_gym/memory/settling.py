@@ -6,9 +6,6 @@
     ΔW_H ∝ (Π_z ε_z + ε_h) f(z_{t-1})ᵀ    ΔW_U ∝ Π_z ε_z [a_t, 1]ᵀ + ε_h [0, 1]ᵀ    ε_h = f'(h_t) ⊙ W_Aᵀ ε_a
     ΔW_F ∝ Π_x ε_x f(z_t)ᵀ    ΔW_A ∝ ε_a f(h_t)ᵀ
 
-Commands to which the state is deaf have no synapse in W_U, and are predicted all the same: a network that hears a
-command that seldom changes, such as a gripper's, learns to repeat it.
-
 Each change is -∂F/∂W at the inferred state. The past is in z alone, and an error teaches one step back and no further.
 W_H begins near the identity, so that units keep what is long past. A stream that runs on alone hands on μ_t in place of
 z_t, and takes its own action.
@@ -155,11 +152,8 @@ class SettlingLearner(Learner):
     weights: SettlingWeights
     early = 1
 
-    def __init__(
-        self, weights: SettlingWeights, schedule: Schedule, rng: np.random.Generator, deaf: Sequence[int] = ()
-    ) -> None:
+    def __init__(self, weights: SettlingWeights, schedule: Schedule, rng: np.random.Generator) -> None:
         super().__init__(weights, SettlingWeights._fields, schedule, rng)
-        self.deaf = list(deaf)
 
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, len(self.weights.W_H)), np.float32)
@@ -179,26 +173,18 @@ class SettlingLearner(Learner):
         of_action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
         energy = 0.5 * float(pi_z * np.sum(of_state**2) + pi_x * np.sum(of_senses**2) + np.sum(of_action**2))
         errors = pi_z * of_state, pi_x * of_senses, of_action
-        change = settling_change(state, taken, h, errors, z, w.W_A)
-        change.W_U[:, self.deaf] = 0
-        self.learn(change, rate)
+        self.learn(settling_change(state, taken, h, errors, z, w.W_A), rate)
         return np.where(alone, mu, z), energy
 
 
 def learn_settling(
-    trajectories: Sequence[Trajectory],
-    hidden: int,
-    schedule: Schedule,
-    rng: np.random.Generator,
-    tick: Tick,
-    deaf: Sequence[int] = (),
+    trajectories: Sequence[Trajectory], hidden: int, schedule: Schedule, rng: np.random.Generator, tick: Tick
 ) -> Trained:
-    """Learn the synapses through time; see ``temporal.Learn``. ``deaf``: commands that the state does not hear."""
+    """Learn the synapses through time; see ``temporal.Learn``."""
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     # A network that runs on alone must keep its state; one that reads hundreds of rows would drift if it kept all.
     least = 1.0 if schedule.free_running_probability > 0 else LEAST
     weights = initial_settling_weights(hidden, sensory, commands - 1, rng, least)
-    weights.W_U[:, list(deaf)] = 0
-    energy = practise(SettlingLearner(weights, schedule, rng, deaf), hidden, trajectories, schedule, rng, tick)
+    energy = practise(SettlingLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick)
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
     return Trained(SettlingNetwork(weights, unassociated(), *how), energy)

@@ -68,7 +68,6 @@ from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 OURS, CELLS, ACTS, FOREST = "settling", ("GRU", "LSTM"), "association", "random forest"
 UNITS = {OURS: 160, "GRU": 80, "LSTM": 68}
 """All have about as many weights: 36,000 to 38,000."""
-DEAF, GRIPPER = "settling, does not hear its gripper", (6,)
 HOW = 64, 6e-3, 8, 1.0, 1.0, 0.0  # of ``Schedule``: the best of five in a pilot
 STEPS = 1, 20  # of inference a row, of which speed and accuracy are compared
 ROWS = 2, 5, 10, 20, 40  # after which names are judged
@@ -123,8 +122,7 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
 
     reader = StreamScaler.fit(SPEC, [e.stream for e in train])
     schedule = Schedule(config.epochs, *HOW)
-    asked = trajectories(reader, train), UNITS[OURS], schedule
-    network: Any = learn_settling(*asked, rng, lambda: None).network
+    network: Any = learn_settling(trajectories(reader, train), UNITS[OURS], schedule, rng, lambda: None).network
     ours = Settling(reader, network, train)
     highest = np.array([ours.felt(e.stream)[2][WARM:].max(axis=0) for e in held])  # (N, G)
     ours.ceilings = np.quantile(highest, 1.0 - RATE / highest.shape[1], axis=0)
@@ -135,8 +133,6 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
     named(note, ours, train, tests, rng)
     surprised(note, ours, tests, files)
     actors = {OURS: ours, **{c: Recurrent(m) for c, m in rivals.items()}, ACTS: Associated(reader, train, rng)}
-    network = learn_settling(*asked, np.random.default_rng([seed, 2]), lambda: None, GRIPPER).network
-    actors[DEAF] = Settling(reader, network, train)
     if config.film and seed == config.seed:
         film(ours, config.out / "panda.gif", seed)
     return records, acted(note, actors, config, seed, rng)
