@@ -75,6 +75,8 @@ def test_a_chunk_is_kept_up_to_the_action_that_leads_where_no_healthy_hand_was(o
     env.reset(seed=0)
     assert env.preview(UP).at is None
     assert env.preview(UP).kept.shape == (16, 7)
+    for action in UP[:8]:
+        env.step(action.astype(np.float32))
     told = env.preview(DOWN)
     assert told.reason in ("place", "pace")
     assert told.known
