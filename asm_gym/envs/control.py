@@ -85,7 +85,7 @@ YIELDS_AT = 60.0  # Y: the force at the hand from which an arm that is held and 
 HELD, BRAKING, YIELDING = 1, 2, 3
 """Of ``Goals.held``: to be held from the next substep on; on its way to rest; and since then."""
 
-REACHES = 0.15  # how far gripper, fingers and what they hold are from the point between the fingers, about [m]
+REACHES = 0.15  # how far gripper and what it holds are from the point between the fingers, and links from joints [m]
 SLOWING = 200.0  # share of the speed beyond its limit that an arm loses in a second [1/s]
 RESTING = 0.1  # an arm none of whose joints is faster than this has come to rest [rad/s]
 YIELD_LEVER = 0.15  # r₀: what a joint has at least for a lever [m]
@@ -256,20 +256,19 @@ def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
 
 @inner
 def fastest_point(views: Views, arms: Arms, a: int) -> float:
-    """Return the greatest speed of a joint of arm ``a``, or of its hand as far as that ``REACHES`` [m/s]."""
-    site, com, most, turning = views.site_xpos[arms.site[a]], views.subtree_com[arms.root[a]], 0.0, 0.0
+    """Return the greatest speed of hand and links of arm ``a``, as far as each ``REACHES`` [m/s]."""
+    site, com, most = views.site_xpos[arms.site[a]], views.subtree_com[arms.root[a]], 0.0
     for n in range(arms.links.shape[1]):
         b = arms.links[a, n]
         if b < 0:
             break
-        v, total = views.cvel[b], 0.0
+        v, place, moving, turning = views.cvel[b], site if n == 0 else views.xpos[b], 0.0, 0.0
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            at_j, at_k = (site[j], site[k]) if n == 0 else (views.xpos[b, j], views.xpos[b, k])
-            speed = v[3 + i] + v[j] * (at_k - com[k]) - v[k] * (at_j - com[j])
-            total += speed * speed
-            turning += v[i] * v[i] if n == 0 else 0.0
-        most = max(most, np.sqrt(total) + (REACHES * np.sqrt(turning) if n == 0 else 0.0))
+            speed = v[3 + i] + v[j] * (place[k] - com[k]) - v[k] * (place[j] - com[j])
+            moving += speed * speed
+            turning += v[i] * v[i]
+        most = max(most, np.sqrt(moving) + REACHES * np.sqrt(turning))
     return most
 
 

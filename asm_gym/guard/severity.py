@@ -23,7 +23,7 @@ AGAIN = 4.0  # each time that the policy has pressed too hard before shortens th
 LEVER = 0.5  # how far from a joint's axis an arm is touched, about [m]
 BLOW = 2900.0  # first blow on a table for each m/s of the hand [N s/m]; measured 2,500 to 3,100, on a bin 4,100
 
-LEANS_S = 0.4
+LEANS_S = 0.5
 """More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
 did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
