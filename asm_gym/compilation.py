@@ -20,9 +20,6 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from llvmlite import binding
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
 from numba.core.config import reload_config
 from numba.core.registry import cpu_target
 
@@ -102,26 +99,10 @@ def _cache_of(dispatcher: Any) -> Any:
 
 
 def inner(function: F, fastmath: bool = False) -> F:
-    """Compile ``function`` into compiled functions that call it, and not by itself: a call from Python ends Python."""
+    """Compile ``function`` for compiled functions to call: it has no entry for Python."""
     how: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
-    how |= {"fastmath": fastmath, "forceinline": fastmath, "pipeline_class": _Inner}
+    how |= {"fastmath": fastmath, "forceinline": fastmath}
     return cast(F, numba.njit(**how)(function))
-
-
-class _Inner(Compiler):  # type: ignore[misc]
-    def compile_extra(self, function: Any) -> Any:
-        self.state.library = _Linked(self.state.targetctx.codegen(), function.__qualname__)
-        return super().compile_extra(function)
-
-
-class _Linked(JITCodeLibrary):  # type: ignore[misc]
-    """Code that becomes machine code where it is linked, and not by itself."""
-
-    def _finalize_final_module(self) -> None:
-        # numba writes to this variable of every function.
-        variables = [v for v in self._final_module.global_variables if v.name.startswith("_ZN08NumbaEnv")]
-        self._codegen._add_module(binding.parse_assembly("\n".join(map(str, variables))))
-        self._finalized = True
 
 
 @lru_cache

@@ -74,8 +74,8 @@ def inspected(
     columns = decide([table, *others], layout, clock)
     refused = [f"{c.name} {c.why}" for c in columns if c.role in ("mixed", "double")]
     rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
-    found = {"times": rows / (rate or 1.0), "rate": rate, "trouble": trouble or "; ".join(refused)} | found
-    return Inspection(name, columns, [_facts(c) for c in columns], **found)
+    unread: dict[str, Any] = {"times": rows / (rate or 1.0), "rate": rate, "trouble": trouble or "; ".join(refused)}
+    return Inspection(name, columns, [_facts(c) for c in columns], **unread | found)
 
 
 def _by_clock(table: Columns, clock: Clock) -> dict[str, Any]:

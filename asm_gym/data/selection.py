@@ -55,7 +55,7 @@ def normal_episodes(
 
 def complete_parts(episode: Episode) -> list[Episode]:
     """Return the parts of an episode between lost numbers; those under half a second are left out."""
-    known = np.isfinite(episode.stream).all(axis=1)
+    known = np.asarray(np.isfinite(episode.stream).all(axis=1))
     return [episode] if known.all() else _parts(episode, known)
 
 

@@ -248,6 +248,7 @@ class Simulation:
         if in_joints:
             speeds = self.views.qvel[self.arms.dofs[a, : int(self.arms.joints[a])]] if moves is None else moves
             return self.hand_jacobian(a) @ speeds
+        assert moves is not None
         frame, twist = int(self.arms.base[a]), np.zeros(6)
         twist[: len(moves)] = moves
         return twist if frame < 0 else (twist.reshape(2, 3) @ self.views.site_xmat[frame].reshape(3, 3).T).ravel()

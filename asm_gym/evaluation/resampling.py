@@ -91,7 +91,7 @@ class Windows:
     def detected(self, threshold: float) -> NDArray[np.bool_]:
         """Return (F,) which faults are detected at a threshold."""
         over = self._surprise > threshold
-        return (over[:, 1:] & ~over[:, :-1]).any(axis=1)
+        return np.asarray((over[:, 1:] & ~over[:, :-1]).any(axis=1))
 
 
 def resample(

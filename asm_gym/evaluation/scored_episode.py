@@ -78,12 +78,12 @@ class ScoredEpisode:
     @property
     def missing(self) -> NDArray[np.bool_]:
         """(T,) the rows that lack a number; none where the stream was not kept."""
-        return np.zeros(len(self), np.bool_) if self.stream is None else np.isnan(self.stream).any(axis=1)
+        return np.zeros(len(self), np.bool_) if self.stream is None else np.asarray(np.isnan(self.stream).any(axis=1))
 
     @cached_property
     def alarm(self) -> NDArray[np.bool_]:
         """(T,) the rows in alarm."""
-        return self.surprise > self.threshold
+        return np.asarray(self.surprise > self.threshold)
 
     @cached_property
     def alarms(self) -> tuple[int, ...]:

@@ -132,5 +132,5 @@ class Adversary(ActionFault):
 
     size: float = within(0.4, low=0, high=2)
 
-    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
+    def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
         return commanded - self.size * np.sign(commanded)

@@ -140,8 +140,7 @@ class Completion:
     @cached_property
     def precision(self) -> Floats:
         """P = (C + λ)⁻¹ (Y, Y)."""
-        found: Floats = np.linalg.inv(self.covariance + PENALTY * np.eye(len(self.covariance)))
-        return found
+        return np.linalg.inv(self.covariance + PENALTY * np.eye(len(self.covariance))).astype(np.float64)
 
     def _weights(self, missing: Mask) -> tuple[NDArray[np.intp], Floats]:
         """Return the places (M,) of the senses of ``missing`` (D,) in y, and the weights (M, Y) that complete them.
@@ -150,7 +149,7 @@ class Completion:
         """
         E, P = np.flatnonzero(self.involved(missing)), self.precision
         places = np.flatnonzero(missing[self.spec.sensory])  # sensory entries come first in y
-        W: Floats = -np.linalg.solve(P[np.ix_(E, E)], P[E])[np.searchsorted(E, places)]
+        W = -np.linalg.solve(P[np.ix_(E, E)], P[E])[np.searchsorted(E, places)].astype(np.float64)
         W[:, E] = 0.0
         return places, W
 

@@ -78,11 +78,11 @@ class SettlingNetwork(TemporalNetwork):
 
     @property
     def hidden_size(self) -> int:
-        return self.weights.W_H.shape[0]
+        return int(self.weights.W_H.shape[0])
 
     @property
     def motor(self) -> int:
-        return self.weights.W_A.shape[0]
+        return int(self.weights.W_A.shape[0])
 
     def at_rest(self, batch: int) -> NDArray[np.float32]:
         return np.zeros((batch, self.hidden_size), np.float32)

@@ -145,11 +145,11 @@ class Network(TemporalNetwork):
 
     @property
     def hidden_size(self) -> int:
-        return self.weights.W_C.shape[0]
+        return int(self.weights.W_C.shape[0])
 
     @property
     def motor(self) -> int:
-        return self.weights.W_D.shape[1] - self.weights.W_C.shape[1] - 1
+        return int(self.weights.W_D.shape[1] - self.weights.W_C.shape[1] - 1)
 
     def at_rest(self, batch: int) -> NDArray[np.float32]:
         return np.zeros((batch, self.weights.W_C.shape[1]), np.float32)

@@ -133,7 +133,7 @@ class Diagnosis:
             missing = np.zeros(self.completion.spec.size, bool)
             missing[h.columns] = True
             E = np.flatnonzero(self.completion.involved(missing))
-            found.append((E, np.linalg.inv(self.completion.precision[np.ix_(E, E)])))
+            found.append((E, np.linalg.inv(self.completion.precision[np.ix_(E, E)]).astype(np.float64)))
         return found
 
     def evidence(

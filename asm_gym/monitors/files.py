@@ -39,7 +39,7 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
     Raises:
         KeyError, ValueError: something is missing, not declared, or out of range.
     """
-    header, saved = saved.header, saved._replace(arrays=unpacked(saved.arrays))
+    header, saved = saved.header, saved._replace(arrays=dict(unpacked(saved.arrays)))
     undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
     if any(".planes" in name for name in undeclared):  # as arrays were packed before
         raise ValueError("the file was written by an older version: make it anew with asm-gym fit or asm-gym babble")
@@ -116,7 +116,7 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> A
 
 def rounded(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """Return arrays whose weights ``packed`` stores in 8 bits. Raises ValueError where a weight is not finite."""
-    found: Arrays = dict(arrays)
+    found: dict[str, NDArray[Any]] = dict(arrays)
     for name in found.keys() & set(WEIGHTS):
         if not np.isfinite(found[name]).all():
             raise ValueError(f"{name} has weights that are not finite: fit the memory anew")
@@ -126,7 +126,7 @@ def rounded(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 def packed(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """Return the arrays as they are stored: weights in 8 bits where nothing is lost by it."""
-    found: Arrays = dict(arrays)
+    found: dict[str, NDArray[Any]] = dict(arrays)
     for name in WEIGHTS:
         if name in arrays and np.isfinite(arrays[name]).all():
             k, scale = _quantised(arrays[name])
@@ -138,7 +138,7 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
     """Return what ``packed`` was given. Raises ValueError for parts that do not fit."""
-    found: Arrays = {}
+    found: dict[str, NDArray[Any]] = {}
     for name, array in arrays.items():
         own = name.removesuffix(BITS).removesuffix(ROOT)
         scale = arrays.get(own + SCALE, np.zeros(0))

@@ -136,7 +136,8 @@ def check_monitor_name(name: str) -> None:
     model, plus, detection = name.partition("+")
     if ":" in model and model not in MONITORS:
         own: Any = target(model)
-        if not isinstance(own, type) or not issubclass(own, StreamModel | CalibratedMonitor):
+        kinds: Any = StreamModel, CalibratedMonitor
+        if not isinstance(own, type) or not issubclass(own, kinds):
             raise ValueError(f"{name} is no model: derive from asm_gym.monitors.stream_model.StreamModel")
         if own.kind not in MONITORS:
             register_monitor(own.kind, own, getattr(own, "detection", "evidence"))

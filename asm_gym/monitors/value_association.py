@@ -310,7 +310,7 @@ def _far(given: _Fitted, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> 
 
 def inverse(gram: Floats) -> Floats:
     """Return (ZᵀZ/N + λ)⁻¹ of ZᵀZ/N (I, I)."""
-    return np.linalg.inv(gram + STIFFNESS * np.eye(len(gram)))
+    return np.linalg.inv(gram + STIFFNESS * np.eye(len(gram))).astype(np.float64)
 
 
 def squares(z: Floats, matrix: Floats) -> Floats:

@@ -180,6 +180,6 @@ def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda
 def export(learner: SAC, view: Standardised) -> NetworkPolicy:
     """Return the learner's policy for unstandardised observations, without its noise, to act in the environment."""
     parts = [part for part in (*learner.actor.latent_pi, learner.actor.mu) if isinstance(part, torch.nn.Linear)]
-    layers = [tuple(t.detach().cpu().numpy().copy() for t in (part.weight, part.bias)) for part in parts]
-    how = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
+    layers = [(part.weight.detach().cpu().numpy().copy(), part.bias.detach().cpu().numpy().copy()) for part in parts]
+    how: dict[str, Any] = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
     return NetworkPolicy(layers, **how).fit_to(view.env, "the agent")
