@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.reproduce import panda, speed_accuracy, workspace
+from asm_gym.scripts.reproduce import panda, workspace
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
@@ -66,19 +64,6 @@ def test_the_memory_recalls_each_letter_from_its_cue():
     still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()
     assert right >= 5 / 6
     assert error < 0.5 * still
-
-
-def test_traces_need_no_inference_and_a_settling_state_does():
-    config = speed_accuracy.Config(skills=2, hidden=32, writings=4, steps=2000, iterations=(1, 5, 30, 100))
-    found = {}
-    for dynamics in ("traces", "settling"):
-        rng = np.random.default_rng(0)
-        records = speed_accuracy.by_iterations(repertoire(2, rng), config, rng, dynamics)
-        found[dynamics] = {(r["iterations"], r["shorter"]): r["next_cm"] for r in records}
-    assert len(set(found["traces"].values())) == 1  # to the bit: nothing is inferred
-    settling = [found["settling"][at] for at in ((1, 20), (5, 20), (30, 20), (100, 1))]
-    assert all(later < sooner for sooner, later in itertools.pairwise(settling))
-    assert settling[0] > 1.3 * settling[-1]
 
 
 def small_batch(steps: int) -> tuple[Weights, Batch]:

@@ -20,7 +20,6 @@ import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded 
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.validation import check_number
 
 Array = NDArray[np.floating[Any]]
 Scalar = float | np.floating[Any]
@@ -171,12 +170,3 @@ def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature:
         if farthest < STILL:
             break
     return z
-
-
-def iterations_within(budget: float, dt: float) -> int:
-    """Return the inference steps a row, from steps a second and seconds a row. Raises ValueError if below one."""
-    each = check_number("budget", budget, above=0.0) * dt
-    if each < 1.0 - 1e-9:
-        rows = f"{1 / dt:.4g} rows a second"
-        raise ValueError(f"a budget of {budget:g} steps of inference a second is less than one for each of {rows}")
-    return int(each + 1e-9)

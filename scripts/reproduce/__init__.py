@@ -15,7 +15,6 @@ INDEPENDENT = {
     "memorise_and_recall": "one network learns skills, recalls each from a cue",
     "panda": "one network, six skills of the Panda, no label",
     "local_learning": "local updates against backpropagation through time",
-    "speed_accuracy": "more inference, or slower movements, for more accuracy",
     "harm": "harm avoided against success kept, under any policy",
     "chunks": "blows foretold from chunks of actions, and false verdicts",
 }

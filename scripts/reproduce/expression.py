@@ -84,12 +84,6 @@ class ExpressionMemory:
             return rows
         return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))])
 
-    def with_inference(self, iterations: int, shorter: int = 1) -> ExpressionMemory:
-        """Return a copy with other steps of inference a row, each ``shorter`` times shorter than usual."""
-        network = self.network.with_iterations(iterations)
-        network.curvature *= np.float32(shorter)  # the length of a step is its inverse
-        return ExpressionMemory(self.reader, network)
-
 
 @dataclass(frozen=True)
 class Backpropagated:
