@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
 import gymnasium as gym
 
@@ -106,7 +106,7 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
 
     args = list(sys.argv[1:] if argv is None else argv)
     text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
-    named = [each.name.replace("_", "-") for each in fields(kind) if not each.metadata.get("positional")]
+    named = [each.name.replace("_", "-") for each in fields(cast(Any, kind)) if not each.metadata.get("positional")]
     options = [f"--{name}" for name in (*named, "help")]
     for word in args:
         if word.startswith("--") and not word.startswith("--tyro-"):
