@@ -1,6 +1,6 @@
 """Film a push and a frozen encoder under the guard: ``python docs/examples/film_an_alarm.py film.gif``.
 
-A red frame is an alarm, an orange one a reflex that still acts.
+A red frame is an alarm, an orange one a reflex that still acts, a golden one a sensor that is completed.
 """
 
 import sys
@@ -20,9 +20,10 @@ for step in range(100):
     if step % 2:
         continue
     asm = info["asm"]
-    colour = "red" if asm["alarm"] else "orange" if asm["intervened"] else "white"
+    colour = "red" if asm["alarm"] else "orange" if asm["intervened"] else "gold" if asm["completed"] else "white"
     picture = ImageOps.expand(Image.fromarray(env.render()).resize((320, 320)), 8, colour)
     fault, doing = ", ".join(info["fault"]) or "no fault", asm["response"] or asm["state"]
+    doing = " ".join([doing, *asm["completed"], "is completed"]) if asm["completed"] else doing
     said = f"{step / 20:.1f} s: {fault}\nsurprise {asm['surprise'] / asm['threshold']:.1f} thresholds\n{doing}"
     ImageDraw.Draw(picture).text((16, 14), said, "white")
     pictures.append(picture.quantize(64))
