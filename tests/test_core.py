@@ -77,13 +77,10 @@ SAID = [
 
 ONE_IMPORT = {
     **dict.fromkeys(("NeuralASM", "NeuralASMSafety", "VectorNeuralASMSafety", "StreamRecorder"), None),
-    **dict.fromkeys(("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy"), None),
+    **dict.fromkeys(("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy", "harmless"), None),
     **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
-    "FaultInjection": SAID[0],
-    **{
-        n: SAID[0].replace("a robosuite environment or a fault in one", n)
-        for n in ("register_fault", "collect", "harmless")
-    },
+    "register_fault": "register_fault needs mujoco: pip install 'asm-gym[robosuite]'",
+    **dict.fromkeys(("FaultInjection", "collect"), SAID[0]),
 }
 """What a core install answers for each name of the package."""
 
