@@ -296,8 +296,7 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
             f"this {name} was made for another environment, and would move that: give the class, on_alarm={name}, "
             "or a function of the environment that makes it"
         )
-    policy: Policy = made
-    return policy
+    return made
 
 
 class Guarding:

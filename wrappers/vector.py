@@ -201,8 +201,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                 return np.concatenate([np.ravel(observations[i]), np.ravel(executed[i])])
             if stream is None or not there[i]:
                 raise KeyError('info has no "stream"')
-            own: NDArray[np.float32] = stream[i]
-            return own
+            return stream[i]
 
         rows, said = zip(*(sensed_row(partial(row, i), size) for i in range(n)), strict=True)
         return np.stack(rows), {i: failure for i, failure in enumerate(said) if failure}

@@ -133,7 +133,7 @@ def clocks_among(names: Iterable[str]) -> list[Clock]:
                 pairs[coarse] = Clock((coarse, name), (1.0, 1e-9 if found["unit"].lower().startswith("n") else 1e-6))
     fine = {pair.columns[1] for pair in pairs.values()}
     single = {name: Clock((name,), (_named_unit(name),)) for name in names if is_clock(name) and name not in fine}
-    return [found for name in names if (found := pairs.get(name) or single.get(name))]
+    return [clock for name in names if (clock := pairs.get(name) or single.get(name))]
 
 
 def _named_unit(name: str) -> float | None:

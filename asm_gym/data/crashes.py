@@ -28,8 +28,7 @@ def peak_torques(episode: Episode) -> NDArray[np.float64]:
     slices = episode.spec.slices
     sensed = [[s for name, s in slices.items() if name.endswith(f"external_torque{end}")] for end in ("_peak", "")]
     torques = [np.abs(episode.stream[:, s]).max(axis=1) for s in sensed[0] or sensed[1]]
-    found: NDArray[np.float64] = np.max([np.zeros(len(episode)), *torques], axis=0)
-    return found
+    return np.max([np.zeros(len(episode)), *torques], axis=0)
 
 
 def crashes(

@@ -111,7 +111,7 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
             note(f"{path}: {left_out.sum()} lines are left out, {what}")
             rows = rows[~left_out]
     cells = rows.map(dialect.cells)
-    if not complete and len(rows) > 1 and _cut_off(dialect, *cells.iloc[-2:], len(names)):
+    if not complete and len(rows) > 1 and _cut_off(dialect, cells.iloc[-2], cells.iloc[-1], len(names)):
         note(f"{path}: its last line was cut off, and is left out")
         rows, cells = rows.iloc[:-1], cells.iloc[:-1]
     if rows.empty:
@@ -262,8 +262,7 @@ def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
     text = pd.Series(cells).astype("string").str.strip()
     plain = text.str.replace(",", ".", regex=False) if comma else text
     found = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
-    values: NDArray[np.float64] = found.to_numpy(np.float64, na_value=np.nan)
-    return values
+    return found.to_numpy(np.float64, na_value=np.nan)
 
 
 def _column(cells: pd.Series[Any], comma: bool) -> NDArray[Any]:
@@ -311,7 +310,9 @@ def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
         row = dict(zip(columns, row, strict=True))
     if not isinstance(row, dict):
         raise ValueError(f"it must be an object or a list, got {str(row)[:40]}")
-    words = next((row[key] for key in ("name", "names", "joint_names") if isinstance(row.get(key), list)), [])
+    words: list[Any] = next(
+        (row[key] for key in ("name", "names", "joint_names") if isinstance(row.get(key), list)), []
+    )
     found: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, dict):

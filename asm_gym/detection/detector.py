@@ -168,8 +168,7 @@ class Detector:
     def reach_of_errors(self) -> Floats:
         """Largest value (X,) in the context of the least surprise, one error alone at ν for ever, the others at 0."""
         least = np.exp(min(self.context_quantile[-1], self.context_range[0]))
-        found: Floats = self._most(self.bound * self.whitening) / least
-        return found
+        return self._most(self.bound * self.whitening) / least
 
     def _most(self, evidence: Floats) -> Floats:
         """Return the pooled ratios (N,) of whitened errors (N, X) that last for ever: v_i = w_i² (2 - a) / a."""

@@ -47,15 +47,13 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
     scale = float(np.trace(covariance)) / len(covariance)
     target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
     values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
-    matrix: Floats = (vectors / np.sqrt(values)) @ vectors.T
-    return matrix
+    return (vectors / np.sqrt(values)) @ vectors.T
 
 
 def bounded(errors: Array, bound: float) -> Floats:
     """Return the errors, none beyond ν = ``bound`` standard deviations."""
     exact = np.asarray(errors, np.float64)
-    pulled: Floats = exact / np.sqrt(1.0 + (exact / bound) ** 2)
-    return pulled
+    return exact / np.sqrt(1.0 + (exact / bound) ** 2)
 
 
 class Evidence(NamedTuple):
@@ -90,8 +88,7 @@ def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats,
 def strength(evidence: Evidence, gains: Array) -> Floats:
     """Return v (B, G, X), the squared evidence in each error."""
     variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * evidence.steps[:, None]))  # (B, G) of each w_t,i
-    squared: Floats = evidence.vector**2 / variance[:, :, None]
-    return squared
+    return evidence.vector**2 / variance[:, :, None]
 
 
 def pool(ratios: Array) -> tuple[Floats, Floats]:
@@ -116,5 +113,4 @@ def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[Floats, F
 def ceilings(maxima: Array, quantile: float) -> Floats:
     """Return q (…): a quantile of the maxima of N nominal episodes (N, …)."""
     found = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
-    least: Floats = np.maximum(found, LEAST_SHARE * np.median(found))
-    return least
+    return np.maximum(found, LEAST_SHARE * np.median(found))

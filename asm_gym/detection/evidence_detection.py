@@ -148,5 +148,4 @@ def _joined(found: Floats, ratios: Floats) -> Floats:
     """Return each number's share (B, D) of its surprise so far pooled with further ratios."""
     value = found.sum(axis=1, keepdims=True)
     _, parts = pool(np.hstack([value, ratios]))
-    shared: Floats = found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]
-    return shared
+    return found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]

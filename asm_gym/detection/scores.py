@@ -52,8 +52,7 @@ class Squares:
 
     def parts(self, output: ModelOutput) -> Floats:
         """Return each error's share of the score (B, X), >= 0."""
-        squared: Floats = np.asarray(output.errors, np.float64) ** 2
-        return squared
+        return np.asarray(output.errors, np.float64) ** 2
 
 
 class Mahalanobis(Squares):

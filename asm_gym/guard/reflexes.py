@@ -69,8 +69,7 @@ class Places:
         if not np.isfinite(action).all() and self._rows.size:
             found = self._meaning.staying(self._rows[robot], self.executed[robot])
             action[:] = np.where(np.isfinite(action), action, found)
-        stay: NDArray[np.float32] = np.where(np.isfinite(action), action, self._rest)
-        return stay
+        return np.where(np.isfinite(action), action, self._rest)
 
 
 class Reflexes:

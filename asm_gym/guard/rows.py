@@ -133,8 +133,7 @@ class Rows:
 
     def known(self, robot: int) -> Mask:
         """Return (D,) what is completed, or right by the hand and its joints."""
-        known: Mask = np.logical_or.reduce([self._missing(robot), *(hand.vouched(robot) for hand in self._hands)])
-        return known
+        return np.logical_or.reduce([self._missing(robot), *(hand.vouched(robot) for hand in self._hands)])
 
     def counted(self, surprise: Surprise, failures: Mapping[int, str]) -> Surprise:
         """Return what counts of the surprise at the last rows: nothing is surprised by what was completed."""

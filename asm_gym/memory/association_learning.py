@@ -163,8 +163,7 @@ def learn_doubt(error: Array, far: Array) -> Array:
 
 def _random(exists: Array, rng: np.random.Generator) -> Array:
     """Return initial V (M, I)."""
-    V: Array = rng.standard_normal(exists.shape).astype(np.float32) / np.float32(np.sqrt(exists.shape[1])) * exists
-    return V
+    return rng.standard_normal(exists.shape).astype(np.float32) / np.float32(np.sqrt(exists.shape[1])) * exists
 
 
 def _learn_hidden(a: Array, left: Array, exists: Change, rng: np.random.Generator, tick: Tick) -> tuple[Array, Array]:

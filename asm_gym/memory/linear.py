@@ -58,8 +58,7 @@ def gram(a: Floats) -> Floats:
 
 def along(a: Floats, W: Floats) -> Floats:
     """Return a @ W.T, (N, P) from (N, Q), by SciPy's BLAS."""
-    found: Floats = dgemm(1.0, W.T, a.T, trans_a=True).T
-    return found
+    return dgemm(1.0, W.T, a.T, trans_a=True).T
 
 
 def moments(a: Array) -> Moments:

@@ -29,8 +29,7 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
     """Return p (B, K) for firing rates (B, M)."""
     drive = units @ W_K.T + b_K
     strength = np.exp(drive - drive.max(axis=1, keepdims=True))
-    shares: NDArray[np.float32] = (strength / strength.sum(axis=1, keepdims=True)).astype(np.float32)
-    return shares
+    return (strength / strength.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 @inner_kernel

@@ -57,8 +57,7 @@ def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
     standard = np.zeros((T, B, reader.spec.size))
     standard[:, :, sensory] = recalled.senses[:, :, : len(sensory)]
     standard[:, :, motor] = recalled.commands
-    rows: NDArray[np.float64] = reader.mean + reader.spread * standard
-    return rows
+    return reader.mean + reader.spread * standard
 
 
 def continued(

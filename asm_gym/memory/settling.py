@@ -102,8 +102,7 @@ class SettlingNetwork(TemporalNetwork):
 
     def _sense(self, z: Array) -> Array:
         """Return x̂ (B, S)."""
-        found: Array = outward(activate(z), self.weights.W_F) + self.weights.b_F
-        return found
+        return outward(activate(z), self.weights.W_F) + self.weights.b_F
 
     def _expected(self, z: Array, u: Array) -> tuple[Array, Array]:
         """Return μ_t (B, H), and â_t (B, A), which does not depend on the action."""

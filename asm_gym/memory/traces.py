@@ -53,8 +53,7 @@ def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
         traces = advance(traces[: len(rows)], rows, plain)
         squares += np.sum(traces.reshape(len(rows), len(DECAYS), width) ** 2, axis=(0, 2), dtype=np.float64)
     count = width * sum(len(episode) for episode in episodes)
-    gains: NDArray[np.float32] = (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
-    return gains
+    return (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
 
 
 class Weights(NamedTuple):
@@ -88,8 +87,7 @@ def expect(c: Array, W_C: Array) -> Array:
 
 def direct(c: Array, u: Array, W_D: Array) -> Array:
     """Return the prediction (B, S + A) past the state, from traces ``c`` (B, I) and action and 1 ``u`` (B, A + 1)."""
-    found: Array = outward(np.hstack([c, u]), W_D)
-    return found
+    return outward(np.hstack([c, u]), W_D)
 
 
 @kernel

@@ -136,12 +136,12 @@ def check_monitor_name(name: str) -> None:
     model, plus, detection = name.partition("+")
     if ":" in model and model not in MONITORS:
         own: Any = target(model)
-        kinds: Any = StreamModel, CalibratedMonitor
-        if not isinstance(own, type) or not issubclass(own, kinds):
+        if not isinstance(own, type) or not issubclass(own, StreamModel | CalibratedMonitor):
             raise ValueError(f"{name} is no model: derive from asm_gym.monitors.stream_model.StreamModel")
-        if own.kind not in MONITORS:
-            register_monitor(own.kind, own, getattr(own, "detection", "evidence"))
-        MONITORS[model] = MONITORS[own.kind]
+        kind = getattr(own, "kind", "")
+        if kind not in MONITORS:
+            register_monitor(kind, own, getattr(own, "detection", "evidence"))
+        MONITORS[model] = MONITORS[kind]
     if plus and name not in MONITORS and model in MONITORS:
         check_choice("detection", detection, DETECTIONS)
     else:

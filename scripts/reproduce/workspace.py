@@ -89,8 +89,7 @@ class Workspace:
 
     def read(self, name: str) -> Floats:
         """Return what was measured last of a channel."""
-        found: Floats = self.inner.measured[self.inner.measured_spec.slices[name]]
-        return found
+        return self.inner.measured[self.inner.measured_spec.slices[name]]
 
     def thing(self) -> tuple[Floats, Floats, Floats]:
         """Return where the thing is (3,), where to grasp it (3,), and how it is turned (3, 3)."""
