@@ -19,7 +19,6 @@ EXTRAS = {
     "video": ("moviepy",),
     "environments": ("gymnasium_robotics", "shimmy", "dm_control"),
     "learners": ("torchrl",),
-    "hub": ("huggingface_hub",),
     "notebooks": ("ipywidgets", "ipykernel", "nbclient", "nbformat"),
     "ros": ("rosbags",),
     "dds": ("cyclonedds",),

@@ -20,7 +20,6 @@ COMMANDS = {
     "evaluate": "compare monitors on tasks and faults",
     "watch": "watch a log or live rows with a memory",
     "train": "train an agent: cloned from an expert, then improved by SAC",
-    "push": "upload a memory and its card to the Hugging Face hub",
     "warmup": "compile now what the first guarded step would wait for",
     "doctor": "say what this machine lacks, and what installs it",
     "corpus": "record the episodes that the tables of detection are judged on",

@@ -50,7 +50,6 @@ CHECKS = {
     "tianshou": Check("agents", "tests/test_learners.py", "tianshou"),
     "rllib": Check("report", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
     "notebooks": Check("robosuite,report,notebooks", "tests/test_docs.py -k notebook"),
-    "hub": Check("hub", "tests/test_hub.py"),
     "environments": Check("environments,report", "tests/test_elsewhere.py"),
     "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'", "stable-baselines3"),
 }
@@ -80,7 +79,7 @@ def check(name: str, wheel: Path) -> str:
 
 
 EXTRAS = (
-    *("robosuite", "report", "data", "agents", "environments", "learners", "hub", "notebooks"),
+    *("robosuite", "report", "data", "agents", "environments", "learners", "notebooks"),
     *("rerun", "ros", "video", "dds"),
 )
 STILL_RUNS = (

@@ -92,9 +92,8 @@ def test_only_envs_imports_robosuite() -> None:
 
 
 def test_no_module_speaks_to_a_network() -> None:
-    # Clusters are Dask's to speak to, where an address is named. Live rows are heard on the loopback alone.
+    # Live rows are heard on the loopback alone.
     names = "socket", "ssl", "urllib", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"
-    # The hub is spoken to by its own library (asm_gym.monitors.shipped), where a repository is named.
     allowed = ("asm_gym.data.",)
     assert not [line for line in offences("asm_gym", *names) if not line.startswith(allowed)]
 

@@ -44,8 +44,6 @@ def normal_episodes(
             kept.episodes.extend(_parts(episode, ~close))
         elif episode.faults.any() or role == "faulty":
             kept.left_out["with a fault"] += 1
-        elif role == "harmless":
-            kept.left_out["under a harmless variation"] += 1
         elif not episode.success:
             kept.left_out["failed"] += 1
         else:

@@ -1,18 +1,10 @@
-"""Memories that come with the package, one for each arm and rate, and memories on the Hugging Face hub.
-
-A shipped file's header says whose body it is. Nothing is fetched from the hub unless it is asked for; ``HF_ENDPOINT``
-names another server of the same API, and ``hf auth login`` or ``HF_TOKEN`` says who you are.
-"""
+"""Memories that come with the package, one for each arm and rate; a file's header says whose body it is."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from asm_gym.checkpoint import read_header
-from asm_gym.extras import require
-from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.registry import load_monitor
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
@@ -22,7 +14,6 @@ SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
 :meta hide-value:
 """
 USUAL = 20  # rows of a stream a second where each control step has one [Hz]
-FILE, CARD = "memory.asm", "README.md"  # files in a repository of a memory on the hub
 
 
 def pretrained() -> dict[str, Path]:
@@ -74,36 +65,3 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "
         f"{make} for an arm of robosuite, asm-gym fit DATA for recordings, and hand it over as monitor"
     )
-
-
-@typed
-def push(path: str | Path, repo: str, private: bool = False) -> str:
-    """Upload a memory and its card to the hub, and return the address of the commit.
-
-    Args:
-        path: of a file that ``save`` wrote.
-        repo: ``owner/name``; it is made where there is none.
-        private: of a repository that is made.
-    """
-    header = read_header(path)
-    spec = StreamSpec.from_json(header["spec"])
-    facts = {"kind": header["kind"], "threshold": header["threshold"], "channels": ", ".join(spec.slices)}
-    card = (
-        "---\nlibrary_name: asm-gym\ntags: [robotics, anomaly-detection]\n---\n\n"
-        f"# A monitor of {spec.source or 'a stream'} at {1 / spec.dt:g} Hz\n\n"
-        f'Load it by `asm_gym.monitors.shipped.from_hub("{repo}")`.\n\n'
-        + "".join(f"- {name}: {value}\n" for name, value in (facts | header.get("about", {})).items())
-    )
-    hub = require("huggingface_hub", what="the hub")
-    api = hub.HfApi(endpoint=os.environ.get("HF_ENDPOINT"))
-    api.create_repo(repo, private=private, exist_ok=True)
-    files = {FILE: Path(path).read_bytes(), CARD: card.encode()}
-    operations = [hub.CommitOperationAdd(name, content) for name, content in files.items()]
-    return str(api.create_commit(repo, operations, commit_message=f"Upload {Path(path).name}").commit_url)
-
-
-@typed
-def from_hub(repo: str, revision: str | None = None) -> CalibratedMonitor:
-    """Return a memory that ``push`` has put on the hub as ``owner/name``; it is downloaded once."""
-    hub = require("huggingface_hub", what="the hub")
-    return load_monitor(hub.hf_hub_download(repo, FILE, revision=revision, endpoint=os.environ.get("HF_ENDPOINT")))
