@@ -33,7 +33,7 @@ from asm_gym.evaluation import alarms as recorded
 from asm_gym.evaluation.alarms import HEADINGS, Alarm
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
-from asm_gym.extras import needed_for, require
+from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
 from asm_gym.guard.live import ALARM, LiveEvent, follow, hold_by_hook, run_hook
 from asm_gym.guard.watchdog import Watchdog
@@ -72,8 +72,6 @@ class Args(LogOptions):
     """Run the hook from a process of its own too: after so long without a row, and where this process dies."""
     policy: int | None = option(None, least=1, metavar="PID")
     """Number of the policy's process, whose death the watchdog takes for an alarm."""
-    rerun: Path | None = option(None, metavar="FILE.rrd")
-    """Where to write the most surprising episodes of a recording for Rerun's viewer."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
     """Without a row for so long a live source has died, which is an alarm."""
     figures: int = option(4, least=1)
@@ -103,8 +101,6 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     csv.writer(table).writerows([HEADINGS, *(map(recorded.plain_cell, alarm.cells()) for alarm in alarms)])
     write_text(args.out / "alarms.csv", table.getvalue())
     written = publish(args, summary, alarms, worst)
-    if args.rerun is not None:
-        recorded.write_rerun(args.rerun, monitor.spec, worst)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")
@@ -145,10 +141,6 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
 def watch(args: Args, console: Console) -> int:
     """Watch a recording or a live source."""
     live = live_source(args.source)
-    if args.rerun is not None:
-        if live is not None:
-            raise ValueError(f"--rerun is for a recording, and {args.source} is live")
-        require("rerun", what="a live view")
     if live is None and (given := [n for n in LIVE_ONLY if getattr(args, n)]):
         raise ValueError(f"--{given[0].replace('_', '-')} is for a live source, and {args.source} is a recording")
     monitor: Any = load_monitor(args.monitor)

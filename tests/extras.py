@@ -43,7 +43,6 @@ class Check(NamedTuple):
 CHECKS = {
     "logs": Check("report,ros", "tests/test_logs.py tests/test_live.py", "mcap pandas polars"),
     "dds": Check("report,dds", "tests/test_dds.py"),
-    "rerun": Check("report,rerun", "tests/test_rerun.py"),
     "data": Check("robosuite,data,report", "tests/test_datasets.py"),
     "agents": Check("agents", "tests/test_learners.py"),
     "learners": Check("learners", "tests/test_learners.py"),
@@ -80,7 +79,7 @@ def check(name: str, wheel: Path) -> str:
 
 EXTRAS = (
     *("robosuite", "report", "data", "agents", "environments", "learners", "notebooks"),
-    *("rerun", "ros", "video", "dds"),
+    *("ros", "video", "dds"),
 )
 STILL_RUNS = (
     "import gymnasium as gym; from asm_gym import NeuralASMSafety; e = NeuralASMSafety(gym.make('asm_gym/Lift-v0'));"

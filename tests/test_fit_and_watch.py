@@ -254,7 +254,6 @@ def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
         (["fit", "nowhere", "--out", "."], "is a folder"),
         (["watch", "nowhere", "--monitor", "none.asm"], "none.asm"),
         (["watch", "nowhere", "--monitor", "x.asm", "--wait", "-1"], "wait must be"),
-        (["watch", "-", "--monitor", "x.asm", "--rerun", "x.rrd"], "--rerun is for a recording, and - is live"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(arguments, message, capsys):

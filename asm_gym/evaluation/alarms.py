@@ -1,10 +1,9 @@
-"""Alarms of recordings without labels: when, on which channel, how far over the threshold; and for Rerun's viewer."""
+"""Alarms of recordings without labels: when, on which channel, how far over the threshold."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,6 @@ from asm_gym.data.episode import spans
 from asm_gym.data.logs import Log
 from asm_gym.data.timing import blamed, bridged, reason
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.extras import require
 from asm_gym.spec import StreamSpec
 
 
@@ -84,38 +82,3 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
 def excused_in(trace: ScoredEpisode) -> dict[str, int]:
     """Count how often a knock, and a stop, alone kept surprise from being an alarm."""
     return {e: len(spans((raw > trace.threshold) & ~trace.alarm)) for e, raw in trace.excused.items()}
-
-
-def write_rerun(path: Path, spec: StreamSpec, traces: Sequence[ScoredEpisode]) -> None:
-    """Write episodes, one after another, to a ``.rrd`` file, which ``rerun FILE.rrd`` opens.
-
-        senses/<channel>                         what was sensed
-        surprise, threshold, shares/<channel>    what each channel adds to surprise
-        log                                      the alarms
-
-    Raises:
-        ImportError: rerun-sdk is not installed.
-    """
-    rr = require("rerun", what="a recording for Rerun's viewer")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    recording = rr.RecordingStream("asm-gym")
-    recording.save(path)
-    begin = 0.0
-    for trace in traces:
-        assert trace.attribution is not None
-        assert trace.stream is not None
-        index = rr.TimeColumn("time", duration=begin + (np.arange(len(trace)) + 1) * trace.dt)
-        columns = {"surprise": trace.surprise, "threshold": np.full(len(trace), trace.threshold)}
-        for channel in spec.channels:
-            place = spec.slices[channel.name]
-            columns[f"senses/{channel.name}"] = trace.stream[:, place].astype(np.float64)
-            columns[f"shares/{channel.name}"] = trace.attribution[:, place].sum(axis=1)
-        for entity, values in columns.items():
-            rr.send_columns(entity, [index], rr.Scalars.columns(scalars=values), recording=recording)
-        for alarm in alarms_of(trace):
-            recording.set_time("time", duration=begin + alarm.start)
-            what = f"alarm: {alarm.channel or alarm.why}, {alarm.excess:.2f} thresholds"
-            recording.log("log", rr.TextLog(what, level="WARN"))
-        begin += len(trace) * trace.dt
-    recording.flush()
-    recording.disconnect()
