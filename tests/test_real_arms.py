@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
@@ -14,8 +13,6 @@ from asm_gym.scripts.reproduce.real_arms import (
     FAULTS,
     NEWTONS,
     SLIP,
-    TX40_MEAN,
-    TX40_RATIOS,
     Job,
     Piece,
     examined,
@@ -74,24 +71,6 @@ def test_a_push_does_the_work_of_its_force_at_the_outermost_link():
     torque = (found.stream - episode.stream)[-1, episode.spec.slices["effort"]].astype(float)
     along = jacobian(TWO_LINKS, episode.stream[-1, episode.spec.slices["position"]].astype(float))[0, 0]
     assert 0.0 < abs(torque[0] / along) <= NEWTONS
-
-
-def test_the_tables_of_tiago_and_of_the_tx40_become_one_each(tmp_path):
-    names = ["t", "- torso_lift_joint_{0}", "- arm_1_joint_{0}", "- arm_2_joint_{0}"]
-    for n, kind in enumerate(("position", "velocity", "effort")):
-        rows = np.column_stack([0.01 * np.arange(50), np.random.default_rng(n).normal(size=(50, 3))])
-        pd.DataFrame(rows, columns=[x.format(kind) for x in names]).to_csv(tmp_path / f"tiago_{kind}.csv", index=False)
-    tiago = Episode.from_table(ARMS["tiago"].read(tmp_path / "tiago_position.csv"))
-    assert tiago.spec.labels[:2] == ("position[arm_1_joint]", "position[arm_2_joint]")
-    assert tiago.spec.slices["effort"] == slice(4, 6)
-    q = np.random.default_rng(0).normal(size=(30 * TX40_MEAN, 6)).cumsum(axis=0)
-    motors = q * TX40_RATIOS
-    motors[:, 5] += TX40_RATIOS[5] * q[:, 4]
-    for name, values in (("pos_read_data", motors), ("curr_data", q)):
-        np.savetxt(tmp_path / f"{name}.csv", values, delimiter=",", header="Joint_1", comments="")
-    found = ARMS["tx40"].read(tmp_path / "pos_read_data.csv")
-    np.testing.assert_allclose(found["position"], q.reshape(30, TX40_MEAN, 6).mean(axis=1), rtol=1e-9, atol=1e-9)
-    assert Episode.from_table(found).spec.dt == pytest.approx(0.008)
 
 
 def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folder, tmp_path, capsys):

@@ -5,7 +5,7 @@ that did nothing wrong, cut into pieces. A quarter of them is tested, in turn; o
 from, and the greatest surprise of the rest is the threshold. Each tested piece is watched as it is, and with each fault
 from its middle on. Pieces are of one trajectory: no table says how a monitor fares on another.
 
-    push, payload    τ + Jᵀ F      J of the outermost link, by the arm's own URDF; where efforts are torques in N m
+    push, payload    τ + Jᵀ F      J of the outermost link, by the arm's own URDF
 """
 
 from __future__ import annotations
@@ -50,42 +50,6 @@ def read_joint_states(path: Path) -> Columns:
     return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
 
 
-def read_tiago(path: Path) -> Columns:
-    """Return the joints of the TIAGo's arm from its three tables; efforts are motor currents."""
-    import pandas as pd
-
-    made: Columns = {}
-    for kind in ("position", "velocity", "effort"):
-        table = pd.read_csv(path.with_name(f"tiago_{kind}.csv"))
-        arm = {name: name.removeprefix("- ").removesuffix(f"_{kind}") for name in table if "arm" in name}
-        made |= {"time": table["t"].to_numpy()} | {f"{kind}[{arm[name]}]": table[name].to_numpy() for name in arm}
-    return made
-
-
-TX40_HZ, TX40_MEAN = 5000.0, 40  # rows a second, and rows that are averaged into one
-TX40_RATIOS = (32.0, 32.0, 45.0, -48.0, 45.0, 32.0)  # angle of each motor by that of its joint
-
-
-def read_tx40(path: Path) -> Columns:
-    """Return time, angles [rad], speeds and motor currents [A] of the TX40, whose sixth motor turns with joint 5."""
-    motors, currents = (
-        np.loadtxt(path.with_name(name), delimiter=",", skiprows=1) for name in ("pos_read_data.csv", "curr_data.csv")
-    )
-    ratios = np.diag(TX40_RATIOS)
-    ratios[5, 4] = TX40_RATIOS[5]
-    angles = np.linalg.solve(ratios, motors.T).T
-    q, effort = (
-        a[: len(a) // TX40_MEAN * TX40_MEAN].reshape(-1, TX40_MEAN, 6).mean(axis=1) for a in (angles, currents)
-    )
-    dt = TX40_MEAN / TX40_HZ
-    return {
-        "time": dt * np.arange(len(q)),
-        "position": q,
-        "velocity": np.diff(q, axis=0, prepend=q[:1]) / dt,
-        "effort": effort,
-    }
-
-
 class RealArm(NamedTuple):
     """A recording of an arm that did nothing wrong."""
 
@@ -93,18 +57,14 @@ class RealArm(NamedTuple):
     place: str  # file below the folder of all recordings
     source: str  # where it is published: repository at a commit, licence
     read: Callable[[Path], Columns]
-    urdf: str = ""  # file of its body model, in the folder ``urdf`` of that of all recordings
-    torques: bool = False  # its efforts are in N m
+    urdf: str  # file of its body model, in the folder ``urdf`` of that of all recordings
 
 
 UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-FIGAROH = "thanhndv212/figaroh-examples @ c0b5c7f0 (Apache-2.0)"
 PANDA_BAG, UR10_BAG = "unisa_acg/panda_exciting_trajectory.db3", "unisa_acg/ur10_exciting_trajectory.db3"
 ARMS = {
-    "panda": RealArm("Franka Panda", PANDA_BAG, UNISA, read_joint_states, "panda.urdf", torques=True),
-    "ur10": RealArm("UR10", UR10_BAG, UNISA, read_joint_states, "ur10_robot.urdf", torques=True),
-    "tiago": RealArm("PAL TIAGo", "tiago_figaroh/tiago_position.csv", FIGAROH, read_tiago, "tiago.urdf"),
-    "tx40": RealArm("Stäubli TX40", "staubli_tx40_figaroh/pos_read_data.csv", FIGAROH, read_tx40),
+    "panda": RealArm("Franka Panda", PANDA_BAG, UNISA, read_joint_states, "panda.urdf"),
+    "ur10": RealArm("UR10", UR10_BAG, UNISA, read_joint_states, "ur10_robot.urdf"),
 }
 
 
@@ -245,9 +205,9 @@ def examined(job: Job, folder: Path) -> list[Record]:
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
     learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
-    urdf = body_of(folder / "urdf" / arm.urdf) if arm.torques or job.monitor in WITH_BODY else ""
+    urdf = body_of(folder / "urdf" / arm.urdf)
     angles = whole.spec.labels[whole.spec.slices["position"]]
-    body = BodyModel.of(urdf, angles) if arm.torques else None
+    body = BodyModel.of(urdf, angles)
     monitor = fitted(job, learned, urdf)
     threshold = monitor.calibrate(calibration, 1.0 / (len(calibration) + 1)).threshold
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
@@ -299,16 +259,15 @@ def table(records: Sequence[Record], arm: RealArm) -> Table:
         quiet, faulty = where(own, kind=""), [r for r in own if r["kind"]]
         found = [[r["found"] for r in where(faulty, kind=kind)] for kind in kinds]
         delays = [r["delay"] for r in faulty if r["found"]]
-        told = [r for r in faulty if r["kind"] in ("push", "payload") or not arm.torques]
+        told = [r for r in faulty if r["kind"] in ("push", "payload")]
         seconds, alarms, alarm_s = (sum(r[value] for r in quiet) for value in ("seconds", "alarms", "alarm_s"))
         shares = [f"{sum(f)} of {len(f)}" for f in (*found, [r["excess"] > healthy[name][fewest] for r in told])]
         delay = f"{np.median(delays):.3g}" if delays else ""
         healthily = f"{3600 * alarms / seconds:.0f}", f"{100 * alarm_s / seconds:.1f} %"
         rows.append((name, *shares[:-1], delay, shares[-1], *healthily))
-    counted = "pushes and payloads" if arm.torques else "faults"
     caption = (
         f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. * added to the recording, found within half a piece. "
-        f"At {fewest}: {counted} found by the threshold that {fewest} healthy pieces pass."
+        f"At {fewest}: pushes and payloads found by the threshold that {fewest} healthy pieces pass."
     )
     headings = ("Monitor", *(f"{kind} *" for kind in kinds), "delay [s]", f"at {fewest}")
     return Table(caption, (*headings, "false alarms an hour", "healthy time in alarm"), rows)
