@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.data.episode import save_episode
 from asm_gym.rollouts import corpus as module
 from asm_gym.rollouts.corpus import MANIFEST, ROUNDS, VERSION, Corpus, Source, record_corpus, skill_files, trials
 from asm_gym.rollouts.trial import faulty_trial
@@ -29,12 +28,11 @@ def recorded(tmp_path, monkeypatch):
     """A corpus of sines, in two rounds; and which episodes were recorded, in order."""
     made = []
 
-    def record(trial, config, folder):
+    def record(trial, config):
         made.append(trial)
-        episode = sine_episodes(1, trial.seed % 1000)[0]
-        return save_episode(folder / trial.label.path, replace(episode, label=trial.label, success=True))
+        return replace(sine_episodes(1, trial.seed % 1000)[0], label=trial.label, success=True)
 
-    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record", record)
+    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record_stream", record)
     for number in range(2):
         record_round(tmp_path, number)
     return tmp_path, made
@@ -110,14 +108,13 @@ def pushed(tmp_path, monkeypatch):
     wanted += [faulty_trial("asm_gym/Lift-v0", "push", "strong", s, 100) for s in seeds]
     wanted = [replace(t, onset=20) if t.role == "faulty" else t for t in wanted]
 
-    def record(trial, config, folder):
+    def record(trial, config):
         (episode,) = sine_episodes(1, trial.seed % 1000, steps=(60, 60))
         stream, onset = episode.stream.copy(), trial.onset or 60
         stream[onset:, :12] += 3.0
-        made = replace(episode, stream=stream, faults=np.arange(60) >= onset, label=trial.label, success=True)
-        return save_episode(folder / trial.label.path, made)
+        return replace(episode, stream=stream, faults=np.arange(60) >= onset, label=trial.label, success=True)
 
-    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record", record)
+    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record_stream", record)
     monkeypatch.setattr(module, "trials", lambda *_: wanted)
     record_round(tmp_path / "corpus", 0, 1, SOURCES[:1])
     return tmp_path / "corpus"

@@ -82,7 +82,8 @@ def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeyp
     monitor.spec = SOLID
     monitor.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(SOLID, streams), streams), Named(family))
     joint = next(h for h in monitor.diagnosis_.hypotheses if h.part == "joint[1]")
-    monkeypatch.setattr(Diagnosis, "_named", lambda *_: joint)
+    diagnosed = Diagnosis.__call__
+    monkeypatch.setattr(Diagnosis, "__call__", lambda *given: diagnosed(*given)._replace(part=joint.part))
     env = NeuralASMSafety(Solid(*fault), monitor, "graded", release_after=2)
     env.reset(seed=99)
     said = []

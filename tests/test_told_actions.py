@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -31,7 +33,7 @@ def test_the_action_that_is_told_moves_the_bare_environment_in_the_same_way(scal
     guarded.reset(seed=0)
     bare.reset(seed=0)
     slowed = []
-    for _ in range(STEPS):
+    for _ in range(STEPS if scale < 1 else 6):  # then the arm is braked as well
         asked = np.float32(scale * np.array([0.6, -0.4, -1.0, 0.1, -0.2, 0.3, 0.5]))
         asm = guarded.step(asked)[4]["asm"]
         bare.step(asm["executed_action"])
@@ -188,7 +190,9 @@ def test_an_action_at_the_limit_exactly_is_not_slowed_and_one_beyond_is_and_none
     assert env.step(1.01 * at)[4]["asm"]["slowed"] > 0.0
     for wild in (np.full(7, 1e30), np.array([0, 0, 0, 0, 0, 0, np.inf]), [0, "up", 0, 0, 0, 0, 0], None):
         try:
-            info = env.step(wild)[4]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                info = env.step(wild)[4]
         except (ValueError, TypeError):
             env.step(np.zeros(7, np.float32))
         else:

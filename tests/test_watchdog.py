@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -46,6 +47,13 @@ def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     monitor = make_monitor("kalman", recorded(0).spec).fit([recorded(n) for n in range(4)])
     monitor.calibrate([recorded(10 + n) for n in range(4)], 0.5).with_threshold(1e9).save(path)
     return path
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 def tell(port: int, why: str) -> None:
@@ -103,7 +111,7 @@ def test_whoever_is_killed_the_arm_is_told_to_hold(victim: str, memory: Path) ->
 
 def test_a_watch_that_is_killed_runs_its_hook_all_the_same(memory: Path, tmp_path: Path) -> None:
     told = tmp_path / "told"
-    command = [sys.executable, "-m", "asm_gym.scripts.watch", "-", "--monitor", str(memory), "--watchdog", "0.5"]
+    command = [sys.executable, "-m", "asm_gym", "watch", "-", "--monitor", str(memory), "--watchdog", "0.5"]
     watch = subprocess.Popen([*command, "--hook", f"cat >> {told}"], stdin=subprocess.PIPE, text=True)
     assert watch.stdin
     row = json.dumps([*sine(0).values(), *sine(0).values()])
@@ -111,12 +119,10 @@ def test_a_watch_that_is_killed_runs_its_hook_all_the_same(memory: Path, tmp_pat
         watch.stdin.write(f"{row}\n")
         watch.stdin.flush()
         time.sleep(0.02)
-    while not told.exists() or not told.read_text():  # silence is told of once rows were judged
-        time.sleep(0.02)
+    wait_for(lambda: told.exists() and bool(told.read_text()))  # silence is told of once rows were judged
     watch.kill()
     watch.wait()
-    while told.read_text().count("\n") < 2:
-        time.sleep(0.02)
+    wait_for(lambda: told.read_text().count("\n") == 2)
     silent, died = map(json.loads, told.read_text().splitlines())
     assert silent["reason"] == died["reason"] == "watchdog"
     assert silent["text"] != died["text"]
