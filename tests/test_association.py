@@ -111,9 +111,10 @@ def test_doubt_is_learned_from_how_errors_grow_with_leverage():
     far = np.exp(rng.normal(size=(20_000, 3)) + 3.0).astype(np.float32)
     truth = np.array([0.0, 0.1, 1.0])
     errors = rng.normal(size=far.shape) * np.sqrt((1 + truth * far / np.median(far, axis=0)) / (1 + truth))
-    steady, slope = learn_doubt(errors.astype(np.float32), far)
+    steady, slope, most = learn_doubt(errors.astype(np.float32), far)
     np.testing.assert_allclose(1 / steady - 1, truth, rtol=0.5, atol=0.02)
     np.testing.assert_allclose(steady + slope * np.median(far, axis=0), 1.0, rtol=1e-4)
+    np.testing.assert_array_equal(most, far.max(axis=0))  # a fault that takes the body further is excused no more
 
 
 def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():

@@ -41,7 +41,8 @@ def expected_by(asm, state, rows):
     sure = np.where(history.steps < lag, 0.0, np.where(history.steps < 2 * lag, UNSURE, 1.0))
     errors = reading.whole * left * np.exp(-0.5 * spread) * sure[:, None]
     if len(a.R):
-        errors /= np.sqrt(a.doubt[0] + a.doubt[1] * leverages(a.R, reading.inputs, model.senses_))
+        far = np.minimum(leverages(a.R, reading.inputs, model.senses_), a.doubt[2])
+        errors /= np.sqrt(a.doubt[0] + a.doubt[1] * far)
     skill = state.skill
     if asm.skills_:
         p = certainty(np.hstack([units, expected]), model.learned_["W_K"], model.learned_["b_K"])

@@ -6,18 +6,18 @@
     log σ²_t = W_S f(h_t) + b_S, within span_S     expected variance of the error
     g²_t = (1 + τ l_t/l̃) / (1 + τ)                 l_t: leverage of the inputs of a group, l̃: its usual value
     ε_t = (Δ_t - Δ̂_t) / (s σ_t g_t)                normalised error; s is the spread that D alone leaves
-    ΔU = η ψ(ε_t) σ_t f(h_t)ᵀ / n_t                follows slow drift, as ΔD does; n_t = ‖f(h_t)‖² + ‖a_t‖²
 
 The linear part D has a closed form (``linear``). The hidden units learn what D leaves (``association_learning``).
-span_S are the limits of nominal contexts, so that a fault cannot excuse itself by an unusual context.
+span_S are the limits of nominal contexts, and g grows up to the greatest leverage of nominal rows only, so that a fault
+cannot excuse itself by an unusual context.
 
 Leverage is the distance of the inputs from those learned from, for each group without its own changes, by one inverse:
 
     l_g = a_gᵀ (E[a_g a_gᵀ] + λ I)⁻¹ a_g = ‖z‖² - ‖Q_g z_Δ‖²    a_g: a without Δ_g;  z = R a;  Rᵀ R = (E[a aᵀ] + λ I)⁻¹
 
 Sources: Whittington and Bogacz 2017 (Neural Computation 29(5)) for learning from prediction errors; Salvatori et al.
-2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Nagumo and Noda 1967
-(IEEE Trans. Automatic Control 12(3)) for the normalised delta rule; Bishop 2006, section 3.3.2, for leverage.
+2021 (NeurIPS) for association by predictive coding; Besag 1975 for judging parts given the rest; Bishop 2006, section
+3.3.2, for leverage.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ class Association(NamedTuple):
     remainder: Array  # (X,) s
     R: Array  # (I, I) lower triangle, or (0, I) where leverage is not known; the changes come last
     Q: Array  # (X, X) rows Q_g: an orthonormal basis of what Δ_g adds to z_Δ, the changes' part of z
-    doubt: Array  # (2, X) of g²: its value at leverage 0, and its slope
+    doubt: Array  # (3, X) of g²: its value at leverage 0, its slope, and the leverage from which on it grows no more
 
 
 def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of ``Association`` by name."""
     M, X = units, changes
     precision = {"W_S": (X, M), "b_S": (X,), "span_S": (2, X), "remainder": (X,)}
-    far = {"R": (inputs, inputs), "Q": (X, X), "doubt": (2, X)}
+    far = {"R": (inputs, inputs), "Q": (X, X), "doubt": (3, X)}
     return {"V": (M, inputs), "U": (X, M), "D": (X, inputs), **precision, **far}
 
 
 def no_doubt(inputs: int, changes: int) -> dict[str, Array]:
     """Return R, Q and ``doubt`` by which g is 1 everywhere."""
-    doubt = np.repeat(np.array([[1.0], [0.0]], np.float32), changes, axis=1)
+    doubt = np.repeat(np.array([[1.0], [0.0], [0.0]], np.float32), changes, axis=1)
     return {"R": np.zeros((0, inputs), np.float32), "Q": np.zeros((changes, changes), np.float32), "doubt": doubt}
 
 
@@ -186,5 +186,5 @@ def normalised_errors(
         far = leverage(inputs, R, Q, groups, first)
         for n in range(out.shape[0]):
             for i in range(out.shape[1]):
-                out[n, i] /= np.sqrt(doubt[0, i] + doubt[1, i] * far[n, i])
+                out[n, i] /= np.sqrt(doubt[0, i] + doubt[1, i] * min(far[n, i], doubt[2, i]))
     return out, f

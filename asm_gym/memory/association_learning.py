@@ -145,7 +145,7 @@ def learn_association(
 
 
 def learn_doubt(error: Array, far: Array) -> Array:
-    """Return g² (2, X) of ``Association.doubt`` from cross-fitted errors and leverages (N, X)."""
+    """Return ``Association.doubt`` (3, X) from cross-fitted errors and leverages (N, X)."""
     usual = np.maximum(np.median(far, axis=0), SMALLEST_SPREAD)  # (X,)
     shown = slice(None, None, -(-len(far) // MOST_DOUBTED))
     squares, ratio = error[shown].astype(np.float64) ** 2, far[shown] / usual
@@ -158,7 +158,7 @@ def learn_doubt(error: Array, far: Array) -> Array:
             spread = np.maximum(np.mean(q * (FREEDOM + 1) / (FREEDOM + q / spread), axis=0), SMALLEST_SPREAD**2)
         costs.append(np.mean(np.log(g * spread) + (FREEDOM + 1) * np.log1p(q / spread / FREEDOM), axis=0))
     tau = np.array(DOUBTS)[np.argmin(costs, axis=0)]
-    return np.stack([1.0 / (1.0 + tau), tau / (1.0 + tau) / usual]).astype(np.float32)
+    return np.stack([1.0 / (1.0 + tau), tau / (1.0 + tau) / usual, far.max(axis=0)]).astype(np.float32)
 
 
 def _random(exists: Array, rng: np.random.Generator) -> Array:

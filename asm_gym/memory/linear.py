@@ -147,7 +147,7 @@ def specialise(
     error = (delta - complete(f, a, U, D)) / known.remainder
     if len(known.R):
         far = leverage(a, known.R, known.Q, groups, changes.start)
-        error /= np.sqrt(known.doubt[0] + known.doubt[1] * far)
+        error /= np.sqrt(known.doubt[0] + known.doubt[1] * np.minimum(far, known.doubt[2]))
     # The body's memory knows how errors differ between contexts; the policy's rows tell how large they are overall.
     scale = np.mean(error**2 * np.exp(-log_variance(f, known.W_S, known.b_S, known.span_S)), axis=0)
     larger = np.log(np.maximum(scale, 1e-6)).astype(np.float32)
