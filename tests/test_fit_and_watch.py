@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from asm_gym.data.episode import Episode, EpisodeLabel
+from asm_gym.data.episode import Episode
 from asm_gym.data.inspection import inspected
 from asm_gym.data.logs import Log
 from asm_gym.data.selection import normal_episodes, pieces, split_at_random, split_in_time, with_shared_noise
@@ -39,9 +39,6 @@ def test_normal_episodes_are_cut_into_pieces_and_split_by_the_seed():
     others = {
         "failed": Episode.from_table(log(1)),
         "with a fault": Episode.from_table(log(2), success=True, faults=np.arange(ROWS) > 9),
-        "under a harmless variation": Episode.from_table(
-            log(4), success=True, label=EpisodeLabel("Lift", "harmless", "slower")
-        ),
     }
     kept = normal_episodes([Log("normal", normal), *(Log(why, episode) for why, episode in others.items())])
     assert kept.episodes == [normal]
