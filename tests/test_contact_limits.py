@@ -127,7 +127,7 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
     env.reset(seed=0)
     arm = env.unwrapped
     arm.contact_limits = ContactLimits(1e3, 1e3, hand_speed=0.15)
-    arm.substep_hooks.append(lambda k: speeds.append(arm.simulation.hand_speed(arm.simulation.hand_twist(0))))
+    arm.substep_hooks.append(lambda k: speeds.append(arm.simulation.hand_speeds(arm.simulation.hand_twist(0)[None])[0]))
     for step in range(12):
         if step % 4 == 0:
             action = rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
@@ -157,14 +157,14 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
 
     def most(*twist, place=here):
         speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
-        return limits.share(0, place, np.array(twist, float), speed)
+        return float(limits.shares(0, place, np.array([twist], float), np.array([speed]))[0])
 
     assert most(0.4, 0, 0, 0, 0, 1.0) >= 1.0  # as healthy hands did
     assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
     assert most(0.4, 0, 0, 0, 0, 0, place=here + 0.3) == pytest.approx(0.15 / 0.4)  # another place
     assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
     assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1) < 0.3  # and slower where no healthy hand went down
-    assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == pytest.approx(0.5)
+    assert ContactLimits().shares(0, here, np.array([[0.3, 0, 0, 0, 0, 0]]), np.array([0.3])) == pytest.approx(0.5)
     assert Pace.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
     for bad in (np.zeros((0, 16)), np.full((1, 16), np.nan), np.full((1, 16), 1e9), np.zeros((1, 15))):
         with pytest.raises(ValueError, match="pace must be rows"):

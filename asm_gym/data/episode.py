@@ -30,8 +30,8 @@ class EpisodeLabel:
     """The task and role that an episode was recorded for."""
 
     task: str
-    role: str  # "fit", "calibration", "nominal", "faulty" or "harmless"
-    kind: str = ""  # of the fault or harmless variation; empty without one
+    role: str  # "fit", "calibration", "nominal" or "faulty"
+    kind: str = ""  # of the fault; empty without one
     severity: str = ""
     seed: int = 0  # of the environment and of the policy. Episodes that share it are twins
     onset: int | None = None  # the first step with the fault or variation

@@ -29,6 +29,7 @@ FAR = 100  # cells; hands further away are not learned of
 CELL = 0.04, 0.04, 0.02  # edges of the cells by which pace is learned [m]
 FASTER = 1.25  # a hand may be commanded to go so many times as fast as healthy ones did: about 0.8 of it is reached
 SLACK = np.array([0.03] * 3 + [0.15] * 3)  # and by so much more [m/s], [rad/s]
+STILL = 1e-9  # no speed is divided by less [m/s]
 DOWN = 0.065  # never slower than this downwards, to where stiff surfaces are: on a bin it is a blow of 270 N [m/s]
 
 
@@ -77,13 +78,13 @@ class Pace:
         there = (cell >= 0).all() and (cell < self._seen.shape[:4]).all()
         return self._seen[tuple(cell)].reshape(2, 6) if there else np.zeros((2, 6))
 
-    def share(self, arm: int, place: Floats, twist: Floats, speed: float, usual: float) -> float:
-        """Return the share of its motion that a hand may have; see ``ContactLimits.share``. ``usual``: its limit."""
+    def shares(self, arm: int, place: Floats, twists: Floats, speeds: Floats, usual: float) -> Floats:
+        """Return the shares of ``ContactLimits.shares``; ``usual`` is the limit of speed."""
         seen = self.seen(arm, place)
-        along = FASTER * np.where(twist > 0.0, seen[0], seen[1])
-        with np.errstate(divide="ignore"):
-            share = max(usual / speed, float(((along + SLACK) / np.abs(twist)).min()))
-        return min(share, min(max(DOWN, along[2]), usual) / -twist[2]) if twist[2] < 0.0 else share
+        along = FASTER * np.where(twists > 0.0, seen[0], seen[1])
+        shares = np.maximum(usual / speeds, ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1))
+        falls = np.maximum(-twists[:, 2], STILL)
+        return np.minimum(shares, np.minimum(np.maximum(DOWN, along[:, 2]), usual) / falls)
 
 
 @dataclass(frozen=True)
@@ -154,16 +155,15 @@ class ContactLimits:
             pace=self.pace if same else None,
         )
 
-    def share(self, arm: int, place: Floats, twist: Floats, speed: float) -> float:
-        """Return the share of its motion that a hand may have, above 1 where it may go faster.
+    def shares(self, arm: int, place: Floats, twists: Floats, speeds: Floats) -> Floats:
+        """Return the share (n,) that a hand may have of each of n motions, above 1 where it may go faster.
 
         Args:
             arm, place: which, and where it is (3,) [m].
-            twist, speed: how it moves (6,), and how fast its fastest point then goes [m/s].
+            twists, speeds: the motions (n, 6), and how fast the hand's fastest point goes in each (n,) [m/s].
         """
-        speed = max(speed, 1e-9)
-        usual = self.hand_speed
-        return usual / speed if self.pace is None else self.pace.share(arm, place, twist, speed, usual)
+        speeds, usual = np.maximum(speeds, STILL), self.hand_speed
+        return usual / speeds if self.pace is None else self.pace.shares(arm, place, twists, speeds, usual)
 
 
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:

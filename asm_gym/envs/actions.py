@@ -53,10 +53,10 @@ class Actions:
             delta = (np.minimum(np.maximum(scaled[part], least), most) - middle) * scale + offset
             delta = delta * (controller.kp / controller.kd)[: len(delta)]
             asked = simulation.hand_twist(a, delta, in_joints=controller.name == "JOINT_POSITION")
-            asked_speed, speed = simulation.hand_speed(asked), simulation.hand_speed(moves := simulation.hand_twist(a))
-            place = simulation.views.site_xpos[simulation.arms.site[a]]
-            share, now = limits.share(a, place, asked, asked_speed), limits.share(a, place, moves, speed)
-            most = min(asked_speed * share, speed * now if now < 1.0 else np.inf)
+            twists = np.stack((asked, simulation.hand_twist(a)))
+            speeds, place = simulation.hand_speeds(twists), simulation.views.site_xpos[simulation.arms.site[a]]
+            share, now = limits.shares(a, place, twists, speeds)
+            most = min(speeds[0] * share, speeds[1] * now if now < 1.0 else np.inf)
             simulation.speed_limits[a] = max(limits.hand_speed, most)
             if share < 1.0:
                 rest = self.resting(simulation, action) if rest is None else rest

@@ -254,9 +254,10 @@ class Simulation:
         return twist if frame < 0 else (twist.reshape(2, 3) @ self.views.site_xmat[frame].reshape(3, 3).T).ravel()
 
     @staticmethod
-    def hand_speed(twist: Floats) -> float:
-        """Return how fast the furthest point of a hand can go under a twist (6,) [m/s]."""
-        return float(np.linalg.norm(twist[:3]) + REACHES * np.linalg.norm(twist[3:]))
+    def hand_speeds(twists: Floats) -> Floats:
+        """Return how fast the furthest point of a hand can go (n,) under each of n twists (n, 6) [m/s]."""
+        squares = twists * twists
+        return np.sqrt(squares[:, :3].sum(axis=1)) + REACHES * np.sqrt(squares[:, 3:].sum(axis=1))
 
     def hand_jacobian(self, a: int) -> NDArray[np.float64]:
         """Return the Jacobian (6, n) of arm ``a``'s hand: linear, then angular velocity."""

@@ -84,7 +84,8 @@ def foretell(
 
 def _share(limits: ContactLimits, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
     """Return the share of a velocity (3,) that limits leave to a hand at a place (3,)."""
-    return min(1.0, limits.share(hand, place, np.append(velocity, np.zeros(3)), float(np.linalg.norm(velocity))))
+    twist, speed = np.append(velocity, np.zeros(3)), np.linalg.norm(velocity)
+    return min(1.0, float(limits.shares(hand, place, twist[None], np.array([speed]))[0]))
 
 
 def _beyond(pace: Pace, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> str:
