@@ -82,11 +82,12 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
         panels[0].yaxis.set_minor_formatter(NullFormatter())
         panels[-1].set_xlabel("time [s]")
         fig.supylabel("surprise", fontsize=10)
-        handles = [
+        handles: list[Any] = [
             Line2D([], [], color=BLACK, linewidth=1, linestyle=DASHED, label="threshold"),
-            Patch(color=ORANGE, alpha=0.3, label="fault active"),
             Line2D([], [], color=VERMILLION, linewidth=4, solid_capstyle="butt", label="in alarm"),
         ]
+        if any(trace.fault.any() for trace in traces):
+            handles.insert(1, Patch(color=ORANGE, alpha=0.3, label="fault active"))
         if any(trace.missing.any() for trace in traces):
             handles.append(Patch(color=GREY, alpha=0.5, label="missing data"))
         fig.legend(handles=handles, loc="outside upper center", ncols=len(handles))
