@@ -86,7 +86,7 @@ def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
             Line2D([], [], color=BLACK, linewidth=1, linestyle=DASHED, label="threshold"),
             Line2D([], [], color=VERMILLION, linewidth=4, solid_capstyle="butt", label="in alarm"),
         ]
-        if any(trace.fault.any() for trace in traces):
+        if any(t.onset is not None or (t.fault is not None and t.fault.any()) for t in traces):
             handles.insert(1, Patch(color=ORANGE, alpha=0.3, label="fault active"))
         if any(trace.missing.any() for trace in traces):
             handles.append(Patch(color=GREY, alpha=0.5, label="missing data"))
