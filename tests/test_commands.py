@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import subprocess
@@ -18,7 +17,7 @@ from asm_gym.scripts import cli, command, reproduce
 from asm_gym.scripts.command import Checked, option
 
 ROOT = Path(__file__).resolve().parents[1]
-STUDIES = [f"reproduce {study}" for study in ("all", *reproduce.STUDIES)]
+STUDIES = [f"reproduce {study}" for study in reproduce.STUDIES]
 EVERY_COMMAND = [*cli.COMMANDS, *STUDIES]
 
 
@@ -90,18 +89,6 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
 def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2
     assert f"did you mean '{near}'?" in capsys.readouterr().err
-
-
-def test_all_studies_check_the_options_of_all_before_the_first_runs(capsys, monkeypatch):
-    first, last = (importlib.import_module(f"asm_gym.scripts.reproduce.{name}") for name in ("panda", "harm"))
-    ran: list[str] = []
-    for module in (first, last):
-        monkeypatch.setattr(module, "run", lambda config, name=module.__name__: ran.append(name))
-    monkeypatch.setattr(last, "Config", Options)  # which has no --seeds
-    monkeypatch.setattr(reproduce, "INDEPENDENT", ("panda", "harm"))
-    assert cli.main(["reproduce", "all", "--seeds", "2"]) == 2
-    assert "--seeds" in capsys.readouterr().err
-    assert not ran
 
 
 @pytest.mark.parametrize(

@@ -40,10 +40,8 @@ from asm_gym.evaluation.metrics import (
     delays_ms,
     false_alarms,
     hourly_alarms,
-    placements,
-    time_matched_auroc,
 )
-from asm_gym.evaluation.resampling import Calibration, Windows, interval, resample
+from asm_gym.evaluation.resampling import Calibration, Windows, Wins, interval, resample
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.scoring import fitted
 from asm_gym.evaluation.statistics import Rate, Share, auroc
@@ -112,10 +110,9 @@ def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episod
     faulty = a_trace([99, 5, 7, 1], onset=1)
     nominal = [a_trace([90, 6, 1, 90]), a_trace([90, 1, 8, 90]), a_trace([90, 7, 1, 90]), a_trace([90, 1, 1, 90])]
     nominal.append(a_trace([90, 90, 90, 90], task="Door"))
-    assert placements([faulty], nominal, window_s=0.2) == pytest.approx([(1 + 0.5) / 4])  # 8 above, 7 tied
-    assert time_matched_auroc([faulty], nominal, window_s=0.2) == pytest.approx(1 - 1.5 / 4)
-    assert math.isnan(time_matched_auroc([faulty], [a_trace([99])], window_s=1.0))  # it ended before the onset
-    assert placements([a_trace([0, 9], onset=2)], nominal, 0.2).size == 0
+    assert Wins([faulty], nominal, 0.2).auroc() == pytest.approx(1 - (1 + 0.5) / 4)  # 8 above, 7 tied
+    assert math.isnan(Wins([faulty], [a_trace([99])], 1.0).auroc())  # it ended before the onset
+    assert math.isnan(Wins([a_trace([0, 9], onset=2)], nominal, 0.2).auroc())
 
 
 def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():

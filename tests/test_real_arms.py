@@ -8,6 +8,7 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.monitors.body_model import BodyModel
 from asm_gym.scripts.cli import main
+from asm_gym.scripts.reproduce import real_arms
 from asm_gym.scripts.reproduce.real_arms import (
     ARMS,
     FAULTS,
@@ -33,7 +34,7 @@ PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIA
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder with a recording of the UR10 alone, which has two joints here."""
-    monkeypatch.setitem(ARMS, "ur10", ARMS["ur10"]._replace(read=lambda path: pendulum_columns(1500)))
+    monkeypatch.setattr(real_arms, "read_joint_states", lambda path: pendulum_columns(1500))
     place = tmp_path / "arms" / ARMS["ur10"].place
     place.parent.mkdir(parents=True)
     place.touch()

@@ -23,16 +23,7 @@ import numpy as np
 
 from asm_gym.compilation import inner
 from asm_gym.envs.commands import rotation, scaled
-from asm_gym.envs.mujoco_views import (
-    JOINT_POSITION,
-    Arms,
-    Floats,
-    Goals,
-    NominalViews,
-    SubstepLimits,
-    Views,
-    Work,
-)
+from asm_gym.envs.mujoco_views import JOINT_POSITION, Arms, Floats, Goals, NominalViews, SubstepLimits, Views, Work
 
 
 @inner

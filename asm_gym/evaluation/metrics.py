@@ -5,8 +5,7 @@ Detection is measured where the monitor only watches (``acting == "policy alone"
 Scores are compared over the same steps: the greatest surprise in ``[onset, onset + window)`` of a faulty episode with
 that of nominal episodes of the same task in the same steps, because surprise depends on the phase of the task. A
 fault's *placement* is the share of nominal episodes at least as surprising there (Janes and Pepe 2009: the
-covariate-adjusted ROC curve). It is uniform on [0, 1] for nominal episodes, so placements of all tasks and onsets can
-be pooled.
+covariate-adjusted ROC curve).
 """
 
 from __future__ import annotations
@@ -21,32 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import alarms_in
-from asm_gym.evaluation.resampling import Calibration, Draws, Windows, resample, wins
+from asm_gym.evaluation.resampling import Calibration, Draws, Windows, Wins, resample
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Floats, Rate, Share
 from asm_gym.monitors.calibration import AlarmRate
 
 Kind = tuple[str, str]  # kind and severity of a fault
-
-
-def placements(
-    faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
-) -> NDArray[np.float64]:
-    """Return for each fault the share of nominal episodes of its task at least as surprising in the same steps.
-
-    Ties count half. Faults that no nominal episode of their task reaches are left out.
-    """
-    won = wins(faulty, nominal, window_s)
-    return np.array([1.0 - np.nanmean(row) for row in won if not np.isnan(row).all()])
-
-
-def time_matched_auroc(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> float:
-    """Return the AUROC of the greatest surprise within the window, against the same steps of nominal episodes.
-
-    NaN where nothing can be compared.
-    """
-    values = placements(faulty, nominal, window_s)
-    return float(1.0 - values.mean()) if values.size else math.nan
 
 
 class Delays(NamedTuple):
@@ -150,12 +129,8 @@ class DetectionMetrics:
 
     @property
     def auroc(self) -> float:
-        """Mean over kinds and severities of fault; NaN without faults."""
-        kinds: dict[Kind, list[ScoredEpisode]] = {}
-        for trace in self.faulty:
-            kinds.setdefault((trace.kind, trace.severity), []).append(trace)
-        each = [time_matched_auroc(own, self.nominal, self.window_s) for own in kinds.values()]
-        return float(np.mean(each)) if each else math.nan
+        """Mean over kinds and severities of fault; NaN where none can be compared."""
+        return Wins(self.faulty, self.nominal, self.window_s).auroc()
 
     @cached_property
     def found(self) -> dict[AlarmRate, Share]:

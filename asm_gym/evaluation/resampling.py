@@ -58,22 +58,31 @@ def interval(value: float, draws: Floats) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def wins(faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> Floats:
-    """Return (F, N) 1 where a fault surprised more than a nominal episode of its task in the same steps, ½ in ties.
+class Wins:
+    """Faults compared with nominal episodes of their task in the same steps."""
 
-    NaN where they cannot be compared: another task, or no step in common.
-    """
-    won = np.full((len(faulty), len(nominal)), np.nan)
-    for row, trace in zip(won, faulty, strict=True):
-        steps = trace.window(window_s)
-        if trace.onset is None or steps.stop <= steps.start:
-            continue
-        peak = trace.surprise[steps].max()
-        for k, other in enumerate(nominal):
-            if other.task == trace.task and len(other) > steps.start:
-                theirs = other.surprise[steps].max()
-                row[k] = 0.5 * ((peak > theirs) + float(peak >= theirs))
-    return won
+    def __init__(self, faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> None:
+        shape, kinds = (len(faulty), len(nominal)), dict[tuple[str, str], int]()
+        self.won, self.comparable = np.zeros(shape), np.zeros(shape)  # (F, N) 1 where a fault surprised more, ½ in ties
+        self.kind = np.array([kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int)
+        for n, trace in enumerate(faulty):
+            steps = trace.window(window_s)
+            if trace.onset is None or steps.stop <= steps.start:
+                continue
+            peak = trace.surprise[steps].max()
+            for k, other in enumerate(nominal):
+                if other.task == trace.task and len(other) > steps.start:
+                    theirs = other.surprise[steps].max()
+                    self.won[n, k], self.comparable[n, k] = 0.5 * ((peak > theirs) + float(peak >= theirs)), 1.0
+
+    def auroc(self, own: Floats | None = None, theirs: Floats | None = None) -> float:
+        """Return the mean over kinds, faults (F,) and nominal episodes (N,) counted so many times; NaN without any."""
+        own, theirs = (np.ones(n) if w is None else w for n, w in zip(self.won.shape, (own, theirs), strict=True))
+        others = self.comparable @ theirs  # (F,)
+        counted = np.where(others > 0, own, 0.0)
+        each = (self.won @ theirs) / np.maximum(others, 1.0)
+        total, drawn = (np.bincount(self.kind, w) for w in (counted * each, counted))
+        return float((total[drawn > 0] / drawn[drawn > 0]).mean()) if drawn.any() else math.nan
 
 
 class Windows:
@@ -108,12 +117,8 @@ def resample(
     place = {name: i for i, name in enumerate(names)}
     tasks = np.array([task for task, _ in names])
     scenes_of = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
-    kinds: dict[tuple[str, str], int] = {}
-    kind = np.array([kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int)
     own, theirs = (np.array([place[t.task, t.seed] for t in traces], int) for traces in (faulty, nominal))
-    won = wins(faulty, nominal, window_s)
-    comparable, won = ~np.isnan(won), np.nan_to_num(won)
-    windows = Windows(faulty, window_s)
+    wins, windows = Wins(faulty, nominal, window_s), Windows(faulty, window_s)
     auroc = np.full(draws, math.nan)
     found: dict[AlarmRate, Floats] = {}
     for k in range(draws):
@@ -121,12 +126,7 @@ def resample(
         for scenes in scenes_of:
             np.add.at(weights, rng.choice(scenes, len(scenes)), 1.0)
         times = weights[own]  # (F,)
-        others = comparable @ weights[theirs]  # (F,) nominal episodes to compare with
-        counted = np.where(others > 0, times, 0.0)
-        each = (won @ weights[theirs]) / np.maximum(others, 1.0)
-        total, drawn = (np.bincount(kind, w, len(kinds)) for w in (counted * each, counted))
-        if drawn.any():
-            auroc[k] = (total[drawn > 0] / drawn[drawn > 0]).mean()
+        auroc[k] = wins.auroc(times, weights[theirs])
         for promise, threshold in calibration.resampled(rng).items():
             shares = found.setdefault(promise, np.full(draws, math.nan))
             if times.any():

@@ -83,9 +83,9 @@ def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
 
 
 @contextmanager
-def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = None) -> Iterator[gym.Env[Any, Any]]:
-    """Yield ``env``, or this process's environment, with the trial's faults; they are undone in the end."""
-    base = environment(trial.env_id, config.settings) if env is None else env
+def staged(trial: Trial, config: RolloutConfig) -> Iterator[gym.Env[Any, Any]]:
+    """Yield this process's environment with the trial's faults; they are undone in the end."""
+    base = environment(trial.env_id, config.settings)
     faults = faults_in(trial, base, config)
     if not faults:
         yield base
@@ -98,10 +98,7 @@ def staged(trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any] | None = 
 
 
 def play(
-    trial: Trial,
-    config: RolloutConfig,
-    env: gym.Env[Any, Any],
-    on_step: Callable[[dict[str, Any]], None] | None = None,
+    trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any], on_step: Callable[[dict[str, Any]], None] | None = None
 ) -> bool:
     """Run the policy in a staged and wrapped ``env``; return whether the task was solved at some step."""
     policy = policy_for(config.policy, env, trial.seed)

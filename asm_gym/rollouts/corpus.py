@@ -1,6 +1,6 @@
 """The corpus on which every table of detection is judged, recorded in rounds.
 
-    FOLDER/manifest.json                              the files, with label and length of each
+    FOLDER/recordings.json                            which corpus it is
     FOLDER/POLICY/episodes/TASK/ROLE/KIND-SEVERITY-SEED.npz
 
 Roles are ``fit`` to learn from, ``calibration`` for thresholds, ``nominal`` to test on, and ``faulty``: each the twin
@@ -19,12 +19,10 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from asm_gym.data.episode import Episode, EpisodeLabel, load_episode
+from asm_gym.data.episode import Episode, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
-from asm_gym.files import written_whole
 from asm_gym.rollouts.collect import environment, record_missing
 from asm_gym.rollouts.parallel import Progress
-from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
@@ -33,9 +31,8 @@ VERSION = 2  # version of the recordings
 SEED = 2026  # seed of the corpus; no shipped memory has learned from its episodes
 SKILLS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblyRound", "PickPlaceMilk")
 """Tasks with episodes to learn from, to calibrate on and to test on."""
-MANIFEST = "manifest.json"
-_LABEL = ("task", "role", "kind", "severity", "seed", "onset")
-COLUMNS = ("policy", *_LABEL, "seconds")  # of the manifest: the policy, the episode's label, and its length [s]
+CLAIM = "recordings.json"
+COLUMNS = ("policy", "task", "role", "kind", "severity")  # of ``Corpus.files``
 
 
 class Source(NamedTuple):
@@ -71,21 +68,16 @@ class Corpus:
 
     @classmethod
     def open(cls, folder: str | Path) -> Corpus:
-        """Read the manifest.
-
-        Raises:
-            FileNotFoundError: no corpus is there.
-            ValueError: it is of another version, damaged, or lacks files.
-        """
-        folder = Path(folder)
-        files = read_manifest(folder)
-        missing = [path for path in files.index if not (folder / path).is_file()]
-        if missing:
-            raise ValueError(
-                f"{folder} is cut off: {len(missing)} of {len(files)} files are missing, such as {missing[0]}; "
-                "asm-gym corpus records what is missing"
-            )
-        return cls(folder, files)
+        """Find the files. Raises FileNotFoundError where no corpus is there, ValueError where it is another version."""
+        claim = Path(folder) / CLAIM
+        if not claim.is_file():
+            raise FileNotFoundError(2, "no corpus is there; asm-gym corpus records one", str(claim))
+        version = json.loads(claim.read_text(encoding="utf-8")).get("corpus")
+        if version != VERSION:
+            raise ValueError(f"{claim} is of version {version!r} of the corpus, and this asm-gym reads {VERSION}")
+        found = [f.relative_to(folder) for f in sorted(Path(folder).glob("*/episodes/*/*/*.npz"))]
+        rows = [(f.parts[0], *f.parts[2:4], *(f.stem.split("-")[:-1] or ("", ""))) for f in found]
+        return cls(Path(folder), pd.DataFrame(rows, [f.as_posix() for f in found], COLUMNS, dtype=object))
 
     def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
         """Load episodes by role, policy and task; all where none is named."""
@@ -104,40 +96,6 @@ def skill_files(folder: Path, fit: int | None = None) -> list[Path]:
         chosen = chosen[(chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)]
     chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
     return [folder / path for path in chosen.index]
-
-
-def place(policy: str, label: EpisodeLabel) -> str:
-    """Return the path of a file in the corpus."""
-    return (policy / label.path).as_posix()
-
-
-def write_manifest(folder: Path, files: dict[str, dict[str, Any]]) -> None:
-    """Write the manifest of these files, and the versions that recorded them."""
-    about = {"format": "asm-gym corpus", "version": VERSION, "made_with": versions()}
-    lines = ",\n".join(json.dumps(files[path]) for path in sorted(files))
-    with written_whole(folder / MANIFEST) as manifest:
-        manifest.write(f'{json.dumps(about)[:-1]}, "files": [\n{lines}\n]}}\n'.encode())
-
-
-def read_manifest(folder: Path) -> pd.DataFrame:
-    """Return the files of a corpus: a row each, by path.
-
-    Raises:
-        FileNotFoundError: no corpus is there.
-        ValueError: it is of another version, or damaged.
-    """
-    path = folder / MANIFEST
-    if not path.is_file():
-        raise FileNotFoundError(2, "no corpus is there; asm-gym corpus records one", str(path))
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-        version, files = about["version"], about["files"]
-        if version != VERSION:
-            raise ValueError(f"it holds version {version!r} of the corpus, and this asm-gym reads {VERSION}")
-        paths = [place(f["policy"], EpisodeLabel(**{name: f[name] for name in _LABEL})) for f in files]
-        return pd.DataFrame(files, paths, COLUMNS, dtype=object)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} cannot be read: {error}; asm-gym corpus makes it anew") from error
 
 
 def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
@@ -160,18 +118,7 @@ def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
 def record_corpus(
     folder: Path, sources: Sequence[Source], number: int, rounds: int, workers: int, progress: Progress
 ) -> None:
-    """Record what is missing of a round, source by source, and add it to the manifest."""
-    there = (folder / MANIFEST).is_file()
-    known: dict[str, dict[str, Any]] = read_manifest(folder).to_dict("index") if there else {}
+    """Record what is missing of a round, source by source."""
     for source in sources:
         wanted = trials(source, number, rounds)
-        paths = [place(source.policy, trial.label) for trial in wanted]
-        new = {path for path in paths if path not in known or not (folder / path).is_file()}
-        files = record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress)
-        for trial, path, file in zip(wanted, paths, files, strict=True):
-            if path in new:
-                episode = load_episode(file)
-                seconds = round(len(episode) * episode.spec.dt, 6)
-                label = {name: getattr(trial.label, name) for name in _LABEL}
-                known[path] = {"policy": source.policy, **label, "seconds": seconds}
-        write_manifest(folder, known)
+        record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress)

@@ -108,35 +108,25 @@ class Backpropagated:
 Expresser = ExpressionMemory | Backpropagated
 
 
-def mean_demonstrations(train: Sequence[Episode], hand: slice = PEN) -> Rows:
+def mean_demonstrations(train: Sequence[Episode]) -> Rows:
     """Return the mean path (K, T, 2) of the hand in each skill, in order of name."""
     names = sorted({str(e.info["skill"]) for e in train})
-    return np.stack([np.mean([e.stream[:, hand] for e in train if e.info["skill"] == n], axis=0) for n in names])
+    return np.stack([np.mean([e.stream[:, PEN] for e in train if e.info["skill"] == n], axis=0) for n in names])
 
 
-def recalled(
-    model: Expresser, tests: Sequence[Episode], means: Rows, cue: int, hand: slice = PEN
-) -> tuple[float, float]:
-    """Return the hand's mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
+def recalled(model: Expresser, tests: Sequence[Episode], means: Rows, cue: int) -> tuple[float, float]:
+    """Return the pen's mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
     Args:
         model: expresses the skills.
         tests: of one length.
         means: (K, T, 2) mean path of each skill, in order of name.
         cue: rows to read; the whole length for online recall.
-        hand: columns of the position.
     """
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    return reached(model.express(streams, cue)[:, :, hand], tests, means, cue if cue < len(streams) else 1, hand)
-
-
-def reached(paths: Rows, tests: Sequence[Episode], means: Rows, first: int, hand: slice = PEN) -> tuple[float, float]:
-    """Return the mean distance [cm] of paths (T, B, 2) from those of ``tests``, from row ``first`` on.
-
-    The second number is the share of paths that are nearest to the mean of the right skill.
-    """
-    paths, truth = paths[first:], np.stack([e.stream[first:, hand] for e in tests], axis=1)
-    error = np.linalg.norm(paths - truth.astype(np.float64), axis=2).mean()
+    first = cue if cue < len(streams) else 1
+    paths, truth = (rows[first:, :, PEN] for rows in (model.express(streams, cue), streams))
+    error = np.linalg.norm(paths - truth, axis=2).mean()
     distance = np.linalg.norm(paths[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
     names = sorted({str(e.info["skill"]) for e in tests})
     right = [names[k] == e.info["skill"] for k, e in zip(distance.argmin(axis=1), tests, strict=True)]

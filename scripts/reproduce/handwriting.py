@@ -113,8 +113,6 @@ def written(letter: Letter, rng: np.random.Generator, speed: float = 1.0, wobble
     return Episode.from_stream(np.hstack([position, v]), PEN, info={"skill": letter.name})
 
 
-def copybook(
-    letters: Sequence[Letter], each: int, rng: np.random.Generator, speeds: Sequence[float] = (1.0,)
-) -> list[Episode]:
-    """Write every letter ``each`` times at every speed."""
-    return [written(letter, rng, speed) for letter in letters for speed in speeds for _ in range(each)]
+def copybook(letters: Sequence[Letter], each: int, rng: np.random.Generator) -> list[Episode]:
+    """Write every letter ``each`` times."""
+    return [written(letter, rng) for letter in letters for _ in range(each)]

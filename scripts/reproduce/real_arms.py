@@ -10,7 +10,7 @@ from its middle on. Pieces are of one trajectory: no table says how a monitor fa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -35,7 +35,6 @@ from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where
 
 Floats = NDArray[np.float64]
-Columns = dict[str, NDArray[Any]]
 
 RULE = "friction_rule"
 SETTINGS: dict[str, dict[str, Any]] = {"neural_asm": {"values": True}}
@@ -45,26 +44,23 @@ WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "asso
 PIECE_S, FOLDS = 1.0, 4  # length of a piece [s], and folds of which one is tested at a time
 
 
-def read_joint_states(path: Path) -> Columns:
+def read_joint_states(path: Path) -> dict[str, NDArray[Any]]:
     """Return time, position [rad], velocity and effort of each joint of a ROS 2 bag."""
     return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
 
 
 class RealArm(NamedTuple):
-    """A recording of an arm that did nothing wrong."""
+    """A recording of an arm that did nothing wrong, and its body model."""
 
     robot: str
-    place: str  # file below the folder of all recordings
-    source: str  # where it is published: repository at a commit, licence
-    read: Callable[[Path], Columns]
-    urdf: str  # file of its body model, in the folder ``urdf`` of that of all recordings
+    place: str  # bag below the folder of all recordings
+    urdf: str  # file in the folder ``urdf`` of that of all recordings
 
 
-UNISA = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
-PANDA_BAG, UR10_BAG = "unisa_acg/panda_exciting_trajectory.db3", "unisa_acg/ur10_exciting_trajectory.db3"
+SOURCE = "unisa-acg/inverse-dynamics-solver @ 41e196de (BSD-3-Clause)"
 ARMS = {
-    "panda": RealArm("Franka Panda", PANDA_BAG, UNISA, read_joint_states, "panda.urdf"),
-    "ur10": RealArm("UR10", UR10_BAG, UNISA, read_joint_states, "ur10_robot.urdf"),
+    "panda": RealArm("Franka Panda", "unisa_acg/panda_exciting_trajectory.db3", "panda.urdf"),
+    "ur10": RealArm("UR10", "unisa_acg/ur10_exciting_trajectory.db3", "ur10_robot.urdf"),
 }
 
 
@@ -181,12 +177,11 @@ class Job(NamedTuple):
 def run(config: Config) -> Findings:
     """Run the experiments whose recordings are in the folder."""
     places = {name: config.folder / ARMS[name].place for name in config.experiments}
-    missing = [f"{place} is missing: it is {ARMS[n].source}" for n, place in places.items() if not place.exists()]
+    missing = [f"{place} is missing: it is {SOURCE}" for place in places.values() if not place.exists()]
     found = [name for name, place in places.items() if place.exists()]
     if not found:
         raise FileNotFoundError("; ".join(missing))
-    each = product(found, config.monitors, config.repetitions, range(FOLDS))
-    jobs = [job for job in (Job(*one) for one in each) if job.monitor not in WITH_BODY or ARMS[job.experiment].urdf]
+    jobs = [Job(*one) for one in product(found, config.monitors, config.repetitions, range(FOLDS))]
     records = kit.together(kit.each("watching", partial(examined, folder=config.folder), jobs, config))
     first, *others = (table(where(records, experiment=name), ARMS[name]) for name in found)
     left_out = "".join(f" Left out: {why}." for why in missing)
@@ -196,7 +191,7 @@ def run(config: Config) -> Findings:
 def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, and for each fault in it."""
     arm = ARMS[job.experiment]
-    whole = Episode.from_table(arm.read(folder / arm.place), success=True)
+    whole = Episode.from_table(read_joint_states(folder / arm.place), success=True)
     effort = whole.stream[:, whole.spec.slices["effort"]].astype(np.float64)
     ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
     cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
@@ -205,7 +200,10 @@ def examined(job: Job, folder: Path) -> list[Record]:
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
     learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
-    urdf = body_of(folder / "urdf" / arm.urdf)
+    model = folder / "urdf" / arm.urdf
+    if not model.is_file():
+        raise FileNotFoundError(f"{model} is missing: it is in example-robot-data 6.0.0 (PyPI)")
+    urdf = read_urdf(model)
     angles = whole.spec.labels[whole.spec.slices["position"]]
     body = BodyModel.of(urdf, angles)
     monitor = fitted(job, learned, urdf)
@@ -218,13 +216,6 @@ def examined(job: Job, folder: Path) -> list[Record]:
     scores = monitor.score_episodes([episode for _, episode in watched])
     ratios = [s.value / threshold for s in scores]
     return [job._asdict() | judged(kind, v, whole.spec.dt) for (kind, _), v in zip(watched, ratios, strict=True)]
-
-
-def body_of(urdf: Path) -> str:
-    """Return the text of a body model. Raises FileNotFoundError that says where it is published."""
-    if not urdf.is_file():
-        raise FileNotFoundError(f"{urdf} is missing: it is in example-robot-data 6.0.0 (PyPI)")
-    return read_urdf(urdf)
 
 
 def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:

@@ -7,6 +7,7 @@ names the task. Distances have a second sense that resolves millimetres and satu
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,14 +133,10 @@ class Workspace:
         return np.concatenate([*body, self.read("gripper_opening"), *seen, self.read("action")])
 
 
-_MADE: dict[str, gym.Env[Any, Any]] = {}
-
-
+@cache
 def environment(skill: str) -> gym.Env[Any, Any]:
     """Return this process's environment of a skill."""
-    if skill not in _MADE:
-        _MADE[skill] = gym.make(f"asm_gym/{skill}-v0", render_mode="rgb_array", render_size=(200, 200))
-    return _MADE[skill]
+    return gym.make(f"asm_gym/{skill}-v0", render_mode="rgb_array", render_size=(200, 200))
 
 
 class Demonstration(NamedTuple):
