@@ -233,7 +233,8 @@ def fit(args: Args, console: Console) -> int:
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     if args.promise.per == EPISODE:
         promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
-    say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promise}.")
+    modelled = ", by a model of the tail of their maxima, as they are few" if monitor.promise.modelled else ""
+    say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promise}{modelled}.")
     expected, most = monitor.promise.hourly(hours)
     more = "" if expected <= 1.0 else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
     say(

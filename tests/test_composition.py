@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection import EvidenceDetection, ModelOutput, conformal_threshold
+from asm_gym.detection import EvidenceDetection, ModelOutput
+from asm_gym.detection.conformal import episode_threshold
 from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
 from asm_gym.monitors import (
     DETECTIONS,
@@ -108,12 +109,12 @@ def test_two_parts_must_not_learn_arrays_of_one_name():
         CalibratedMonitor(Careless(sine_spec()), EvidenceDetection(sine_spec())).fit(sine_episodes(5))
 
 
-def test_the_threshold_at_any_rate_is_the_conformal_rank_of_the_kept_maxima(kalman, tmp_path):
+def test_the_threshold_at_any_rate_is_that_of_the_kept_maxima(kalman, tmp_path):
     maxima = np.array([s.value.max() for s in kalman.score_episodes(sine_episodes(60, 1))])
     kalman.save(tmp_path / "k.asm")
     for monitor in (kalman, load_monitor(tmp_path / "k.asm")):
         for rate in (0.02, 0.05, 0.3):
-            assert monitor.threshold_at(rate) == conformal_threshold(maxima, rate)
+            assert monitor.threshold_at(rate) == episode_threshold(maxima, rate)
         with pytest.raises(ValueError, match=r"rate of 0\.01 needs at least 99 nominal episodes, got 60"):
             monitor.threshold_at(0.01)
         with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got 2"):

@@ -10,8 +10,16 @@ m_i is the largest value in block i, T_i its duration [h], and r the rate [1/h].
 [m_i > q] - r T_i, falls with q and is at most 1, so conformal risk control bounds the mean loss of the next block by 0.
 Rows of a block may depend on each other; blocks must be exchangeable.
 
+From few maxima
+    threshold    q = u (k/e)^ξ,   ξ = H (1 + 1/(2√k)),   H = mean of ln(m_i/u) over the k maxima above u
+
+e is how many of the n maxima may exceed q: n·rate, or r (T_1 + … + T_n). Where that is less than ``ENOUGH``, both of
+the above hang on one or two maxima, and q differs much from sample to sample. Then the k = n/5 largest maxima are taken
+to have a Pareto tail. The mean rate is then no theorem; docs/results/detection.md has what it came to.
+
 Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction); Angelopoulos et al. 2024 (ICLR,
-conformal risk control), Theorem 1.
+conformal risk control), Theorem 1; Hill 1975 and Weissman 1978 (the tail). The allowance of half a standard error in
+ξ is ours.
 """
 
 from __future__ import annotations
@@ -32,6 +40,9 @@ CONFIDENCE = 0.95  # share of calibrations in which ``Promise.at_most`` holds
 MINUTE = 60.0  # longest block, and time below the threshold before another alarm counts [s]
 LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 1e6  # limits of a rate
 ROUNDING = 1e-9
+ENOUGH = 5.0  # maxima that may exceed a threshold, from which on they are counted
+FEWEST_IN_TAIL = 50  # maxima that a model of their tail takes
+TAIL_SHARE = 5  # one in so many maxima is in the tail
 
 
 def conformal_episodes(rate: float) -> int:
@@ -62,6 +73,39 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
     return float(np.sort(found)[rank - 1])
 
 
+class Tail(NamedTuple):
+    """A Pareto tail of the largest maxima: beyond q > u, ``k (q/u)^(-1/ξ)`` of them are to be expected."""
+
+    k: int
+    u: float
+    xi: float
+
+    @classmethod
+    def of(cls, maxima: Array, expected: float) -> Self | None:
+        """Return the tail of maxima (n,), ``expected`` of which may exceed a threshold; None where they are counted."""
+        found, n = np.sort(maxima), len(maxima)
+        k = n // TAIL_SHARE
+        if n < FEWEST_IN_TAIL or expected >= ENOUGH or not 0.0 < found[-k - 1] < found[-1] < np.inf:
+            return None
+        hill = float(np.log(found[-k:] / found[-k - 1]).mean())
+        return cls(k, float(found[-k - 1]), hill * (1.0 + 0.5 / math.sqrt(k)))
+
+    def threshold(self, expected: float) -> float:
+        """Return what so many are expected to exceed."""
+        return self.u * (self.k / expected) ** self.xi
+
+    def expected(self, threshold: float) -> float:
+        """Return how many are expected to exceed a threshold above u: half of one at least, where the model ends."""
+        return max(self.k * (threshold / self.u) ** (-1.0 / self.xi), 0.5)
+
+
+def episode_threshold(maxima: Array, rate: float) -> float:
+    """Return the threshold by the episode from the maxima (n,); by their tail where they are few. Raises as below."""
+    counted = conformal_threshold(maxima, rate)
+    tail = Tail.of(maxima, len(maxima) * rate)
+    return tail.threshold(len(maxima) * rate) if tail else counted
+
+
 class Promise(NamedTuple):
     """The promise of a threshold set on nominal episodes, or blocks by the hour.
 
@@ -73,17 +117,26 @@ class Promise(NamedTuple):
     at_most: float  # upper bound of the rate in 95 % of calibrations
     per: str = EPISODE  # or ``HOUR``
     hours: float = 0.0  # of the blocks; 0 by the episode
+    modelled: bool = False  # the rate is that of the maxima's ``Tail``, as too few were above the threshold to count
 
     @classmethod
     def of(cls, maxima: Array, threshold: float) -> Self:
         """Return the promise by the episode, from the maxima (n,) of nominal ones."""
         n, beyond = len(maxima), int((maxima > threshold).sum())
-        return cls(n, (beyond + 1) / (n + 1), surely_below(beyond, n))
+        counted, tail = (beyond + 1) / (n + 1), tail_at(maxima, threshold)
+        rate = tail.expected(threshold) / n if tail else counted
+        return cls(n, rate, surely_below(beyond, n), modelled=tail is not None)
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
         each = self.episodes / hours if self.per == EPISODE else 1.0
         return self.rate * each, self.at_most * each
+
+
+def tail_at(maxima: Array, threshold: float) -> Tail | None:
+    """Return the tail that set a threshold; None where one of the maxima (n,) is the threshold."""
+    tail = None if threshold in maxima else Tail.of(maxima, 0.0)
+    return tail if tail and threshold > tail.u else None
 
 
 def surely_below(beyond: int, n: int) -> float:
@@ -165,6 +218,8 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     if len(groups := blocks.groups) > 1:
         return max(hourly_threshold(own, rate) for own in groups)
     check_hours(rate, blocks.total)
+    if tail := Tail.of(blocks.maxima, rate * blocks.total):
+        return tail.threshold(rate * blocks.total)
     allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)
     return float(maxima[max(len(maxima) - 1 - allowed, 0)])
@@ -175,8 +230,9 @@ def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:
     if len(groups := blocks.groups) > 1:
         worst = max((hourly_promise(own, threshold, episodes) for own in groups), key=lambda each: each.rate)
         return worst._replace(hours=blocks.total)
-    n, hours, beyond = len(blocks.maxima), blocks.total, int((blocks.maxima > threshold).sum())
-    return Promise(episodes, (beyond + 1) / hours, surely_below(beyond, n) * n / hours, HOUR, hours)
+    n, hours, one = len(blocks.maxima), blocks.total, Promise.of(blocks.maxima, threshold)
+    rate = one.rate * (n if one.modelled else n + 1) / hours
+    return Promise(episodes, rate, one.at_most * n / hours, HOUR, hours, one.modelled)
 
 
 def _rows(dt: float) -> int:

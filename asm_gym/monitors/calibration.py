@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection import Blocks, EvidenceDetection, conformal_episodes, conformal_threshold
+from asm_gym.detection import Blocks, EvidenceDetection, conformal_episodes
 from asm_gym.detection.base import Array
-from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, hourly_threshold
+from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, episode_threshold, hourly_threshold
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors.stream_model import model_outputs
@@ -64,7 +64,7 @@ class AlarmRate(NamedTuple):
     def threshold(self, maxima: Array, blocks: Blocks | None) -> float:
         """Return the threshold from the maxima of nominal episodes, or from their blocks by the hour."""
         if self.per == EPISODE:
-            return conformal_threshold(maxima, self.rate)
+            return episode_threshold(maxima, self.rate)
         assert blocks is not None
         return hourly_threshold(blocks, self.rate)
 
