@@ -12,7 +12,7 @@ from rich.console import Console
 from scipy import stats
 
 from asm_gym.data.episode import EpisodeLabel
-from asm_gym.detection import conformal_threshold
+from asm_gym.detection import Blocks, conformal_threshold
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import (
     BenchmarkResult,
@@ -32,6 +32,7 @@ from asm_gym.evaluation.detection_tables import (
     kinds_table,
     lead_table,
     monitors_table,
+    splits_table,
 )
 from asm_gym.evaluation.metrics import (
     Delays,
@@ -282,6 +283,24 @@ def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_no
     assert set(brief_monitors_table(result).headings) < set(table.headings)
     assert brief_monitors_table(result).rows[1][1] == "0.750"
     assert kinds_table(result).rows[2] == ("(noise mild)", "0.59 / 0 %", "0.00 / 0 %")
+
+
+def test_a_promise_is_tried_on_random_halves_of_the_nominal_episodes():
+    calibrated = np.random.default_rng(1).pareto(3.0, 300) + 1.0
+    nominal = [ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(calibrated[150:])]
+    faulty = [
+        ScoredEpisode("push", 0, 0.1, 1.0, np.array([0.0, p, 0.0]), onset=1, severity="mild") for p in (0.5, 99.0)
+    ]
+    promises = dict.fromkeys((ONE, FIVE, AlarmRate(1.0, "hour")), 0.0)
+    blocks = Blocks.of([t.surprise for t in nominal], 0.1)
+    one = DetectionMetrics("asm", faulty, nominal, 0.5, Calibration(promises, calibrated[:150], blocks))
+    table = splits_table(BenchmarkResult({"asm": one}, [visibility(100.0, severity="mild")], 0.05, 0.5))
+    for row in table.rows:
+        for cell, rate in zip(row[2:4], (1.0, 5.0), strict=True):
+            came, found = cell.split(", ")
+            assert 0.3 * rate < float(came.split()[0]) < 1.3 * rate
+            assert found == "50.0 ± 0.0 % found"
+        assert row[4] == ""  # half of the episodes are seconds long
 
 
 def promised(calibrated, tested):

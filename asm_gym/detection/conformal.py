@@ -99,10 +99,10 @@ class Tail(NamedTuple):
         return max(self.k * (threshold / self.u) ** (-1.0 / self.xi), 0.5)
 
 
-def episode_threshold(maxima: Array, rate: float) -> float:
-    """Return the threshold by the episode from the maxima (n,); by their tail where they are few. Raises as below."""
+def episode_threshold(maxima: Array, rate: float, modelled: bool = True) -> float:
+    """Return ``conformal_threshold``, or by the tail of few maxima (n,) if that may be ``modelled``; raises as that."""
     counted = conformal_threshold(maxima, rate)
-    tail = Tail.of(maxima, len(maxima) * rate)
+    tail = Tail.of(maxima, len(maxima) * rate) if modelled else None
     return tail.threshold(len(maxima) * rate) if tail else counted
 
 
@@ -209,16 +209,17 @@ def check_hours(rate: float, hours: float) -> None:
         )
 
 
-def hourly_threshold(blocks: Blocks, rate: float) -> float:
+def hourly_threshold(blocks: Blocks, rate: float, modelled: bool = True) -> float:
     """Return the q that healthy operation exceeds in at most ``rate`` blocks an hour, on average over calibrations.
 
-    The rate holds in each group. Raises ValueError where there are too few hours for it.
+    The rate holds in each group. The tail of few blocks may be ``modelled``. Raises ValueError where there are too few
+    hours for it.
     """
     check_per_hour(rate)
     if len(groups := blocks.groups) > 1:
-        return max(hourly_threshold(own, rate) for own in groups)
+        return max(hourly_threshold(own, rate, modelled) for own in groups)
     check_hours(rate, blocks.total)
-    if tail := Tail.of(blocks.maxima, rate * blocks.total):
+    if modelled and (tail := Tail.of(blocks.maxima, rate * blocks.total)):
         return tail.threshold(rate * blocks.total)
     allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)

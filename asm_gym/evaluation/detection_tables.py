@@ -6,20 +6,22 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import numpy as np
 from scipy import stats
 
-from asm_gym.detection import conformal_episodes
+from asm_gym.detection import Blocks, conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.evaluation import metrics
 from asm_gym.evaluation.comparison import IDEAL, BenchmarkResult, Bound
 from asm_gym.evaluation.defaults import PER_HOUR, RATES, TRANSIENT
 from asm_gym.evaluation.metrics import DetectionMetrics, Kind, Outcomes
-from asm_gym.evaluation.resampling import Calibration, interval
+from asm_gym.evaluation.resampling import Calibration, Windows, interval
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Estimate, Rate, Share
 from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors.calibration import AlarmRate
 
+SPLITS = 20  # of nominal episodes into halves
 UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely than this
 
 
@@ -176,6 +178,50 @@ def kept_table(result: BenchmarkResult) -> Table:
         f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N.",
         ("Monitor", *(f"promised {_rate(promise)}" for promise in promises)),
         rows,
+    )
+
+
+def splits_table(result: BenchmarkResult) -> Table:
+    """Return what each promise comes to over random halves: set on one half of the nominal episodes, kept on the other.
+
+    With thresholds as ``calibrate`` sets them, and counted alone.
+    """
+    first = result.on_visible[0]
+    promises = list(first.calibration.thresholds)
+    rows = []
+    for m in result.on_visible:
+        of = Blocks.of([t.surprise for t in m.nominal], m.nominal[0].dt)
+        known = m.calibration.blocks or Blocks(*np.zeros((2, 0)))
+        by_hour = Blocks(*(np.concatenate(both) for both in zip(known[:2], of[:2], strict=True)))
+        maxima = np.concatenate([m.calibration.maxima, [t.surprise.max() for t in m.nominal]])
+        units = {EPISODE: Blocks(maxima, np.ones(len(maxima))), HOUR: by_hour}
+        for modelled in (True, False):
+            cells = [_over_splits(m, units[p.per], p, modelled) for p in promises]
+            rows.append((m.name, "as calibrated" if modelled else "counted", *cells))
+    return Table(
+        f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where {SPLITS} random halves "
+        "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD.",
+        ("Monitor", "threshold", *(f"promised {_rate(promise)}" for promise in promises)),
+        rows,
+    )
+
+
+def _over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate, modelled: bool) -> str:
+    rng, windows, came, found = np.random.default_rng(0), Windows(m.faulty, m.window_s), [], []
+    for _ in range(SPLITS):
+        half = np.zeros(len(units.maxima), bool)
+        half[rng.permutation(len(half))[: len(half) // 2]] = True
+        own = Blocks(units.maxima[half], units.hours[half])
+        try:
+            threshold = promise.threshold(own.maxima, own, modelled)
+        except ValueError:  # too few
+            return ""
+        came.append((units.maxima[~half] > threshold).sum() / units.hours[~half].sum())
+        found.append(windows.detected(threshold).mean())
+    unit, scale = ("/h", 1.0) if promise.per == HOUR else (" %", 100.0)
+    return (
+        f"{scale * np.mean(came):.2f} ± {scale * np.std(came):.2f}{unit}, "
+        f"{100 * np.mean(found):.1f} ± {100 * np.std(found):.1f} % found"
     )
 
 

@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from asm_gym.evaluation.comparison import BenchmarkResult
-from asm_gym.evaluation.detection_tables import kept_table, kinds_table, lead_table, monitors_table
+from asm_gym.evaluation.detection_tables import kept_table, kinds_table, lead_table, monitors_table, splits_table
 from asm_gym.evaluation.scored_episode import window_steps
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import require
@@ -78,7 +78,7 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
     require("pyarrow", what="results.parquet")
     with written_whole(folder / "results.parquet") as file:
         pd.DataFrame(_rows(result)).to_parquet(file, index=False)
-    tables = [monitors_table(result), kept_table(result), kinds_table(result)]
+    tables = [monitors_table(result), kept_table(result), splits_table(result), kinds_table(result)]
     if len(result.monitors) > 1:
         tables.insert(1, lead_table(result))
     write_text(folder / "results.md", "\n\n".join(map(markdown, tables)) + "\n")

@@ -198,7 +198,8 @@ class CalibratedMonitor:
     ) -> Self:
         """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
 
-        ``threshold_at`` then knows the threshold of every other rate too.
+        ``threshold_at`` then knows the threshold of every other rate too. Where fewer than five of the episodes' maxima
+        may exceed it, their tail is modelled, and ``promise.modelled`` is true.
 
         Args:
             episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.

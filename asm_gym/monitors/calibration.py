@@ -61,12 +61,15 @@ class AlarmRate(NamedTuple):
         if self.per == HOUR:
             check_hours(self.rate, hours)
 
-    def threshold(self, maxima: Array, blocks: Blocks | None) -> float:
-        """Return the threshold from the maxima of nominal episodes, or from their blocks by the hour."""
+    def threshold(self, maxima: Array, blocks: Blocks | None, modelled: bool = True) -> float:
+        """Return the threshold from the maxima of nominal episodes, or from their blocks by the hour.
+
+        Where so few may exceed it that one of them would set it, their tail is ``modelled``.
+        """
         if self.per == EPISODE:
-            return episode_threshold(maxima, self.rate)
+            return episode_threshold(maxima, self.rate, modelled)
         assert blocks is not None
-        return hourly_threshold(blocks, self.rate)
+        return hourly_threshold(blocks, self.rate, modelled)
 
     def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
         """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups."""
