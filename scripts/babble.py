@@ -166,9 +166,11 @@ def babble(args: Args, console: Console) -> None:
         marks = examined(args, memory, console) if args.exam_episodes else []
         if marks:
             table = card(marks, memory, WINDOW_S)
-            write_text(args.out / "card.md", f"{markdown(table)}\n\n{summary(marks)}\n")
+            adapted = summary([m.adapted(args.false_alarms_per_hour) for m in marks])
+            said = f"{summary(marks)}\nWith an adaptive threshold: {adapted}"
+            write_text(args.out / "card.md", f"{markdown(table)}\n\n{said}\n")
             console.print(table)
-            console.print(summary(marks))
+            console.print(said)
     console.print(
         f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it"
     )

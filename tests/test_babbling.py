@@ -280,6 +280,12 @@ def test_alarms_are_counted_by_event_and_faults_at_any_threshold():
     marks = Marks("Lift", solved, [], DetectionMetrics("Lift", [trace(3.5, onset=1)], solved, 1.0))
     assert summary([marks]).endswith("in 1.00 healthy hours, 0 of 1 faults found.")
     assert summary([marks.at(3.2)]).endswith("1 of 1 faults found.")
+    calm = marks._replace(solved=[trace(1.0)] * 100).adapted(20.0)  # surprises less often than it may
+    assert summary([calm]).endswith("1 of 1 faults found.")
+    louder = marks._replace(solved=[trace(5.0)] * 100)
+    adapted = louder.adapted(5.0)
+    assert (hourly_alarms(louder.solved).k, hourly_alarms(adapted.solved).k <= 8) == (100, True)
+    assert summary([adapted]).endswith("0 of 1 faults found.")
 
 
 def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usual():
