@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from asm_gym import collect
-from asm_gym.detection.contact_limits import ContactLimits, Pace, healthy_forces
+from asm_gym.detection.contact_limits import MOMENTUM, ContactLimits, Pace, healthy_forces
 from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
@@ -137,6 +137,25 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
     assert 0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)  # that one pulls between substeps
 
 
+def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_healthy_hand_was(lift):
+    def most(action, pace):
+        """The greatest momentum [N s] and speed [m/s] of a hand that is driven by an action for three seconds."""
+        lift.reset(seed=0)
+        simulation = lift.unwrapped.simulation
+        lift.unwrapped.contact_limits = ContactLimits(1e3, 1e3, pace=pace)
+        found = []
+        for _ in range(60):
+            lift.step(np.float32(action))
+            twist = simulation.hand_twist(0)
+            found.append((simulation.hand_momenta(0, twist[None])[0], np.linalg.norm(twist[:3])))
+        return np.max(found, axis=0)
+
+    elsewhere = Pace(np.array([[0, 20, 20, 20, *[0.1] * 12]]))
+    forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
+    assert most(forward, elsewhere)[0] < 1.2 * MOMENTUM < most(forward, None)[0] / 1.5
+    assert most(sideways, elsewhere)[1] == pytest.approx(most(sideways, None)[1], rel=0.05)
+
+
 def test_what_is_fixed_to_the_world_belongs_to_it(lift):
     lift.reset(seed=0)
     arm = lift.unwrapped
@@ -155,16 +174,17 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
     spec, stream = hands([0.4, 0.0, -0.1, 0, 0, 1.0], [0.0, 0.0, -0.3, 0, 0, 0])
     limits, here = ContactLimits(pace=Pace(Pace.learned([stream], spec))), np.array([0.1, 0.2, 0.91])
 
-    def most(*twist, place=here):
+    def most(*twist, place=here, momentum=0.0):
         speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
-        return float(limits.shares(0, place, np.array([twist], float), np.array([speed]))[0])
+        return float(limits.shares(0, place, np.array([twist], float), *np.array([[speed], [momentum]]))[0])
 
     assert most(0.4, 0, 0, 0, 0, 1.0) >= 1.0  # as healthy hands did
     assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
     assert most(0.4, 0, 0, 0, 0, 0, place=here + 0.3) == pytest.approx(0.15 / 0.4)  # another place
     assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
-    assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1) < 0.3  # and slower where no healthy hand went down
-    assert ContactLimits().shares(0, here, np.array([[0.3, 0, 0, 0, 0, 0]]), np.array([0.3])) == pytest.approx(0.5)
+    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(0.15 / 0.3)  # with whatever is behind it
+    assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2  # not so where no healthy hand went down
+    assert ContactLimits().shares(0, here, np.array([[0.3, 0, 0, 0, 0, 0]]), *np.array([[0.3], [0]])) == [0.5]
     assert Pace.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
     for bad in (np.zeros((0, 16)), np.full((1, 16), np.nan), np.full((1, 16), 1e9), np.zeros((1, 15))):
         with pytest.raises(ValueError, match="pace must be rows"):

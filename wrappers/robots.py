@@ -324,6 +324,17 @@ class Guarding:
         self._engine = Engine(self._robots, monitor, self._options, policies, self._rows_per_step)
         self._next = monitor
 
+    def _limit_contact(self, anew: bool = False) -> None:
+        """Tell the environments their contact limits, where they have changed; new episodes have forgotten them."""
+        limits = self._engine.limits
+        if self._robots.limits_contact and (anew or limits is not self._limits):
+            told = [(self._name, own) for own in limits]
+            if isinstance(self.env, VectorEnv):
+                askable(self.env).set_attr("limits_of_guard", told)
+            else:
+                self.env.unwrapped.limits_of_guard = told[0]
+        self._limits: tuple[Any, ...] = limits
+
     def _watch_with_next(self) -> None:
         """Take over the monitor that was assigned, or was fitted or calibrated since."""
         if Fitted.of(self._next, self._spec).differs(self._engine.fitted):

@@ -260,13 +260,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             self._limit_contact()
             self.env.get_wrapper_attr("command")(self._executed)
 
-    def _limit_contact(self, anew: bool = False) -> None:
-        """Tell the environment its contact limits, where they have changed; a new episode has forgotten them."""
-        limits = self._engine.limits[0]
-        if self._robots.limits_contact and (anew or limits is not self._limits):
-            self._inner.limits_of_guard = self._name, limits
-        self._limits: Any = limits
-
     def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
         """Say in ``info`` what became of a step."""
         surprise = max([float(row.surprise.value[0]) for row in rows])

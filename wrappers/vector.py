@@ -178,7 +178,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         def seen(robot: int) -> Any:
             return list(iterate(self.observation_space, self._observations))[robot]
 
-        self._limit()
+        self._limit_contact()
         command = self._engine.act(chosen.reshape(len(chosen), -1), seen, idle=begun)
         brakes = bool(command.brakes.any())
         if brakes or self._holding:
@@ -225,16 +225,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if not begun.any():
             return self._engine.nothing()
         nothing = self._engine.begin(begun)
-        self._limits: tuple[Any, ...] = ()
-        self._limit()
+        self._limit_contact(anew=True)
         return nothing
-
-    def _limit(self) -> None:
-        """Tell the environments their contact limits, where those have changed."""
-        limits = self._engine.limits
-        if self._robots.limits_contact and limits is not self._limits:
-            self._members.set_attr("limits_of_guard", [(self._name, own) for own in limits])
-        self._limits = limits
 
     def _report(
         self,

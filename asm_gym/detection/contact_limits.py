@@ -30,7 +30,7 @@ CELL = 0.04, 0.04, 0.02  # edges of the cells by which pace is learned [m]
 FASTER = 1.25  # a hand may be commanded to go so many times as fast as healthy ones did: about 0.8 of it is reached
 SLACK = np.array([0.03] * 3 + [0.15] * 3)  # and by so much more [m/s], [rad/s]
 STILL = 1e-9  # no speed is divided by less [m/s]
-DOWN = 0.065  # never slower than this downwards, to where stiff surfaces are: on a bin it is a blow of 270 N [m/s]
+MOMENTUM = 1.5  # of an arm along its hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
 
 
 class Pace:
@@ -78,13 +78,13 @@ class Pace:
         there = (cell >= 0).all() and (cell < self._seen.shape[:4]).all()
         return self._seen[tuple(cell)].reshape(2, 6) if there else np.zeros((2, 6))
 
-    def shares(self, arm: int, place: Floats, twists: Floats, speeds: Floats, usual: float) -> Floats:
+    def shares(self, arm: int, place: Floats, twists: Floats, speeds: Floats, momenta: Floats, usual: float) -> Floats:
         """Return the shares of ``ContactLimits.shares``; ``usual`` is the limit of speed."""
         seen = self.seen(arm, place)
         along = FASTER * np.where(twists > 0.0, seen[0], seen[1])
-        shares = np.maximum(usual / speeds, ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1))
-        falls = np.maximum(-twists[:, 2], STILL)
-        return np.minimum(shares, np.minimum(np.maximum(DOWN, along[:, 2]), usual) / falls)
+        known = ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1)
+        known = np.minimum(known, np.clip(along[:, 2], SLACK[2], usual) / np.maximum(-twists[:, 2], STILL))
+        return np.maximum(np.minimum(usual / speeds, MOMENTUM / np.maximum(momenta, STILL)), known)
 
 
 @dataclass(frozen=True)
@@ -155,15 +155,16 @@ class ContactLimits:
             pace=self.pace if same else None,
         )
 
-    def shares(self, arm: int, place: Floats, twists: Floats, speeds: Floats) -> Floats:
+    def shares(self, arm: int, place: Floats, twists: Floats, speeds: Floats, momenta: Floats) -> Floats:
         """Return the share (n,) that a hand may have of each of n motions, above 1 where it may go faster.
 
         Args:
             arm, place: which, and where it is (3,) [m].
             twists, speeds: the motions (n, 6), and how fast the hand's fastest point goes in each (n,) [m/s].
+            momenta: the arm's along its hand's motion in each (n,) [N s]; 0 where nobody knows.
         """
         speeds, usual = np.maximum(speeds, STILL), self.hand_speed
-        return usual / speeds if self.pace is None else self.pace.shares(arm, place, twists, speeds, usual)
+        return usual / speeds if self.pace is None else self.pace.shares(arm, place, twists, speeds, momenta, usual)
 
 
 def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:

@@ -55,7 +55,7 @@ class Actions:
             asked = simulation.hand_twist(a, delta, in_joints=controller.name == "JOINT_POSITION")
             twists = np.stack((asked, simulation.hand_twist(a)))
             speeds, place = simulation.hand_speeds(twists), simulation.views.site_xpos[simulation.arms.site[a]]
-            share, now = limits.shares(a, place, twists, speeds)
+            share, now = limits.shares(a, place, twists, speeds, simulation.hand_momenta(a, twists))
             most = min(speeds[0] * share, speeds[1] * now if now < 1.0 else np.inf)
             simulation.speed_limits[a] = max(limits.hand_speed, most)
             if share < 1.0:

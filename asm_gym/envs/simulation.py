@@ -33,6 +33,8 @@ from asm_gym.envs.robots import SLOWED, NominalDynamics, bodies, describe, is_co
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.spec import Channel
 
+LIGHT = 1e-12  # no inverse mass is taken to be less [1/kg]
+
 
 class Simulation:
     """Runs control steps of one loaded model.
@@ -258,6 +260,18 @@ class Simulation:
         """Return how fast the furthest point of a hand can go (n,) under each of n twists (n, 6) [m/s]."""
         squares = twists * twists
         return np.sqrt(squares[:, :3].sum(axis=1)) + REACHES * np.sqrt(squares[:, 3:].sum(axis=1))
+
+    def hand_momenta(self, a: int, twists: Floats) -> Floats:
+        """Return m |v| (n,) at arm ``a``'s hand in each of n twists (n, 6), by the reflected mass m along v [N s].
+
+        1/m = uᵀ J M⁻¹ Jᵀ u, u = v/|v| (Khatib 1995): it grows as the arm is stretched.
+        """
+        jacobian, solved = np.zeros((2, 3, self.model.nv))
+        mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self.arms.site[a]))
+        mujoco.mj_solveM(self.model, self.data, solved, jacobian)
+        v = twists[:, :3]
+        speeds, gives = np.linalg.norm(v, axis=1), ((v @ jacobian @ solved.T) * v).sum(axis=1)
+        return np.asarray(speeds**3 / np.maximum(gives, LIGHT))
 
     def hand_jacobian(self, a: int) -> NDArray[np.float64]:
         """Return the Jacobian (6, n) of arm ``a``'s hand: linear, then angular velocity."""

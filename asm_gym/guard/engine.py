@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,26 +29,13 @@ from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPR
 from asm_gym.guard.responses import Response, responses_from
 from asm_gym.guard.robots import NOTHING, Robots
 from asm_gym.guard.rows import Believed, Rows
-from asm_gym.guard.severity import Severity, SeverityEstimator, nothing_felt
+from asm_gym.guard.severity import SeverityEstimator, nothing_felt
 from asm_gym.monitors import ExpectsActions, Monitor
 from asm_gym.policies.base import Policy
 
 FAULTY, KNOCKED = EVENTS.index(FAULT), EVENTS.index(KNOCK)
 
 Mask = NDArray[np.bool_]
-
-
-class _Row(NamedTuple):
-    """The next row of each of n robots, as the stages before the decision have left it."""
-
-    believed: Believed
-    observed: Observation
-    severity: Severity
-    over: Mask  # (n,) surprise is over the threshold
-    event: NDArray[np.int8]  # (n,) what excuses it where it is over but for that
-    executed: NDArray[np.float32]  # (n, A)
-    intervened: Mask  # (n,) something else than the policy acted
-    refused: Mask  # (n,) the policy's action was none
 
 
 class Engine:
@@ -223,8 +210,8 @@ class Engine:
             believed.lost,
         )
         if some or self._rows.repairs:
-            row = _Row(believed, observed, severity, over, event, executed, intervened, refused)
-            outcomes = {i: self._decide(i, row) for i in np.flatnonzero(decides).tolist()}
+            found = believed, observed, over, executed, refused
+            outcomes = {i: self._decide(i, report, *found) for i in np.flatnonzero(decides).tolist()}
             self._held = self._arbiter.state == REFLEX
             report = self._completed(report, outcomes, self._forget(outcomes, active))
             self._rows.drop_repairs()
@@ -262,11 +249,15 @@ class Engine:
             decides[[*believed.lost, *believed.contradictions, *failures, *repairs, *incidents]] = True
         return decides
 
-    def _decide(self, robot: int, row: _Row) -> Outcome:
-        """Return what is done about the row of one robot."""
-        i, believed, observed = robot, row.believed, row.observed
-        value, (force, impulse, speed) = float(observed.surprise.value[i]), row.severity.numbers[i].tolist()
-        over, knocked, presses = bool(row.over[i]), bool(row.event[i] == KNOCKED), bool(row.severity.presses[i])
+    def _decide(
+        self, i: int, row: RowReport, believed: Believed, observed: Observation, beyond: Mask, executed: Any, no: Mask
+    ) -> Outcome:
+        """Return what is done about the row of robot ``i``.
+
+        Surprise is over its threshold where ``beyond`` (n,) says so; ``no`` (n,) action was the policy's.
+        """
+        value, (force, impulse, speed) = float(row.surprise.value[i]), row.severity.numbers[i].tolist()
+        over, knocked, presses = bool(beyond[i]), bool(row.event[i] == KNOCKED), bool(row.severity.presses[i])
         failed, lost, contradiction = i in observed.failures, i in believed.lost, believed.contradictions.get(i)
         causes = {
             CONTACT: presses,
@@ -284,16 +275,16 @@ class Engine:
             repair = self._rows.repairs.get(i)
             completed = None if self._rows.read is None else () if repair is None else repair.names
             feels = bool(np.isfinite(row.severity.felt[i, 0]) or np.isfinite(force))
-            shares, known, may_go_on = observed.surprise.attribution[i], self._rows.known(i), self._arbiter.may_go_on(i)
+            shares, known, may_go_on = row.surprise.attribution[i], self._rows.known(i), self._arbiter.may_go_on(i)
             found = over, knocked, lost, contradiction, failed, presses, feels, force, speed, may_go_on
             response = self._response(i, Alarm(rows, shares, known, *found, completed))
         intervened = bool(row.intervened[i])
         if not intervened and np.isfinite(value) and (warning := self._arbiter.judge_policy(i, alarm)):
             warnings.warn(warning, stacklevel=4)
-        judged = Judged(value, over, knocked, alarm, presses, impulse, intervened, bool(row.refused[i]), response)
+        judged = Judged(value, over, knocked, alarm, presses, impulse, intervened, bool(no[i]), response)
         decision = self._arbiter.decide(i, judged)
         if decision.takes_over:
-            self._motions.start(i, row.executed[i])
+            self._motions.start(i, executed[i])
         event = 0 if not alarm else FAULTY if over or lost or contradiction else KNOCKED
         return Outcome(alarm, reason, event, response, decision)
 

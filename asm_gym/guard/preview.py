@@ -85,7 +85,7 @@ def foretell(
 def _share(limits: ContactLimits, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
     """Return the share of a velocity (3,) that limits leave to a hand at a place (3,)."""
     twist, speed = np.append(velocity, np.zeros(3)), np.linalg.norm(velocity)
-    return min(1.0, float(limits.shares(hand, place, twist[None], np.array([speed]))[0]))
+    return min(1.0, float(limits.shares(hand, place, twist[None], np.array([speed]), np.zeros(1))[0]))
 
 
 def _beyond(pace: Pace, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> str:
