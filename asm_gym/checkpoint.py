@@ -129,9 +129,9 @@ def _opened(
         with zipfile.ZipFile(path) as file:
             members = file.infolist()
             if len({m.filename for m in members}) < len(members):
-                raise ValueError("two of its members have one name")
+                raise ValueError("two of its members have the same name")
             if expanded == 1 and any(m.compress_type != zipfile.ZIP_STORED for m in members):
-                raise ValueError("its members are compressed, which asm-gym does not do")
+                raise ValueError("its members are compressed, and those of asm-gym never are")
             if sum(m.file_size for m in members) > expanded * size:
                 raise ValueError(f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}")
             yield file

@@ -28,18 +28,18 @@ MOTOR = "action"  # the group that holds the commanded action
 
 @dataclass(frozen=True)
 class Channel:
-    """One named signal of one or more numbers.
+    """Describe one named signal of one or more numbers.
 
     Args:
         name: for example ``joint_position``.
-        size: number of its numbers.
-        unit: SI unit, ``"1"`` where there is none.
-        noise: standard deviation of the sensor noise [unit].
-        group: for example ``joint`` or ``wrench``. The group ``action`` is the efference copy: it is given to the
-            memory, not predicted from the senses.
-        elements: a name for each number; ``0, 1, …`` where empty.
-        resolution: smallest difference of two readings [unit]; 0 where unknown or computed from several sensors.
-        stops: (least, most) of each joint [unit]; empty where unknown.
+        size: how many numbers it has.
+        unit: SI unit, ``"1"`` without a unit.
+        noise: standard deviation of the sensor noise [unit]; 0 if unknown.
+        group: for example ``joint`` or ``wrench``; a memory predicts each group from the others. The group ``action``
+            is the commanded action.
+        elements: a name for each number; by default ``0, 1, …``.
+        resolution: smallest difference of two readings [unit]; 0 if unknown or computed from several sensors.
+        stops: (least, most) of each joint [unit]; empty if unknown.
 
     Example:
         >>> from asm_gym import Channel
@@ -72,7 +72,7 @@ class Channel:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Name of each number, such as ``joint_position[3]``; the bare name where there is one number."""
+        """Name of each number, such as ``joint_position[3]``; the bare name for a single number."""
         if self.size == 1 and not self.elements:
             return (self.name,)
         return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
@@ -85,7 +85,7 @@ def _is_pair(stops: Any) -> bool:
 
 @dataclass(frozen=True)
 class StreamSpec:
-    """The layout of a stream row, and the rate of rows.
+    """Describe the numbers of a stream row, and the rate of rows.
 
     Args:
         channels: in their order in a row.
@@ -170,7 +170,7 @@ class StreamSpec:
             )
 
     def difference(self, other: StreamSpec) -> list[str]:
-        """Return what keeps a memory of this spec from reading streams of ``other``, a line each."""
+        """Return one line for each reason why a memory of this spec cannot read streams of ``other``."""
         mine, theirs = ({c.name: c for c in s.channels} for s in (self, other))
         lines = [f"{n}: missing" for n in mine if n not in theirs] + [f"{n}: new" for n in theirs if n not in mine]
         for name in (n for n in mine if n in theirs):
@@ -272,8 +272,8 @@ def control_period(env: gym.Env[Any, Any]) -> float:
     if not rate:
         return 1.0
     warnings.warn(
-        f"{type(bare).__name__} says nothing of its control period: {1 / rate:g} s is taken from the rate of its "
-        "videos; where steps are of another length, give it an attribute dt [s]",
+        f"{type(bare).__name__} does not state its control period: {1 / rate:g} s is taken from its render_fps; if "
+        "that is wrong, give it an attribute dt [s]",
         PeriodWarning,
         stacklevel=2,
     )

@@ -78,7 +78,7 @@ def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:
     while isinstance(env, gym.Wrapper | VectorWrapper):
         if isinstance(env, NormalizeObservation | VectorNormalizeObservation) and env.update_running_mean:
             raise ValueError(
-                "NormalizeObservation changes what it makes of the same sense as it goes on: put it outside, as in "
+                "NormalizeObservation inside the guard changes its scaling over time: put it outside, as in "
                 f"NormalizeObservation({guard}(env, monitor)), or set its update_running_mean to False"
             )
         env = env.env

@@ -61,12 +61,12 @@ OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")  # tasks of ``reg
 def register_task(
     name: str, make: Callable[..., gym.Env[Any, Any]] | type[Any] | str, horizon: int, **arguments: Any
 ) -> None:
-    """Register a user's environment as a task, here and in worker processes; raise ValueError where the name is taken.
+    """Register an environment as a task, in this process and its workers; raise ValueError if the name is taken.
 
     Args:
         name: the Gymnasium id is ``asm_gym/<name>-v0``.
-        make: a class of environments with Box spaces, a function that makes one, or ``module:name`` of either. The
-            sensors of a class of robosuite's environments become channels of the stream.
+        make: a class of environments with Box spaces, a function that makes one, or its ``module:name``. The
+            sensors of a robosuite class become channels of the stream.
         horizon: control steps before an episode is truncated.
         arguments: of the environment: ``robots="Panda"``, ``controller_configs=…``.
 

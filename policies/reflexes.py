@@ -1,4 +1,4 @@
-"""Staying where one is: what a reflex of your own derives from, and which action is rest."""
+"""Hold, the base class of reflexes, and the action at which a robot rests."""
 
 from __future__ import annotations
 
@@ -21,19 +21,18 @@ class HoldsItself(Protocol):
 
 
 class Hold:
-    """Stay, and keep the grip, so that nothing is dropped.
+    """Keep the robot in place and keep its grip.
 
-    An environment that can hold itself, as all of this package can, is told to before each step, under any controller
-    and wrapper. In any other environment a zero action means "stay" where its attribute ``action_means`` is
-    ``"delta"`` or ``"velocity"``.
+    This package's environments hold by themselves, under any controller and wrapper. In any other environment a zero
+    action holds if its attribute ``action_means`` is ``"delta"`` or ``"velocity"``.
 
     Args:
-        env: one with a Box action space.
-        safe_action: what to do instead, where a zero action does not mean "stay"; it goes through all wrappers.
+        env: an environment with a Box action space.
+        safe_action: (A,) the action to take instead, if a zero action does not hold; it passes through all wrappers.
 
     Raises:
         TypeError: the action space is no Box.
-        ValueError: ``safe_action`` does not fit the action space, or no action is known for which the robot stays.
+        ValueError: ``safe_action`` does not fit the action space, or no action is known that holds the robot.
     """
 
     def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
@@ -55,7 +54,7 @@ class Hold:
             self._grip = self._grip[:0]
 
     def begin(self, executed: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The state to start from, after ``executed`` (A,), whose grip is kept."""
+        """Return the initial state after the action ``executed`` (A,), whose grip is kept."""
         return np.array(executed, np.float32)
 
     def predict(
@@ -65,14 +64,14 @@ class Hold:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = False,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-        """The next action (A,)."""
+        """Return the next action (A,) and the state."""
         action = self._rest.copy() if self.explicit else self.move()
         if state is not None and not self.explicit:
             action[self._grip] = state[self._grip]
         return action, state
 
     def move(self) -> NDArray[np.float32]:
-        """The next action (A,); the gripper's part of it does not count."""
+        """Return the next action (A,); its numbers for the gripper are replaced."""
         if self._robot is not None:
             self._robot.holding = True
         return self._rest.copy()
@@ -84,7 +83,7 @@ def _zero_that_rests(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     each = {means} if isinstance(means, str) else set(means or ())
     if not each or not each <= {DELTA, VELOCITY}:
         raise ValueError(
-            f'{env.unwrapped} does not say by action_means="delta" or "velocity" that a zero action makes it stay: '
+            f'{env.unwrapped} has no action_means="delta" or "velocity", so a zero action may not make it stay: '
             'use Hold(env, safe_action=...), or on_alarm="hold" with NeuralASMSafety\'s action_means'
         )
     return resting_action(env)

@@ -56,10 +56,11 @@ SHIPPED = Path(__file__).resolve().parent / "agents"  # trained agents that come
 
 
 def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
-    """Register a policy, in this process and in its workers; raise ValueError where the name is taken.
+    """Register a policy, in this process and its workers; raise ValueError if the name is taken.
 
     Args:
-        make: is called as ``make(env, seed=seed)``, with whatever else ``make_policy`` is given; or ``module:name``.
+        name: for ``make_policy`` and ``--policy``.
+        make: called as ``make(env, seed=seed)`` with further arguments of ``make_policy``; or its ``module:name``.
 
     Example:
         >>> from asm_gym import make_policy, register_policy
@@ -86,19 +87,20 @@ def _agent_file(name: str) -> Path:
 
 @typed
 def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
-    """Make the policy called ``name`` for ``env``.
+    """Return a policy by name.
 
     Args:
-        name: ``"scripted"`` (the task's expert), ``"hold"`` (stay where you are), ``"sway"`` (smooth motion in any
-            environment with Box actions), an agent that comes with the package, such as ``"lift_sac"``, or the path of
-            one: ``.npz`` of ``asm-gym train``, ``.asm`` of a Neural ASM that learned to act; or an archive of
-            stable-baselines3 after its algorithm, ``"SAC:model.zip"``, which runs code in it: load only your own.
-        seed: of whatever the policy draws.
-        kwargs: handed to the expert, for example ``style=Style(noise=0.1)``.
+        name: ``"scripted"`` (the expert of the task), ``"hold"`` (stay in place), ``"sway"`` (smooth motion in any
+            environment with Box actions), a shipped agent such as ``"lift_sac"``, or the path of an agent: ``.npz`` of
+            ``asm-gym train``, ``.asm`` of a Neural ASM that learned to act, or an archive of stable-baselines3 with
+            its algorithm, ``"SAC:model.zip"``. Such an archive can run code: load only your own.
+        env: the environment that the policy acts in.
+        seed: of the random draws of the policy.
+        kwargs: further arguments of the expert, for example ``style=Style(noise=0.1)``.
 
     Raises:
         ValueError: an unknown name, a task without an expert, or an agent that was trained in another environment.
-        FileNotFoundError: there is no such agent.
+        FileNotFoundError: no file at the path of an agent.
 
     Example:
         >>> import gymnasium as gym

@@ -1,7 +1,7 @@
-"""Learn one memory of a body, for any policy: record motor babbling, learn from it, and examine the memory.
+"""Learn a memory of a body for any policy: record motor babbling, learn from it, and test the memory.
 
-The memory alarms at what no body does, whatever the policy. It is examined on policies and on tasks that babbling never
-showed. A run lives in one folder and can be killed at any time: what was recorded is not recorded again.
+The memory is tested on policies and tasks that babbling never showed. A run can be killed at any time; the same command
+continues it.
 """
 
 from __future__ import annotations
@@ -49,30 +49,30 @@ _GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name
 
 @dataclass(frozen=True)
 class Args(Options):
-    """A memory of a body, from motor babbling."""
+    """Options of babbling."""
 
     robot: str = option("Panda", known=ROBOTS)
     """The arm."""
     episodes: int = option(60, quick=18, least=1)
-    """Lessons in each task; a second call with more of them continues."""
+    """Babbling episodes (lessons) in each task; a second call with a larger number continues."""
     reaching: bool = False
-    """Hands reach for places where noise alone would move them; one lesson more for each three presses."""
+    """Let hands reach for places instead of moving by noise alone, with one more lesson for each three that press."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
-    """Rows of the stream per second; one per control step by default."""
+    """Rows of the stream per second; by default one per control step."""
     healthy_episodes: int = option(60, quick=0, least=0)
-    """Episodes of the expert of each task to calibrate on, beside the held-out lessons."""
+    """Expert episodes of each task to calibrate on, beside held-out lessons."""
     corpus: Path | None = option(None, metavar="FOLDER")
-    """A corpus of asm-gym corpus, whose experts' healthy hours are calibrated on, too."""
+    """Folder of asm-gym corpus, to calibrate also on its healthy hours of experts."""
     exam_episodes: int = option(60, quick=0, least=0)
-    """Healthy episodes of each examination; 0 examines nothing."""
+    """Healthy episodes of each test; 0 for no test."""
     workers: int = option(2, least=1)
-    """Processes."""
+    """Number of processes."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
     """Folder of the run."""
     tasks: tuple[str, ...] | None = option(None)
-    """Tasks to babble in; by default seven with the Panda, and those of them that other arms' experts do."""
+    """Tasks to babble in; by default seven with the Panda, and with other arms those that their experts solve."""
     false_alarms_per_hour: float = option(5.0, quick=120.0, check=check_per_hour)
-    """False alarms per hour of healthy episodes."""
+    """Promised false alarms per hour."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -48,18 +48,18 @@ Rivals = dict[str, Callable[[], Any]]
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Speeds as ratios against rivals."""
+    """Options of a benchmark."""
 
     what: tuple[str, ...] = option(NAMES, least=1, known=NAMES, positional=True)
-    """One call of observe(); steps under the guard against those without; environments against MuJoCo and robosuite."""
+    """monitor: a call of observe(); safety: steps with and without the guard; env: against MuJoCo and robosuite."""
     task: str = option("Lift", check=env_id, metavar="TASK")
     """Task of the environments, with the Panda."""
     steps: int = option(400, quick=20, least=1)
-    """Control steps of each rival, in parts of a second; five times as many calls of observe()."""
+    """Control steps of each rival; five times as many calls of observe()."""
     members: tuple[int, ...] = option(
         (1, 2, 4, 16), quick=(1, 2), least=1, check=partial(check_number, "members", low=1)
     )
-    """Environments side by side in one vector, on as many threads as there are cores."""
+    """Numbers of environments in a vector, which runs one thread on each core."""
     out: Path = option(Path("runs/benchmark"), metavar="FOLDER")
     """Folder of benchmark.md."""
 

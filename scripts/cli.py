@@ -12,17 +12,17 @@ from asm_gym.validation import check_choice
 from asm_gym.version import __version__
 
 COMMANDS = {
-    "demo": "watch a robot notice that something is wrong",
+    "demo": "show the safety wrapper on one task, with injected faults",
     "collect": "record episodes of a policy, as a Minari dataset",
-    "inspect": "show what a log holds",
+    "inspect": "show how a log is read: clock, columns, roles",
     "fit": "learn a memory from recorded episodes or logs",
-    "babble": "learn one memory of a body, for any policy",
+    "babble": "learn a memory of a body, for any policy",
     "evaluate": "compare monitors on tasks and faults",
     "watch": "watch a log or live rows with a memory",
     "train": "train an agent: cloned from an expert, then improved by SAC",
-    "warmup": "compile now what the first guarded step would wait for",
-    "doctor": "say what this machine lacks, and what installs it",
-    "corpus": "record the episodes that the tables of detection are judged on",
+    "warmup": "compile once, so that the first guarded step does not wait",
+    "doctor": "check this machine, and print what to install",
+    "corpus": "record the episodes behind the detection tables",
     "reproduce": "run the studies behind the method's claims",
     "benchmark": "measure speeds as ratios against named rivals",
 }

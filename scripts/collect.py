@@ -1,7 +1,6 @@
-"""Record a policy's episodes, in worker processes, into a Minari dataset.
+"""Record episodes of a policy, in worker processes, as a Minari dataset.
 
-Every episode is written to a file as soon as it has ended: a run that is killed loses those that were running, and the
-same command continues with the rest.
+Each episode is written when it ends: a killed run loses only running episodes, and the same command continues.
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ class Args(Options):
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with numeric spaces, such as Pusher-v5."""
     policy: str = "scripted"
-    """Policy: scripted, hold, sway, a shipped agent, or the path of one."""
+    """Policy: scripted, hold, sway, a shipped agent, or the path of an agent."""
     robot: str | None = option(None, known=ROBOTS)
-    """The arm; the task's own by default."""
+    """The arm; by default that of the task."""
     episodes: int = option(100, quick=4, least=1)
-    """How many; a second call with more of them continues."""
+    """Number of episodes; a second call with a larger number continues."""
     only_successful: bool = False
     """Leave failed episodes out of the dataset."""
     workers: int = option(2, least=1)
-    """Processes."""
+    """Number of processes."""
     out: Path = option(Path("runs/collect"), metavar="FOLDER")
     """Folder of the episodes and of the dataset."""
 

@@ -90,9 +90,9 @@ class Options(Checked):
     """Options of most commands."""
 
     seed: int = option(0, least=0)
-    """Seed of all that is drawn: the same seed gives the same result."""
+    """Seed of all random draws: the same seed gives the same result."""
     quick: bool = False
-    """Little of everything: to see that it runs, not to judge the figures."""
+    """A small run, to see that the command works; its figures mean nothing."""
 
 
 def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Args:

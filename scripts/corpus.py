@@ -1,7 +1,6 @@
-"""Record the corpus that every table of detection is judged on: healthy motion, and faults with their healthy twins.
+"""Record the corpus behind the detection tables: healthy motion, and faults with their healthy twins.
 
-It can be killed at any time: what was recorded is not recorded again. A corpus of which some rounds are missing can be
-used already.
+It can be killed at any time; the same command continues. An incomplete corpus can already be used.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from asm_gym.scripts.command import Options, option, run
 
 @dataclass(frozen=True)
 class Args(Options):
-    """The recordings that monitors are judged on."""
+    """Options of the corpus."""
 
     part: tuple[str, ...] = option(tuple(PARTS), least=1, known=PARTS)
     """Parts to record."""
     rounds: int = option(ROUNDS, quick=1, least=1)
-    """How many rounds; each has as much of every task, and the first what is learned from."""
+    """Number of rounds; each has the same share of every task, and the first also the training episodes."""
     workers: int = option(2, least=1)
-    """Processes."""
+    """Number of processes."""
     out: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of the corpus."""
 

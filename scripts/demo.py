@@ -1,8 +1,7 @@
-"""Watch a robot notice that something is wrong: the whole safety loop on one robosuite task.
+"""Demonstrate the safety wrapper on one robosuite task, from recording to a table of detected faults.
 
 The demo collects nominal episodes, fits and calibrates a memory of the task, and runs nominal and faulty episodes with
-the policy alone and under the safety wrapper, paired by seed. It prints one table, and writes a report with figures,
-and the memory.
+the policy alone and under the safety wrapper, paired by seed. It prints one table, and writes the memory and a report.
 """
 
 from __future__ import annotations
@@ -42,14 +41,14 @@ PUSHED = "robot0_link5"  # link that is pushed
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Collect, fit, calibrate, break things, and see who notices."""
+    """Options of the demonstration."""
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task."""
     on_alarm: Literal["graded", "hold", "terminate"] = option("graded", known=("graded", "hold", "terminate"))
     """Response of the wrapper to an alarm; graded depends on the cause."""
     workers: int = option(os.cpu_count() or 1, least=1)
-    """Processes."""
+    """Number of processes."""
     out: Path = option(Path("runs/demo"), metavar="FOLDER")
     """Folder to write to."""
     fit_episodes: int = option(60, quick=20, least=1)
@@ -61,7 +60,7 @@ class Args(Options):
     faulty_episodes: int = option(20, quick=6, least=1)
     """Episodes to test on for each fault."""
     epochs: int = option(40, quick=13, least=1)
-    """Passes over the episodes in learning."""
+    """Training passes over the episodes."""
 
 
 def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:

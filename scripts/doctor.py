@@ -1,4 +1,4 @@
-"""Say what this machine lacks to run asm-gym, and what installs it. Exit code 1: it cannot run here."""
+"""Check this machine, and print what it lacks and what installs it. Exit code 1: asm-gym cannot run here."""
 
 # Nothing that is checked here is imported here: the doctor must work where `import robosuite` does not.
 
@@ -93,7 +93,7 @@ def report(args: Args, console: Console) -> int:
     for check in missing:  # whole lines, to be copied
         console.print(f"{check.name}: {check.remedy}", markup=False, highlight=False, soft_wrap=True)
     if any(check.needed for check in missing):
-        console.print("[red]asm-gym cannot run here yet:[/] do what is said above, from the top.")
+        console.print("[red]asm-gym cannot run here yet:[/] follow the lines above, from the top.")
         return BAD_NEWS
     names = escape(", ".join(check.name for check in missing))
     console.print(f"asm-gym runs here, without {names}." if missing else "[green]Everything is here.")

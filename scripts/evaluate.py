@@ -1,7 +1,6 @@
-"""Record nominal and faulty episodes once, let every monitor judge them, and report who noticed what.
+"""Compare monitors: record nominal and faulty episodes, score them with every monitor, and report what each found.
 
-A run lives in one folder and can be killed at any time: what was recorded, and what was fitted, is not made again. The
-same arguments give the same table.
+A run can be killed at any time; the same command continues it. The same arguments give the same table.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _QUICK = (
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Tasks × monitors × faults: who notices what, how fast, and how often for nothing."""
+    """Options of a comparison: tasks × monitors × faults."""
 
     tasks: tuple[str, ...] = option(
         ("Lift", "Stack", "PickPlaceCan", "Door"),
@@ -59,33 +58,33 @@ class Args(Options):
     )
     """Names of tasks; or one Gymnasium id with Box spaces, such as Pusher-v5 or gymnasium_robotics:FetchReach-v4."""
     robot: str = option("Panda", known=ROBOTS)
-    """The arm, in robosuite's tasks."""
+    """The arm, for robosuite's tasks."""
     policy: str = "scripted"
     """Policy: scripted, sway, or the path of an agent."""
     steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
-    """Length of an episode, in an environment by its id; by default its own."""
+    """Length of an episode of an environment given by its id; by default its own."""
     monitors: tuple[str, ...] = option(tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name)
-    """Names of monitors; any model goes under any detection, as in external_torque_limit+evidence."""
+    """Names of monitors; MODEL+DETECTION combines any two, as in external_torque_limit+evidence."""
     faults: tuple[str, ...] = option((), metavar="KIND")
-    """Kinds of fault, by default all; development or test for the halves of robosuite's."""
+    """Kinds of fault, by default all; development or test for one half of the suite."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
-    """How bad each is."""
+    """Severities of each fault."""
     fit_episodes: int = option(60, quick=16, least=1)
     """Nominal episodes of each task to learn from."""
     calibration_episodes: int = option(60, quick=10, least=1)
-    """Other nominal episodes of each task; the thresholds are set on those of all tasks together."""
+    """Other nominal episodes of each task, which set one threshold for all tasks."""
     nominal_episodes: int = option(60, quick=8, least=1)
     """Nominal episodes of each task to test on."""
     faulty_episodes: int = option(20, quick=3, least=1)
-    """Episodes of each task for each kind and severity; each is the twin of a nominal one."""
+    """Episodes of each task for each kind and severity, each the twin of a nominal one."""
     false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
     """Share of nominal episodes that may raise an alarm."""
     workers: int = option(2, least=1)
-    """Processes."""
+    """Number of processes."""
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
     corpus: Path | None = option(None, metavar="FOLDER")
-    """Judge the recordings of asm-gym corpus, all of its skills, faults and splits but what fit_episodes leaves out."""
+    """Score the recordings of asm-gym corpus instead; only --fit-episodes then limits them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,7 +1,7 @@
-"""A memory of what is normal, learned from recordings: run folders, Minari datasets, or logs from elsewhere.
+"""Learn a memory of normal motion from recordings: run folders, datasets, or logs of a robot.
 
-Part of the episodes are learned from, the others set the threshold. Episodes that failed or hold a fault are left out.
-A file of a folder that cannot be read is named and left out; the exit code is 2 then.
+The memory learns from half of the episodes; the others set the threshold. Episodes that failed or contain a fault are
+left out. A file of a folder that cannot be read is named and left out, with exit code 2.
 """
 
 from __future__ import annotations
@@ -53,31 +53,31 @@ class Args(LogOptions):
     """A memory from recordings."""
 
     data: Path = option(positional=True, metavar="DATA")
-    """A run folder of collect or evaluate, a Minari or LeRobot dataset, or logs (a file, or a folder): .csv, .tsv,
-    .txt, .jsonl, .parquet, .npz, .npy, and .mcap, .db3 or .bag of ROS. Or a live source of asm-gym watch, with JSON
-    objects: it is recorded beside FILE."""
+    """A log or a folder of logs (.csv, .tsv, .txt, .jsonl, .parquet, .npz, .npy; .mcap, .db3 or .bag of ROS), a LeRobot
+    or Minari dataset, or a run folder of collect or evaluate. Or a live source of asm-gym watch with JSON objects,
+    which is recorded beside FILE."""
     out: Path = option(Path("runs/fit/memory.asm"), metavar="FILE")
     """File to write the memory to."""
     monitor: str = option("neural_asm", check=check_monitor_name, known=MONITORS)
     """Name of the monitor."""
     false_alarm_rate: float = option(FALSE_ALARM_RATE, check=conformal_episodes)
-    """Share of normal episodes that may raise an alarm."""
+    """Share of normal episodes that may raise an alarm, in (0, 1)."""
     false_alarms_per_hour: float | None = option(None, metavar="X")
-    """Alarms per hour of normal episodes, in place of a share of them."""
+    """Alarms per hour of normal motion, in place of --false-alarm-rate."""
     action: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns of logs that were commanded and not sensed: names, or patterns such as 'cmd*'."""
+    """Columns of commands: names, or patterns such as 'cmd*'."""
     bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
-    """Gaps up to this long are interpolated, by default two rows; a log is cut at others."""
+    """Longest gap to interpolate, by default two rows; a log is cut at longer gaps."""
     urdf: Path | None = option(None, metavar="FILE")
-    """Body model of the arm: torques are compared with the weight of its links, and weaker pushes are found."""
+    """Body model of the arm, to predict torques from the weight of its links, which finds weaker pushes."""
     split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
-    """Length of the pieces that long logs are cut into; each then counts as an episode."""
+    """Cut long logs into pieces of this length; each piece counts as an episode."""
     minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
-    """A live source is recorded for this long at most."""
+    """Longest recording of a live source."""
     seed: int = option(0, least=0)
-    """Seed of the memory, and of which episodes it learns from."""
+    """Seed of the memory and of the choice of episodes to learn from."""
     quick: bool = False
-    """Learn little, from few episodes: to see that everything runs."""
+    """Learn briefly from few episodes, to see that the command works."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -238,11 +238,11 @@ def fit(args: Args, console: Console) -> int:
     expected, most = monitor.promise.hourly(hours)
     more = "" if expected <= 1.0 else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
     say(
-        f"False alarms to expect while the arm moves as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, "
-        f"at most {most:.3g} with 95 % confidence; motion that is not in them raises more.{more}"
+        f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, at most "
+        f"{most:.3g} with 95 % confidence; other motion raises more.{more}"
     )
     seconds = time.perf_counter() - start
-    say(f"Wrote {args.out} after {seconds:.0f} s. Watch with it: asm-gym watch LOG --monitor {args.out}")
+    say(f"Wrote {args.out} after {seconds:.0f} s. Next: asm-gym watch LOG --monitor {args.out}")
     return ended(notes)
 
 

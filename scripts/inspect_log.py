@@ -1,7 +1,7 @@
-"""What a log is, before anything is learned from it: its clock, its columns, and what is done with each.
+"""Show how a log is read before learning from it: its clock, its columns, and the role of each.
 
-A table of columns: unit, range, noise, resolution, how often one repeats itself, what is missing; and a picture of
-them all. Exit code 1: it cannot be read as it is.
+It prints a table of columns (range, noise, resolution, repeated and missing readings) and draws them all. Exit code 1:
+the log cannot be read as it is.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{
 
 @dataclass(frozen=True, kw_only=True)
 class Args(LogOptions):
-    """What a log is."""
+    """Options of an inspection."""
 
     log: Path = option(positional=True, metavar="LOG")
     """A file or a folder, as asm-gym fit reads it."""
     out: Path = option(Path("runs/inspect"), metavar="FOLDER")
     """Folder of the pictures."""
     logs: int = option(3, least=1)
-    """How many logs of a folder are drawn; of all others there is a line each."""
+    """Number of logs of a folder to draw; each other log gets one line."""
 
 
 def inspect(args: Args, console: Console) -> int:

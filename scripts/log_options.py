@@ -1,4 +1,4 @@
-"""Options of the commands that read logs: what they say always wins over what the reader would decide."""
+"""Options of the commands that read logs; they override what the reader decides."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ class LogOptions(Checked):
     """How logs are read."""
 
     rate: float | None = option(None, check=partial(check_number, "rate", above=0), metavar="HZ")
-    """Rows of logs a second; by default their clock tells."""
+    """Rows of a log per second; by default from its clock."""
     clock: str = option("", metavar="COLUMN")
-    """Column of times, perhaps with a unit, as in 'tick [ms]'; by default the steadiest."""
+    """Column of times, optionally with a unit, as in 'tick [ms]'; by default the steadiest."""
     channels: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns that are read: names, or patterns such as 'q*'; by default all that sense."""
+    """Columns to read: names, or patterns such as 'q*'; by default all sensor readings and commands."""
     ignore: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns that are left out: names, or patterns."""
+    """Columns to leave out: names, or patterns."""
     label: tuple[str, ...] = option((), metavar="COLUMN")
-    """Columns that mark what is wrong, beside those called so; marked rows are not learned from."""
+    """Columns that mark faulty rows, beside those with usual names; marked rows are not learned from."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
 

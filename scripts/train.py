@@ -1,7 +1,6 @@
-"""Train a stable-baselines3 agent: cloned from an expert's episodes, then improved by its own (SAC).
+"""Train a stable-baselines3 agent: clone an expert from its episodes, then improve the clone by SAC.
 
-Demonstrations that were recorded are not recorded again. The best agent of the evaluations is written as arrays and
-JSON, and judged once more on seeds of its own.
+The best agent is saved, and evaluated again on other seeds. The same command reuses demonstrations after a kill.
 """
 
 from __future__ import annotations
@@ -34,20 +33,20 @@ from asm_gym.tasks import ROBOTS, TASKS, env_id
 
 @dataclass(frozen=True)
 class Args(Options):
-    """An agent for a task."""
+    """Options of training."""
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task, or any Gymnasium id with Box spaces."""
     robot: str | None = option(None, known=ROBOTS)
-    """The arm; the task's own by default."""
+    """The arm; by default that of the task."""
     steps: int = option(20_000, quick=300, least=0)
-    """Control steps of its own that the agent learns from; 0 for a clone."""
+    """Control steps of SAC; 0 for a clone."""
     demonstrations: int = option(200, quick=4, least=1)
-    """Episodes of the scripted expert to begin with."""
+    """Episodes of the scripted expert to clone."""
     dataset: Path | None = option(None, metavar="FOLDER")
-    """Minari dataset of demonstrations, in place of the scripted expert's."""
+    """Minari dataset of demonstrations, instead of the scripted expert."""
     cloning_updates: int = option(15_000, quick=200, least=1)
-    """Updates of the actor on demonstrations, before it acts."""
+    """Updates of the actor in cloning."""
     evaluate_every: int = option(5_000, quick=150, least=1)
     """Control steps between evaluations."""
     evaluation_episodes: int = option(40, quick=1, least=1)

@@ -1,4 +1,4 @@
-"""Compile once on this machine what runs in every step, so that the first guarded step does not wait for it."""
+"""Compile the code of every step once on this machine, so that the first guarded step does not wait for it."""
 
 from __future__ import annotations
 

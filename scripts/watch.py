@@ -1,11 +1,11 @@
-"""Says when a recording is surprising, where, and how much; or watches rows as they come.
+"""Watch recorded logs or live rows with a fitted memory, and print each alarm with its time, channel and reason.
 
-A recording gives a table, figures and a report. A live source is - for standard input, tail:FILE for a file that grows,
-udp:PORT for datagrams from this machine (udp:PORT@ADDRESS:PORT for those of one sender), or dds:/joint_states for
-ROS 2: JSON lines (a list of numbers, or an object by channel, one a row), or CSV with a header. Every alarm is printed
-as it is raised; a line that cannot be read is an alarm too.
+For a recording it writes a table, figures and a report. Live sources: - (standard input), tail:FILE (a growing file),
+udp:PORT (datagrams from this machine; udp:PORT@ADDRESS:PORT from one sender), dds:/joint_states (ROS 2). They send JSON
+lines (a list of numbers, or an object with a key for each channel) or CSV with a header, one row a line. Every alarm is
+printed at once; a line that cannot be read is an alarm too.
 
-Exit codes: 0 no alarm, 1 alarms, 2 an error, also where a file of a folder cannot be read.
+Exit codes: 0 no alarm, 1 alarms, 2 an error or a file in a folder that cannot be read.
 """
 
 from __future__ import annotations
@@ -53,29 +53,29 @@ class Args(LogOptions):
     """Watches a recording, or rows as they come."""
 
     source: str = option(positional=True, metavar="SOURCE")
-    """What asm-gym fit reads; or what is live: -, tail:FILE, udp:PORT or dds:/TOPIC."""
+    """A log, folder or dataset, as for asm-gym fit; or a live source: -, tail:FILE, udp:PORT or dds:/TOPIC."""
     monitor: Path = option(metavar="FILE.asm")
-    """A calibrated monitor, such as asm-gym fit writes."""
+    """The memory, written by asm-gym fit."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
     """Folder of the table, the figures and the report of a recording."""
     bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
-    """For how long a number may be missing without an alarm, by default two rows; such rows are not judged."""
+    """Longest gap without an alarm, by default two rows; rows in a gap are not judged."""
     wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
-    """For how long a live source may take to send its first row, or to come back after it has died."""
+    """How long to wait for the first row of a live source, or for one that died to return."""
     until_alarm: bool = False
-    """The first alarm of a live source ends the watch, with exit code 1: asm-gym watch ... --until-alarm || stop."""
+    """End at the first alarm of a live source, with exit code 1: asm-gym watch ... --until-alarm || stop."""
     json: bool = False
-    """Print what a live source gives as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
+    """Print events of a live source as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
     hook: str | None = option(None, metavar="COMMAND")
-    """Shell command, run at every alarm of a live source, with the alarm as a line of JSON on its standard input."""
+    """Shell command to run at every alarm of a live source; it gets the alarm as JSON on its standard input."""
     watchdog: float | None = option(None, check=partial(check_number, "watchdog", above=0.0), metavar="SECONDS")
-    """Run the hook from a process of its own too: after so long without a row, and where this process dies."""
+    """Also run the hook from a second process: after this time without a row, and if this process dies."""
     policy: int | None = option(None, least=1, metavar="PID")
-    """Number of the policy's process, whose death the watchdog takes for an alarm."""
+    """Process id of the policy; the watchdog treats its death as an alarm."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
-    """Without a row for so long a live source has died, which is an alarm."""
+    """Time without a row after which a live source counts as dead, which is an alarm."""
     figures: int = option(4, least=1)
-    """How many of the most surprising episodes are drawn."""
+    """Number of episodes to draw, the most surprising first."""
 
 
 def review(args: Args, monitor: Any, console: Console) -> int:
@@ -105,9 +105,9 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     for line in notes:
         say(f"Note: {line}.")
     if over:
-        say(f"Bridged {over} rows that lack a number, for at most {bridge:.3g} s at once: they are not judged.")
+        say(f"Bridged {over} rows that lack a number, in gaps of at most {bridge:.3g} s: they are not judged.")
     shown = sorted(alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))[:SHOWN_ROWS]
-    say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} greatest:"))
+    say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} largest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
     for log, start, end, channel, why, excess in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")

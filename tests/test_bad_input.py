@@ -95,5 +95,5 @@ def test_episodes_of_one_row_are_refused_with_how_many_it_takes(name):
 def test_ten_thousand_senses_are_refused_at_once_with_what_to_do(name):
     spec = StreamSpec((Channel("pixels", 10_000), Channel("command", 1, group=MOTOR)), dt=0.05)
     episode = Episode.from_stream(np.random.default_rng(0).normal(size=(6, 10_001)), spec)
-    with pytest.raises(ValueError, match=r"at most 8192 of them.* makes \d+: leave channels out"):
+    with pytest.raises(ValueError, match=r"at most 8192 inputs.* makes \d+: leave channels out"):
         fresh(name, spec).fit([episode])

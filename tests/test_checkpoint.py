@@ -113,7 +113,7 @@ def test_what_claims_to_be_larger_than_its_file_is_refused_before_it_is_read(tmp
         file.writestr("header.json", "{}")
         with pytest.warns(UserWarning, match="Duplicate"):
             file.writestr("header.json", "{}")
-    with pytest.raises(ValueError, match="one name"):
+    with pytest.raises(ValueError, match="same name"):
         read_checkpoint(tmp_path / "two.asm", "test")
 
 

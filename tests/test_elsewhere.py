@@ -207,7 +207,7 @@ def named():
 @pytest.mark.parametrize(
     ("env", "fault", "error", "message"),
     [
-        (lambda: gym.make(ARM), Push(), ValueError, "Push happens in robosuite environments"),
+        (lambda: gym.make(ARM), Push(), ValueError, "Push needs a robosuite environment"),
         (lambda: gym.make(ARM), Bias(channel="smell"), ValueError, "unknown channel 'smell'; known: joint_position"),
         (lambda: gym.make(ARM), Bias(element=7), ValueError, r"element of joint_position must be .*\[0, 6\], got 7"),
         (
@@ -250,7 +250,7 @@ def test_every_kind_strikes_a_sense_that_moves_and_a_twin_shows_it():
             assert "joint_position[0]" in struck
             if severity == "strong":
                 assert not np.array_equal(broken, healthy), kind
-    with pytest.raises(ValueError, match="no sensor of this environment moves"):
+    with pytest.raises(ValueError, match="no sensor reading of this environment changes"):
         faults_anywhere("frozen_sense", interface, 0 * sigma, "strong", ONSET, seed=1)
 
 

@@ -209,7 +209,7 @@ def test_a_bad_description_is_refused(kind, bad):
 
 
 def test_faults_need_one_of_our_environments(lift):
-    with pytest.raises(ValueError, match="robosuite environments"):
+    with pytest.raises(ValueError, match="robosuite environment"):
         FaultInjection(FakeEnv(), [Push()])
     with pytest.raises(TypeError, match="push"):
         FaultInjection(lift, ["push"])

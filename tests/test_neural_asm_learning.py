@@ -42,5 +42,5 @@ def test_the_running_skill_is_told_by_name_and_changes_nothing_else(asm, tmp_pat
     assert np.mean(right) > 0.95
     with pytest.raises(ValueError, match="does not say its skill"):
         name_skills(memory, sine_episodes(2))
-    with pytest.raises(ValueError, match="two skills"):
+    with pytest.raises(ValueError, match="at least two"):
         name_skills(memory, labelled(2, 0)[:1])

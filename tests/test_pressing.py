@@ -184,7 +184,7 @@ def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
 @pytest.mark.parametrize("response", ["go on", "complete"])
 @pytest.mark.parametrize("cause", ["pressing", "lasting pressing"])
 def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
-    with pytest.raises(ValueError, match=f"'{response}' would let an arm go on that presses: {cause} takes hold"):
+    with pytest.raises(ValueError, match=f"'{response}' would let a pressing arm go on: {cause} takes hold"):
         NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
 
 

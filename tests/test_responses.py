@@ -162,7 +162,7 @@ def test_readings_that_are_lost_and_were_never_read_stop_nobody(caplog):
 
 def test_where_it_is_not_known_what_a_policy_reads_the_robot_holds():
     changed = gym.wrappers.TransformObservation(Partial(lone_offset), lambda o: o[:3], gym.spaces.Box(-50, 50, (3,)))
-    with pytest.warns(UserWarning, match="on a sensor at fault the robot holds"):
+    with pytest.warns(UserWarning, match="so the robot holds"):
         env = NeuralASMSafety(changed, of_stream(Judge({21})), on_alarm="graded", release_after=2)
     assert [s["intervened"] for s in infos(env, 30)[21:25]] == [False, True, True, False]
 

@@ -183,7 +183,7 @@ def test_the_control_period_is_what_an_environment_says_of_time_and_never_silent
     clocked = env(**own)
     assert control_period(clocked) == pytest.approx(0.2)  # by its own clock, in a copy
     assert clocked.unwrapped.time == 3.0
-    with pytest.warns(PeriodWarning, match="Foreign says nothing of its control period: 0.1 s"):
+    with pytest.warns(PeriodWarning, match="Foreign does not state its control period: 0.1 s"):
         assert control_period(env()) == pytest.approx(0.1)
     assert control_period(env(metadata={})) == 1.0
 

@@ -1,4 +1,4 @@
-"""Makes things go wrong on time, says so in ``info["fault"]``, and puts everything back at reset."""
+"""Inject timed faults, name them in ``info["fault"]``, and undo them at reset."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from asm_gym.validation import short_repr, typed
 
 
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Injects timed faults.
+    """Inject timed faults into every episode.
 
     ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth.
-    Wrappers around one another add up.
+    Faults of nested wrappers add up.
 
     Args:
-        env: a robosuite environment of this package, wrapped or not; for faults of senses and actions, any with Boxes.
-        faults: what goes wrong in every episode.
+        env: a robosuite environment of this package, wrapped or not; for sensor and action faults, any with Box spaces.
+        faults: the faults of an episode, with their onsets and durations in control steps.
 
     Raises:
-        TypeError: the environment has other spaces, or ``faults`` is not a sequence of them.
+        TypeError: the environment has other spaces, or ``faults`` is not a sequence of faults.
         ValueError: a fault that this environment cannot have: an unknown body or joint, an onset past the horizon.
 
     Example:
@@ -52,7 +52,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             if not isinstance(fault, Fault):
                 raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {short_repr(fault)}")
             if inner is not theirs and not fault.anywhere:
-                raise ValueError(f"{fault.name} happens in robosuite environments of asm_gym, and this is {theirs}")
+                raise ValueError(f"{fault.name} needs a robosuite environment of asm_gym, got {theirs}")
             fault.check(inner)
             if inner.horizon is not None and fault.onset >= inner.horizon:
                 raise ValueError(f"{fault} starts at or after the horizon of {inner.horizon} steps")
@@ -84,7 +84,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         super().close()
 
     def undo_faults(self) -> None:
-        """Ends every fault that acts now and puts back what it changed, as ``reset`` and ``close`` do."""
+        """End and undo every active fault, as ``reset`` and ``close`` do."""
         while self._running:
             self._running.popitem()[1].close()
         if self.env.has_wrapper_attr("undo_faults"):

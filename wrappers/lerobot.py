@@ -1,10 +1,10 @@
 """Guard a policy that runs in LeRobot: a step of the pipeline between the policy and the robot.
 
-    row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before it is sent
+    row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before sending
 
-From an alarm on, until surprise has been low for ``release_s``, a hold is sent and judged in place of the policy's
-action. A memory that was fitted without rests is surprised by a hold, which then does not end. Only finite numbers are
-sent; until every joint has been sensed or commanded once, an alarm sends nothing.
+After an alarm a hold replaces the policy's action until surprise has been low for ``release_s``. Fit the memory on
+data with pauses: otherwise a hold surprises it and never ends. Only finite numbers are sent; until every joint has been
+sensed or commanded once, an alarm sends nothing.
 
 Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 """
@@ -53,20 +53,20 @@ _GRIPPER = re.compile(r".*(gripper|hand|jaw).*")
 
 
 class LeRobotGuard:
-    """A processor step; where LeRobot is installed it counts as one of its own.
+    """Guard a policy as a processor step of LeRobot's pipeline.
 
     Args:
-        monitor: calibrated, on a LeRobot dataset of this robot (``asm-gym fit DATASET``); or its file.
-        on_alarm: one of ``ON_ALARM``.
-        release_s: for how long surprise must be under 80 % of the threshold until the policy acts again [s].
-        action_means: as in ``NeuralASMSafety``, by the order of the memory's actions. By default ``.pos`` is a target
+        monitor: a monitor calibrated on a LeRobot dataset of this robot (``asm-gym fit DATASET``), or its file.
+        on_alarm: ``"hold"`` until surprise is low, ``"stop"`` until ``reset``, or ``"monitor"`` only reports.
+        release_s: time of surprise below 80 % of the threshold after which the policy acts again [s].
+        action_means: as in ``NeuralASMSafety``, in the order of the memory's actions. By default ``.pos`` is a target
             and ``.vel`` a velocity.
-        watchdog: told of every row; where it has died, that is an alarm.
+        watchdog: receives a beat at every row; its death is an alarm.
 
     Attributes:
-        alarm, intervened: whether there was an alarm at the newest row, and whether a hold was sent.
-        last_alarm: of the newest alarm its surprise in thresholds, reason, channel, servo, and the servo's fault,
-            "overheated", "stalled" or empty; empty before the first.
+        alarm, intervened: whether the newest row raised an alarm, and whether a hold was sent.
+        last_alarm: surprise in thresholds, reason, channel, servo and fault of the servo ("overheated", "stalled" or
+            empty) of the newest alarm; empty before the first.
 
     Example:
         >>> guard = LeRobotGuard("so101.asm")  # doctest: +SKIP
@@ -83,7 +83,7 @@ class LeRobotGuard:
         quiet_s: float | None = None,
     ) -> None:
         if quiet_s is not None:  # until 0.3
-            warnings.warn("quiet_s is called release_s", DeprecationWarning, stacklevel=2)
+            warnings.warn("quiet_s is deprecated: use release_s", DeprecationWarning, stacklevel=2)
             release_s = quiet_s
         check_choice("on_alarm", on_alarm, ON_ALARM)
         self.on_alarm = on_alarm
@@ -104,7 +104,7 @@ class LeRobotGuard:
         self.reset()
 
     def reset(self) -> None:
-        """Begin a new episode; a stop is over."""
+        """Begin a new episode, and end a stop."""
         self._engine: Engine | None = None  # made once the names of the actions are known
         self._sent: Floats32 = np.zeros((1, 0), np.float32)  # (1, A) last
         self._pace = Pace(self._spec.dt)
@@ -113,7 +113,7 @@ class LeRobotGuard:
         self.last_alarm: dict[str, Any] = {}
 
     def __call__(self, transition: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the transition with the action that is to be sent, and ``info["asm"]``."""
+        """Return the transition with the action to send, and with ``info["asm"]``."""
         observation, action = transition["observation"] or {}, transition["action"]
         if not isinstance(action, Mapping):
             raise TypeError(f"LeRobotGuard needs actions with names, got {type(action).__name__}")
@@ -122,18 +122,18 @@ class LeRobotGuard:
         return {**transition, "action": sent, "info": {**(transition.get("info") or {}), "asm": asm}}
 
     def preview(self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]) -> Foretold:
-        """Say of a chunk of actions, before the first is done, which leaves the range of healthy commands, and why.
+        """Return which action of a chunk leaves the range of healthy commands and why, before the first is executed.
 
-        Do ``actions[:at]``, and ask the policy anew. Raises ValueError for a chunk without an action.
+        Execute ``actions[:at]``, then ask the policy again. Raises ValueError for a chunk without an action.
         """
         if not len(actions):
-            raise ValueError("a chunk has an action at least, got none")
+            raise ValueError("a chunk needs at least one action, got none")
         engine = self._begun(actions[0])
         chunk = np.array([[_number(action, name) for name in self._names] for action in actions], np.float32)
         return engine.preview(0, chunk, self._row(observation, self._sent[0]), self._sent[0])
 
     def guarded(self, observation: Mapping[str, Any], action: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what is to be sent in place of an action: finite numbers only, and nothing while no place is known."""
+        """Return the numbers to send in place of an action: finite ones only, and none while no position is known."""
         self._follow_clock()
         engine, acts = self._begun(action), self.on_alarm != "monitor"
         asked = np.array([_number(action, name) for name in self._names], np.float32)[None]
@@ -269,7 +269,7 @@ def _motor_of(label: str) -> tuple[bool, str]:
     found = _MOTOR.fullmatch(label)
     if found is None:
         raise ValueError(
-            "the memory must be of a LeRobot dataset that names its motors, observation.state[MOTOR] and "
+            "the memory must be fitted on a LeRobot dataset that names its motors, observation.state[MOTOR] and "
             f"action[MOTOR], got the channel {label!r}"
         )
     return found["what"] == "action", found["motor"]

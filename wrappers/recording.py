@@ -17,10 +17,10 @@ from asm_gym.validation import as_float32
 
 
 class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Keeps every finished episode in ``episodes``, and gives environments without a stream one.
+    """Keep every finished episode in ``episodes``.
 
-    Where the stream runs faster than control, an episode has several rows of it for each action. An episode counts as a
-    success where ``info`` says nothing of ``"success"`` or ``"is_success"``.
+    Without ``info["stream"]``, observation and action form the stream. A stream that is faster than control has several
+    rows for each action. Without ``info["success"]`` and ``info["is_success"]`` an episode counts as a success.
 
     Args:
         env: an environment with a stream, or with spaces that can be read as numbers.
@@ -77,7 +77,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
     def finish(self) -> Episode:
-        """End the episode that is recorded, and return the last one, which is not kept. Raises ValueError without."""
+        """End the running episode; remove the last episode and return it. Raises ValueError if there is none."""
         self._finish()
         if not self.episodes:
             raise ValueError("no step was recorded yet")

@@ -61,7 +61,7 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     inner: Any = envs.unwrapped
     if not (hasattr(inner, "call") and hasattr(inner, "set_attr")):
         raise TypeError(
-            f"{inner} cannot be asked what its environments are: make it with SyncVectorEnv or AsyncVectorEnv"
+            f"the environments in {inner} cannot be inspected: make it with SyncVectorEnv or AsyncVectorEnv"
         )
     return inner
 

@@ -1,4 +1,4 @@
-"""Guard a policy: watch every step, and take over or stop when the robot senses what the memory does not expect."""
+"""Guard a policy: watch every step, and take over or stop when sensor readings differ from the prediction."""
 
 from __future__ import annotations
 
@@ -30,58 +30,56 @@ COUNTS = "stable_baselines3.common.monitor"  # module of a wrapper that counts e
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Guard an environment with a Box action space under any policy; other environments can be watched.
 
-    From the step after an alarm on, a reflex acts in the policy's place, until surprise has stayed under
-    80 % of the threshold for ``release_after`` steps. A failure is an alarm too: a monitor that raises or
-    returns nonsense, a stream that is missing, an action of the policy that is not finite (it is not executed). A
-    reflex that fails is replaced by a hold.
+    From the step after an alarm, a reflex acts in place of the policy, until surprise has stayed under 80 % of the
+    threshold for ``release_after`` steps. A failure is an alarm too: a monitor that raises or returns nonsense, a
+    missing stream, an action of the policy that is not finite (it is not executed). A hold replaces a failing reflex.
 
-    In environments of this package contact force comes first: from the physics substep that passes ``contact_limits``
-    on the arm holds, which is an alarm whatever the surprise. Under ``"graded"`` severity and cause decide what is
-    done, and a sensor at fault is completed in observation and stream.
+    In environments of this package the arm holds from the physics substep that passes ``contact_limits``, which is an
+    alarm whatever the surprise. Under ``"graded"``, severity and cause choose the response, and an estimate replaces a
+    faulty sensor in observation and stream.
 
-    ``info["asm"]`` describes a step: see ``asm_gym.guard.report.report``. Beside it stand, as NumPy scalars,
-    ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]``, ``info["cost"]`` (1.0 on every step
-    with an alarm) and ``info["cost_sum"]`` (of the episode so far). ``info["overridden"]`` is True after a step that
-    began with another action than the policy's: a policy with a state then resumes from its state before.
+    ``info["asm"]`` describes the step; ``asm_gym.guard.report.report`` lists its fields. Flat NumPy scalars are beside
+    it: ``asm_surprise``, ``asm_alarm``, ``asm_intervened``, ``cost`` (1.0 in every step in alarm), ``cost_sum`` (of the
+    episode), and ``overridden`` (the policy's action was not executed: a recurrent policy keeps its previous state).
 
-    Guards may stand around one another: of their contact limits and speeds the strictest count, and cost and alarm are
-    those of all; ``info["asm"]`` is the outermost's.
+    Guards may be nested: the strictest contact limits and speeds apply, and cost and alarm combine all guards, while
+    ``info["asm"]`` describes the outermost.
 
     Args:
-        env: any Gymnasium environment; where ``info`` has no ``"stream"``, observation and action are the stream.
-            Without a Box action space ``on_alarm`` must be ``"monitor"`` or ``"terminate"``.
-        monitor: a fitted and calibrated monitor; where None, the shipped memory of the robot in ``env``.
+        env: any Gymnasium environment. Without ``info["stream"]``, observation and action form the stream. Without a
+            Box action space, ``on_alarm`` must be ``"monitor"`` or ``"terminate"``.
+        monitor: a fitted and calibrated monitor; by default the shipped memory of the robot in ``env``.
         on_alarm: ``"monitor"`` only reports; ``"hold"`` stays and keeps the grip; ``"retract"`` goes back along the
-            path; ``"comply"`` gives way; ``"recall"`` goes on as the memory expects; ``"graded"`` does what severity
-            and cause ask for (``responses``), hands back on trial, and ends the episode where trials fail or the policy
-            presses too often; ``"terminate"`` ends the episode; any other policy acts itself. A class, or a function
-            that makes a policy for an environment, is given this one. None for ``"graded"`` with a monitor that names
-            causes, and for ``"hold"`` with any other.
-        release_after: control steps of low surprise after which control is handed back.
-        max_override: control steps for which a reflex may act, after which the episode ends; an alarm within
-            ``release_after`` steps of handing back continues the count. None for no limit, with ``"graded"`` for 3 s.
-        try_after: control steps of override after which control is handed back on trial; after each trial that fails,
-            twice as many. None for no trials, with ``"graded"`` for 0.5 s.
-        truncate: an episode that is ended by an alarm is truncated rather than terminated.
-        adaptive_threshold: how the threshold follows a policy that changes, from episode to episode; ``info["asm"]``
-            then holds ``ceiling`` and ``level`` too. Alarms above the ceiling, alarms that went on while the reflex
-            acted, and episodes with ``confirm_alarm`` do not count as false. None for a threshold that stays.
+            path; ``"comply"`` yields to external forces; ``"recall"`` moves as predicted; ``"graded"`` chooses
+            by severity and cause (``responses``), returns control on trial, and ends the episode if trials fail or the
+            policy presses too often; ``"terminate"`` ends the episode; any other policy acts itself. A class, or a
+            function that makes a policy for an environment, is called with this one. By default ``"graded"`` with a
+            monitor that names causes, and ``"hold"`` with any other.
+        release_after: control steps of low surprise after which control returns to the policy.
+        max_override: control steps for which a reflex may act; then the episode ends. An alarm within
+            ``release_after`` steps afterwards continues the count. None for no limit, 3 s with ``"graded"``.
+        try_after: control steps of override after which the policy acts on trial; each failed trial doubles them. None
+            for no trials, 0.5 s with ``"graded"``.
+        truncate: an alarm that ends an episode truncates it instead of terminating it.
+        adaptive_threshold: how the threshold follows a changing policy, from episode to episode; ``info["asm"]`` then
+            has ``ceiling`` and ``level`` too. Alarms above the ceiling, alarms that continued while the reflex acted,
+            and episodes with ``confirm_alarm`` do not count as false. None for a fixed threshold.
         responses: under ``"graded"``, responses by cause that replace those of ``asm_gym.guard.responses.DEFAULT``:
-            ``{"contact": "comply"}``. None may let a pressing arm go on.
-        contact_limits: what an arm may feel and how fast its hand may go. ``"memory"`` for the defaults, raised where
-            the monitor's calibration episodes exceed them. None for none; ``"graded"`` then holds at every alarm but a
-            sensor's.
-        action_means: ``"delta"``, ``"target"``, ``"velocity"`` or ``"torque"``, or one for each number of an action,
-            where an environment cannot hold by itself: a target arm is held by the target at which it is, others by
-            zero. None for what its attribute ``action_means`` says, or else the episodes that the monitor was
-            fitted on.
+            ``{"contact": "comply"}``. None of them may let a pressing arm go on.
+        contact_limits: limits of contact force and of the hand's speed. ``"memory"`` for the defaults, raised where
+            the monitor's calibration episodes exceed them. None for no limits; ``"graded"`` then holds at every alarm
+            except that of a sensor.
+        action_means: for an environment that cannot hold by itself, ``"delta"``, ``"target"``, ``"velocity"`` or
+            ``"torque"``, or one for each number of an action. A target arm is held by its present position as target,
+            others by zero. By default the attribute ``action_means`` of the environment, or else what the
+            monitor found in its training episodes.
 
     Raises:
         ValueError: an unknown ``on_alarm``, cause or response; a response that lets a pressing arm go on; a reflex
-            made for another environment; a monitor of another robot, controller, stream or rate (both are named);
-            no shipped memory that fits (the message lists them); a hold where nothing tells what
-            actions mean, or where they are torques; ``"recall"`` with a monitor that expects no action; a
-            wrapper inside that changes actions, where a reflex cannot know what reaches the robot.
+            made for another environment; a monitor of another robot, controller, stream or rate (the message names
+            both); no shipped memory fits (the message lists them); a hold although actions are torques or of unknown
+            meaning; ``"recall"`` with a monitor that predicts no action; a wrapper inside that changes
+            actions, so that a reflex cannot know what reaches the robot.
         RuntimeError: the monitor is not calibrated.
 
     Example:
@@ -141,7 +139,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     @property
     def threshold(self) -> float:
-        """What surprise must exceed for an alarm in this episode."""
+        """Surprise above which a row is an alarm in this episode."""
         return float(self._engine.threshold[0])
 
     def confirm_alarm(self) -> None:
@@ -166,13 +164,13 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         return observation, info
 
     def preview(self, actions: Any) -> Foretold:
-        """Say of a chunk of actions (k, A), before the first is done, which should not be, and why.
+        """Return which action of a chunk (k, A) should not be executed and why, before the first is.
 
-        ``kept`` are those before it, all of them under ``"monitor"``: do these, and ask the policy anew. Until it
-        is done ``info["asm"]["preview"]`` counts down to that action. A chunk of another shape is a ValueError.
+        Execute ``kept``, the actions before it (all of them under ``"monitor"``), then ask the policy again. Meanwhile
+        ``info["asm"]["preview"]`` counts down to that action. Raises ValueError for a chunk of another shape.
         """
         if self._ended or self._box is None:
-            raise gym.error.ResetNeeded("preview() needs an episode that runs, and a Box action space")
+            raise gym.error.ResetNeeded("preview() needs a running episode and a Box action space")
         chunk = checked_chunk(actions, self._box.shape)
         row = self._source.first(self._observation, self._begun) if self._row is None else self._row
         last = self._executed.ravel() if self._executed.size else self._robots.rest
@@ -217,7 +215,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         return observation, reward, terminated, truncated, info
 
     def _command(self, action: NDArray[np.float32]) -> bool:
-        """Choose what is to be done next: the policy's ``action`` (A,), or something else."""
+        """Choose the next action: the policy's ``action`` (A,), or another."""
         command = self._engine.act(action.reshape(1, -1), lambda _: self._observation)
         self._executed = command.actions[0].reshape(action.shape)
         if command.brakes[0]:
@@ -225,7 +223,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         return bool(command.overridden[0])
 
     def _run(self) -> tuple[bool, tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]]:
-        """Command and step the environment; return whether the policy was overridden, and what came of it.
+        """Command and step the environment; return whether the policy was overridden, and the result of the step.
 
         Rows within the step are judged meanwhile, and a hold lasts through all its parts; one that a guard outside has
         asked for goes on.
@@ -248,7 +246,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
                 hooks.remove(self._judge)
 
     def _judge(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
-        """Judge one row, with ``info`` of the step that it ends; in mid-step a reflex takes over at once."""
+        """Judge one row, with the ``info`` of the step that it completes; in mid-step a reflex acts at once."""
         executed = np.zeros((1, 0), np.float32) if self._box is None else self._executed.reshape(1, -1)
         felt = None if info is None else felt_by(self._robots, info)
         acts = bool(self._engine.overriding[0])
@@ -261,7 +259,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             self.env.get_wrapper_attr("command")(self._executed)
 
     def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
-        """Say in ``info`` what became of a step."""
+        """Write the report of a step to ``info``."""
         surprise = max([float(row.surprise.value[0]) for row in rows])
         alarm = True in [bool(row.alarm[0]) for row in rows] or bool(info.get("asm_alarm"))  # of a guard inside
         intervened = True in [bool(row.intervened[0]) for row in rows] or bool(info.get("asm_intervened"))
@@ -288,7 +286,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
 
 def _check_counts(env: gym.Env[Any, Any]) -> None:
-    """Raise ValueError where a wrapper inside counts episodes, and would not see those that the guard ends."""
+    """Raise ValueError if a wrapper inside counts episodes: it would miss those that the guard ends."""
     while isinstance(env, gym.Wrapper):
         own = any(kind.__module__ == COUNTS for kind in type(env).__mro__)
         if own or isinstance(env, RecordEpisodeStatistics):
@@ -297,7 +295,7 @@ def _check_counts(env: gym.Env[Any, Any]) -> None:
                 "; with Stable-Baselines3, make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))" if own else ""
             )
             raise ValueError(
-                f"{name} counts episodes inside, and would not see those that the guard ends: put it outside, as in "
+                f"{name} inside the guard would miss the episodes that the guard ends: put it outside, as in "
                 f"{name}(NeuralASMSafety(env, monitor)){usual}"
             )
         env = env.env

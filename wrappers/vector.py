@@ -27,23 +27,23 @@ Mask = NDArray[np.bool_]
 
 
 class VectorNeuralASMSafety(Guarding, VectorWrapper):
-    """``NeuralASMSafety`` for n environments side by side, with one batched ``observe`` for all of them.
+    """Guard the n members of a vector environment, with one batched ``observe`` for all of them.
 
-    Other arguments and reports are those of ``NeuralASMSafety``: ``info["asm"]`` has arrays whose first axis is n, and
-    ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` are (n,). A monitor
-    that raises puts all environments in alarm. Where an episode has just begun, surprise is 0 and ``executed_action``
-    NaN.
+    Other arguments and reports are those of ``NeuralASMSafety``. The arrays in ``info["asm"]`` have a first axis of
+    length n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` have
+    the shape (n,). If the monitor raises, all environments are in alarm. In the first step of an episode surprise is 0
+    and ``executed_action`` NaN.
 
     Args:
-        env: of ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``; where ``info`` has no ``"stream"``,
-            observation and action are the stream.
-        on_alarm: a name as in ``NeuralASMSafety``, or one policy that all share and that keeps its memory in its state.
-        adaptive_threshold: as there; all environments share one running threshold, and an episode keeps what it began
-            with.
+        env: from ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``. Without ``info["stream"]``,
+            observation and action form the stream.
+        on_alarm: a name as in ``NeuralASMSafety``, or one policy for all members that keeps its memory in its state.
+        adaptive_threshold: as in ``NeuralASMSafety``; all environments share one running threshold, and an episode
+            keeps the threshold that it began with.
 
     Raises:
-        TypeError: ``env`` is no vector environment, cannot be asked for what its members are, or takes no Box actions.
-        ValueError: as ``NeuralASMSafety``, or another mode of autoreset.
+        TypeError: ``env`` is no vector environment, its members cannot be inspected, or it takes no Box actions.
+        ValueError: as ``NeuralASMSafety``, or another autoreset mode.
         RuntimeError: the monitor is not calibrated.
 
     Example:
@@ -101,7 +101,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if not all(self._members.call("has_wrapper_attr", "stream_spec")):
             if not isinstance(env.single_observation_space, gym.spaces.Box):
                 raise TypeError(
-                    f"environments without a stream are watched side by side where each senses a Box, got "
+                    f"environments without a stream must have Box observations to be watched in a vector, got "
                     f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
                 )
             spaces = env.single_observation_space, env.single_action_space
@@ -111,16 +111,16 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         for other in others:
             first.require(other, "the first environment")
         if round(Members(env).first("dt", first.dt) / first.dt) > 1:
-            raise ValueError("many environments are watched at their control rate: make them without stream_freq")
+            raise ValueError("a vector is watched at its control rate: make the environments without stream_freq")
         return first, True
 
     @property
     def threshold(self) -> NDArray[np.float64]:
-        """(n,) what surprise must exceed for an alarm in the episodes that run."""
+        """(n,) surprise above which a row is an alarm in the running episodes."""
         return self._engine.threshold.copy()
 
     def confirm_alarm(self, which: Mask | None = None) -> None:
-        """As in ``NeuralASMSafety``, of ``which`` (n,) environments; of all by default."""
+        """Confirm the alarms of the environments ``which`` (n,), by default of all; see ``NeuralASMSafety``."""
         self._engine.confirmed[:] |= np.ones(self.num_envs, bool) if which is None else which
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -131,7 +131,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._observations, infos = self.env.reset(seed=seed, options=dict(options) if options else options)
         infos = dict(infos)
         if ended is None and not begun.all():
-            raise gym.error.ResetNeeded("the first reset() must be of all environments")
+            raise gym.error.ResetNeeded("the first reset() must reset all environments")
         self._ended = np.zeros(n, bool) if ended is None else ended
         if begun.all():
             self._watch_with_next()

@@ -90,8 +90,8 @@ class ActionMeaning:
         if wrong:
             which = ", ".join(names[k] if names else f"number {k}" for k in wrong)
             raise ValueError(
-                f"no hold is known for actions of {robot}: {which} are torques, or nothing tells what they mean. Say "
-                f"it by action_means, {', '.join(MEANINGS[:3])} for all or for each; or use Hold(env, "
+                f"no hold is known for actions of {robot}: {which} are torques, or their meaning is unknown. Set "
+                f"action_means to {', '.join(MEANINGS[:3])} for all or for each; or use Hold(env, "
                 'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
             )
 

@@ -98,7 +98,7 @@ def check_hdf5(path: Path) -> None:
     def check(group: Any) -> None:
         for name in group:
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-                raise ValueError(f"{group.name}/{name} points elsewhere, which is not followed")
+                raise ValueError(f"{group.name}/{name} is a link, and links are not followed")
             node = group[name]
             if isinstance(node, h5py.Group):
                 check(node)

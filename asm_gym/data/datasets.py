@@ -109,7 +109,7 @@ def _refuse_foreign(folder: Path) -> None:
     found = {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()} if folder.is_dir() else {folder}
     foreign = found - {folder / "data" / name for name in OWN_FILES}
     if folder.exists() and foreign:
-        raise ValueError(f"{min(foreign)} is nothing that asm-gym wrote, so {folder} is not replaced")
+        raise ValueError(f"asm-gym did not write {min(foreign)}, so {folder} is not replaced")
 
 
 def _buffer(n: int, episode: Episode) -> Any:

@@ -46,7 +46,7 @@ class EpisodeLabel:
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode of T control steps.
+    """Hold the arrays of one episode of T control steps.
 
     Args:
         stream: (T, D) float32; row t was sensed after action t. (k T, D) at k times the control rate.
@@ -100,9 +100,9 @@ class Episode:
 
     @property
     def labelled(self) -> EpisodeLabel:
-        """The label. Raises ValueError where there is none."""
+        """The label. Raises ValueError without one."""
         if self.label is None:
-            raise ValueError("this episode has no label: nobody said which task and role it was recorded for")
+            raise ValueError("this episode has no label, which holds the task and the role that it was recorded for")
         return self.label
 
     @classmethod
@@ -114,7 +114,7 @@ class Episode:
     @classmethod
     @typed
     def from_table(cls, frame: Any, channels: StreamSpec | Sequence[str] | None = None, **how: Any) -> Episode:
-        """Make an episode from a log, as ``from_tables`` makes them from several."""
+        """Make an episode from one log; the arguments are those of ``from_tables``."""
         return cls.from_tables([frame], channels, **how)[0]
 
     @classmethod
@@ -130,16 +130,16 @@ class Episode:
         clock: str = "",
         **fields: Any,
     ) -> list[Episode]:
-        """Make an episode from each log of one robot, all with one spec: what a column is, they tell together.
+        """Make an episode from each log of one robot, with one spec that is found from all logs together.
 
         Args:
-            frames: of each a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
-            channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all that sense.
-            rate: rows a second [Hz]; by default that of its clock.
-            action: patterns of the commanded columns.
+            frames: for each log a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
+            channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all sensor columns.
+            rate: rows a second [Hz]; by default from the clock.
+            action: patterns of the columns of commands.
             labels: patterns of further columns that label faults.
-            ignore: patterns of columns that are left out.
-            clock: the column of times, perhaps with a unit, ``"tick [ms]"``; by default the steadiest.
+            ignore: patterns of columns to leave out.
+            clock: the column of times, optionally with a unit, ``"tick [ms]"``; by default the steadiest.
             fields: other arguments of ``Episode``.
 
         Raises:

@@ -220,7 +220,7 @@ def _kind(participant: Any, name: str) -> str:
         others = ", ".join(sorted(topic[2:] for topic in there if topic.startswith("rt/")))
         raise OSError(f"nobody publishes /{name}" + (f"; there are {others}" if others else ""))
     if kind not in known:
-        raise ValueError(f"/{name} is of {kind}; read are {', '.join(MESSAGES)}")
+        raise ValueError(f"/{name} has the type {kind}; readable types: {', '.join(MESSAGES)}")
     return known[kind]
 
 

@@ -20,7 +20,7 @@ from asm_gym.validation import check_number
 
 @dataclass(frozen=True)
 class AdaptiveThreshold:
-    """How a threshold follows a policy that changes.
+    """Let the threshold follow a policy that changes.
 
     Args:
         rate: α in (0, 1), share of nominal episodes that may raise an alarm.

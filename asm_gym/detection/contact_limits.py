@@ -89,21 +89,21 @@ class Pace:
 
 @dataclass(frozen=True)
 class ContactLimits:
-    """What an arm may feel and how fast it may go.
+    """Limit the contact forces of an arm and the speed of its hand.
 
     Args:
-        wrist_force: on each axis of the wrist, the hand's own weight included [N].
+        wrist_force: on each axis of the wrist, including the weight of the hand [N].
         external_torque: of each joint [N m].
-        hand_speed: what the hand, and what is 0.15 m from its fingers as it turns, may have [m/s]; infinite for none.
-            A command that would be faster is scaled down where its controller tells by how much: OSC_POSE, OSC_POSITION
-            and JOINT_POSITION. Under every controller the arm is braked where it is faster all the same.
-        pace: how much faster it may be where healthy hands were; None for no faster.
-        healthy: the most that healthy motion of this body and task was seen to reach, (N,) in the order of
-            ``RobosuiteEnv.felt_channels``; where that is more, it counts. Empty where nobody knows.
-        stays: the arm stays from the physics substep on after a limit was passed; else it is only said.
+        hand_speed: of the hand, and of points 0.15 m from its fingers as it turns [m/s]; infinite for no limit.
+            Under OSC_POSE, OSC_POSITION and JOINT_POSITION a faster command is scaled down. Under every controller a
+            brake slows an arm that is still too fast.
+        pace: higher speeds where healthy hands were faster; None for no such places.
+        healthy: largest values in healthy motion of this body and task, (N,) in the order of
+            ``RobosuiteEnv.felt_channels``; a larger one replaces the limit. Empty if unknown.
+        stays: hold the arm from the physics substep after a limit was passed; False only reports.
 
     Raises:
-        ValueError: a limit that is none.
+        ValueError: a limit is not positive.
     """
 
     wrist_force: float = 80.0

@@ -84,9 +84,9 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         begun = np.asarray(options.pop("reset_mask", np.ones(n, bool)))
         seeds = [None if seed is None else seed + i for i in range(n)] if np.ndim(seed) == 0 else list(seed)
         if len(seeds) != n or begun.dtype != bool or begun.shape != (n,):
-            raise ValueError(f"seed and reset_mask must be one of each of {n} environments, got {seed} and {begun}")
+            raise ValueError(f"seed and reset_mask must have {n} entries (one an environment), got {seed} and {begun}")
         if any(seen is None and not now for seen, now in zip(self._env_obs, begun, strict=True)):
-            raise gym.error.ResetNeeded("the first reset() must be of all environments")
+            raise gym.error.ResetNeeded("the first reset() must reset all environments")
 
         def start(i: int) -> tuple[int, Any, dict[str, Any]]:
             return (i, *self.envs[i].reset(seed=seeds[i], options=options or None))
@@ -101,7 +101,7 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
     def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
         given = list(iterate(self.action_space, actions))
         if len(given) != self.num_envs:
-            raise ValueError(f"actions must be one of each of {self.num_envs} environments, got {len(given)}")
+            raise ValueError(f"actions must have {self.num_envs} rows, one for each environment, got {len(given)}")
         outcomes = self._of_each(lambda i: self._outcome(i, given[i]))
         self._env_obs, rewards, terminated, truncated, infos = map(list, zip(*outcomes, strict=True))
         ended = np.array(terminated, bool), np.array(truncated, bool)
@@ -112,7 +112,7 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         """Step member ``i``, or begin its next episode."""
         env, mode = self.envs[i], self.autoreset_mode
         if self._autoreset_envs[i] and mode == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded(f"the episode of environment {i} has ended: reset it by its reset_mask")
+            raise gym.error.ResetNeeded(f"the episode of environment {i} has ended: reset it with reset_mask")
         if self._autoreset_envs[i] and mode == AutoresetMode.NEXT_STEP:
             observation, info = env.reset()
             return observation, 0.0, False, False, info

@@ -35,7 +35,7 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.action_space, spaces.Box) or not _boxes(env.observation_space):
             raise TypeError(
-                f"faults are injected where actions and senses are Boxes, got {env.action_space} and "
+                f"faults need Box spaces of actions and observations, got {env.action_space} and "
                 f"{env.observation_space}"
             )
         self._source = StreamSource(env)
@@ -52,7 +52,7 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._source.own:
             sensed = np.asarray(info["stream"])[self._source.spec.sensory]
             if not np.allclose(sensed, flat(self.observation_space, observation), equal_nan=True):
-                raise ValueError("this environment's stream does not hold its observation: no fault can be in both")
+                raise ValueError("this environment's stream does not hold its observation: a fault cannot be in both")
         return self._sensed(observation, info), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -147,7 +147,7 @@ def faults_anywhere(
     check_choice("severity", severity, SEVERITIES)
     moving = np.flatnonzero(sigma > 0)
     if not len(moving):
-        raise ValueError("no sensor of this environment moves, so that none can be faulty")
+        raise ValueError("no sensor reading of this environment changes, so no sensor can be faulty")
     rng = np.random.default_rng([seed, 2])
     spec, struck = env.measured_spec, int(rng.choice(moving))
     name, place = next((n, span) for n, span in spec.slices.items() if span.start <= struck < span.stop)

@@ -40,13 +40,18 @@ def within(default: Any, *, low: float | None = None, high: float | None = None,
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 @dataclass(frozen=True, kw_only=True)
 class Fault(ABC):
-    """Something that goes wrong for a while; every subclass is a frozen dataclass.
+    """Describe a temporary malfunction; every subclass is a frozen dataclass.
 
     Args:
-        onset: the first control step it acts in; step 0 is the first one after reset.
-        duration: how many control steps it lasts; to the end of the episode where None.
-        seed: of whatever the fault draws. It draws nothing from the environment's own generator, so that an episode
-            with it and one without have the same sensor noise.
+        onset: the first control step of the fault; step 0 is the first one after reset.
+        duration: number of control steps; None until the end of the episode.
+        seed: of the random draws of the fault. It never uses the environment's generator, so an episode with the fault
+            has the same sensor noise as one without.
+
+    Example:
+        >>> from asm_gym.faults import Push
+        >>> Push(body="robot0_link5", newtons=20.0, onset=40, duration=10).active(45)
+        True
     """
 
     onset: int = within(40, low=0)

@@ -115,11 +115,12 @@ def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def register_fault(name: str, make: Kind | str) -> None:
-    """Register a kind of fault, in this process and in its workers; raise ValueError where the name is taken.
+    """Register a kind of fault, in this process and its workers; raise ValueError if the name is taken.
 
     Args:
-        make: is called with a ``Drawn`` and a severity, 0 to 2; or ``module:name`` of it. The fault that it returns
-            gets the onset and the seed of the episode.
+        name: for ``asm-gym evaluate --faults``.
+        make: called with a ``Drawn`` and a severity (0, 1 or 2), returns a fault; or its ``module:name``. The fault
+            then gets the onset and the seed of the episode.
 
     Example:
         >>> from asm_gym import register_fault

@@ -67,7 +67,7 @@ class Engine:
         graded, acts = name == GRADED, bool(policies) or name in (*REFLEXES, GRADED)
         recalls = name == "recall"
         if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
-            raise ValueError(f"recall needs a memory that expects actions, and {type(monitor).__name__} does not")
+            raise ValueError(f"recall needs a memory that predicts actions, and {type(monitor).__name__} does not")
         self.fitted = Fitted.of(monitor, spec)
         self.options, self.ends_on_alarm = options, name == "terminate"
         self._count, self._spec, self._name, self._graded, self._robots = n, spec, name, graded, robots

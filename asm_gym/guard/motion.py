@@ -121,7 +121,7 @@ class Motions:
             motion = self._asked(robot, name, seen) if self._reacts else stay
             action = np.array(as_float32(motion.action)).reshape(-1)
             if action.shape != robots.rest.shape or not np.isfinite(action).all():
-                raise ValueError(f"a finite action of {robots.rest.size} numbers was needed, got {action}")
+                raise ValueError(f"the action must be {robots.rest.size} finite numbers, got {action}")
         except Exception as error:
             # Whatever a user's policy does, an alarm must not end in no action.
             failed = f"reflex: {error!r}"

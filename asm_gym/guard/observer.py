@@ -81,7 +81,7 @@ def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -
     learned = getattr(monitor, "about", {}).get(CONTROLLER, "")
     for what, mine, theirs in ("robot", monitor.spec.source, watched.source), (CONTROLLER, learned, controller):
         if mine != theirs and not {mine, theirs} & UNNAMED:
-            raise ValueError(f"the monitor knows the {what} {mine}, and is to watch {theirs}: give it one of {theirs}")
+            raise ValueError(f"the monitor was fitted for the {what} {mine}, got {theirs}: give a monitor for {theirs}")
     return check_number("the monitor's threshold", monitor.threshold)
 
 

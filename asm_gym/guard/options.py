@@ -90,7 +90,7 @@ class GuardOptions:
         usual: OnAlarmName = "graded" if names_causes else "hold"
         chosen: OnAlarm = usual if self.on_alarm is None else self.on_alarm
         if self.responses is not None and not (isinstance(chosen, str) and chosen == GRADED):
-            raise ValueError(f"responses are those of on_alarm='graded', got on_alarm={short_repr(chosen)}")
+            raise ValueError(f"responses need on_alarm='graded', got on_alarm={short_repr(chosen)}")
         return chosen
 
     def rule(self, graded: bool, dt: float, rows_per_step: int) -> ReleaseRule:

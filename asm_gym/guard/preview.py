@@ -1,10 +1,10 @@
-"""Say of a chunk of actions, before the first is done, which of them would leave what healthy motion did.
+"""Check a chunk of actions, before the first is executed, against the places and speeds of healthy hands.
 
     v_j = [v_{j-1}, u_j] M,    p_j = p_{j-1} + Δt v_j        of all hands, after action u_j (``detection.commands``)
 
-p_j and v_j are looked up in the places of healthy hands. Where no hand is sensed each action is held against the range
-of healthy commands. How hard a contact will be nothing here tells, nor what surprises: the memory's own rows, rolled
-forward, surprise it more in healthy chunks than in hostile ones.
+p_j and v_j are looked up in the places of healthy hands. If no hand is sensed, each action is compared with the range
+of healthy commands. The preview predicts neither the force of a contact nor surprise: rows that the memory predicts for
+a chunk surprise it more in healthy chunks than in hostile ones.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ Floats32 = NDArray[np.float32]
 
 
 class Foretold(NamedTuple):
-    """What a chunk of actions will lead to."""
+    """The prediction for a chunk of actions."""
 
-    at: int | None  # the first action that is not to be done, from 0 on; None where all may be
-    reason: str = ""  # ``"place"``, ``"pace"``, ``"no action"``; empty where all may be
-    seconds: float = np.inf  # until then
-    known: bool = True  # the monitor was calibrated on streams that tell
-    kept: Floats32 = np.zeros((0, 0), np.float32)  # (k', A) the actions that are to be done
+    at: int | None  # index of the first action that should not be executed; None if all may be
+    reason: str = ""  # ``"place"``, ``"pace"``, ``"no action"``; empty if all may be executed
+    seconds: float = np.inf  # time until that action [s]
+    known: bool = True  # False: the monitor was calibrated on streams without hands and commands
+    kept: Floats32 = np.zeros((0, 0), np.float32)  # (k', A) the actions to execute
 
 
 def checked_chunk(actions: Any, shape: tuple[int, ...]) -> Floats32:
     """Return a chunk (k, *shape). Raises ValueError for another shape, or no action."""
     chunk = np.array(as_float32(actions, "a chunk of actions"))
     if chunk.shape[1:] != shape or not len(chunk):
-        raise ValueError(f"a chunk has actions of the shape {shape}, one at least, got the shape {chunk.shape}")
+        raise ValueError(f"a chunk must have the shape {shape} and at least one action, got the shape {chunk.shape}")
     return chunk
 
 

@@ -73,5 +73,5 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
         check_choice("response", response, RESPONSES)
         if cause.endswith(PRESSING) and response in GOING_ON:
             possible = ", ".join(name for name in RESPONSES if name not in GOING_ON)
-            raise ValueError(f"{short_repr(response)} would let an arm go on that presses: {cause} takes {possible}")
+            raise ValueError(f"{short_repr(response)} would let a pressing arm go on: {cause} takes {possible}")
     return {**DEFAULT, **(table or {})}

@@ -62,7 +62,7 @@ class Rows:
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
             reason = robots.refused.get("complete", "it is not known where they stand in the observation")
             warnings.warn(
-                f"senses cannot be completed, and on a sensor at fault the robot holds: {reason}", stacklevel=5
+                f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}", stacklevel=5
             )
         self.read = None if self._completion is None else robots.read
         """(D,) which columns the policy reads; None where senses cannot be completed."""

@@ -1,10 +1,10 @@
-"""Tell an arm to hold when the process that guards it, or one that it depends on, dies or falls silent.
+"""Make an arm hold when the process that guards it, or one that it depends on, dies or falls silent.
 
-The watchdog is a process of its own, which does nothing but wait:
+The watchdog is a separate process, which only waits:
 
     guard ── beat, a row ──► watchdog ── no beat for ``patience``, or a process has ended ──► hold(why)
 
-It ends with the guard, after ``close`` without a hold. Where the watchdog itself dies, ``beat`` says so to the guard.
+It ends with the guard, after ``close`` without a hold. If the watchdog itself dies, ``beat`` returns False.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Hold = Callable[[str], object]
 
 
 class Watchdog:
-    """Watches the process that makes it.
+    """Watch the process that makes it, from a process of its own.
 
     Args:
-        hold: tells the arm to hold, and takes the reason. It runs in the watchdog's process, which imports it anew: a
-            function of a module that opens what it needs.
-        patience: time without ``beat`` after which the guard is silent [s]; it is waited for from the first beat on.
-        processes: numbers of other processes that must live, such as the policy's.
+        hold: called with the reason, makes the arm hold. The watchdog's process imports it, so it must be a function
+            in a module, and open by itself what it needs.
+        patience: time without ``beat`` after which the guard counts as silent [s], from the first beat on.
+        processes: ids of other processes that must live, such as the policy's.
 
     Raises:
-        ProcessLookupError: one of the processes does not live.
-        RuntimeError: the watchdog's process did not begin.
+        ProcessLookupError: one of the processes does not exist.
+        RuntimeError: the watchdog's process did not start.
 
     Example:
         >>> watchdog = Watchdog(print, patience=0.25)  # doctest: +SKIP
@@ -55,10 +55,10 @@ class Watchdog:
         self.process.start()
         while not ready.wait(POLL_S):
             if not self.process.is_alive():
-                raise RuntimeError("the watchdog's process did not begin: its hold must be a function of a module")
+                raise RuntimeError("the watchdog did not start: hold must be a function of an importable module")
 
     def beat(self) -> bool:
-        """Say that a row was judged; return whether the watchdog lives."""
+        """Report that a row was judged; return whether the watchdog lives."""
         self._beat.value = time.monotonic()
         return self.process.is_alive()
 

@@ -86,8 +86,8 @@ def check_inputs(count: int) -> None:
     """Refuse more inputs than can be weighed against each other. Raises ValueError."""
     if count > MOST_INPUTS:
         raise ValueError(
-            f"every number of a stream is weighed against every other here, at most {MOST_INPUTS} of them (values, "
-            f"changes, actions, rows), but this stream makes {count}: leave channels out, or reduce them before"
+            f"a memory takes at most {MOST_INPUTS} inputs (values, changes, actions, rows), but this stream makes "
+            f"{count}: leave channels out, or reduce them first"
         )
 
 

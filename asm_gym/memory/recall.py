@@ -81,7 +81,7 @@ def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) 
         raise ValueError(f"a cue has the shape (T, {reader.spec.size}), got {rows.shape}")
     reader.spec.check_row(rows)
     if len(rows) < least:
-        raise ValueError(f"a cue must be at least {least} rows long, or nothing in it moves, got {len(rows)}")
+        raise ValueError(f"a cue needs at least {least} rows to contain motion, got {len(rows)}")
     bad = np.argwhere(~np.isfinite(rows))
     if len(bad):
         row, column = bad[0]

@@ -1,4 +1,4 @@
-"""A monitor: a model, a detection on its errors, a threshold from nominal episodes, and a file to keep them in."""
+"""A monitor: a model, a detection on its errors, a threshold from nominal episodes, and its file."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class MonitorState(NamedTuple):
 
 
 class CalibratedMonitor:
-    """Any model under any detection, with a threshold that is conformal on the maxima of nominal episodes.
+    """Combine a model with a detection, and set a conformal threshold from the maxima of nominal episodes.
 
     Args:
         model: predicts the stream.
-        detections: make surprise of its errors. The first is in use; the others are fitted and saved beside it.
+        detections: compute surprise from its errors. The first is in use; the others are fitted and saved beside it.
         seed: of all random draws while learning.
 
     Attributes:
@@ -57,10 +57,10 @@ class CalibratedMonitor:
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
         blocks_: the same by the hour, as ``detection.conformal`` counts it.
-        promised_: ``"episode"`` or ``"hour"``, the unit that the promise counts by.
+        promised_: ``"episode"`` or ``"hour"``, the unit of the promise.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
-            limits; empty where the stream has no such channels.
-        pace_: (N, 16) how fast hands went in these episodes, by place and direction; see ``Pace``.
+            limits; empty if the stream has no such channels.
+        pace_: (N, 16) speed of the hands in these episodes, by place and direction; see ``Pace``.
     """
 
     model: StreamModel
@@ -128,21 +128,21 @@ class CalibratedMonitor:
 
     @typed
     def fit(self, episodes: Sequence[Episode], progress: Progress | None = None, *, warm_start: bool = False) -> Self:
-        """Learn from whole nominal episodes of any number of skills; no labels.
+        """Learn from nominal episodes of any number of skills, without labels, and return the monitor.
 
         Args:
-            episodes: of this spec.
+            episodes: nominal episodes with this spec.
             progress: called as ``progress(done, total)`` while learning.
-            warm_start: go on from what it knows, for a model that can: 10 to 50 episodes are enough then. Its detection
-                stays as it is.
+            warm_start: continue from the fitted model, for a model that can: 10 to 50 episodes are then enough. The
+                detection does not change.
 
         Raises:
-            ValueError: no episode, one that is too short or of another spec, or a number that is not finite.
-            TypeError, RuntimeError: the model cannot go on from what it knows, or knows nothing yet.
+            ValueError: no episode, one that is too short or has another spec, or a number that is not finite.
+            TypeError, RuntimeError: with ``warm_start``, the model has no warm start, or is not fitted yet.
         """
         if check_flag("warm_start", warm_start):
             if not hasattr(self.model, "specialise"):
-                raise TypeError(f"a {self._name} learns all anew: leave warm_start out")
+                raise TypeError(f"{self._name} has no warm start: leave warm_start out")
             self._require_fitted()
         check_nominal(episodes, self.spec, self.model.shortest)
         new = self._copy()  # an interrupt leaves this one as it was
@@ -196,34 +196,34 @@ class CalibratedMonitor:
         false_alarms_per_hour: float | None = None,
         each: Sequence[str] = (),
     ) -> Self:
-        """Set the threshold from nominal episodes that ``fit`` has not seen, for one of two promises.
+        """Set the threshold from nominal episodes that ``fit`` has not seen, and return the monitor.
 
-        ``threshold_at`` then knows the threshold of every other rate too. Where fewer than five of the episodes' maxima
-        may exceed it, their tail is modelled, and ``promise.modelled`` is true.
+        Give one rate; ``threshold_at`` then returns the threshold of any other rate. If fewer than five of the episodes'
+        maxima may exceed the threshold, their tail is modelled, and ``promise.modelled`` is true.
 
         Args:
-            episodes: 99 at least for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
-            false_alarm_rate: largest P(any alarm in a nominal episode); ``promise`` says how surely.
-            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. One that persists, or
-                comes back within a minute of the same episode, is one alarm.
-            each: task or policy of each episode, where the promise is to hold in each of them.
+            episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
+            false_alarm_rate: largest probability of an alarm in a nominal episode, in (0, 1).
+            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. An alarm that persists,
+                or returns within a minute of the same episode, counts once.
+            each: task or policy of each episode, to keep the promise in each of them.
 
         Raises:
-            ValueError: too few episodes or hours for this rate (the message says which they can promise), or bad ones;
-                by the hour also an episode given twice, or that ``fit`` has learned from. Or not exactly one rate.
+            ValueError: too few episodes or hours for this rate (the message names the rate that they can promise), bad
+                episodes, or not exactly one rate; per hour also an episode given twice, or one used in ``fit``.
         """
         self._require_fitted()
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         check_nominal(episodes, self.spec, self.model.shortest)
         if each and len(each) != len(episodes):
-            raise ValueError(f"each must name one group an episode, got {len(each)} for {len(episodes)} episodes")
+            raise ValueError(f"each must name a group for each episode, got {len(each)} for {len(episodes)} episodes")
         asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
         try:
             check_fresh(episodes, self.learned_from_, self.ceilings_from_)
         except ValueError as error:
             if asked.per == HOUR:
                 raise
-            LOG.warning("%s; the promise by the episode does not hold for these", error)
+            LOG.warning("%s; with it the promised rate does not hold", error)
         new = self._balanced(episodes)
         values = [s.value for s in new.score_episodes(episodes)]
         threshold = asked.threshold_of(values, self.spec.dt, each)
@@ -247,18 +247,18 @@ class CalibratedMonitor:
     def threshold_at(
         self, false_alarm_rate: float | None = None, *, false_alarms_per_hour: float | None = None
     ) -> float:
-        """Return the threshold of another rate, from the episodes of ``calibrate``; raises as that does."""
+        """Return the threshold for another rate, from the episodes of ``calibrate``; raises as that does."""
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         kept = self.blocks_ if asked.per == HOUR else self.maxima_
         if kept is None or self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
+            raise RuntimeError(f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first")
         return asked.threshold(self.maxima_, self.blocks_)
 
     @property
     def promise(self) -> Promise:
-        """How often the threshold promises an alarm in nominal operation. Raises RuntimeError before ``calibrate``."""
+        """The promised rate of alarms in nominal operation. Raises RuntimeError before ``calibrate``."""
         if self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} knows no calibration: call calibrate(nominal_episodes) first")
+            raise RuntimeError(f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first")
         if self.promised_ == HOUR and self.blocks_ is not None:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
@@ -275,10 +275,10 @@ class CalibratedMonitor:
         return MonitorState(self.model.start(batch), self.detection.start(batch, len(self.model.error_columns)))
 
     def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
-        """Return the new state after the next row (B, D) of each stream, and how surprising the rows were.
+        """Return the new state after the next row (B, D) of each stream, and the surprise of the rows.
 
-        A number that is not finite makes the value and its own attribution infinite; it counts as unseen, so that
-        later rows can be judged again. The old state is not changed.
+        A number that is not finite makes the surprise and its own attribution infinite, and counts as missing
+        afterwards. The old state does not change.
         """
         self._require_fitted()
         rows = self._rows(state, stream)
@@ -292,16 +292,16 @@ class CalibratedMonitor:
 
     @typed
     def reset_evidence(self, state: MonitorState) -> MonitorState:
-        """Return the state without the evidence so far, after an alarm that was acted on; the model goes on."""
+        """Return the state without its evidence, after the response to an alarm; the state of the model stays."""
         return state._replace(detection=self.detection.reset(state.detection))
 
     @typed
     def score(self, episode: Episode) -> Surprise:
-        """Return the surprise of each step of an episode."""
+        """Return the surprise of each step of an episode: values (T,), attributions (T, D)."""
         return self.score_episodes([episode])[0]
 
     def score_episodes(self, episodes: Sequence[Episode]) -> list[Surprise]:
-        """Return ``score`` of many episodes, which are run side by side."""
+        """Return the ``score`` of each episode; they run in one batch."""
         for episode in episodes:
             self.spec.require(episode.spec, "the episode")
         self._require_fitted()
@@ -316,7 +316,7 @@ class CalibratedMonitor:
 
     @typed
     def save(self, path: str | Path) -> None:
-        """Write everything learned to one file of arrays and JSON."""
+        """Write all that was learned to one file of arrays and JSON, which ``load`` reads."""
         self._require_fitted()
         write_monitor(path, self)
 

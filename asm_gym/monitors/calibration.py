@@ -42,8 +42,8 @@ class AlarmRate(NamedTuple):
         """Return the one of two that is given. Raises ValueError unless exactly one is, and is a rate."""
         if (false_alarm_rate is None) == (false_alarms_per_hour is None):
             raise ValueError(
-                "which promise: give false_alarm_rate (such as 0.01, by the episode) or false_alarms_per_hour (such as "
-                f"1.0), got {'neither' if false_alarm_rate is None else 'both'}"
+                "give either false_alarm_rate (such as 0.01, of episodes) or false_alarms_per_hour (such as 1.0), got "
+                f"{'neither' if false_alarm_rate is None else 'both'}"
             )
         if false_alarms_per_hour is not None:
             return cls(check_per_hour(false_alarms_per_hour), HOUR)
@@ -129,7 +129,7 @@ def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> C
     """
     monitor._require_fitted()
     if not isinstance(monitor.detection, EvidenceDetection):
-        raise TypeError(f"the detection {monitor.detection.name} has no ceilings: learn those of evidence")
+        raise TypeError(f"the detection {monitor.detection.name} has no ceilings: use the detection evidence")
     check_nominal(episodes, monitor.spec, monitor.model.shortest)
     if len(episodes) < FEWEST_EPISODES:
         raise ValueError(f"ceilings take {FEWEST_EPISODES} healthy episodes or more, got {len(episodes)}")

@@ -71,7 +71,7 @@ def threshold_below(threshold: object, reach: float) -> float | None:
         return None
     number = check_number("threshold", threshold, low=0.0)
     if number >= reach:
-        raise ValueError(f"threshold must be below {reach:g}, all that errors can add up to, got {number:g}")
+        raise ValueError(f"threshold must be below {reach:g}, the largest possible surprise, got {number:g}")
     return number
 
 

@@ -16,24 +16,22 @@ MOST_ITERATIONS = 1000
 
 @dataclass(frozen=True)
 class MemoryConfig:
-    """How a memory learns, infers and adds up evidence, beside the arguments of ``NeuralASM``.
+    """Set how a memory learns, infers and accumulates evidence, beside the arguments of ``NeuralASM``.
 
     Args:
-        iterations: largest number of inference steps, which end sooner where nothing moves any more. By default 5 by
-            traces, while learning and where a sense is missing, for a row that is seen needs none; 20 by settling, on
+        iterations: largest number of inference steps; inference ends earlier when the state stops changing. By default
+            5 with traces (in learning and with a missing sense; a complete row needs none), and 20 with settling, on
             every row.
-        learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H where H
-            is larger, so that a unit's input does not change more for having more synapses.
-        batch_size: episodes it learns from side by side.
-        prior_precision: Π_z, trust in what was expected. By default 30 by traces, for the firmer, the closer local
-            learning is to the gradient; 1 by settling, where the senses are to move the state.
-        sensory_precision: Π_x, trust in what is sensed.
-        gains: a in (0, 1], weights of the newest step in the accumulated evidence; several, for faults that come as
-            a knock and faults that creep.
-        bound: ν > 0, how many standard deviations an error counts at most, so that a knock that is soon over counts
-            less than what stays.
+        learning_rate: largest change of a synapse in one step, decaying to 0 along a cosine; scaled by 256 / H for
+            larger H, so that the input of a unit does not change faster with more synapses.
+        batch_size: episodes in a batch of learning.
+        prior_precision: Π_z, trust in the prediction. By default 30 with traces (a higher value brings local learning
+            closer to the gradient), and 1 with settling, where the senses must move the state.
+        sensory_precision: Π_x, trust in the senses.
+        gains: a in (0, 1], weights of the newest step in the evidence; several, for sudden and for slow faults.
+        bound: ν > 0, largest number of standard deviations that an error counts, to limit the effect of short knocks.
         shrinkage: λ in [0, 1] of the whitening, towards no correlation between errors.
-        tail_index: ξ_0 in (0, 1]: surprise falls off as probability to this power. The smaller, the more senses add up.
+        tail_index: ξ_0 in (0, 1]: surprise falls off as probability to this power; the smaller, the more senses add up.
     """
 
     iterations: int | None = None

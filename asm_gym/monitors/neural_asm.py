@@ -1,8 +1,8 @@
-"""The Neural Associative Skill Memory as a monitor: it learns what skills feel like, and says when one feels wrong.
+"""The Neural Associative Skill Memory as a monitor: it learns to predict the sensor readings of skills.
 
 row → memory: errors, context → whiten → accumulate → value, attribution
 
-What else a memory can do takes it as an argument: ``skills``, ``calibration.learn_ceilings``, ``shipped``.
+Further functions take a memory as an argument: ``skills``, ``calibration.learn_ceilings``, ``shipped``.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ from asm_gym.validation import check_choice, check_flag, check_number, typed
 
 
 class NeuralASM(CalibratedMonitor):
-    """A predictive coding network through time, association across the senses, and a calibrated threshold.
+    """Learn to predict a stream from healthy episodes, and return the surprise of each row.
 
     Args:
-        spec: the stream it watches.
+        spec: the stream to watch.
         hidden_size: H, hidden units of the temporal network.
         association_size: hidden units of association, shared out among the groups of senses.
-        epochs: passes of the temporal network over the training episodes; fewer where they are very many.
-        free_running_probability: of a training step that goes on from what was expected, with the memory's own action;
-            reached half-way through training. Above 0 the memory learns to recall (``skills.recall``, best at 0.6).
-        habituates: surprise is measured against what is usual in a context. A context knows the policy, so a memory
-            that is to watch any policy leaves it out.
-        dynamics: how the temporal network carries on the past: ``"traces"`` of what was sensed and done, or
-            ``"settling"``, the temporal predictive coding network of the papers, whose state is inferred on every row.
-        excuses: knocks, joints at their stops and fingers that move are no faults (``detection.events``):
-            for a memory that is to watch any policy, of which some strike things.
-        values: torques, and other values that the rest of a row predicts, are judged beside changes
-            (``monitors.values``): for a push that is held, in logs of real arms.
-        urdf: text of the arm's body model, as ``body_model.read_urdf`` reads it: torques are then predicted from the
-            weight and the inertia of its links. It takes ``values=True``.
+        epochs: passes of the temporal network over the training episodes; fewer if there are very many episodes.
+        free_running_probability: probability that a training step continues from the prediction and the memory's own
+            action; reached halfway through training. Above 0 the memory learns recall (``skills.recall``, best at 0.6).
+        habituates: divide surprise by its usual size in a context. The context depends on the policy, so use False for
+            a memory that watches any policy.
+        dynamics: how the temporal network represents the past: ``"traces"`` of senses and actions, or ``"settling"``,
+            the temporal predictive coding network of the papers, whose state is inferred on every row.
+        excuses: do not count knocks, joints at their stops and moving fingers as faults (``detection.events``): for a
+            memory that watches any policy, including policies that hit things.
+        values: judge values, such as torques, beside changes (``monitors.values``), if other senses predict them: for
+            lasting pushes, in logs of real arms.
+        urdf: text of the arm's body model, from ``body_model.read_urdf``, to predict torques from the weight and the
+            inertia of its links. It needs ``values=True``.
         seed: of the initial weights and of the order of the episodes.
         config: all other hyperparameters.
 
     Attributes:
-        values_: judges values; None before ``fit``, with ``values=False``, and where nothing predicts any.
-        excuses_: tells knocks and stops from faults; None with ``excuses=False``.
+        values_: judges values; None before ``fit``, with ``values=False``, and if nothing predicts a value.
+        excuses_: distinguishes knocks and stops from faults; None with ``excuses=False``.
 
     Example:
         >>> import numpy as np
@@ -144,21 +144,21 @@ class NeuralASM(CalibratedMonitor):
     @classmethod
     @typed
     def pretrained(cls, name: str) -> Self:
-        """Return a calibrated memory that comes with the package, learned from an arm's motor babbling.
+        """Return a calibrated memory that is shipped with the package, learned from an arm's motor babbling.
 
         Raises:
-            ValueError: there is none of that name; the message lists those that there are.
+            ValueError: an unknown name; the message lists the known ones.
         """
         return cls.load(pretrained_file(name))
 
     @property
     def senses_(self) -> StreamScaler:
-        """How it reads a row."""
+        """The reader of rows."""
         return self.model.senses_
 
     @property
     def diagnosis_(self) -> Diagnosis | None:
-        """Names the cause of a surprise, and completes senses; None where nothing completes senses."""
+        """Names the cause of a surprise and estimates senses; None if no sense can be estimated."""
         completion = self.model.completion_
         if completion is None:
             return None
@@ -179,7 +179,7 @@ class NeuralASM(CalibratedMonitor):
     def observe(
         self, state: MonitorState, stream: NDArray[np.floating[Any]], out: MonitorState | None = None
     ) -> tuple[MonitorState, Surprise]:
-        """As in ``CalibratedMonitor``; the new state is written to ``out``, a state that is needed no more."""
+        """Observe as in ``CalibratedMonitor``; write the new state to ``out``, a state that is no longer needed."""
         kernel = self._row_kernel()
         if kernel is None:
             self._require_fitted()

@@ -104,12 +104,12 @@ as those of the Neural ASM are. ``+`` and the name of any other detection will d
 
 @typed
 def register_monitor(name: str, model: type[Any] | str, detection: str = "evidence") -> None:
-    """Make a model of your own known, here and in worker processes, by its name and by ``name+evidence``.
+    """Register a model, in this process and its workers, for ``make_monitor(name)`` and ``name+evidence``.
 
     Args:
-        name: the ``kind`` of the model, by which its files are known too.
-        model: a subclass of ``StreamModel`` or of a monitor; or ``module:class``.
-        detection: which judges it unless asked otherwise; a name in ``DETECTIONS``.
+        name: the ``kind`` of the model, which its files contain too.
+        model: a subclass of ``StreamModel`` or of a monitor; or its ``module:class``.
+        detection: its default detection, a name in ``DETECTIONS``.
 
     Raises:
         ValueError: the name is taken or is not that of the model's ``kind``, or there is no such detection.
@@ -174,7 +174,7 @@ def make_monitor(name: str, spec: StreamSpec, **hyperparameters: Any) -> Calibra
         **hyperparameters: of that monitor.
 
     Raises:
-        ValueError: there is no monitor of that name, or it has no such hyperparameter; the message lists what exists.
+        ValueError: an unknown monitor or hyperparameter; the message lists the known ones.
 
     Example:
         >>> from asm_gym import Channel, StreamSpec, make_monitor

@@ -55,13 +55,13 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         lines.append(f"  {name}: {'; '.join(misfits)}")
     if spec.source == "spaces":
         raise ValueError(
-            "shipped memories know arms of robosuite, and this stream is made of an environment's spaces: fit one on "
-            "nominal episodes of it, as StreamRecorder(env) keeps them, and hand it over as monitor"
+            "shipped memories know only robosuite's arms in environments of asm_gym: fit a monitor on healthy episodes "
+            "of this environment, recorded by StreamRecorder(env), and pass it as monitor"
         )
     rate = round(1.0 / spec.dt)
     make = f"asm-gym babble --robot {spec.source or 'ROBOT'}" + (f" --stream-freq {rate}" if rate != USUAL else "")
     raise ValueError(
         f"no shipped memory fits this stream of {spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
-        f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit one of your own: "
-        f"{make} for an arm of robosuite, asm-gym fit DATA for recordings, and hand it over as monitor"
+        f"{f' under {controller}' if controller else ''}. There are:\n" + "\n".join(lines) + f"\nFit your own: "
+        f"{make} for an arm of robosuite, asm-gym fit DATA for recordings, and pass it as monitor"
     )

@@ -35,7 +35,7 @@ def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
         raise ValueError(f"episode {names.index('')} does not say its skill: set info['skill']")
     known, skills = np.unique(np.repeat(names, [len(e) for e in episodes]), return_inverse=True)
     if len(known) < 2:
-        raise ValueError(f"two skills at least are needed to tell them apart, got {', '.join(known)}")
+        raise ValueError(f"naming skills needs at least two of them, got {', '.join(known)}")
     inputs = np.concatenate([model.senses_.read_episode(e.stream).inputs for e in episodes])
     V = model.network.association.V
     with threadpool_limits(1):

@@ -74,7 +74,7 @@ def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
     for n, own in enumerate(hashes_of(episodes)):
         if any(own in hashes for hashes in known):
             raise ValueError(
-                f"episode {n} was learned from: such episodes surprise too little to promise by; give others"
+                f"episode {n} was learned from, so its surprise is too low to set a threshold: give other episodes"
             )
         if own in first:
             raise ValueError(f"episodes {first[own]} and {n} are the same: give each once")

@@ -166,25 +166,25 @@ def collect(
     progress: Progress | None = None,
     **env_kwargs: Any,
 ) -> list[Episode]:
-    """Record episodes of ``policy`` in ``env_id``, in an order that does not depend on ``workers``.
+    """Record episodes of a policy and return them, in an order that does not depend on ``workers``.
 
-    Where ``info`` has no ``"stream"``, observation and action are the stream.
+    Without ``info["stream"]``, observation and action form the stream.
 
     Args:
         env_id: any Gymnasium id with numeric spaces, such as ``asm_gym/Lift-v0``, ``Pusher-v5`` or ``module:id``.
-        policy: a name or a path, as ``asm_gym.policies.make_policy`` takes; any object with stable-baselines3's
-            ``predict``; or a factory that makes one for an environment, called for every episode. An object is shared
-            by the episodes of one process, so it must reset itself where ``episode_start`` is set; one that draws at
-            random must have ``set_random_seed``.
-        episodes: how many.
-        seed: of everything; the same seed gives the same episodes.
-        workers: processes, 1 of which is this one.
-        stage: sets of episodes with the same ``seed`` and different stages are different.
-        progress: is called as (done, total).
-        env_kwargs: arguments of ``gym.make``.
+        policy: a name or a path, as for ``asm_gym.policies.make_policy``; any object with stable-baselines3's
+            ``predict``; or a function that makes one for an environment, called for every episode. The episodes of one
+            process share an object, so it must reset itself when ``episode_start`` is set; a random one must have
+            ``set_random_seed``.
+        episodes: number of episodes.
+        seed: of all random draws; the same seed gives the same episodes.
+        workers: number of processes; 1 means this process.
+        stage: different stages give different episodes for the same ``seed``.
+        progress: called as ``progress(done, total)``.
+        env_kwargs: further arguments of ``gym.make``.
 
     Raises:
-        ValueError: fewer than one episode or worker; whatever the environment and the policy refuse.
+        ValueError: fewer than one episode or worker; arguments that the environment or the policy refuses.
         TypeError: spaces that are not numeric, or a policy that cannot be sent to another process.
 
     Example:

@@ -9,11 +9,11 @@ from asm_gym.data.episode import spans
 
 
 class SafetyCallback(BaseCallback):
-    """Log the mean over the episodes that have ended, to stable-baselines3's logger.
+    """Log means over finished episodes to stable-baselines3's logger.
 
-    ``safety/surprise``: the greatest, in thresholds. ``safety/alarms``: how often one began. ``safety/cost``: steps in
-    alarm. ``safety/overridden``: steps in which something else than the policy acted. ``safety/slowed``: the mean share
-    that the limit of the hand's speed took from the action.
+    ``safety/surprise``: the largest surprise in thresholds. ``safety/alarms``: the number of alarms. ``safety/cost``:
+    steps in alarm. ``safety/overridden``: steps in which a reflex acted. ``safety/slowed``: the mean share
+    of the action that the speed limit removed.
     """
 
     def __init__(self) -> None:

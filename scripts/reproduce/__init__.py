@@ -10,13 +10,13 @@ from asm_gym.scripts.command import DONE, exit_code
 from asm_gym.validation import check_choice
 
 STUDIES = {
-    "memorise_and_recall": "one network learns skills, recalls each from a cue",
-    "panda": "one network, six skills of the Panda, no label",
-    "local_learning": "local updates against backpropagation through time",
-    "harm": "harm avoided against success kept, under any policy",
-    "chunks": "blows foretold from chunks of actions, and false verdicts",
-    "hours": "alarms an hour of a shipped memory, as promised? needs a corpus",
-    "real_arms": "faults in recordings of real arms, once downloaded",
+    "memorise_and_recall": "one network learns skills and recalls each from a cue",
+    "panda": "one network learns six skills of the Panda without labels",
+    "local_learning": "local learning compared with backpropagation through time",
+    "harm": "harm that the guard avoids, and success that it keeps",
+    "chunks": "impacts predicted from chunks of actions, and false predictions",
+    "hours": "false alarms an hour of a shipped memory; needs a corpus",
+    "real_arms": "faults added to recordings of real arms (to download)",
 }
 
 

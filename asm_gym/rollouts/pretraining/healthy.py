@@ -86,21 +86,21 @@ def _undisturbed(episode: Episode) -> bool:
 
 
 def harmless(episodes: Sequence[Episode]) -> list[Episode]:
-    """Return the stretches of a policy's own episodes in which nothing presses twice as hard as it usually does.
+    """Return the parts of episodes in which contact forces stay below twice their usual maximum.
 
-    Agents crash now and then in episodes that they solve. A memory specialised on those would take a crash for usual,
-    and a threshold set on them would be a crash's.
+    Agents sometimes collide in episodes that they solve. A memory fitted on those would treat a collision as normal,
+    and a threshold set on them would be too high.
 
     Args:
-        episodes: of one task, at least half of them harmless; without contact forces, joint torques tell.
+        episodes: of one task, at least half of them without a collision; joint torques replace missing contact forces.
 
     Example:
         >>> import numpy as np
         >>> from asm_gym import Channel, Episode, StreamSpec, harmless
         >>> spec = StreamSpec((Channel("external_torque_peak", 1, "N m"),), dt=0.05)
-        >>> calm, crash = np.ones((100, 1)), np.ones((100, 1))
+        >>> healthy, crash = np.ones((100, 1)), np.ones((100, 1))
         >>> crash[50:] = 30.0
-        >>> [len(e) for e in harmless([Episode.from_stream(x, spec) for x in (calm, calm, crash)])]
+        >>> [len(e) for e in harmless([Episode.from_stream(x, spec) for x in (healthy, healthy, crash)])]
         [100, 100, 46]
     """
     torque = float(np.median([peak_torques(episode).max() for episode in episodes]))
