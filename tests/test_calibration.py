@@ -79,7 +79,7 @@ def test_what_cannot_be_promised_is_refused_in_a_line_and_nothing_changes(monito
 def test_a_promise_by_the_episode_says_so_and_is_made_all_the_same(monitor, caplog, added, message):
     with caplog.at_level("WARNING"):
         monitor.calibrate([*NOMINAL, added], 0.1)
-    assert re.search(f"{message}.* promise by the episode does not hold", caplog.text)
+    assert re.search(f"{message}.* promised rate does not hold", caplog.text)
     assert monitor.promise.episodes == 121
 
 
