@@ -216,7 +216,7 @@ def named():
             ValueError,
             "horizon of 200",
         ),
-        (Both, ActionScale(), TypeError, "where actions and senses are Boxes"),
+        (Both, ActionScale(), TypeError, "faults need Box spaces"),
     ],
 )
 def test_a_fault_that_an_environment_cannot_have_is_refused(env, fault, error, message):

@@ -198,7 +198,7 @@ class CalibratedMonitor:
     ) -> Self:
         """Set the threshold from nominal episodes that ``fit`` has not seen, and return the monitor.
 
-        Give one rate; ``threshold_at`` then returns the threshold of any other rate. If fewer than five of the episodes'
+        Give one rate; ``threshold_at`` returns the threshold of any other rate. If fewer than five of the episodes'
         maxima may exceed the threshold, their tail is modelled, and ``promise.modelled`` is true.
 
         Args:
