@@ -212,12 +212,12 @@ def fit(args: Args, console: Console) -> int:
     writable(args.out)
     layout = args.layout(action=args.action, by_name=True)
     with stage("reading", console, {}) as progress, noted() as notes:
-        found = normal_episodes(read_logs(args.data, layout), args.split is not None, progress)
-    left_out = ", ".join(f"{count} {why}" for why, count in found.left_out.items())
-    if not found.episodes:
+        found, reasons = normal_episodes(read_logs(args.data, layout), args.split is not None, progress)
+    left_out = ", ".join(f"{count} {why}" for why, count in reasons.items())
+    if not found:
         hint = "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    parts, cuts = parts_between_gaps(args, with_shared_noise(found.episodes))
+    parts, cuts = parts_between_gaps(args, with_shared_noise(found))
     fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live)
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:

@@ -1,11 +1,12 @@
 """Show how a log is read before learning from it: its clock, its columns, and the role of each.
 
 It prints a table of columns (range, noise, resolution, repeated and missing readings) and draws them all. Exit code 1:
-the log cannot be read as it is.
+the log cannot be read as it is, or not with the others of its folder.
 """
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -58,9 +59,11 @@ def inspect(args: Args, console: Console) -> int:
                     say(line)
             known.update(line for line in lines if line.startswith("- "))
             if n < args.logs:
-                picture = figures.save(figures.log_figure(log), args.out / f"{Path(source.name).stem or 'log'}.png")
+                name = source.name.replace(Path(source.file).suffix, "").replace(os.sep, "_") or "log"
+                picture = figures.save(figures.log_figure(log), args.out / f"{name}.png")
                 say(f"Wrote {picture}")
             if first is not None and (line := differences(first, log)):
+                trouble = True
                 say(line)
             first = first or log
     for note in notes:

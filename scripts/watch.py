@@ -45,6 +45,8 @@ from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
 LIVE_ONLY = ("until_alarm", "json", "hook", "watchdog", "policy")  # options
+RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
+KINDS = "a live source", "a recording"
 SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
 
 
@@ -141,8 +143,9 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
 def watch(args: Args, console: Console) -> int:
     """Watch a recording or a live source."""
     live = live_source(args.source)
-    if live is None and (given := [n for n in LIVE_ONLY if getattr(args, n)]):
-        raise ValueError(f"--{given[0].replace('_', '-')} is for a live source, and {args.source} is a recording")
+    wrong, given, own = (RECORDED_ONLY, *KINDS[::-1]) if live else (LIVE_ONLY, *KINDS)
+    if said := [n for n in wrong if getattr(args, n)]:
+        raise ValueError(f"--{said[0].replace('_', '-')} is for {given}, and {args.source} is {own}")
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
@@ -160,7 +163,7 @@ def watch(args: Args, console: Console) -> int:
     lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
     with _watchdog(args, monitor.spec.dt) as watchdog:
         beat = None if watchdog is None else watchdog.beat
-        alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm, beat)
+        alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm, beat, args.clock)
     return BAD_NEWS if alarms else DONE
 
 

@@ -19,8 +19,8 @@ RATE, ROWS = 50.0, 80
 pytestmark = pytest.mark.filterwarnings("default::asm_gym.data.reader_notes.LogWarning")
 
 
-def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = True) -> Path:
-    """A wrist at twice the rate of two joints, and their commands."""
+def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = True, finger: bool = False) -> Path:
+    """A wrist at twice the rate of two joints, and their commands; perhaps a finger at three times that."""
     rosbag2 = needs("rosbags.rosbag2")
     typesys = needs("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -47,6 +47,10 @@ def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = Tr
             force = types["geometry_msgs/msg/Wrench"](vector(3 * k, 0.0, 1.0), vector(0.0, 0.0, 0.0))
             kind = types["geometry_msgs/msg/WrenchStamped"]
             write(writer, made["/wrist"], t, kind(header(stamp(int(t), 0), "tool"), force))
+            for part in range(3 if finger else 0):
+                state, numbers = types["sensor_msgs/msg/JointState"], (np.array([1.0]), np.zeros(3), np.zeros(0))
+                message = state(header(stamp(int(t), 0), ""), ["finger"], *numbers)
+                write(writer, made["/joint_states"], t + part / (6 * RATE) + 1e-4, message)
             if k % 2 == 0 and k // 2 not in lost and joints:
                 layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
                 target = types["std_msgs/msg/Float64MultiArray"](layout, np.array([0.1 * k]))
@@ -73,6 +77,14 @@ def test_joint_states_that_a_bag_lost_are_marked(tmp_path):
     ((_, episode),) = read_logs(bag(tmp_path / "bag", "MCAP", lost=(20, 21)))
     assert len(episode) == ROWS
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(episode.stream[:, 0])), [20, 21])
+
+
+def test_rows_are_those_of_the_arm_and_not_of_a_faster_finger_whose_velocities_fit_no_name(tmp_path):
+    ((_, episode),) = read_logs(bag(tmp_path / "bag", "MCAP", finger=True))
+    assert len(episode) == ROWS
+    labels = episode.spec.labels
+    assert {"joint_states.position[j1]", "joint_states.position[j2]"} < set(labels)
+    assert "joint_states.velocity[finger]" not in labels
 
 
 def test_a_bag_that_is_cut_off_or_has_no_joints_is_named(tmp_path):

@@ -110,6 +110,19 @@ def test_a_row_holds_the_newest_of_other_topics_and_nothing_of_one_that_fell_sil
     assert held[-1] is None
 
 
+def test_publishers_of_other_joints_on_one_topic_make_one_row(publish):
+    def finger(k: int) -> JointState:
+        return JointState(Header(Time(0, 0), ""), ["finger"], [7.0], [1.0, 2.0], [])  # two velocities are whose?
+
+    publish("/joint_states", finger)
+    publish("/joint_states", joints)
+    found = lines()
+    rows = [json.loads(next(found)) for _ in range(80)][30:]
+    np.testing.assert_allclose(np.diff([row["time"] for row in rows]), 1 / RATE, rtol=1e-4)
+    assert {row["joint_states.position[finger]"] for row in rows} == {7.0}
+    assert all("joint_states.velocity[finger]" not in row for row in rows)
+
+
 def test_a_topic_that_falls_silent_has_died(publish):
     publish("/joint_states", joints, 0.5)
     with pytest.raises(SourceDied, match=r"nothing came for 0\.5 s"):

@@ -48,6 +48,13 @@ def test_rows_that_are_missing_by_their_time_are_counted():
     assert [lost for _, lost in read(map(json.dumps, named))] == [0, 3]
 
 
+def test_the_clock_that_is_asked_for_is_read():
+    row = {"time": 0, "q": [1, 2], "torque": 3, "cmd": 4}  # the first clock stands still
+    lines = [json.dumps(row | {"tick": 20 * k}) for k in (0, 1, 4)]
+    rows = [row for row, _ in RowReader(SPEC, "tick [ms]").rows(lines)]
+    assert [(row.lost, row.problem) for row in rows] == [(0, ""), (0, ""), (2, "")]
+
+
 def test_nested_json_and_units_are_read_as_from_a_file():
     spec = StreamSpec((Channel("arm.q", 2, "rad"), Channel("current", 1, "A")), dt=0.02)
     lines = [

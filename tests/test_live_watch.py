@@ -247,6 +247,18 @@ def test_an_infinite_surprise_is_json_too():
 def test_what_is_for_a_live_source_is_refused_with_a_recording(monitor, tmp_path, capsys):
     assert live(monitor, tmp_path, str(tmp_path), "--json") == 2
     assert "--json is for a live source" in capsys.readouterr().err
+    assert live(monitor, tmp_path, "-", "--ignore", "q") == 2
+    assert "--ignore is for a recording" in capsys.readouterr().err
+
+
+def test_alarms_of_one_cause_are_one(monitor):
+    rows = episode(500).stream.copy()
+    rows[[20, 28, 36, 75], 2] += 100.0  # at 50 Hz: a push, and another one
+    events = []
+    follow(lines(rows), monitor, events.append)
+    alarms = [event for event in events if event.kind == "alarm"]
+    assert len(alarms) == 2
+    assert [round(alarm.time / DT) for alarm in alarms] == [21, 76]
 
 
 @pytest.mark.parametrize("rate", [20, 100])

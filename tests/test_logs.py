@@ -177,6 +177,16 @@ def test_a_clock_without_a_unit_is_read_by_plausible_rates_by_the_memory_and_by_
     assert Episode.from_table({"t": t, "q": np.sin(t)}, clock="t [s]").spec.dt == 50
 
 
+@pytest.mark.parametrize(("name", "unit"), [("time [min]", 60.0), ("time [h]", 3600.0), ("t", 86400.0)])
+def test_clocks_in_minutes_hours_and_days_tell_the_rate(name, unit):
+    start = 45_000.5 if name == "t" else 0.0  # a date of Excel
+    table = {name: start + np.arange(ROWS) / RATE / unit, "q": log(0)["q_0"]}
+    assert Episode.from_table(table, clock=name).spec.dt == pytest.approx(1 / RATE, rel=1e-3)
+    assert Episode.from_table(table).spec.dt == pytest.approx(1 / RATE, rel=1e-3)
+    with pytest.raises(ValueError, match="a clock counts in one of"):
+        Episode.from_table(table, clock=f"{name.split()[0]} [week]")
+
+
 def test_the_period_is_the_mean_step_and_gaps_and_lost_rows_are_none_of_it():
     rng = np.random.default_rng(0)
     steady = np.arange(5000) / 100.331
@@ -257,8 +267,8 @@ def test_semicolons_decimal_commas_iso_times_and_labels(tmp_path):
     assert np.isnan(episode.stream[2, 1])
     np.testing.assert_array_equal(episode.faults, [False, True, False, False])
     with noted():
-        kept = normal_episodes(read_logs(tmp_path / "x.csv"))
-    assert kept.left_out == {"with a fault": 1}
+        _, left_out = normal_episodes(read_logs(tmp_path / "x.csv"))
+    assert left_out == {"with a fault": 1}
 
 
 def test_labels_are_asked_for_by_name_and_words_of_them_are_read(tmp_path):
@@ -297,6 +307,7 @@ def test_tables_with_and_without_a_header(text, columns, tmp_path):
         ("0,1\n1,2\n", ["t"], "1 columns are named, and its first line has 2 cells"),
         ("a,b\n1," + "9" * 1_000_000 + "\n", [], "line 2 has 1000002 characters: at most 8192 columns"),
         (",".join(f"x{k}" for k in range(10_000)) + "\n", [], "it has 10000 columns, and at most 8192"),
+        ("a,b\n1,2\n2,3\nb,a\n4,5\n", [], "line 4 is another header"),
     ],
 )
 def test_text_that_is_no_table_is_refused_in_one_line(text, columns, message, tmp_path):
@@ -315,6 +326,23 @@ def test_a_last_row_that_was_cut_off_is_left_out_and_that_is_said(end, tmp_path)
     np.testing.assert_array_equal(columns["time"], [0, 1])
     whole = written(tmp_path / "y.csv", "time,a,b\n0,1,2\n1,1,2\n2,1,2")  # many write no last end of line
     assert len(read_text(whole)["time"]) == 3
+
+
+@pytest.mark.parametrize(("encoding", "end"), [("utf-8", b"\x00" * 900), ("utf-16", b"3"), ("utf-16", b"\x00" * 900)])
+def test_what_a_loss_of_power_leaves_at_the_end_costs_no_row(encoding, end, tmp_path):
+    rows = "".join(f"{k},{k * k}\n" for k in range(60))
+    (tmp_path / "x.csv").write_bytes(("time,a\n" + rows).encode(encoding) + end)
+    with pytest.warns(LogWarning):
+        np.testing.assert_array_equal(read_text(tmp_path / "x.csv")["a"], np.arange(60) ** 2)
+
+
+def test_too_many_columns_are_refused_in_every_format(tmp_path):
+    wide = np.zeros((3, 10_000))
+    np.save(tmp_path / "x.npy", wide)
+    np.savez(tmp_path / "x.npz", t=np.arange(3), q=wide)
+    for name in ("x.npy", "x.npz"):
+        with pytest.raises(ValueError, match=rf"{name}: it has 1000\d columns, and at most"):
+            read(tmp_path / name, rate=10.0)
 
 
 def test_mixed_encodings_notes_between_rows_and_marks_for_nothing_are_read(tmp_path):

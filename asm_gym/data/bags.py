@@ -5,8 +5,8 @@
     std_msgs/Float64MultiArray       data[0], …           such as commands
 
 Each column is named after its topic, ``joint_states.position[panda_joint1]``. A row is a message of JointState: of the
-ones with the same joints, on one topic, the most frequent. It stands at the time in its header, with the newest values
-of all others, such as a gripper on the same topic, as long as these are not old.
+ones with the same joints, on one topic, those with the most joints. It stands at the time in its header, with the
+newest values of all others, such as a gripper on the same topic, as long as these are not old.
 """
 
 from __future__ import annotations
@@ -26,9 +26,8 @@ def _joints(message: Any) -> Numbers:
     found: Numbers = {}
     for kind in ("position", "velocity", "effort"):
         values = getattr(message, kind)
-        if len(values) not in (0, len(message.name)):
-            raise ValueError(f"a JointState of {len(message.name)} joints has {len(values)} {kind}s")
-        found |= {f"{kind}[{name}]": float(v) for name, v in zip(message.name, values, strict=False)}
+        if len(values) == len(message.name):  # others are missing: nothing tells whose they are
+            found |= {f"{kind}[{name}]": float(v) for name, v in zip(message.name, values, strict=True)}
     return found
 
 
@@ -45,6 +44,9 @@ MESSAGES: dict[str, Callable[[Any], Numbers]] = {
 }
 """The numbers of a message, by its type."""
 
+MENDS = {".mcap": "mcap recover", ".bag": "rosbag reindex", ".db3": "sqlite3 FILE .recover | sqlite3 NEW.db3"}
+"""What mends a bag that was cut off, by its suffix."""
+
 
 def read_bag(path: Path) -> Columns:
     """Return the columns of a bag, ``time`` [s] among them. Raises ValueError if it is damaged or has no JointState."""
@@ -56,8 +58,8 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = "; a recorder that was killed leaves such a file: mcap recover mends it"
-        raise ValueError(f"it is damaged: {error}{mend if path.suffix == '.mcap' else ''}") from error
+        mend = MENDS[path.suffix]
+        raise ValueError(f"it is damaged: {error}; where its recorder was killed, {mend} mends it") from error
 
 
 def _columns(bag: Any) -> Columns:
@@ -77,7 +79,7 @@ def _columns(bag: Any) -> Columns:
         came = 1e-9 * written
         said.setdefault(key, []).append({"came": came, "time": stamp_of(message) or came} | named)
     of_states = {c.topic for c in states}
-    clock = max((key for key in said if key[0] in of_states), key=lambda key: len(said[key]))
+    clock = max((key for key in said if key[0] in of_states), key=lambda key: (len(key), len(said[key])))
     if len(said) > 1:
         note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
     tables = {key: pd.DataFrame(messages) for key, messages in said.items()}

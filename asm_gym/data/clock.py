@@ -10,7 +10,7 @@ text       ISO 8601, 24/11/2026 10:00:00.5, 10:00:00.5
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import CLOCK, COUNTERS, SECONDS, is_clock, split_unit
+from asm_gym.data.names import CLOCK, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
@@ -26,6 +26,7 @@ Floats = NDArray[np.float64]
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least number since 1970, and its unit [s]
 SLOWEST_WITHOUT_UNIT = 2.0  # step from which on a clock without a unit is not believed to count seconds
 UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
+DAY, LEAST_DATE, BRIEF = 86400.0, 3e4, 1e-4  # [s]; Excel and MATLAB count days, from 1982 on so many, in steps so short
 MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: they were written twice
 ALIKE = 0.2  # how far two clocks, or a clock and a memory, may be off, as a share, and tell each other's unit
 
@@ -142,7 +143,7 @@ def _named_unit(name: str) -> float | None:
     found = CLOCK.fullmatch(name.strip())
     if found is not None and found["unit"]:
         return SECONDS[found["unit"].lower()]
-    return SECONDS.get(split_unit(name)[1].lower()) or SECONDS.get(name.lower().rpartition("_")[2])
+    return LONGER.get(split_unit(name)[1].lower()) or SECONDS.get(name.lower().rpartition("_")[2])
 
 
 def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | None = None) -> Clock | None:
@@ -152,7 +153,7 @@ def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | 
     where none can be read, and says why.
     """
     if wanted:
-        return _wanted(table, wanted, dt)
+        return _with_unit(clock_called(wanted, table), table, dt)
     trouble, usable = "", list[tuple[tuple[float, float], Clock]]()
     for clock in clocks_among(table):
         try:
@@ -174,26 +175,27 @@ def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | 
     return rising or best
 
 
-def _wanted(table: Mapping[str, NDArray[Any]], wanted: str, dt: float | None) -> Clock:
-    """The clock of this name, with the unit behind it."""
+def clock_called(wanted: str, columns: Collection[str]) -> Clock:
+    """Return the clock of this name, with the unit behind it. Raises ValueError where there is none."""
     bare, unit = split_unit(wanted)
-    names = {split_unit(name)[0]: name for name in table} | {name: name for name in table}
+    names = {split_unit(name)[0]: name for name in columns} | {name: name for name in columns}
     name = names.get(wanted) or names.get(bare)
     if name is None:
-        raise ValueError(f"no column is called {wanted!r}; there are: {', '.join(table)[:300]}")
-    pair = next((clock for clock in clocks_among(table) if clock.columns[0] == name and clock.columns[1:]), None)
+        raise ValueError(f"no column is called {wanted!r}; there are: {', '.join(columns)[:300]}")
+    pair = next((clock for clock in clocks_among(columns) if clock.columns[0] == name and clock.columns[1:]), None)
     if pair is not None and not unit:
         return pair
-    return _with_unit(Clock((name,), (SECONDS.get(unit.lower()) or _named_unit(name),)), table, dt)
+    if unit and wanted not in columns and unit.lower() not in LONGER:
+        raise ValueError(f"a clock counts in one of {', '.join(LONGER)}, got {wanted!r}")
+    return Clock((name,), (LONGER.get(unit.lower()) or _named_unit(name),))
 
 
 def _unsteadiness(times: Floats) -> tuple[float, float]:
     """The share of rows with the stamp of the one before, and how much steps differ, as a share."""
     steps = np.diff(times)
-    if not np.isfinite(times).all():
+    if not len(steps) or not np.isfinite(times).all():
         return 1.0, 1.0
-    median = float(np.median(steps)) if len(steps) else 1.0
-    doubled = float(np.mean(steps == 0.0)) if len(steps) else 0.0
+    median, doubled = float(np.median(steps)), float(np.mean(steps == 0.0))
     jitter = float(np.median(np.abs(steps / median - 1))) if median > 0 else 1.0
     return (0.0 if doubled <= MOST_DOUBLED else doubled) + float(median < 0), round(jitter, 2)
 
@@ -218,11 +220,11 @@ def _with_unit(clock: Clock, table: Mapping[str, NDArray[Any]], dt: float | None
     plausible = [u for u in UNITS if 1.0 <= 1 / (step * u) <= 1000.0] if step >= SLOWEST_WITHOUT_UNIT else []
     moved = _seconds_a_row(table) or dt
     alike = [u for u in UNITS if moved is not None and abs(step * u / moved - 1) < ALIKE]
-    unit = next(iter([*alike, *plausible]), 1.0)
+    unit = DAY if known[0] > LEAST_DATE and step < BRIEF else next(iter([*alike, *plausible]), 1.0)
     if unit != 1.0:
         note(
-            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {UNITS[unit]}, a plausible "
-            f"rate; --clock '{column} [s]' or --rate HZ says otherwise"
+            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {UNITS.get(unit, 'days')}, a "
+            f"plausible rate; --clock '{column} [s]' or --rate HZ says otherwise"
         )
     return Clock((column,), (unit,))
 

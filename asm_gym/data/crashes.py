@@ -1,8 +1,6 @@
 """Crashes in healthy episodes: those that press twice as hard as the policy does at its hardest in most episodes.
 
-    healthy    the task was solved, and the hardest moment is at most CRASH times that of the task's median episode
-
-Measured by contact forces where an episode has them, and by external joint torques where its stream has them.
+healthy    the task was solved, and the greatest force is at most CRASH times that of the task's median episode
 """
 
 from __future__ import annotations
@@ -31,23 +29,17 @@ def peak_torques(episode: Episode) -> NDArray[np.float64]:
     return np.max([np.zeros(len(episode)), *torques], axis=0)
 
 
-def crashes(
-    episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = (), torques: bool = True
-) -> dict[int, float]:
+def crashes(episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = ()) -> dict[int, float]:
     """Return the numbers of the episodes that crash, and how many times as hard as is usual in their tasks they press.
 
-    ``reference`` says which episodes tell what is usual: by default, and where none does, all. ``torques`` of joints
-    count beside contact forces.
+    ``reference`` says which episodes tell what is usual: by default, and where none does, all.
     """
     of, times = np.asarray(tasks), np.zeros(len(episodes))
     tells = np.array(reference or [True] * len(episodes), bool)
-    peaks = [np.array([peak_force(e) for e in episodes])]
-    if torques:
-        peaks.append(np.array([peak_torques(e).max() for e in episodes]))
-    for peak in peaks:
-        for task in dict.fromkeys(tasks):
-            own = (of == task) & np.isfinite(peak)
-            known = own & tells if (own & tells).any() else own
-            if own.any() and (usual := np.median(peak[known])) > 0:
-                times[own] = np.maximum(times[own], peak[own] / usual)
+    peak = np.array([peak_force(e) for e in episodes])
+    for task in dict.fromkeys(tasks):
+        own = (of == task) & np.isfinite(peak)
+        known = own & tells if (own & tells).any() else own
+        if own.any() and (usual := np.median(peak[known])) > 0:
+            times[own] = peak[own] / usual
     return {int(n): float(times[n]) for n in np.flatnonzero(times > CRASH)}

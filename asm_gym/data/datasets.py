@@ -268,14 +268,9 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
 def _names(feature: dict[str, Any]) -> list[str]:
     """Names of the numbers of a feature, in a list or in lists by what they name; empty where they have none."""
     names = feature.get("names") or []
-    found = list(_words(list(names.values()) if isinstance(names, dict) else names))
+    parts = names.values() if isinstance(names, dict) else names if isinstance(names, list) else []
+    found = [str(name) for part in parts for name in np.ravel(part)]
     return found if len(set(found)) == len(found) else []
-
-
-def _words(names: Any) -> Iterator[str]:
-    """The names in lists at any depth."""
-    for name in names if isinstance(names, list) else []:
-        yield from _words(name) if isinstance(name, list) else [str(name)]
 
 
 def _split(name: str, values: NDArray[Any], names: Sequence[str]) -> Iterator[tuple[str, NDArray[Any]]]:

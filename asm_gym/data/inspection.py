@@ -18,9 +18,6 @@ from asm_gym.readings import noise_of, resolution, spans
 FEW_VALUES = 8  # A channel of fewer different values hardly moves
 JITTERS = 0.1  # share of a period that steps spread by from which on a clock jitters
 
-SHOWN = {"mixed": "words", "double": "sense"}
-"""How a role is called in the table, where not by its name."""
-
 
 class Inspection(NamedTuple):
     """A log."""
@@ -106,7 +103,7 @@ def _facts(column: Column) -> dict[str, Any]:
     return {
         "channel": column.name,
         "unit": column.unit,
-        "is": SHOWN.get(column.role, column.role),
+        "is": column.role,
         "from": float(known.min()) if len(known) else np.nan,
         "to": float(known.max()) if len(known) else np.nan,
         "noise": noise_of(values),

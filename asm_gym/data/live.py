@@ -3,7 +3,8 @@
 A source that falls silent has died. A new source is one row of ``LIVE``. ROS itself is not needed for its topics:
 
     /joint_states      on DDS rt/joint_states, of type sensor_msgs::msg::dds_::JointState_
-    a row              a message of the first topic, at the time in its header, with the newest of the others
+    a row              a message of the first topic, at the time in its header, with the newest of the others; of
+                       several publishers there, one with the most joints
     numbers            named as those of a bag are, joint_states.position[panda_joint1] (``asm_gym.data.bags``)
 
 Source: ROS 2 design, "Topic and Service name mapping to DDS".
@@ -33,9 +34,6 @@ from asm_gym.validation import check_number
 POLL_S = 0.002  # how often a source is looked at for more [s]
 LARGEST = 65_535  # bytes of a datagram
 LONGEST = 100 * LARGEST  # bytes of a line: more than a row of any robot
-EMPTY = b"an empty datagram"  # the line that stands for one
-
-
 CONNECT_S = 5.0  # how long a topic may take to be found [s]
 WAIT_S = 0.05  # how often the end of a topic is looked for while nothing comes [s]
 AT_ONCE = 2048  # messages of a topic taken, and kept for the reader, at once: four seconds of 500 Hz
@@ -131,7 +129,7 @@ def _follow_datagrams(place: str, stdin: TextIO, silence: float, first: float) -
                 return None
             if (host and IPv4Address(address) != believed) or (own and source != int(own)):
                 return None
-            return (found.rstrip(b"\n") or EMPTY) + b"\n"
+            return (found.rstrip(b"\n") or b"an empty datagram") + b"\n"
 
         yield from _lines(more, silence, first)
 
@@ -186,21 +184,22 @@ def _follow_topics(topics: str, silence: float) -> Iterator[str]:
     waiting.attach(
         core.ReadCondition(readers[clock], core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead)
     )
-    last_at, latest, rows = dict.fromkeys(names, time.monotonic()), dict[str, Numbers](), 0
-    while time.monotonic() - last_at[clock] <= silence:
+    latest, start, rows = dict[tuple[str, ...], tuple[float, Numbers]](), time.monotonic(), 0
+    while time.monotonic() - max((at for (of, *_), (at, _) in latest.items() if of == clock), default=start) <= silence:
         waiting.wait(_dds("util").duration(seconds=WAIT_S))
         for name in (*others, clock):
             for sample in readers[name].take(N=AT_ONCE):
                 if not getattr(getattr(sample, "sample_info", None), "valid_data", False):
                     continue  # it only says that a writer went
-                last_at[name] = time.monotonic()
-                latest[name] = {f"{name}.{number}": v for number, v in MESSAGES[kinds[name]](sample).items()}
-                if name == clock:
+                said = (name, *sorted(getattr(sample, "name", ())))  # several may publish there, each its own joints
+                numbers = {f"{name}.{number}": v for number, v in MESSAGES[kinds[name]](sample).items()}
+                latest[said] = time.monotonic(), numbers
+                if said == max((key for key in latest if key[0] == clock), key=len, default=None):
                     rows += 1
                     seconds = stamp_of(sample) or 1e-9 * sample.sample_info.source_timestamp
-                    yield json.dumps({"time": seconds} | {n: v for part in latest.values() for n, v in part.items()})
-            if name != clock and time.monotonic() - last_at[name] > silence:
-                latest.pop(name, None)  # an old value is a missing one
+                    yield json.dumps({"time": seconds} | {n: v for _, part in latest.values() for n, v in part.items()})
+        now = time.monotonic()
+        latest = {said: newest for said, newest in latest.items() if now - newest[0] <= silence}  # old is missing
     if not rows:
         raise OSError(f"no row came from {topics} for {silence:g} s")
     raise SourceDied(f"nothing came for {silence:g} s")

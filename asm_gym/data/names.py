@@ -35,6 +35,8 @@ SECONDS = {
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), 1e-9),
 }
 """Seconds in one, by the unit behind the name of a clock."""
+LONGER = SECONDS | dict.fromkeys(("min", "minutes"), 60.0) | dict.fromkeys(("h", "hours"), 3600.0) | {"d": 86400.0}
+"""Those that stand in brackets: an ``angle_min`` holds no minutes."""
 
 # Names of columns that count rows.
 COUNTERS = {"", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0"}
@@ -142,7 +144,8 @@ def label_of(name: str) -> str:
 
 def is_clock(name: str) -> bool:
     """Tell whether a column holds times. A bare ``T`` is a temperature."""
-    return name.strip() != "T" and CLOCK.fullmatch(name.strip()) is not None
+    bare, unit = split_unit(name.strip())
+    return bare != "T" and CLOCK.fullmatch(bare if unit in LONGER else name.strip()) is not None
 
 
 def is_label(name: str, patterns: Sequence[str] = ()) -> bool:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.channels import RESAMPLED, ColumnPlan
-from asm_gym.data.clock import EPOCHS, SLOWEST_WITHOUT_UNIT, UNITS, Clock, clocks_among
+from asm_gym.data.clock import EPOCHS, SLOWEST_WITHOUT_UNIT, UNITS, Clock, clock_called, clocks_among
 from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.tables import Named, is_key, named_columns, named_row
 from asm_gym.data.text import Dialect, check_cells, flat_row, header_of
@@ -86,10 +86,10 @@ class Row(NamedTuple):
 
 
 class RowReader:
-    """Read lines as rows of the stream of a memory."""
+    """Read lines as rows of the stream of a memory; ``clock`` is the column of times, by default the first one."""
 
-    def __init__(self, spec: StreamSpec) -> None:
-        self.spec, self.line = spec, 0
+    def __init__(self, spec: StreamSpec, clock: str = "") -> None:
+        self.spec, self.line, self._wanted = spec, 0, clock
         self._dialect = Dialect(",", comma=False)
         self._header: list[str] | None = None  # of CSV
         self._plan: ColumnPlan | None = None  # of rows by name
@@ -167,7 +167,8 @@ class RowReader:
         doubled = [name for name in plan.columns if names.count(name) > 1]
         if doubled:
             raise ValueError(f"it has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
-        self._clock = next((c for c in clocks_among(names) if not set(plan.columns) & set(c.columns)), None)
+        found = [clock_called(self._wanted, names)] if self._wanted else clocks_among(names)
+        self._clock = next((c for c in found if not set(plan.columns) & set(c.columns)), None)
         self._plan = plan
         return plan
 

@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,35 +19,29 @@ SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learn
 AROUND_S = 5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is no normal motion
 
 
-class NormalEpisodes(NamedTuple):
-    """The episodes that are learned from, and how many others were left out, by why."""
-
-    episodes: list[Episode]
-    left_out: Counter[str]
-
-
 def normal_episodes(
     logs: Iterable[Log], between_marks: bool = False, progress: Callable[[int, int], object] = lambda *_: None
-) -> NormalEpisodes:
-    """Return the normal episodes among logs; ``progress`` is called with the number of logs so far.
+) -> tuple[list[Episode], Counter[str]]:
+    """Return the normal episodes among logs, and how many others were left out, by why.
 
-    A table with marked rows is left out, or with ``between_marks`` learned from where none of them is near.
+    ``progress`` is called with the number of logs so far. A table with marked rows is left out, or with
+    ``between_marks`` learned from where none of them is near.
     """
-    kept = NormalEpisodes([], Counter())
+    kept, left_out = list[Episode](), Counter[str]()
     for n, (_, episode) in enumerate(logs, 1):
         progress(n, n)  # how many there are is known at the end
         role = episode.label.role if episode.label is not None else ""
         if between_marks and episode.spec.source == "table" and episode.faults.any():
             near = round(AROUND_S / episode.spec.dt)
             close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
-            kept.episodes.extend(_parts(episode, ~close))
+            kept.extend(_parts(episode, ~close))
         elif episode.faults.any() or role == "faulty":
-            kept.left_out["with a fault"] += 1
+            left_out["with a fault"] += 1
         elif not episode.success:
-            kept.left_out["failed"] += 1
+            left_out["failed"] += 1
         else:
-            kept.episodes.append(episode)
-    return kept
+            kept.append(episode)
+    return kept, left_out
 
 
 def complete_parts(episode: Episode) -> list[Episode]:

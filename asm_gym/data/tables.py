@@ -26,6 +26,7 @@ Named = dict[str, dict[str, str]]  # values by their kind, by the column that na
 _NAMES = re.compile(r"(?P<of>.*?)(?:joint_?)?names?[_.]?\[?(?P<place>\d+)\]?", re.I)
 _KEYS = "joint|motor|axis|servo|actuator|name|channel|signal|sensor|topic|field|variable"  # whose row it is
 _KEY = re.compile(rf"(.*[^a-z])?({_KEYS})s?([^a-z].*)?", re.I)
+MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
 MOST_KEYS = 64  # joints of a long table
 MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
 SPARSE = 0.55  # share of filled rows up to which a column comes at a lower rate: at most at every other row
@@ -49,6 +50,12 @@ def table_of(frame: Any) -> Columns:
         else:
             made[str(name)] = values
     return made
+
+
+def check_width(size: int) -> None:
+    """Raise ValueError where a table has more columns than can be watched."""
+    if size > MOST_COLUMNS:
+        raise ValueError(f"it has {size} columns, and at most {MOST_COLUMNS} can be watched")
 
 
 def as_array(column: Any) -> NDArray[Any]:
@@ -172,9 +179,10 @@ def _regular(mask: NDArray[np.bool_]) -> bool:
 def laid_out(frame: Any) -> Columns:
     """Return a table as ``table_of`` reads it, with a column a sense and a row a moment.
 
-    Raises ValueError where it has no row, or columns of several lengths.
+    Raises ValueError where it has no row, too many columns, or columns of several lengths.
     """
     table = table_of(frame)
+    check_width(len(table))
     lengths = {name: len(values) for name, values in table.items()}
     if not any(lengths.values()):
         raise ValueError(f"a table must hold columns of numbers, got {', '.join(table)[:200] or 'nothing'}")

@@ -24,17 +24,17 @@ from numpy.typing import NDArray
 
 from asm_gym.data.names import element_name
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns
+from asm_gym.data.tables import MOST_COLUMNS, Columns, check_width
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 LONGEST_WORD = 64  # characters that are kept of a word, of a label or a time
-MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
 LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
 SEPARATORS = ";\t,|"
 FLAGS = {"true": 1.0, "false": 0.0}
+BEFORE = " #%"  # a header
 DOUBLED = " #"  # stands, with a number, behind the name of a column that another has
 MOST_PREAMBLE, AGREE = 50, 5  # lines above a header; lines below it that must have as many cells
 LONGEST_UNIT = 12  # characters of a unit
@@ -117,6 +117,8 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     if rows.empty:
         raise ValueError(f"it needs a header and at least one row, got {len(lines)} lines")
     for n, found in cells.items():
+        if has_header and found and found[0].strip() in names and {cell.strip() for cell in found} <= set(names):
+            raise ValueError(f"line {n} is another header: cut the file there")
         check_cells(found, len(names), f"line {n} has")
     try:
         frame = pd.read_csv(
@@ -139,7 +141,7 @@ def _header_at(lines: Sequence[str]) -> int:
     for at, line in enumerate(lines[:MOST_PREAMBLE]):
         dialect = Dialect.of(line)
         with suppress(ValueError):
-            size = len(dialect.cells(_uncommented(line)))
+            size = len(dialect.cells(line.lstrip(BEFORE)))
             below = [dialect.cells(other) for other in lines[at + 1 :] if not other.lstrip().startswith("#")][:AGREE]
             agree = all(len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below)
             numbers = [sum(dialect.numbers_among(cells[:size])) for cells in below]
@@ -179,8 +181,10 @@ def _lines(path: Path) -> tuple[pd.Series[str], bool]:
 
     raw = path.read_bytes()
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff") or raw[1:200:2].count(0) > 80:  # UTF-16 of Windows
-        with suppress(UnicodeDecodeError):
-            raw = raw.decode("utf-16").encode()
+        raw = raw.decode("utf-16", "replace").encode()
+    if raw.endswith(b"\x00"):
+        note(f"{path}: zero bytes at its end, which a loss of power leaves, are left out")
+        raw = raw.rstrip(b"\x00")
     if b"\x00" in raw[:LONGEST_LINE]:
         raise ValueError("it is no text")
     found = [_decoded(line) for line in re.split(rb"\r\n?|\n", raw.removeprefix(b"\xef\xbb\xbf"))]
@@ -214,14 +218,9 @@ def _cut_off(dialect: Dialect, before: Sequence[str], last: Sequence[str], size:
     return len(cells) < size or any(dialect.is_number(was) and not dialect.is_number(now) for was, now in cells)
 
 
-def _uncommented(line: str) -> str:
-    """The line of a header that stands behind a # or a %."""
-    return line.lstrip(" ").lstrip("#%").lstrip(" ")
-
-
 def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
     """Names of the columns, and whether the first line holds them."""
-    cells = dialect.cells(_uncommented(line))
+    cells = dialect.cells(line.lstrip(BEFORE))
     numbers = dialect.numbers_among(cells)
     size = len(cells) - (bool(cells) and not cells[0].strip())
     if columns:
@@ -247,12 +246,6 @@ def header_of(cells: Sequence[str]) -> list[str]:
         raise ValueError("it needs a header and at least one row, got 0 lines")
     check_width(len(names))
     return names
-
-
-def check_width(size: int) -> None:
-    """Raise ValueError where a table has more columns than can be watched."""
-    if size > MOST_COLUMNS:
-        raise ValueError(f"it has {size} columns, and at most {MOST_COLUMNS} can be watched")
 
 
 def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:

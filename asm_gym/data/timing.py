@@ -32,6 +32,7 @@ FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in
 MOST_LOST = 4  # a log may have lost so many times its rows, or ten minutes; more is a clock that was set
 BRIDGED_ROWS = 2  # rows that are bridged where nobody says for how long
 PAID_BACK = 0.1  # of a second that is whole, how much may be missing for good: a tenth of all rows
+TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
 SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"  # why there is an alarm
 
 

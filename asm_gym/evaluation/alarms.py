@@ -10,7 +10,7 @@ import numpy as np
 
 from asm_gym.data.episode import spans
 from asm_gym.data.logs import Log
-from asm_gym.data.timing import blamed, bridged, reason
+from asm_gym.data.timing import TOGETHER_S, blamed, bridged, reason
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.spec import StreamSpec
 
@@ -30,7 +30,6 @@ class Alarm(NamedTuple):
         return self.log, f"{self.start:.3f}", f"{self.end:.3f}", self.channel, self.why, f"{self.excess:.2f}"
 
 
-TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
 FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
 
 

@@ -48,7 +48,7 @@ class Recordings(NamedTuple):
         """Sort by role. Raises ValueError where there is nothing normal to learn from or to test on."""
         healthy = [r for r in recordings if r.labelled.role in NOMINAL_ROLES and r.success]
         reference = [r.labelled.role != "nominal" for r in healthy]
-        found = crashes(healthy, [r.labelled.task for r in healthy], reference, torques=False)
+        found = crashes(healthy, [r.labelled.task for r in healthy], reference)
         crashed = {(healthy[n].labelled.task, healthy[n].labelled.seed) for n in found}
         roles: dict[str, list[Episode]] = {}
         failed = 0

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.data.rows import Row, RowReader, SourceDied
-from asm_gym.data.timing import LATE, SURPRISING, Bridge, blamed, reason
+from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
 from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions
@@ -32,13 +32,13 @@ from asm_gym.validation import as_float32
 MOST_LOST = 1000  # lost rows that a bridge is asked about one by one
 LATENCIES = 10_000  # newest rows whose latency is kept
 RETRY_S = 0.2  # time between two attempts to open a source again [s]
-TOGETHER_S = 1.0  # lines that cannot be read, and come within this time of another, are one alarm [s]
 
 ALARM, NOTE, SUMMARY = "alarm", "note", "summary"  # kinds of events
 DIED, UNREADABLE, CLOCK, RATE, WATCHDOG = "source died", "unreadable", "clock", "rate", "watchdog"
 """Why there is an alarm, beside surprise."""
 
 Opened = Callable[[float], Iterator[str]]
+Beat = Callable[[], bool] | None
 
 
 class LiveEvent(NamedTuple):
@@ -85,9 +85,10 @@ def follow(
     again: Opened | None = None,
     wait: float = 0.0,
     until_alarm: bool = False,
-    beat: Callable[[], bool] | None = None,
+    beat: Beat = None,
+    clock: str = "",
 ) -> int:
-    """Say every alarm as it is raised, and why; return how many there were.
+    """Say every alarm as it is raised, and why; return how many there were. Those of one cause are one.
 
     Args:
         lines, monitor: rows, as ``asm_gym.data.live.lines_from`` yields them; a calibrated monitor.
@@ -97,11 +98,12 @@ def follow(
             first line may take.
         until_alarm: the first alarm ends the watch.
         beat: of a watchdog, told of every row that was judged; it returns whether the watchdog lives.
+        clock: the column of times; by default the first that is called so.
 
     Raises:
         ValueError: no row came, or the first line of a source that cannot be opened anew is no row.
     """
-    watch = _Watch(monitor, say, seconds, beat)
+    watch = _Watch(monitor, say, seconds, beat, clock)
     source: Iterable[str] | None = lines
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*rows under this policy alarm")  # every alarm is said here
@@ -120,13 +122,11 @@ def follow(
 class _Watch:
     """The state of a source while it is watched; the arguments are those of ``follow``."""
 
-    def __init__(
-        self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float, beat: Callable[[], bool] | None
-    ) -> None:
+    def __init__(self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float, beat: Beat, clock: str) -> None:
         self.say, self.seconds, self.spec, self.beat = say, seconds, monitor.spec, beat
         spec: StreamSpec = monitor.spec
         self.engine = Engine(Robots.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
-        self.reader = RowReader(spec)
+        self.reader = RowReader(spec, clock)
         self.no_action = np.zeros((1, spec.motor.size), np.float32)
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.rows = self.alarms = self.unreadable = 0
@@ -138,8 +138,8 @@ class _Watch:
         """Begin anew: no row before is the past of those that follow."""
         self.engine.begin()
         self.bridge = Bridge(self.seconds, self.spec.dt, self.spec.size)
-        self.above = self.late = False
-        self.event = NO_EVENT
+        self.late, self.above, self.event = False, "", NO_EVENT  # above: why surprise is, empty where it is not
+        self.newest = dict[str, int]()  # row over the threshold, by why it was
 
     def _judge(self, numbers: Any, bridged: bool) -> RowReport:
         return self.engine.judge(as_float32(numbers)[None], self.no_action, active=np.array([not bridged]))
@@ -211,8 +211,9 @@ class _Watch:
             self.beat = None
             self.alarm("the watchdog has died: an alarm", WATCHDOG)
         excess = float(report.surprise.value[0] / report.threshold[0])
-        if excess > 1.0 and not self.above:
-            at, why = blamed(numbers, report.surprise.attribution[0]), reason(numbers)
+        why = (self.above or reason(numbers)) if excess > 1.0 else ""
+        if why and (self.rows - self.newest.get(why, -math.inf)) * self.spec.dt > TOGETHER_S:
+            at = blamed(numbers, report.surprise.attribution[0])
             channel = "" if at is None else self.spec.labels[at]
             because = "" if why == SURPRISING else f"  ({why})"
             took = self.latencies[-1]
@@ -222,7 +223,9 @@ class _Watch:
         event = EVENTS[report.event[0]]
         if event in (KNOCK, STOP) and event != self.event:
             self._note(f"{event}: no alarm")
-        self.above, self.event = excess > 1.0, event
+        self.above, self.event = why, event
+        if why:
+            self.newest[why] = self.rows
 
     def _lost(self, lost: int) -> None:
         """Go on over rows that did not come, as many as the bridge allows."""

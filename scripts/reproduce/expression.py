@@ -58,16 +58,9 @@ class ExpressionMemory:
         gain: float = 1.0,
         dynamics: str = TRACES,
     ) -> ExpressionMemory:
-        """Learn from whole episodes without labels.
+        """Learn from whole episodes without labels, in ``steps`` batches of 64 rows.
 
-        Args:
-            episodes: to learn from.
-            hidden: units.
-            rng: draws everything random.
-            steps: number of batches of 64 rows.
-            rate: learning rate.
-            gain: of the initial synapses from traces to the state.
-            dynamics: one of ``DYNAMICS``.
+        ``gain`` is of the initial synapses from traces to the state, ``dynamics`` one of ``DYNAMICS``.
         """
         reader, how, size = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]), DYNAMICS[dynamics], 64
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
@@ -117,11 +110,7 @@ def mean_demonstrations(train: Sequence[Episode]) -> Rows:
 def recalled(model: Expresser, tests: Sequence[Episode], means: Rows, cue: int) -> tuple[float, float]:
     """Return the pen's mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
-    Args:
-        model: expresses the skills.
-        tests: of one length.
-        means: (K, T, 2) mean path of each skill, in order of name.
-        cue: rows to read; the whole length for online recall.
+    ``tests`` are of one length, which as ``cue`` is online recall; ``means`` (K, T, 2) are paths in order of name.
     """
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
     first = cue if cue < len(streams) else 1

@@ -155,9 +155,9 @@ def _unrolled(
     return energy, error
 
 
-def cosine(a: Changes, b: Changes, names: Sequence[str] = COMPARED) -> float:
-    """Return the cosine between two changes of these arrays; 0 where one of them is 0."""
-    p, q = (np.concatenate([c.arrays[n].ravel() for n in names]) for c in (a, b))
+def cosine(a: Changes, b: Changes) -> float:
+    """Return the cosine between two changes; 0 where one of them is 0."""
+    p, q = (np.concatenate([c.arrays[n].ravel() for n in COMPARED]) for c in (a, b))
     length = float(np.linalg.norm(p) * np.linalg.norm(q))
     return float(p @ q) / length if length > 0 else 0.0
 
@@ -193,15 +193,13 @@ def one_seed(seed: int, config: Config) -> list[Record]:
 
 
 def angles(weights: Weights, probe: Batch, epoch: int) -> list[Record]:
-    """Return the angles [°] between the local change and each gradient, of all synapses and of each array."""
+    """Return the angles [°] between the local change and each gradient."""
     records = []
     read, alone = (local(weights, probe, ITERATIONS, alone) for alone in (False, True))
     for target in TARGETS:
         theirs, ours = exact(weights, probe, ITERATIONS, target), alone if target == "alone" else read
-        for name in (*COMPARED, "all"):
-            value = min(1.0, cosine(ours, theirs, COMPARED if name == "all" else (name,)))
-            where = {"epoch": epoch, "target": target, "array": name}
-            records.append({**where, "degrees": math.degrees(math.acos(value))})
+        degrees = math.degrees(math.acos(min(1.0, cosine(ours, theirs))))
+        records.append({"epoch": epoch, "target": target, "degrees": degrees})
     return records
 
 
@@ -239,15 +237,13 @@ def run(config: Config) -> Findings:
     targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
     angle = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
     missed = "Mean squared error of the next row [variance], before so many epochs"
-    arrays = kit.by("array", COMPARED)
     tables = [
-        kit.grid(angle, records, "degrees", targets, before, 0, array="all"),
-        kit.grid("Of each array, to the second", records, "degrees", arrays, before, 0, target="error"),
+        kit.grid(angle, records, "degrees", targets, before, 0),
         kit.grid(missed, records, "mse", ways, before, 3),
     ]
     with figure(height=3.3, width=8) as fig:
         left, right = fig.subplots(1, 2)
-        curves(left, records, "degrees", ("epoch", epochs), targets, array="all")
+        curves(left, records, "degrees", ("epoch", epochs), targets)
         curves(right, records, "mse", ("epoch", epochs), ways)
         left.axhline(90, color="#999999", linewidth=1)
         left.set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")

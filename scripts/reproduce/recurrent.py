@@ -89,16 +89,9 @@ def train(
     rate: float = 1e-2,
     cell: str = "GRU",
 ) -> Recurrent:
-    """Return a network that has learned from whole episodes.
+    """Return a network, a ``"GRU"`` or ``"LSTM"``, that has learned from so many batches of whole episodes.
 
-    Args:
-        trajectories: the episodes.
-        hidden: units.
-        updates: number of batches.
-        rng: draws everything random.
-        noise: standard deviation of the noise on the rows it reads.
-        rate: of Adam, with a cosine decay.
-        cell: ``"GRU"`` or ``"LSTM"``.
+    ``noise`` is the standard deviation of the noise on the rows it reads, ``rate`` that of Adam, with a cosine decay.
     """
     torch.set_num_threads(1)
     with torch.random.fork_rng(devices=[]):
