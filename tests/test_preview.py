@@ -8,7 +8,7 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.contact_limits import ContactLimits, Pace
-from asm_gym.guard.preview import foretell
+from asm_gym.guard.preview import preview_chunk
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -62,7 +62,7 @@ def test_a_hand_that_would_go_faster_than_any_was_there_is_the_end_of_a_chunk():
     row, last = rows[10], rows[10, 9:]
 
     def at(speed):
-        return foretell(np.float32([[speed, 0.0]] * 2), row, last, known, HAND.dt)[:2]
+        return preview_chunk(np.float32([[speed, 0.0]] * 2), row, last, known, HAND.dt)[:2]
 
     assert at(0.2) == (None, "")
     assert at(0.3) == (0, "pace")
@@ -88,7 +88,7 @@ def test_a_chunk_is_kept_up_to_the_action_that_leads_where_no_healthy_hand_was(o
     assert ahead[-1] is None
 
 
-def test_the_limit_of_speed_counts_in_what_is_foretold(memory, lift):
+def test_the_limit_of_speed_counts_in_a_preview(memory, lift):
     free = NeuralASMSafety(lift, memory, contact_limits=None)
     free.reset(seed=0)
     early = free.preview(DOWN).at

@@ -30,7 +30,7 @@ from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
-from asm_gym.guard.preview import Foretold
+from asm_gym.guard.preview import Preview
 from asm_gym.guard.report import FAILURE, RowReport
 from asm_gym.guard.robots import Robots
 from asm_gym.guard.watchdog import Watchdog
@@ -121,7 +121,7 @@ class LeRobotGuard:
         asm = {"alarm": self.alarm, "intervened": self.intervened, **self.last_alarm}
         return {**transition, "action": sent, "info": {**(transition.get("info") or {}), "asm": asm}}
 
-    def preview(self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]) -> Foretold:
+    def preview(self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]) -> Preview:
         """Return which action of a chunk leaves the range of healthy commands and why, before the first is executed.
 
         Execute ``actions[:at]``, then ask the policy again. Raises ValueError for a chunk without an action.

@@ -16,7 +16,7 @@ from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.arbiter import ENDED
 from asm_gym.guard.options import GuardOptions, OnAlarm
-from asm_gym.guard.preview import Foretold, checked_chunk
+from asm_gym.guard.preview import Preview, checked_chunk
 from asm_gym.guard.report import LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself, changed_by, outside
@@ -155,7 +155,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._limit_contact(anew=True)
         self._observation, self._alarms, self._solved = observation, 0, False
         self._row: NDArray[np.float32] | None = None  # (D,) sensed last in this episode
-        self._begun, self._foretold, self._announced = info, Foretold(None), 0
+        self._begun, self._preview, self._announced = info, Preview(None), 0
         if self._robots.meaning is not None:
             self._engine.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
@@ -163,7 +163,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._report(info, [nothing], None)
         return observation, info
 
-    def preview(self, actions: Any) -> Foretold:
+    def preview(self, actions: Any) -> Preview:
         """Return which action of a chunk (k, A) should not be executed and why, before the first is.
 
         Execute ``kept``, the actions before it (all of them under ``"monitor"``), then ask the policy again. Meanwhile
@@ -175,8 +175,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         row = self._source.first(self._observation, self._begun) if self._row is None else self._row
         last = self._executed.ravel() if self._executed.size else self._robots.rest
         found = self._engine.preview(0, chunk.reshape(len(chunk), -1), row, last)
-        self._foretold, self._announced = found._replace(kept=chunk[: len(found.kept)]), len(chunk)
-        return self._foretold
+        self._preview, self._announced = found._replace(kept=chunk[: len(found.kept)]), len(chunk)
+        return self._preview
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         if self._ended:
@@ -266,10 +266,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._alarms += alarm
         robots, asked, ahead = self._robots, self._executed, None
         if self._announced > 0:
-            at = None if self._foretold.at is None else self._foretold.at - 1
+            at = None if self._preview.at is None else self._preview.at - 1
             self._announced = 0 if at == -1 else self._announced - 1
-            self._foretold = self._foretold._replace(at=at)
-            ahead = {"at": at, "reason": self._foretold.reason, "known": self._foretold.known}
+            self._preview = self._preview._replace(at=at)
+            ahead = {"at": at, "reason": self._preview.reason, "known": self._preview.known}
             ahead = ahead if self._announced else None
         more: dict[str, float] = {"alarms": self._alarms}
         if (running := self._engine.running) is not None:

@@ -23,7 +23,7 @@ from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import STALE, Fitted, Observation, Observer, diagnosis_of, joined
 from asm_gym.guard.options import GuardOptions
-from asm_gym.guard.preview import Foretold, foretell
+from asm_gym.guard.preview import Preview, preview_chunk
 from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
 from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from
@@ -135,12 +135,12 @@ class Engine:
 
     def preview(
         self, robot: int, chunk: NDArray[np.float32], row: NDArray[np.float32], last: NDArray[np.float32]
-    ) -> Foretold:
+    ) -> Preview:
         """Return what becomes of a robot's chunk of actions (k, A), after a row (D,) and the action (A,) done last."""
         robots, limits = self._robots, self.limits[robot]
         within = np.where(np.isfinite(chunk), np.clip(chunk, robots.low, robots.high), chunk)
         slows = limits is not None and np.isfinite(limits.hand_speed) and robots.limits_contact
-        found = foretell(within, row, last, self.fitted.monitor, robots.dt, limits if slows else None)
+        found = preview_chunk(within, row, last, self.fitted.monitor, robots.dt, limits if slows else None)
         return found._replace(kept=chunk if self._name == "monitor" else chunk[: found.at])
 
     def act(self, actions: NDArray[np.float32], seen: Callable[[int], Any], idle: Mask | None = None) -> Command:

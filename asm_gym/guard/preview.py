@@ -25,7 +25,7 @@ SLACK = 0.05  # a hand may be faster than healthy ones by so much [m/s]
 Floats32 = NDArray[np.float32]
 
 
-class Foretold(NamedTuple):
+class Preview(NamedTuple):
     """The prediction for a chunk of actions."""
 
     at: int | None  # index of the first action that should not be executed; None if all may be
@@ -43,14 +43,14 @@ def checked_chunk(actions: Any, shape: tuple[int, ...]) -> Floats32:
     return chunk
 
 
-def foretell(
+def preview_chunk(
     chunk: Floats32,
     row: NDArray[np.floating[Any]],
     last: NDArray[np.floating[Any]],
     monitor: Any,
     dt: float,
     limits: ContactLimits | None = None,
-) -> Foretold:
+) -> Preview:
     """Return what becomes of a chunk.
 
     Args:
@@ -77,9 +77,9 @@ def foretell(
         elif commands is not None and not reason:
             reason = out_of_range(commands, last, action)
         if reason:
-            return Foretold(j, reason, j * dt, known)
+            return Preview(j, reason, j * dt, known)
         last = action
-    return Foretold(None, known=known)
+    return Preview(None, known=known)
 
 
 def _share(limits: ContactLimits, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:

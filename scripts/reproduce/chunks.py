@@ -1,4 +1,4 @@
-"""First blows foretold from chunks of actions, and chunks refused in vain, by what healthy episodes of the task tell.
+"""First impacts predicted from chunks of actions, and chunks refused in vain, with places from healthy episodes.
 
 Policies act alone. Every ``EVERY`` steps the next ``CHUNK`` actions are announced, as a policy of chunks would.
 """
@@ -15,7 +15,7 @@ import pandas as pd
 from asm_gym.detection.commands import learned_motion
 from asm_gym.detection.contact_limits import Pace
 from asm_gym.evaluation.tables import Table
-from asm_gym.guard.preview import foretell
+from asm_gym.guard.preview import preview_chunk
 from asm_gym.policies import rollout
 from asm_gym.rollouts.collect import collect, environment, staged
 from asm_gym.scripts.command import option
@@ -51,11 +51,11 @@ def episode(job: tuple[harm.Case, Any]) -> kit.Record:
     done, hits = np.array(rows)[:, known.spec.motor], np.flatnonzero(np.array(forces) > harm.EXCESS)
     until = int(hits[0]) if hits.size else len(rows) - 1
     chunks = {t: done[t + 1 : t + 1 + CHUNK] for t in range(0, until, EVERY)}
-    told = {t: foretell(chunk, rows[t], done[t], known, arm.dt) for t, chunk in chunks.items()}
-    refused = [t for t, foretold in told.items() if foretold.at is not None]
+    previews = {t: preview_chunk(chunk, rows[t], done[t], known, arm.dt) for t, chunk in chunks.items()}
+    refused = [t for t, preview in previews.items() if preview.at is not None]
     early = bool(refused) and (until - refused[0]) * arm.dt >= AHEAD_S
     vain = [t for t in refused if not hits.size or t + CHUNK < until]
-    found = {"blow": bool(hits.size), "foretold": bool(hits.size) and early, "in_vain": len(vain)}
+    found = {"blow": bool(hits.size), "predicted": bool(hits.size) and early, "in_vain": len(vain)}
     return {**case.key, **found, "hours": until * arm.dt / 3600}
 
 
@@ -76,7 +76,7 @@ def run(config: Config) -> kit.Findings:
     groups = [*frame.groupby(["kind"], sort=False), *frame.groupby(["task", "policy"], sort=False)]
     rows = []
     for names, own in groups:
-        counts = f"{len(own)}", f"{own.foretold.sum()} of {own.blow.sum()}", f"{own.in_vain.sum()}"
+        counts = f"{len(own)}", f"{own.predicted.sum()} of {own.blow.sum()}", f"{own.in_vain.sum()}"
         rows.append((", ".join(names), *counts, f"{own.hours.sum():.2f}"))
-    headings = ("", "episodes", f"blows foretold {AHEAD_S:g} s ahead", "chunks refused in vain", "hours")
+    headings = ("", "episodes", f"impacts predicted {AHEAD_S:g} s ahead", "chunks refused in vain", "hours")
     return kit.Findings(records, [Table("Chunks of actions", headings, rows)])
