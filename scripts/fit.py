@@ -178,24 +178,24 @@ def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
     """Yield notes on which columns of a log are commands."""
     names = ", ".join(c.name for c in spec.channels if c.group == MOTOR)
     if spec.source == "table" and not names:
-        yield "no command is recorded: it is guessed from the motion, and faults are found later; --action names one"
+        yield "no command is recorded, so faults are found later; --action names the columns of commands"
     elif spec.source == "table" and not args.action:
-        yield f"taken as commanded, by name: {names}; the output of a controller would hide pushes"
+        yield f"read as commands, by name: {names}; the output of a controller would hide pushes"
 
 
 def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
-    """Yield notes on what the body model is worth, and which columns it takes for which joints."""
+    """Yield notes on the gain from the body model, and the column of each joint."""
     values = monitor.values_ if isinstance(monitor, NeuralASM) else None
     model = monitor.model if values is None else values.monitor.model
     if args.urdf is None or not isinstance(model, ValueAssociation):
         return
-    left = f"it leaves {model.left_by_body:.2f} of what is left of unseen torques without it"
+    left = f"with it the squared error of held-out torques is {model.left_by_body:.2f} of that without it"
     if model.links is None:
-        yield f"{args.urdf} is not used, for {left}: see that it holds this arm's masses, and names joints as the log"
+        yield f"{args.urdf} is not used: {left}; check its masses, and that it names joints as the log does"
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
-    how = "by name" if model.links.by_name else "by what explains the torques best, for no column names a joint"
-    yield f"{args.urdf} is used: {left}; angles are taken {how}: {joints}"
+    how = "by name" if model.links.by_name else "by the best fit to the torques, as no column names a joint"
+    yield f"{args.urdf} is used: {left}; angles are assigned {how}: {joints}"
 
 
 def hours_of(episodes: list[Episode]) -> float:

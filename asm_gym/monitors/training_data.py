@@ -53,11 +53,11 @@ def mute_channels(episodes: Sequence[Episode]) -> list[str]:
     """Say, a line each, which numbers of the stream never move, and which are copies of others."""
     rows, labels = np.concatenate([e.stream for e in episodes]).astype(np.float64), episodes[0].spec.labels
     moves = np.ptp(rows, axis=0) > 0
-    lines = [f"{labels[i]} never moves in these episodes: any move of it will surprise" for i in np.flatnonzero(~moves)]
+    lines = [f"{labels[i]} never moves in these episodes: its motion will be an alarm" for i in np.flatnonzero(~moves)]
     moving = np.flatnonzero(moves)
     alike = np.abs(np.corrcoef(rows[:, moving], rowvar=False).reshape(len(moving), -1)) > ALIKE
     pairs = ((i, np.argmax(own)) for i, own in enumerate(alike) if np.argmax(own) < i)
-    return lines + [f"{labels[moving[i]]} says what {labels[moving[j]]} says, and cannot check it" for i, j in pairs]
+    return lines + [f"{labels[moving[i]]} is a copy of {labels[moving[j]]}, and cannot check it" for i, j in pairs]
 
 
 def hashes_of(episodes: Sequence[Episode]) -> Hashes:
