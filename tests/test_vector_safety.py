@@ -160,6 +160,16 @@ def test_one_observe_serves_all_environments():
     assert calls == [(3, SPEC.size)] * 12
 
 
+def test_actions_of_a_wrong_shape_are_refused_and_end_no_episode():
+    many = VectorNeuralASMSafety(SyncVectorEnv(fakes(lambda e: e)), monitor())
+    many.reset(seed=0)
+    for wrong in (np.zeros(3), np.zeros((3, 4)), np.zeros((2, 3))):
+        with pytest.raises(ValueError, match="actions have the shape"):
+            many.step(wrong)
+    *_, terminated, truncated, _ = many.step(np.zeros((3, 3), np.float32))
+    assert not (terminated | truncated).any()
+
+
 def test_what_makes_no_sense_is_refused(lift):
     many = SyncVectorEnv(fakes(lambda e: e))
     other = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05)

@@ -131,6 +131,8 @@ class Observer:
         self._recalls = monitor if isinstance(monitor, ExpectsActions) and recalls else None
         self.latency = 0.0  # of the monitor at the last rows [s]
         self.begin(np.ones(count, bool))
+        if self._ours is not None:  # what a row needs is loaded now, and not within the first step
+            self._ours.observe(self._initial, np.zeros((count, self._size), np.float32))
 
     def begin(self, which: Mask) -> None:
         """New episodes in the streams of ``which`` (n,)."""
