@@ -44,7 +44,7 @@ MESSAGES: dict[str, Callable[[Any], Numbers]] = {
 }
 """The numbers of a message, by its type."""
 
-MENDS = {".mcap": "mcap recover", ".bag": "rosbag reindex", ".db3": "sqlite3 FILE .recover | sqlite3 NEW.db3"}
+MENDS = {".mcap": "mcap recover", ".bag": "rosbag reindex"}
 """What mends a bag that was cut off, by its suffix."""
 
 
@@ -58,8 +58,8 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = MENDS[path.suffix]
-        raise ValueError(f"it is damaged: {error}; where its recorder was killed, {mend} mends it") from error
+        mend = f"; where its recorder was killed, {MENDS[path.suffix]} mends it" if path.suffix in MENDS else ""
+        raise ValueError(f"it is damaged: {error}{mend}") from error
 
 
 def _columns(bag: Any) -> Columns:
