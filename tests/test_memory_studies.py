@@ -10,7 +10,7 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.reproduce import panda, workspace
+from asm_gym.scripts.reproduce import memorise_and_recall, panda, workspace
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
@@ -73,6 +73,18 @@ def small_batch(steps: int) -> tuple[Weights, Batch]:
     weights.W_F[:] = rng.normal(size=weights.W_F.shape)
     weights.W_D[:] = 0.1 * rng.normal(size=weights.W_D.shape) * direct_synapses(5, 2)
     return weights, Batch(senses, commands)
+
+
+def test_the_network_as_published_memorises_what_it_reads_side_by_side(monkeypatch):
+    monkeypatch.setattr(memorise_and_recall, "PUBLISHED_UNITS", 32)
+    monkeypatch.setattr(memorise_and_recall, "PUBLISHED_RATE", 3e-3)
+    train = copybook(repertoire(2, np.random.default_rng(0)), 1, np.random.default_rng(1))
+    means, errors = mean_demonstrations(train), {}
+    for epochs in (1, 60):
+        model = memorise_and_recall.as_published(train, epochs, np.random.default_rng(2))
+        assert model.network.hidden_size == 32
+        errors[epochs] = recalled(model, train, means, STEPS)[0]
+    assert errors[60] < 0.5 * errors[1]
 
 
 def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finite_differences():
