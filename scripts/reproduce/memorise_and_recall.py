@@ -45,7 +45,7 @@ MODELS = {
     "memory": "traces, local",
     "memory_wide": "traces, local, 4 × the units",
     "settling": "settling, local",
-    "published": "settling, as published",
+    "published": "settling, as published, 480 units",
     "gru": "GRU, BPTT",
 }
 UNITS = {"memory_wide": 4.0, "settling": 1.75}
