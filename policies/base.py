@@ -17,7 +17,7 @@ PolicyState = Any  # what a policy carries from step to step, a value: passed in
 
 @runtime_checkable
 class Policy(Protocol):
-    """Acts. Every stable-baselines3 model is one."""
+    """Choose actions; every stable-baselines3 model is a policy."""
 
     def predict(
         self,

@@ -65,7 +65,7 @@ class ActionDelay(ActionFault):
 
 
 class ActionDrop(ActionFault):
-    """Lose actions, each with ``probability``: the arm is told to stay, and the grippers what they were told."""
+    """Lose actions, each with ``probability``: the arm then stays, and the grippers keep their last command."""
 
     probability: float = within(0.5, low=0, high=1)
 
@@ -128,7 +128,7 @@ class ActionNoise(ActionFault):
 
 
 class Adversary(ActionFault):
-    """Disturb each axis by ``size`` [action units] straight against the commanded motion, the worst of this size."""
+    """Disturb each axis by ``size`` [action units] against the commanded motion, the worst disturbance of this size."""
 
     size: float = within(0.4, low=0, high=2)
 

@@ -26,7 +26,7 @@ class MotorFault(JointFault, EditingFault):
 
 
 class WeakJoint(MotorFault):
-    """A ``joint`` whose motor gives only a share ``strength`` of the commanded torque; 0 is a dead motor."""
+    """Reduce the torque of a ``joint``'s motor to a share ``strength``; 0 is a dead motor."""
 
     strength: float = within(0.5, low=0, high=1)
 
@@ -36,7 +36,7 @@ class WeakJoint(MotorFault):
 
 
 class JointFriction(MotorFault):
-    """A ``joint`` that moves stiffly: dry friction in ``newton_metres``, and ``viscous`` friction [N m s/rad].
+    """Stiffen a ``joint`` by dry friction of ``newton_metres`` and ``viscous`` friction [N m s/rad].
 
     A thousand newton metres are beyond every motor: the joint is blocked.
     """
@@ -53,7 +53,7 @@ class JointFriction(MotorFault):
 
 
 class Backlash(JointFault, HookedFault):
-    """Play of ±``gap`` [rad] in a joint's gear: its encoder follows only after the joint has crossed it."""
+    """Add play of ±``gap`` [rad] to a joint's gear: its encoder follows only after the joint has crossed it."""
 
     hooks = "corruptions"
 
@@ -81,7 +81,7 @@ class GripperFault(Fault):
 
 
 class GripperOpens(GripperFault, HookedFault):
-    """The grippers open, and stay open whatever they are told."""
+    """Open the grippers, and keep them open whatever their command."""
 
     hooks = "deliveries"
 
@@ -95,7 +95,7 @@ class GripperOpens(GripperFault, HookedFault):
 
 
 class WeakGripper(GripperFault, EditingFault):
-    """The grippers close with only a share ``strength`` of their force."""
+    """Reduce the force of the grippers to a share ``strength``."""
 
     strength: float = within(0.2, low=0, high=1)
 

@@ -27,7 +27,7 @@ class BodyFault(Fault):
 
 
 class Push(BodyFault, EditingFault):
-    """A steady force of so many ``newtons`` on a ``body``, along a ``direction`` in the world's axes."""
+    """Push a ``body`` with a steady force of ``newtons`` along a ``direction`` in the world's axes."""
 
     newtons: float = within(20.0, low=-1e4, high=1e4)
     direction: Vector3 = (0.0, 1.0, 0.0)
@@ -39,7 +39,7 @@ class Push(BodyFault, EditingFault):
 
 
 class Payload(BodyFault, EditingFault):
-    """A mass of so many ``kilograms`` on a ``body`` that the controller does not know of."""
+    """Attach a mass of ``kilograms`` to a ``body``, unknown to the controller."""
 
     body: str = HAND
     kilograms: float = within(1.0, above=0, high=1e3)
@@ -80,7 +80,7 @@ class ForceField(BodyFault):
 
 
 class Collision(ForceField):
-    """A stiff wall that appears across the way of a ``body``, ``gap`` [m] before it: F = k·depth - d·v while inside.
+    """Put a stiff wall in the way of a ``body``, ``gap`` [m] ahead of it: F = k·depth - d·v while inside.
 
     With ``stiffness`` k [N/m] and ``damping`` d [N s/m] on the way in, it pushes back with ``newtons`` at most.
     """
@@ -105,7 +105,7 @@ class Collision(ForceField):
 
 
 class CablePull(ForceField):
-    """An elastic cable that has caught: with ``stiffness`` [N/m] after ``slack`` [m], and ``newtons`` at most."""
+    """Pull by an elastic cable that has caught: ``stiffness`` [N/m] beyond ``slack`` [m], at most ``newtons``."""
 
     body: str = HAND
     stiffness: float = within(300.0, low=0, high=1e5)
@@ -123,7 +123,7 @@ class CablePull(ForceField):
 
 
 class HeldByPerson(ForceField):
-    """A person holds the arm with ``newtons`` at most: spring [N/m] and damper [N s/m] to a hand that sways.
+    """Hold the arm as a person does, with at most ``newtons``: spring [N/m] and damper [N s/m] to a hand that sways.
 
     The hand moves by ``sway`` [m], at about half a hertz.
     """

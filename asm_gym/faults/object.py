@@ -65,7 +65,7 @@ def _position(env: RobosuiteEnv, joint: int) -> Floats:
 
 
 class Slip(ObjectFault, EditingFault):
-    """The ``object`` turns slippery: ``friction`` is the coefficient that is left."""
+    """Make the ``object`` slippery: ``friction`` is the remaining coefficient."""
 
     friction: float = within(0.05, above=0, high=10)
 
@@ -82,7 +82,7 @@ class Slip(ObjectFault, EditingFault):
 
 
 class Snatch(ObjectFault, EditingFault):
-    """Somebody pulls at the ``object`` with so many ``newtons``, along a ``direction`` in the world's axes."""
+    """Pull at the ``object`` with ``newtons`` along a ``direction`` in the world's axes."""
 
     newtons: float = within(15.0, low=-1e4, high=1e4)
     direction: Vector3 = (0.0, 1.0, 0.3)
@@ -94,7 +94,7 @@ class Snatch(ObjectFault, EditingFault):
 
 
 class Teleport(ObjectFault):
-    """The ``object`` is suddenly elsewhere by ``offset`` [m], at rest; a reset puts it back."""
+    """Move the ``object`` by ``offset`` [m], at rest; a reset puts it back."""
 
     offset: Vector3 = within((0.05, 0.05, 0.0), low=-10, high=10)
 
@@ -105,7 +105,7 @@ class Teleport(ObjectFault):
 
 
 class Missing(ObjectFault):
-    """The ``object`` is gone; a reset brings it back."""
+    """Remove the ``object``; a reset brings it back."""
 
     @contextmanager
     def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
@@ -114,7 +114,7 @@ class Missing(ObjectFault):
 
 
 class Heavy(ObjectFault, EditingFault):
-    """The ``object`` is heavier than it looks by so many ``kilograms``."""
+    """Make the ``object`` heavier by ``kilograms``."""
 
     kilograms: float = within(0.5, above=0, high=1e3)
 
@@ -123,7 +123,7 @@ class Heavy(ObjectFault, EditingFault):
 
 
 class ObjectMass(ObjectFault, EditingFault):
-    """The mass of the ``object`` is ``factor`` times the usual."""
+    """Multiply the mass of the ``object`` by ``factor``."""
 
     factor: float = within(1.1, above=0, high=100)
 

@@ -99,7 +99,7 @@ class Noise(SensorFault):
 
 
 class Spikes(SensorFault):
-    """Put single readings off by ``amount`` [unit of the channel] either way, each with ``probability``."""
+    """Shift single readings by ±``amount`` [unit of the channel], each with ``probability``."""
 
     amount: float = within(0.5, low=-1e6, high=1e6)
     probability: float = within(0.2, low=0, high=1)
@@ -120,7 +120,7 @@ class Dropout(SensorFault):
 
 
 class Freeze(SensorFault):
-    """Keep the last reading, to the last digit."""
+    """Repeat the last reading exactly."""
 
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
         return memory[0]
@@ -137,7 +137,7 @@ class Delay(SensorFault):
 
 
 class FrozenEncoder(JointFault, HookedFault):
-    """Keep a ``joint``'s position at its last reading, to the last digit, and its velocity at 0."""
+    """Repeat the last position of a ``joint`` exactly, with velocity 0."""
 
     hooks = "corruptions"
 

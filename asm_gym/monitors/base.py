@@ -20,7 +20,7 @@ State = Any  # a monitor's running state: a value, passed in and returned, never
 
 
 class Surprise(NamedTuple):
-    """How unexpected the last row of each stream in a batch was.
+    """Hold the surprise of the last row of each stream in a batch.
 
     Attributes:
         value: (B,) number that the threshold applies to; ``inf`` where the row is not finite.
@@ -74,7 +74,7 @@ class Surprise(NamedTuple):
 
 
 class Monitor(Protocol):
-    """Anything that watches a stream and returns a surprise a row."""
+    """Watch a stream and return the surprise of each row; any object with these methods is a monitor."""
 
     spec: StreamSpec
 
@@ -96,7 +96,7 @@ class Monitor(Protocol):
 
 @runtime_checkable
 class ForgetsEvidence(Protocol):
-    """A monitor that adds up evidence, and can start anew after an alarm that was acted on."""
+    """A monitor that accumulates evidence, and can clear it after the response to an alarm."""
 
     def reset_evidence(self, state: State) -> State:
         """Return the state without the evidence so far; the model goes on."""

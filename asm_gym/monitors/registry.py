@@ -150,7 +150,7 @@ def check_monitor_name(name: str) -> None:
 
 @typed
 def monitor_class(name: str) -> MonitorKind:
-    """Return what makes and loads the monitors of that name.
+    """Return the kind of the monitors of that name.
 
     Raises:
         ValueError: there is no monitor of that name, or no such detection; the message lists what exists.
@@ -190,7 +190,7 @@ def make_monitor(name: str, spec: StreamSpec, **hyperparameters: Any) -> Calibra
 
 @typed
 def load_monitor(path: str | Path) -> CalibratedMonitor:
-    """Read what any monitor has saved, with the detection that it had.
+    """Read the file of any monitor, with its detection.
 
     Raises:
         FileNotFoundError: there is no such file.
