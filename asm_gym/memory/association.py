@@ -125,7 +125,12 @@ def leverage(a: Array, R: Array, Q: Array, groups: NDArray[np.intp], first: int)
     """Return l (B, X) of inputs (B, I), of which the X changes begin at ``first``; ``groups`` (X,) are numbered."""
     B, X, past = len(a), len(groups), a.shape[1] - len(groups)
     b, z, squares = np.empty_like(a), np.empty_like(a), np.empty(X, a.dtype)  # squares of a group, at its number
-    b[:, :first], b[:, first:past], b[:, past:] = a[:, :first], a[:, first + X :], a[:, first : first + X]
+    tail = np.empty((B, X), a.dtype)
+    for n in range(B):  # numba takes seconds to compile an assignment to a slice
+        for i in range(past):
+            b[n, i] = a[n, i if i < first else i + X]
+        for i in range(X):
+            b[n, past + i] = a[n, first + i]
     if B > 1:
         np.dot(b, R.T, z)
     else:
@@ -134,12 +139,16 @@ def leverage(a: Array, R: Array, Q: Array, groups: NDArray[np.intp], first: int)
             for j in range(i + 1):
                 total += R[i, j] * b[0, j]
             z[0, i] = total
-    out = outward(z[:, past:].copy(), Q)
     for n in range(B):
-        squares[:] = np.float32(0)
+        for i in range(X):
+            tail[n, i] = z[n, past + i]
+    out = outward(tail, Q)
+    for n in range(B):
+        total = np.float32(0)
         for i in range(a.shape[1]):
-            squares[0] += z[n, i] * z[n, i]
-        squares[1:] = squares[0]
+            total += z[n, i] * z[n, i]
+        for i in range(X):
+            squares[i] = total
         for i in range(X):
             squares[groups[i]] -= out[n, i] * out[n, i]
         for i in range(X):
@@ -170,7 +179,10 @@ def normalised_errors(
     f = hidden_units(inputs, V)
     out = outward(inputs, D)
     if inputs.shape[0] > 1:
-        out += outward(f, U)
+        driven = outward(f, U)
+        for n in range(out.shape[0]):
+            for i in range(out.shape[1]):
+                out[n, i] += driven[n, i]
     else:
         for i in range(U.shape[0]):
             total = np.float32(0)
