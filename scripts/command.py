@@ -187,17 +187,10 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
         return REFUSED
 
 
-def origin(name: str, args: Any) -> dict[str, str]:
+def origin() -> dict[str, str]:
     """Return how to make a report again: the whole command, the version, and when it was made."""
-    words = ["asm-gym", name]
-    for each in fields(args):
-        value = getattr(args, each.name)
-        if value == each.default or value in (None, ()):
-            continue
-        words += [] if each.metadata.get("positional") else [f"--{each.name.replace('_', '-')}"]
-        words += [] if value is True else map(str, value) if isinstance(value, tuple) else [str(value)]
     made = datetime.now(UTC).astimezone().isoformat(timespec="seconds")
-    return {"command": shlex.join(words), "version": f"asm-gym {__version__}", "date": made}
+    return {"command": shlex.join(["asm-gym", *sys.argv[1:]]), "version": f"asm-gym {__version__}", "date": made}
 
 
 def one_line(error: BaseException) -> str:

@@ -15,6 +15,7 @@ from asm_gym.rollouts.corpus import CLAIM, PARTS, QUICK, ROUNDS, VERSION, Corpus
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.scripts.command import Options, option, run
+from asm_gym.validation import check_number
 
 
 @dataclass(frozen=True)
@@ -23,17 +24,12 @@ class Args(Options):
 
     part: tuple[str, ...] = option(tuple(PARTS), least=1, known=PARTS)
     """Parts to record."""
-    rounds: int = option(ROUNDS, quick=1, least=1)
+    rounds: int = option(ROUNDS, quick=1, check=partial(check_number, "rounds", low=1, high=ROUNDS))
     """Number of rounds; each has the same share of every task, and the first also the training episodes."""
     workers: int = option(2, least=1)
     """Number of processes."""
     out: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of the corpus."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.rounds > ROUNDS:
-            raise ValueError(f"rounds must be at most {ROUNDS}, got {self.rounds}")
 
 
 def make(args: Args, console: Console) -> None:

@@ -127,9 +127,7 @@ def demonstrate(args: Args, console: Console) -> None:
     console.print(result)
     examples = [typical(m.watched) for m in rows]
     details = asdict(args) | versions("numba") | {"window_s": WINDOW_S}
-    drawn = {
-        "Surprise over time in a typical episode of each condition": figures.surprise_figure(examples),
-    }
+    drawn = {"Surprise over time in a typical episode of each condition": figures.surprise_figure(examples)}
     intro = (
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
         f"watched others, some of them faulty. {result}"

@@ -135,7 +135,7 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
         f"{summary}, as {args.monitor} sees them.",
         [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
         {over_time: drawn["surprise"], "What its most surprising channels sensed": drawn["stream"]},
-        details=origin("watch", args),
+        details=origin(),
     )
     return f"Wrote {args.out / 'report.html'} and alarms.csv"
 

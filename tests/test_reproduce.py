@@ -100,6 +100,3 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
     assert [row[2].split()[0] for row in table.rows] == ["2.0", "5.0"]  # peaks 5 and 6; peaks 2 to 6
     assert [row[-2:] for row in table.rows] == [("50 % of 2", "0 % of 1"), ("100 % of 2", "100 % of 1")]
-    (row,) = hours.exams_table(marks, {0.5: 0.5, 10.0: 0.5}).rows
-    assert row[:3] == ("lift_sac", "6 of 7", "1.00")
-    assert (row[3].endswith("broken"), row[4].endswith("broken")) == (True, False)

@@ -61,7 +61,7 @@ _mass: Any = types.ExternalFunction("mj_makeM", _on_data)
 _rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, types.int32, types.intp))
 
 
-@inner
+@partial(inner, inlined=True)
 def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
     """Evaluate the nominal model's dynamics at the live joint positions and velocities."""
     for i in range(len(nominal.qpos)):

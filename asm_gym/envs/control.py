@@ -19,6 +19,8 @@ Loops over arrays that exist already compile in a fifth of the time that array e
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from asm_gym.compilation import inner
@@ -82,7 +84,7 @@ RESTING = 0.1  # an arm none of whose joints is faster than this has come to res
 YIELD_LEVER = 0.15  # r₀: what a joint has at least for a lever [m]
 
 
-@inner
+@partial(inner, inlined=True)
 def set_goal(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Move the set-point of arm ``a`` as the action asks, from where the arm is now; M, L, A and G are scratch."""
     for i in range(arms.inputs[a]):
@@ -116,7 +118,7 @@ def set_goal(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None
                 goals.orientation[a, i, j] += work.L[i, k] * work.M[k, j]
 
 
-@inner
+@partial(inner, inlined=True)
 def read_arm(views: Views, nominal: NominalViews, arms: Arms, work: Work, a: int) -> None:
     """Write mass matrix M and bias h of arm ``a``, as the robot knows itself, its Jacobian J and velocity v."""
     site, root = arms.site[a], arms.root[a]
@@ -149,7 +151,7 @@ def multiply(M: Floats, n: int, x: Floats, out: Floats) -> None:
             out[i] += M[i, j] * x[j]
 
 
-@inner
+@partial(inner, inlined=True)
 def osc_torques(work: Work, n: int) -> None:
     """Write the torques of operational space control into tau.
 
@@ -182,7 +184,7 @@ def osc_torques(work: Work, n: int) -> None:
             work.tau[i] += J[r, i] * (F[0, r] - F[1, r])
 
 
-@inner
+@partial(inner, inlined=True)
 def brake(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Write the torques that hold arm ``a`` at its anchor, which follows what presses too hard, into tau."""
     n, fastest = arms.joints[a], 0.0
@@ -212,7 +214,7 @@ def brake(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
         work.tau[i] += work.h[i]
 
 
-@inner
+@partial(inner, inlined=True)
 def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Write the torques of arm ``a``'s controller into tau."""
     n, site = arms.joints[a], arms.site[a]
@@ -245,7 +247,7 @@ def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     osc_torques(work, n)
 
 
-@inner
+@partial(inner, inlined=True)
 def fastest_point(views: Views, arms: Arms, a: int) -> float:
     """Return the greatest speed of hand and links of arm ``a``, as far as each ``REACHES`` [m/s]."""
     site, com, most = views.site_xpos[arms.site[a]], views.subtree_com[arms.root[a]], 0.0
@@ -263,7 +265,7 @@ def fastest_point(views: Views, arms: Arms, a: int) -> float:
     return most
 
 
-@inner
+@partial(inner, inlined=True)
 def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: int) -> None:
     """Brake arm ``a``, of which M and v are known, along its own motion while its fastest point passes its limit."""
     limit = limits.speed[a]
@@ -278,7 +280,7 @@ def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: in
             views.ctrl[m] = min(max(command, views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
 
 
-@inner
+@partial(inner, inlined=True)
 def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, a: int) -> None:
     """Command the motors of arm ``a``, as far as they go."""
     read_arm(views, nominal, arms, work, a)

@@ -33,10 +33,7 @@ ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 
 @typed
 def parallel_map(
-    task: Callable[[Item], Result],
-    items: Sequence[Item],
-    workers: int = 2,
-    progress: Progress | None = None,
+    task: Callable[[Item], Result], items: Sequence[Item], workers: int = 2, progress: Progress | None = None
 ) -> list[Result]:
     """Return ``[task(item) for item in items]``, computed by so many processes, 1 of which is this one.
 

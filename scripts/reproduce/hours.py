@@ -16,7 +16,7 @@ from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.pretraining.exam import SEVERITIES, Exam, Marks, examine, usual_force
+from asm_gym.rollouts.pretraining.exam import SEVERITIES, Exam, Marks, card, examine, usual_force
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings
@@ -55,7 +55,7 @@ def run(config: Config) -> Findings:
         for m in marks:
             rate = hourly_alarms(m.at(threshold).solved)
             records.append({"promised": promised, "exam": m.name, "alarms": rate.k, "hours": rate.hours})
-    return Findings(records, [kept_table(marks, thresholds), exams_table(marks, thresholds)])
+    return Findings(records, [kept_table(marks, thresholds), card(marks, memory, WINDOW_S)])
 
 
 def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:
@@ -79,17 +79,3 @@ def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Tab
     )
     found = (f"{' and '.join(SEVERITIES)} found", "mild found")
     return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *found), rows)
-
-
-def exams_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:
-    """Return a row for each policy and task: false alarms at each promise."""
-    rows = []
-    for m in marks:
-        hours = sum(len(t) * t.dt for t in m.solved) / 3600
-        rates = (kept_rate(hourly_alarms(m.at(q).solved), r) for r, q in thresholds.items())
-        rows.append((m.name, f"{len(m.solved)} of {len(m.solved) + len(m.failed)}", f"{hours:.2f}", *rates))
-    return Table(
-        "False alarms per hour of each policy and task. A promise for all of them promises nothing of one.",
-        ("", "solved", "hours", *(f"promised {r:g}" for r in thresholds)),
-        rows,
-    )

@@ -123,7 +123,11 @@ class Babbler(StatefulPolicy):
     """The policy of a lesson."""
 
     def __init__(self, env: gym.Env[Any, Any], lesson: Lesson) -> None:
-        self._guide = _guide(lesson, env)
+        self._guide: Policy | None = None
+        if lesson.guide == REACHING:
+            self._guide = Reaching(env, lesson.seed, lesson.speed)
+        elif lesson.guide:
+            self._guide = make_policy(lesson.guide, env, seed=lesson.seed, style=Style(speed=lesson.speed))
         self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
         self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
@@ -212,12 +216,6 @@ class Reaching(StatefulPolicy):
         place = began + self._rng.uniform(*AROUND)
         turn = Rotation.from_rotvec(self._rng.uniform(-1.0, 1.0, 3) * TURNED).as_matrix()
         return Aim(began, upright, place, turn @ upright, float(self._rng.choice([OPEN, CLOSE])), GIVEN_UP)
-
-
-def _guide(lesson: Lesson, env: gym.Env[Any, Any]) -> Policy | None:
-    if lesson.guide == REACHING:
-        return Reaching(env, lesson.seed, lesson.speed)
-    return make_policy(lesson.guide, env, seed=lesson.seed, style=Style(speed=lesson.speed)) if lesson.guide else None
 
 
 def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
