@@ -99,11 +99,7 @@ def _cache_of(dispatcher: Any) -> Any:
 
 
 def inner(function: F, fastmath: bool = False, inlined: bool = False) -> F:
-    """Compile ``function`` for compiled functions to call: it has no entry for Python.
-
-    ``inlined`` into its callers before they are compiled, it is compiled once for each, and takes no arguments, of
-    which tuples of arrays make hundreds.
-    """
+    """Compile ``function`` for compiled functions to call; ``inlined``, as a part of each of them."""
     how: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
     how |= {"fastmath": fastmath, "forceinline": fastmath, "inline": "always" if inlined else "never"}
     return cast(F, numba.njit(**how)(function))

@@ -118,11 +118,6 @@ def each(what: str, work: Callable[[Item], Result], items: Sequence[Item], confi
         return parallel_map(work, items, config.workers, tell)
 
 
-def together(found: Sequence[Sequence[Record]]) -> list[Record]:
-    """Return the records of all repetitions as one list."""
-    return [record for own in found for record in own]
-
-
 def where(records: Sequence[Record], **values: Any) -> list[Record]:
     """Return the records that have these values."""
     return [r for r in records if all(r.get(name) == value for name, value in values.items())]

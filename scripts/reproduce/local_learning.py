@@ -231,7 +231,8 @@ def _reached(how: str, weights: Weights, judged: Batch, epoch: int) -> Record:
 
 def run(config: Config) -> Findings:
     """Run every seed."""
-    records = kit.together(kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config))
+    each = kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config)
+    records = [record for own in each for record in own]
     epochs = checkpoints(config.epochs)
     before, ways = kit.by("epoch", epochs), kit.by("learned_by", RATES)
     targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}

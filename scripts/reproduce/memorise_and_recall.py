@@ -90,7 +90,8 @@ class Config(kit.Config):
 def run(config: Config) -> Findings:
     """Measure every model on every repertoire."""
     jobs = list(product(config.repetitions, config.repertoires))
-    records = kit.together(kit.each("learning", partial(recall, config=config), jobs, config))
+    each = kit.each("learning", partial(recall, config=config), jobs, config)
+    records = [record for own in each for record in own]
     models, longest = {MODELS[m]: {"model": m} for m in config.models}, max(config.cues)
     sizes, cues = kit.by("skills", config.repertoires), kit.by("cue", config.cues)
     cued = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds"

@@ -378,5 +378,5 @@ def run(config: Config) -> Findings:
         make_missing(partial(demonstrate, folder=folder), wanted, lambda d: folder / d.name, config.workers, tell)
     files = {name: [folder / d.name for d in own] for name, own in asked.items()}
     found = kit.each("learning and acting", partial(one, config=config, files=files), config.repetitions, config)
-    records = kit.together([own for own, _ in found])
+    records = [record for own, _ in found for record in own]
     return Findings(records, tables(records), drawn(records, found[0][1]))

@@ -154,10 +154,7 @@ class Config(kit.Config):
     experiments: tuple[str, ...] = option(tuple(ARMS), quick=("panda",), least=1, known=ARMS)
     """Recordings; missing ones are left out, and named."""
     monitors: tuple[str, ...] = option(
-        (
-            *("neural_asm", "association_values", "association_linear+evidence", "kalman+evidence", "gru+evidence"),
-            RULE,
-        ),
+        ("neural_asm", "association_values", "association_linear+evidence", "kalman+evidence", "gru+evidence", RULE),
         quick=("association_values", RULE),
         least=1,
         known=(*MONITORS, *WITH_BODY, RULE),
@@ -182,7 +179,8 @@ def run(config: Config) -> Findings:
     if not found:
         raise FileNotFoundError("; ".join(missing))
     jobs = [Job(*one) for one in product(found, config.monitors, config.repetitions, range(FOLDS))]
-    records = kit.together(kit.each("watching", partial(examined, folder=config.folder), jobs, config))
+    each = kit.each("watching", partial(examined, folder=config.folder), jobs, config)
+    records = [record for own in each for record in own]
     first, *others = (table(where(records, experiment=name), ARMS[name]) for name in found)
     left_out = "".join(f" Left out: {why}." for why in missing)
     return Findings(records, [replace(first, caption=first.caption + left_out), *others])
