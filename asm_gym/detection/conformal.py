@@ -125,7 +125,7 @@ class Promise(NamedTuple):
         n, beyond = len(maxima), int((maxima > threshold).sum())
         counted, tail = (beyond + 1) / (n + 1), tail_at(maxima, threshold)
         rate = tail.expected(threshold) / n if tail else counted
-        return cls(n, rate, surely_below(beyond, n), modelled=tail is not None)
+        return cls(n, rate, max(rate, surely_below(beyond, n)), modelled=tail is not None)
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
