@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym import collect
+from asm_gym import Episode, collect
+from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import MOMENTUM, ContactLimits, Pace, healthy_forces
 from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -115,7 +116,7 @@ def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_
     monitor.save(tmp_path / "limit.asm")
     loaded = load_monitor(tmp_path / "limit.asm")
     assert loaded.healthy_ == monitor.healthy_
-    np.testing.assert_array_equal(loaded.pace_, monitor.pace_)
+    np.testing.assert_equal(loaded.pace_, monitor.pace_)
     assert limits_of("memory", loaded).pace is not None
     assert limits_of("memory", NeuralASM.pretrained("panda")).hand_speed == 0.15
 
@@ -189,3 +190,16 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
     for bad in (np.zeros((0, 16)), np.full((1, 16), np.nan), np.full((1, 16), 1e9), np.zeros((1, 15))):
         with pytest.raises(ValueError, match="pace must be rows"):
             Pace(bad)
+
+
+def test_a_task_with_enough_healthy_episodes_has_a_pace_of_its_own(tmp_path):
+    def episodes(task, count, velocity):
+        spec, stream = hands([velocity, 0, 0, 0, 0, 0], [0] * 6)
+        label = EpisodeLabel(task, "nominal")
+        return [Episode.from_stream(stream, spec, label=label) for _ in range(count)]
+
+    every = [*episodes("Lift", 40, 0.2), *episodes("Stack", 40, 0.4), *episodes("Door", 3, 0.6)]
+    known, here = Pace.by_task(every, every[0].spec), np.array([0.1, 0.2, 0.91])
+    fastest = {t: float(Pace.of(known, t).seen(0, here)[0, 0]) for t in ("Lift", "Stack", "Door", "Wipe")}
+    assert fastest == pytest.approx({"Lift": 0.2, "Stack": 0.4, "Door": 0.6, "Wipe": 0.6})
+    assert Pace.of({}, "Lift") is None

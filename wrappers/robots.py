@@ -191,6 +191,7 @@ def robots_of(
         brakes=holds_itself and members.ask("keeps_holding") is not None,
         grip=grip,
         dt=dt,
+        task=getattr(first("task"), "name", ""),
         chains=tuple(zip(*chains, strict=True)),
         felt_channels=felt,
         limits_contact=limits_contact,

@@ -8,14 +8,15 @@ counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from asm_gym.data.episode import Episode
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
 
@@ -25,6 +26,7 @@ LEFT_OUT = 0.05  # share of healthy episodes, those that pressed hardest, left o
 MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 100 N m
 
 
+OWN_PACE = 40  # healthy episodes of a task, from which on its pace is its own: at a bin others may go down fast
 FAR = 100  # cells; hands further away are not learned of
 CELL = 0.04, 0.04, 0.02  # edges of the cells by which pace is learned [m]
 FASTER = 1.25  # a hand may be commanded to go so many times as fast as healthy ones did: about 0.8 of it is reached
@@ -37,7 +39,8 @@ class Pace:
     """How fast healthy hands went, by place and direction.
 
     Args:
-        cells: (N, 16) arm; place in cells; greatest twist along the axes of the world and against them.
+        cells: (N, 16) arm; place in cells; greatest twist along the axes of the world and against them. The greatest
+            counts where a place is given twice.
 
     Raises:
         ValueError: numbers that are none of these.
@@ -50,10 +53,28 @@ class Pace:
         self.cells, at = cells, cells[:, :4].astype(np.intp)
         self._low = at.min(axis=0) - (0, 1, 1, 1)
         grid = np.zeros((*(at.max(axis=0) - self._low + (1, 2, 2, 2)), 12), np.float32)
-        grid[tuple((at - self._low).T)] = cells[:, 4:]
+        np.maximum.at(grid, tuple((at - self._low).T), cells[:, 4:])
         # Neighbours count as well, downwards those at the same height.
         self._seen = maximum_filter(grid, (1, 3, 3, 3, 1))
         self._seen[..., 8] = maximum_filter(grid[..., 8], (1, 3, 3, 1))
+
+    @classmethod
+    def of(cls, known: Mapping[str, NDArray[np.floating[Any]]], task: str = "") -> Self | None:
+        """Return the pace of a task, by cells of each; of all tasks where it is not ``known``, None where none is."""
+        cells = [known[task]] if task in known else list(known.values())
+        return cls(np.concatenate(cells)) if cells else None
+
+    @classmethod
+    def by_task(cls, episodes: Sequence[Episode], spec: StreamSpec) -> dict[str, NDArray[np.float32]]:
+        """Return the cells of each task with ``OWN_PACE`` healthy episodes, and of all others under an empty name."""
+        tasks = [e.label.task if e.label else "" for e in episodes]
+        names = [task if tasks.count(task) >= OWN_PACE else "" for task in tasks]
+        found = {}
+        for name in dict.fromkeys(names):
+            cells = cls.learned([e.stream for e, of in zip(episodes, names, strict=True) if of == name], spec)
+            if cells is not None:
+                found[name] = cells
+        return found
 
     @staticmethod
     def learned(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> NDArray[np.float32] | None:

@@ -80,7 +80,8 @@ class Engine:
         completion = diagnosis.completion if diagnosis is not None and graded else None
         self._rows = Rows(robots, spec, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, n, self._rows, recalls)
-        limits, acts_on_them = limits_of(options.contact_limits, monitor), name != "monitor" and robots.rest.size > 0
+        limits = limits_of(options.contact_limits, monitor, robots.task)
+        acts_on_them = name != "monitor" and robots.rest.size > 0
         self._limits = EpisodeLimits(robots, limits, acts_on_them)
         self.running = self._arbiter.running
         """The threshold that follows a policy; None where it does not."""

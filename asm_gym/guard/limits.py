@@ -57,9 +57,8 @@ class EpisodeLimits:
         self.now = tuple(self._gentle if careful else self._usual for careful in self._careful)
 
 
-def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor) -> ContactLimits | None:
-    """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones."""
+def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor, task: str = "") -> ContactLimits | None:
+    """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones in a task."""
     if contact_limits is None or isinstance(contact_limits, ContactLimits):
         return contact_limits
-    cells = getattr(monitor, "pace_", None)
-    return ContactLimits(healthy=getattr(monitor, "healthy_", ()), pace=None if cells is None else Pace(cells))
+    return ContactLimits(healthy=getattr(monitor, "healthy_", ()), pace=Pace.of(getattr(monitor, "pace_", {}), task))

@@ -61,8 +61,9 @@ def preview_chunk(
         dt: control period [s].
         limits: slow hands down; None for no limits.
     """
-    cells, motion, commands = (getattr(monitor, name, None) for name in ("pace_", "motion_", "commands_"))
-    pace = None if cells is None or motion is None else Pace(cells)
+    motion, commands = getattr(monitor, "motion_", None), getattr(monitor, "commands_", None)
+    own = limits.pace if limits is not None else None
+    pace = None if motion is None else own or Pace.of(getattr(monitor, "pace_", {}))
     place, velocity = row.astype(np.float64)[hands_of(monitor.spec)].swapaxes(0, 1)  # (H, 3)
     known, rows = pace is not None or commands is not None, max(1, round(dt / monitor.spec.dt))
     for j, action in enumerate(chunk):

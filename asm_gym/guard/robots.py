@@ -40,6 +40,7 @@ class Robots:
     brakes: bool = False  # the robots stay by themselves where they are told to, whatever the action is
     grip: NDArray[np.intp] = field(default_factory=lambda: NO_COLUMNS)  # (G,) places in the action of grippers
     dt: float = 1.0  # control period [s]
+    task: str = ""  # its name; empty where unknown
     chains: tuple[tuple[Chain, ...], ...] = ()  # of each arm, its kinematics in each of the n robots
     felt_channels: tuple[Channel, ...] = ()  # what the arms feel in physics substeps; empty where nothing
     limits_contact: bool = False  # they compare what they feel with contact limits in every physics substep

@@ -60,7 +60,7 @@ class CalibratedMonitor:
         promised_: ``"episode"`` or ``"hour"``, the unit of the promise.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty if the stream has no such channels.
-        pace_: (N, 16) speed of the hands in these episodes, by place and direction; see ``Pace``.
+        pace_: (N, 16) speed of the hands in these episodes, by place and direction, of each task; see ``Pace``.
     """
 
     model: StreamModel
@@ -68,7 +68,7 @@ class CalibratedMonitor:
     maxima_: NDArray[np.float64] | None
     blocks_: Blocks | None
     healthy_: tuple[float, ...]
-    pace_: NDArray[np.float32] | None
+    pace_: dict[str, NDArray[np.float32]]
     motion_: NDArray[np.floating[Any]] | None
     commands_: NDArray[np.floating[Any]] | None
 
@@ -232,7 +232,7 @@ class CalibratedMonitor:
         self.threshold_, self.promised_ = threshold, asked.per
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
         streams = [episode.stream for episode in episodes]
-        self.healthy_, self.pace_ = healthy_forces(streams, self.spec), Pace.learned(streams, self.spec)
+        self.healthy_, self.pace_ = healthy_forces(streams, self.spec), Pace.by_task(episodes, self.spec)
         self.motion_, self.commands_ = learned_motion(streams, self.spec), healthy_commands(streams, self.spec)
         return self
 
@@ -352,7 +352,7 @@ class CalibratedMonitor:
     def _uncalibrate(self) -> None:
         self.threshold_ = self.maxima_ = self.blocks_ = None
         self.promised_, self.healthy_ = EPISODE, ()
-        self.pace_ = self.motion_ = self.commands_ = None
+        self.pace_, self.motion_, self.commands_ = {}, None, None
 
     @property
     def _name(self) -> str:

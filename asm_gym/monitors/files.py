@@ -56,7 +56,7 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
     kept = {
         "learned_from_": arrays.pop(LEARNED_FROM, None),
         "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
-        "pace_": arrays.pop(PACE, None),
+        "pace_": {n.removeprefix(PACE).strip(): arrays.pop(n) for n in list(arrays) if n.startswith(PACE)},
         "motion_": arrays.pop(MOTION, None),
         "commands_": arrays.pop(COMMANDS, None),
         "about": dict(header["about"]),
@@ -83,10 +83,10 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
         BLOCKS: None if monitor.blocks_ is None else monitor.blocks_.array,
         LEARNED_FROM: monitor.learned_from_,
         CEILINGS_FROM: monitor.ceilings_from_,
-        PACE: monitor.pace_,
         MOTION: monitor.motion_,
         COMMANDS: monitor.commands_,
     }
+    kept |= {f"{PACE} {task}": cells for task, cells in monitor.pace_.items()}
     arrays: dict[str, NDArray[Any]] = learned | {name: array for name, array in kept.items() if array is not None}
     header = {
         "spec": monitor.spec.to_json(),

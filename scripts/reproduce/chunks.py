@@ -66,8 +66,9 @@ def run(config: Config) -> kit.Findings:
         task = case.trial.task
         if task not in known:
             found = collect(env_id(task), policy="scripted", episodes=config.learned, seed=500, workers=config.workers)
-            spec, streams = found[0].spec, [episode.stream for episode in found if episode.success]
-            learned = {"pace_": Pace.learned(streams, spec), "motion_": learned_motion(streams, spec)}
+            spec, solved = found[0].spec, [episode for episode in found if episode.success]
+            motion = learned_motion([episode.stream for episode in solved], spec)
+            learned = {"pace_": Pace.by_task(solved, spec), "motion_": motion}
             known[task] = SimpleNamespace(spec=spec, **learned)
         trials = [replace(case.trial, seed=1000 + config.seed + n) for n in range(count)]
         jobs += [(case._replace(trial=trial), known[task]) for trial in trials]

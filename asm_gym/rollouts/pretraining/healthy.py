@@ -147,9 +147,8 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
         duration[task] += len(episode) * episode.spec.dt / 3600
     each = tasks if min(duration.values()) * per_hour >= 1.0 else []
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=each)
-    gentle = [episode.stream for episode in lessons.calibration]
-    memory.healthy_ = healthy_forces(gentle, memory.spec)
-    memory.pace_ = Pace.learned([*gentle, *(episode.stream for episode in hours)], memory.spec)
+    memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
+    memory.pace_ = Pace.by_task([*lessons.calibration, *hours], memory.spec)
     return memory
 
 
