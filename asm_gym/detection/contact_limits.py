@@ -22,7 +22,9 @@ from asm_gym.validation import check_flag, check_number
 
 FELT = "external_torque", "wrist_force"  # ends of the names of the channels that limits are about
 Floats = NDArray[np.float64]
-LEFT_OUT = 0.05  # share of healthy episodes, those that pressed hardest, left out of what healthy motion needs
+LEFT_OUT = (
+    0.05  # share of healthy episodes, those that pressed hardest or went fastest, that limits do not make room for
+)
 MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 100 N m
 
 
@@ -78,18 +80,21 @@ class Pace:
 
     @staticmethod
     def learned(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> NDArray[np.float32] | None:
-        """Return the cells of healthy streams (T, D); None where these do not tell how hands move."""
+        """Return the cells of healthy streams (T, D); None where these do not tell how hands move.
+
+        The fastest ``LEFT_OUT`` of the episodes at a place do not count there.
+        """
         found = []
         names = [c.name.removesuffix("position") for c in spec.channels if c.name.endswith("hand_position")]
         for arm, name in enumerate(names):
             parts = [spec.slices.get(name + what) for what in ("position", "velocity", "angular_velocity")]
             if None in parts:
                 continue
-            rows = np.concatenate([np.hstack([stream[:, part] for part in parts]) for stream in streams])  # (T, 9)
-            rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, :3]) < FAR * np.array(CELL)).all(axis=1)]
-            places, which = np.unique(np.floor(rows[:, :3] / CELL), axis=0, return_inverse=True)
-            seen = np.zeros((len(places), 12))
-            np.maximum.at(seen, which.ravel(), np.hstack((rows[:, 3:], -rows[:, 3:])))
+            each = [_fastest(np.hstack([stream[:, part] for part in parts])) for stream in streams]
+            cells, twists = (np.concatenate(part) for part in zip(*each, strict=True))
+            places, which = np.unique(cells, axis=0, return_inverse=True)
+            each_place = (np.sort(twists[which.ravel() == n], axis=0) for n in range(len(places)))
+            seen = [own[-1 - int(LEFT_OUT * len(own))] for own in each_place]
             found.append(np.column_stack((np.full(len(places), arm), places, seen)))
         return np.concatenate(found).astype(np.float32) if found else None
 
@@ -106,6 +111,15 @@ class Pace:
         known = ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1)
         known = np.minimum(known, np.clip(along[:, 2], SLACK[2], usual) / np.maximum(-twists[:, 2], STILL))
         return np.maximum(np.minimum(usual / speeds, MOMENTUM / np.maximum(momenta, STILL)), known)
+
+
+def _fastest(rows: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the cells (P, 3) of an episode's places, velocities and turns (T, 9), and the greatest twists there."""
+    rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, :3]) < FAR * np.array(CELL)).all(axis=1)]
+    places, which = np.unique(np.floor(rows[:, :3] / CELL), axis=0, return_inverse=True)
+    twists = np.zeros((len(places), 12))
+    np.maximum.at(twists, which.ravel(), np.hstack((rows[:, 3:], -rows[:, 3:])))
+    return places, twists
 
 
 @dataclass(frozen=True)
