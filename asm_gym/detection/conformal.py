@@ -13,13 +13,11 @@ Rows of a block may depend on each other; blocks must be exchangeable.
 From few maxima
     threshold    q = u (k/e)^ξ,   ξ = H (1 + 1/(2√k)),   H = mean of ln(m_i/u) over the k maxima above u
 
-e is how many of the n maxima may exceed q: n·rate, or r (T_1 + … + T_n). Where that is less than ``ENOUGH``, both of
-the above hang on one or two maxima, and q differs much from sample to sample. Then the k = n/5 largest maxima are taken
-to have a Pareto tail. The mean rate is then no theorem; docs/results/detection.md has what it came to.
+e is how many of the n maxima may exceed q: n·rate, or r (T_1 + … + T_n). Where that is less than ``ENOUGH``, one or two
+maxima would set q above. Then the k = n/5 largest are taken to have a Pareto tail, and the mean rate is no theorem.
 
 Sources: Vovk et al. 2005 and Angelopoulos and Bates 2023 (split conformal prediction); Angelopoulos et al. 2024 (ICLR,
-conformal risk control), Theorem 1; Hill 1975 and Weissman 1978 (the tail). The allowance of half a standard error in
-ξ is ours.
+conformal risk control), Theorem 1; Hill 1975 and Weissman 1978 (the tail; half a standard error in ξ is ours).
 """
 
 from __future__ import annotations
@@ -99,10 +97,10 @@ class Tail(NamedTuple):
         return max(self.k * (threshold / self.u) ** (-1.0 / self.xi), 0.5)
 
 
-def episode_threshold(maxima: Array, rate: float, modelled: bool = True) -> float:
-    """Return ``conformal_threshold``, or by the tail of few maxima (n,) if that may be ``modelled``; raises as that."""
+def episode_threshold(maxima: Array, rate: float) -> float:
+    """Return ``conformal_threshold``, or what the tail of few maxima (n,) makes of it; raises as that."""
     counted = conformal_threshold(maxima, rate)
-    tail = Tail.of(maxima, len(maxima) * rate) if modelled else None
+    tail = Tail.of(maxima, len(maxima) * rate)
     return tail.threshold(len(maxima) * rate) if tail else counted
 
 
@@ -123,25 +121,16 @@ class Promise(NamedTuple):
     def of(cls, maxima: Array, threshold: float) -> Self:
         """Return the promise by the episode, from the maxima (n,) of nominal ones."""
         n, beyond = len(maxima), int((maxima > threshold).sum())
-        counted, tail = (beyond + 1) / (n + 1), tail_at(maxima, threshold)
-        rate = tail.expected(threshold) / n if tail else counted
-        return cls(n, rate, max(rate, surely_below(beyond, n)), modelled=tail is not None)
+        tail = None if threshold in maxima else Tail.of(maxima, 0.0)
+        modelled = tail is not None and threshold > tail.u
+        rate = tail.expected(threshold) / n if tail and modelled else (beyond + 1) / (n + 1)
+        at_most = float(betaincinv(beyond + 1, n - beyond, CONFIDENCE)) if beyond < n else 1.0
+        return cls(n, rate, max(rate, at_most), modelled=modelled)
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
         each = self.episodes / hours if self.per == EPISODE else 1.0
         return self.rate * each, self.at_most * each
-
-
-def tail_at(maxima: Array, threshold: float) -> Tail | None:
-    """Return the tail that set a threshold; None where one of the maxima (n,) is the threshold."""
-    tail = None if threshold in maxima else Tail.of(maxima, 0.0)
-    return tail if tail and threshold > tail.u else None
-
-
-def surely_below(beyond: int, n: int) -> float:
-    """Return the bound on the share of fresh maxima above a threshold that ``beyond`` of n exceed."""
-    return float(betaincinv(beyond + 1, n - beyond, CONFIDENCE)) if beyond < n else 1.0
 
 
 class Blocks(NamedTuple):
@@ -209,17 +198,16 @@ def check_hours(rate: float, hours: float) -> None:
         )
 
 
-def hourly_threshold(blocks: Blocks, rate: float, modelled: bool = True) -> float:
+def hourly_threshold(blocks: Blocks, rate: float) -> float:
     """Return the q that healthy operation exceeds in at most ``rate`` blocks an hour, on average over calibrations.
 
-    The rate holds in each group. The tail of few blocks may be ``modelled``. Raises ValueError where there are too few
-    hours for it.
+    The rate holds in each group. Raises ValueError where there are too few hours for it.
     """
     check_per_hour(rate)
     if len(groups := blocks.groups) > 1:
-        return max(hourly_threshold(own, rate, modelled) for own in groups)
+        return max(hourly_threshold(own, rate) for own in groups)
     check_hours(rate, blocks.total)
-    if modelled and (tail := Tail.of(blocks.maxima, rate * blocks.total)):
+    if tail := Tail.of(blocks.maxima, rate * blocks.total):
         return tail.threshold(rate * blocks.total)
     allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)

@@ -72,12 +72,9 @@ class Pace:
         """Return the cells of each task with ``OWN_PACE`` healthy episodes, and of all others under an empty name."""
         tasks = [e.label.task if e.label else "" for e in episodes]
         names = [task if tasks.count(task) >= OWN_PACE else "" for task in tasks]
-        found = {}
-        for name in dict.fromkeys(names):
-            cells = cls.learned([e.stream for e, of in zip(episodes, names, strict=True) if of == name], spec)
-            if cells is not None:
-                found[name] = cells
-        return found
+        groups = {name: [e.stream for e, of in zip(episodes, names, strict=True) if of == name] for name in names}
+        learned = {name: cls.learned(streams, spec) for name, streams in groups.items()}
+        return {name: cells for name, cells in learned.items() if cells is not None}
 
     @staticmethod
     def learned(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> NDArray[np.float32] | None:
@@ -91,11 +88,16 @@ class Pace:
             parts = [spec.slices.get(name + what) for what in ("position", "velocity", "angular_velocity")]
             if None in parts:
                 continue
-            each = [_fastest(np.hstack([stream[:, part] for part in parts])) for stream in streams]
-            cells, twists = (np.concatenate(part) for part in zip(*each, strict=True))
-            places, which = np.unique(cells, axis=0, return_inverse=True)
-            each_place = (np.sort(twists[which.ravel() == n], axis=0) for n in range(len(places)))
-            seen = [own[-1 - int(LEFT_OUT * len(own))] for own in each_place]
+            each = (np.column_stack((np.full(len(x), n), *(x[:, p] for p in parts))) for n, x in enumerate(streams))
+            rows = np.concatenate(list(each)).astype(np.float64)  # (T, 10) episode, place, velocity, turn
+            rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, 1:4]) < FAR * np.array(CELL)).all(axis=1)]
+            rows[:, 1:4] = np.floor(rows[:, 1:4] / CELL)
+            visits, which = np.unique(rows[:, :4], axis=0, return_inverse=True)
+            fastest = np.zeros((len(visits), 12))
+            np.maximum.at(fastest, which.ravel(), np.hstack((rows[:, 4:], -rows[:, 4:])))
+            places, which = np.unique(visits[:, 1:], axis=0, return_inverse=True)
+            ordered = (np.sort(fastest[which.ravel() == n], axis=0) for n in range(len(places)))
+            seen = [own[-1 - int(LEFT_OUT * len(own))] for own in ordered]
             found.append(np.column_stack((np.full(len(places), arm), places, seen)))
         return np.concatenate(found).astype(np.float32) if found else None
 
@@ -112,15 +114,6 @@ class Pace:
         known = ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1)
         known = np.minimum(known, np.clip(DOWN * seen[1, 2], SLACK[2], usual) / np.maximum(-twists[:, 2], STILL))
         return np.maximum(np.minimum(usual / speeds, MOMENTUM / np.maximum(momenta, STILL)), known)
-
-
-def _fastest(rows: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the cells (P, 3) of an episode's places, velocities and turns (T, 9), and the greatest twists there."""
-    rows = rows[np.isfinite(rows).all(axis=1) & (np.abs(rows[:, :3]) < FAR * np.array(CELL)).all(axis=1)]
-    places, which = np.unique(np.floor(rows[:, :3] / CELL), axis=0, return_inverse=True)
-    twists = np.zeros((len(places), 12))
-    np.maximum.at(twists, which.ravel(), np.hstack((rows[:, 3:], -rows[:, 3:])))
-    return places, twists
 
 
 @dataclass(frozen=True)

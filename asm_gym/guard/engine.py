@@ -81,8 +81,7 @@ class Engine:
         self._rows = Rows(robots, spec, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, n, self._rows, recalls)
         limits = limits_of(options.contact_limits, monitor, robots.task)
-        acts_on_them = name != "monitor" and robots.rest.size > 0
-        self._limits = EpisodeLimits(robots, limits, acts_on_them)
+        self._limits = EpisodeLimits(robots, limits, acts=name != "monitor" and robots.rest.size > 0)
         self.running = self._arbiter.running
         """The threshold that follows a policy; None where it does not."""
         self.confirmed = self._arbiter.confirmed

@@ -283,7 +283,9 @@ class CalibratedMonitor:
         self._require_fitted()
         rows = self._rows(state, stream)
         model, output = self.model.predict(state.model, rows)
-        detection, attribution = self.detection.attribute_step(state.detection, output, rows, self._placed)
+        detection, attribution = self.detection.attribute_step(
+            state.detection, output, rows, lambda x: x @ self._places
+        )
         finite = np.isfinite(rows)
         broken = ~finite.all(axis=1)
         if broken.any():
@@ -383,10 +385,6 @@ class CalibratedMonitor:
             self.spec.check_row(rows)
             raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
         return rows
-
-    def _placed(self, parts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the share of each number (B, D) from that of each error (B, X)."""
-        return parts @ self._places
 
     def _place_errors(self) -> None:
         """Find the columns of errors, once the model knows them."""

@@ -61,15 +61,12 @@ class AlarmRate(NamedTuple):
         if self.per == HOUR:
             check_hours(self.rate, hours)
 
-    def threshold(self, maxima: Array, blocks: Blocks | None, modelled: bool = True) -> float:
-        """Return the threshold from the maxima of nominal episodes, or from their blocks by the hour.
-
-        Where so few may exceed it that one of them would set it, their tail is ``modelled``.
-        """
+    def threshold(self, maxima: Array, blocks: Blocks | None) -> float:
+        """Return the threshold from the maxima of nominal episodes, or from their blocks by the hour."""
         if self.per == EPISODE:
-            return episode_threshold(maxima, self.rate, modelled)
+            return episode_threshold(maxima, self.rate)
         assert blocks is not None
-        return hourly_threshold(blocks, self.rate, modelled)
+        return hourly_threshold(blocks, self.rate)
 
     def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
         """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups."""
