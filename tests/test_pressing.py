@@ -212,12 +212,6 @@ def test_who_leans_again_and_again_presses_though_he_lets_go_for_a_moment():
     assert not weighed([0.0] * 20 + [60.0, 0.0, 0.0, 0.0] * 6)[:, 2].any()
 
 
-def test_who_leans_harder_presses_sooner():
-    hard, soft = (np.flatnonzero(weighed([0.0] * 20 + [force] * 30)[:, 2])[0] - 20 for force in (67.0, 45.0))
-    assert (hard, soft) == (3, 10)
-    assert not weighed([0.0] * 20 + [90.0] + [0.0] * 10)[:, 2].any()  # a blow
-
-
 def test_an_impulse_that_ends_the_episode_is_an_alarm():
     found = weighed([0.0, 6000.0])  # with what one row leaves of the time to lean
     assert found[-1, 1] > IMPULSE

@@ -227,7 +227,7 @@ def test_recall_goes_on_with_every_third_row(fast, slow):
     for turn in range(LAG):  # the cue's first row belongs to none of them
         expected = continued(slow.network, slow.senses_, cue[1 + turn :: LAG], 3)
         np.testing.assert_allclose(rows[turn::LAG], expected[: len(rows[turn::LAG])], rtol=1e-4, atol=1e-5)
-    with pytest.raises(ValueError, match="at least 6 rows long"):
+    with pytest.raises(ValueError, match="at least 6 rows"):
         recall(fast, cue[:5], 1)
 
 

@@ -220,7 +220,7 @@ def test_recall_is_in_the_units_of_the_stream_and_better_than_standing_still(asm
 @pytest.mark.parametrize(
     ("rows", "steps", "message"),
     [
-        (np.zeros((1, 14)), 5, "at least 2 rows long.*got 1"),
+        (np.zeros((1, 14)), 5, "at least 2 rows.*got 1"),
         (np.zeros(14), 5, r"shape \(T, 14\), got \(14,\)"),
         (np.zeros((5, 13)), 5, r"14 numbers a step.*\(5, 13\)"),
         (np.full((5, 14), np.nan), 5, r"cue row 0, joint_position\[0\] must be finite, got nan"),

@@ -27,8 +27,6 @@ LEANS_S = 0.5
 """More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
 did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
 
-LEANT = 10.0  # what is beyond ``FREE_FORCE`` by more than this counts for as much longer [N]: 5 N s come to ``LEANS_S``
-
 HEAVIEST, WEIGHED_S = 15.0, 5.0
 """What a wrist bears without a contact, its hand's weight, is at most so much [N]; it is averaged over so long [s]."""
 
@@ -182,9 +180,7 @@ def _weigh(
             force = contact_force(rows[n], wrists, torques, weights[1, n], WEIGHED_S / dt)
         more = max(force - FREE_FORCE, 0.0) if np.isfinite(force) else 0.0
         pressed[0, n] += more * dt
-        pressed[1, n] = max(
-            pressed[1, n] + (dt * max(more / LEANT, 1.0) if more > 0.0 else -dt), 0.0
-        )  # a moment below ends none
+        pressed[1, n] = max(pressed[1, n] + (dt if more > 0.0 else -dt), 0.0)  # a moment below does not end it
         numbers[n, 0], numbers[n, 1], numbers[n, 2] = force, pressed[0, n], largest_norm(rows[n], hands, nothing)
         leans = pressed[1, n] > leans_s / (1.0 + AGAIN * counts[STRIKES, n])
         # What ends the episode is an alarm too.
