@@ -192,7 +192,7 @@ def test_a_channel_that_is_never_finite_is_reported(value, columns, monitor, tmp
         assert (out / "report.html").stat().st_size > 10_000
 
 
-def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, tmp_path):
+def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, tmp_path, monkeypatch):
     needs("matplotlib")
     monitor.save(tmp_path / "x.asm")
     stream = episode(500).stream.copy()
@@ -205,6 +205,7 @@ def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, t
         (out / name).symlink_to(tmp_path / f"own {name}")
     source = recording(tmp_path, stream, name="@SUM(1).csv")
     command = ["watch", source, "--monitor", str(tmp_path / "x.asm"), "--out", str(out), "--figures", "2"]
+    monkeypatch.setattr("sys.argv", ["asm-gym", *command])
     assert main(command) == 1
     assert {(tmp_path / f"own {name}").read_text() for name in names} == {"precious"}
     with (out / "alarms.csv").open(newline="") as file:
