@@ -59,7 +59,7 @@ def test_the_demo_writes_everything_it_promises(folder):
 
 def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(folder):
     push = Push(newtons=100.0, onset=10, duration=10)
-    trace = watch(Trial(LIFT, 3, "push", faults=(push,), acting="terminate"), RolloutConfig(), folder / "lift.asm")
+    trace = watch(Trial(LIFT, 4, "push", faults=(push,), acting="terminate"), RolloutConfig(), folder / "lift.asm")
     assert trace.detected_after is not None
     assert trace.detected_after <= 4
 
