@@ -8,6 +8,7 @@ counts.
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -22,9 +23,7 @@ from asm_gym.validation import check_flag, check_number
 
 FELT = "external_torque", "wrist_force"  # ends of the names of the channels that limits are about
 Floats = NDArray[np.float64]
-LEFT_OUT = (
-    0.05  # share of healthy episodes, those that pressed hardest or went fastest, that limits do not make room for
-)
+LEFT_OUT = 0.05  # share of healthy episodes that no limit makes room for: those that pressed hardest, or went fastest
 MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 100 N m
 
 
@@ -70,10 +69,11 @@ class Pace:
     @classmethod
     def by_task(cls, episodes: Sequence[Episode], spec: StreamSpec) -> dict[str, NDArray[np.float32]]:
         """Return the cells of each task with ``OWN_PACE`` healthy episodes, and of all others under an empty name."""
-        tasks = [e.label.task if e.label else "" for e in episodes]
-        names = [task if tasks.count(task) >= OWN_PACE else "" for task in tasks]
-        groups = {name: [e.stream for e, of in zip(episodes, names, strict=True) if of == name] for name in names}
-        learned = {name: cls.learned(streams, spec) for name, streams in groups.items()}
+        streams: defaultdict[str, list[NDArray[np.float32]]] = defaultdict(list)
+        count = Counter(e.label.task if e.label else "" for e in episodes)
+        for e in episodes:
+            streams[e.label.task if e.label and count[e.label.task] >= OWN_PACE else ""].append(e.stream)
+        learned = {name: cls.learned(own, spec) for name, own in streams.items()}
         return {name: cells for name, cells in learned.items() if cells is not None}
 
     @staticmethod
