@@ -125,7 +125,7 @@ def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[S
             from asm_gym.evaluation.report import write_report
     except ImportError as error:
         return f"Wrote {args.out / 'alarms.csv'}; {error}"
-    over_time = f"Surprise over time in the {len(worst)} most surprising episodes (--figures)"
+    over_time = "Surprise over time, the most surprising episode first (--figures sets how many)"
     drawn = {"surprise": figures.surprise_figure(worst), "stream": figures.stream_figure(worst[0])}
     for name, figure in drawn.items():
         figures.save(figure, args.out / f"{name}.png")
