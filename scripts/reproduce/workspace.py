@@ -66,6 +66,7 @@ HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
 EVENT, SECOND, YIELD = 30, 20, 12  # row of an event; rows of a second; rows for which a pushed arm yields
 SMOOTH = 0.5  # gain of energies
+SHARPEST, PRIOR = 0.01, 0.01  # smallest variance of an error, in its mean; ridge of the regression on the state
 LONGEST = 250  # rows of an expression
 
 
@@ -179,7 +180,7 @@ class Settling:
     Args:
         reader: how it reads a row.
         network: its weights.
-        episodes: healthy ones, of which it learns the spreads σ of its errors.
+        episodes: healthy ones, of which it learns how far its errors spread in each state: log σ² = W f(μ).
 
     Attributes:
         ceilings: (G,) of the energies of ``GROUPS``.
@@ -189,24 +190,33 @@ class Settling:
         self.reader, self.network, spec = reader, network, reader.spec
         columns = np.concatenate([spec.sensory, reader.slow, spec.motor])  # of each error
         self.members = np.array([np.isin(columns, np.arange(spec.size)[where]) for where in GROUPS.values()])
-        self.spread, self.ceilings = np.ones(len(columns)), np.ones(len(GROUPS))
-        errors = np.concatenate([self.felt(e.stream)[1] for e in episodes])
-        self.spread = np.sqrt(np.mean(errors**2, axis=0)) + 1e-6
+        self.variance, self.ceilings = np.zeros((network.hidden_size + 1, len(columns))), np.ones(len(GROUPS))
+        self.least = self.variance[-1]  # (E,) logarithm of the smallest variance
+        states, errors, _ = (
+            np.concatenate(part) for part in zip(*(self.felt(e.stream) for e in episodes), strict=True)
+        )
+        states, squares = np.pad(states, ((0, 0), (0, 1)), constant_values=1.0), errors**2
+        self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
+        near = states.T @ states + PRIOR * len(states) * np.eye(states.shape[1])
+        self.variance = np.linalg.solve(near, states.T @ np.log(squares + np.exp(self.least)))
+        self.variance[-1] += np.log(np.mean(squares / np.exp(states @ self.variance), axis=0))
 
     def begin(self) -> None:
         """Forget the past."""
         self.c, self.rows, self.energy = self.network.at_rest(1), list[Floats](), np.zeros(len(GROUPS))
 
     def read(self, row: Floats) -> tuple[Floats, Floats, Floats]:
-        """Read a row (D,), NaN where left out; return f(μ) (H,), errors in spreads, and energies in ceilings (G,)."""
+        """Read a row (D,), NaN where left out; return f(μ) (H,), errors in σ, and energies in their ceilings (G,)."""
         self.rows = [*self.rows[-2:], row[None]]
         seen = self.reader.read(*(self.rows[max(0, len(self.rows) - k)] for k in (1, 2, 3)))
         step = self.network.follow(self.c, seen.commands, seen.senses, seen.seen)
         left = np.hstack([seen.senses, seen.commands[:, :-1]]) - step.expected
         left[:, : self.reader.size] *= seen.seen
-        error = left[0] / self.spread * (len(self.rows) > 1)
+        state = np.tanh(step.mu[0])
+        variance = np.exp(np.maximum(np.append(state, 1.0) @ self.variance, self.least))
+        error = left[0] / np.sqrt(variance) * (len(self.rows) > 1)
         self.c, self.energy = step.traces, self.energy + SMOOTH * (0.5 * self.members @ error**2 - self.energy)
-        return np.tanh(step.mu[0]), error, self.energy / self.ceilings
+        return state, error, self.energy / self.ceilings
 
     def felt(self, stream: NDArray[Any]) -> tuple[Floats, Floats, Floats]:
         """Return what ``read`` does of each row of a stream (T, D)."""
@@ -315,8 +325,8 @@ def express(
             energies.append(felt[2])
             over = [group for group, energy in zip(GROUPS, felt[2], strict=True) if energy > 1.0 and group != "action"]
             if reacts and not yields and t > EVENT // 2:
-                if len(over) > 1:
-                    yields, yielded = YIELD, True
+                if len(over) > 1:  # once: it hands back, and goes on
+                    yields, yielded = YIELD * (not yielded), True
                 elif over and not out:
                     out = over[0]
         action, grip = readout(model.command().astype(np.float32), grip)
