@@ -78,7 +78,6 @@ STUCK, PUSHED, TWINS, ALARMS = "encoders stuck", "pushed", "twins", "share over 
 ALIKE = ("PickPlaceCan", "PickPlaceMilk")
 TWO_FIT = ("objects hidden for a second: one of Can and Milk", "the right one", "rows until right, once seen")
 CHANGED = ("another skill begins: right after a second", "rows until right")
-SHORT = ("Lift", "Stack", "Can", "Milk", "Door", "Nut")
 Note = Callable[[str, str, object, float], None]
 """Notes a measure of a model in a condition."""
 
@@ -93,7 +92,7 @@ class Config(kit.Config):
     """Episodes of each skill that are recorded; a seed learns from most of them."""
     epochs: int = option(40, quick=4, least=1)
     """Passes of the network over its episodes."""
-    updates: int = option(300, quick=20, least=1)
+    updates: int = option(1200, quick=20, least=1)
     """Batches of the recurrent networks."""
     faulty: int = option(2, quick=1, least=1)
     """Episodes of each skill with each kind of fault, and of each unknown skill."""
@@ -200,9 +199,7 @@ def predicted(note: Note, ours: Settling, rivals: dict[str, Backpropagated], tes
     streams = np.stack([e.stream[: EVENT + SECOND] for e in tests if len(e) >= EVENT + SECOND], axis=1)
     senses, commands = read(reader, streams.astype(np.float64))
     rest = network.at_rest(senses.shape[1])
-    online = {
-        f"{OURS}, {steps}": follow(network.with_iterations(steps), rest, senses, commands).senses for steps in STEPS
-    }
+    online = {f"{OURS}, {n}": follow(network.with_iterations(n), rest, senses, commands).senses for n in STEPS}
     alone = {OURS: run_on(network, follow(network, rest, senses[:EVENT], commands[:EVENT]).traces, SECOND).senses}
     for cell, model in rivals.items():
         online[cell] = expected(model.network, senses, commands, len(senses))[0]
@@ -301,13 +298,7 @@ def claims(records: Sequence[Record]) -> Table:
     slow, quick = (of("next row", f"{OURS}, {steps}") for steps in (STEPS[-1], STEPS[0]))
     behind = solved(OURS) - np.maximum(*(solved(cell) for cell in CELLS))
     lines = (
-        (
-            "one network learns a repertoire by local rules",
-            "error of the next row, in that of the last",
-            slow,
-            1.0,
-            True,
-        ),
+        ("one network learns a repertoire by local rules", "error of the next row, in the last's", slow, 1.0, True),
         ("it expresses skills as well as BPTT does", "share solved, less the better rival's", behind, -0.1, False),
         ("no skill is selected", "right names after a second", names, 0.8, False),
         ("", "the same, less a random forest's", names - forest, -0.1, False),
@@ -349,7 +340,7 @@ def drawn(records: Sequence[Record], energies: dict[str, Floats]) -> Figure:
         for n, model in enumerate((OURS, *CELLS, ACTS)):
             solved = [kit.over_seeds(records, "value", measure="solved", model=model, at=s).mean for s in SKILLS]
             first.bar(np.arange(len(SKILLS)) + 0.2 * n - 0.3, solved, 0.2, color=look(n)[0], label=model)
-        first.set_xticks(range(len(SKILLS)), SHORT, fontsize=7)
+        first.set_xticks(range(len(SKILLS)), [s.removeprefix("PickPlace")[:5] for s in SKILLS], fontsize=7)
         told = product((OURS, FOREST), ("named", "named blind"))
         for n, (model, measure) in enumerate(told):
             right = [kit.over_seeds(records, "value", measure=measure, model=model, at=str(r)).mean for r in ROWS]

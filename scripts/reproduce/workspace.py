@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.linear_model import Ridge
 
 from asm_gym.data.episode import Episode, save_episode
 from asm_gym.faults.suite import suite_fault
@@ -66,7 +67,7 @@ HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
 EVENT, SECOND, YIELD = 30, 20, 12  # row of an event; rows of a second; rows for which a pushed arm yields
 SMOOTH = 0.5  # gain of energies
-SHARPEST, PRIOR = 0.01, 0.01  # smallest variance of an error, in its mean; ridge of the regression on the state
+SHARPEST, PRIOR = 0.01, 150.0  # smallest variance of an error, in its mean; ridge of the regression on the state
 LONGEST = 250  # rows of an expression
 
 
@@ -190,16 +191,13 @@ class Settling:
         self.reader, self.network, spec = reader, network, reader.spec
         columns = np.concatenate([spec.sensory, reader.slow, spec.motor])  # of each error
         self.members = np.array([np.isin(columns, np.arange(spec.size)[where]) for where in GROUPS.values()])
-        self.variance, self.ceilings = np.zeros((network.hidden_size + 1, len(columns))), np.ones(len(GROUPS))
-        self.least = self.variance[-1]  # (E,) logarithm of the smallest variance
-        states, errors, _ = (
-            np.concatenate(part) for part in zip(*(self.felt(e.stream) for e in episodes), strict=True)
-        )
-        states, squares = np.pad(states, ((0, 0), (0, 1)), constant_values=1.0), errors**2
+        self.spread, self.least, self.ceilings = Ridge(PRIOR), np.zeros(len(columns)), np.ones(len(GROUPS))
+        self.spread.coef_, self.spread.intercept_ = np.zeros((len(columns), network.hidden_size)), self.least
+        felt = [self.felt(e.stream) for e in episodes]
+        states, squares = np.concatenate([f[0] for f in felt]), np.concatenate([f[1] for f in felt]) ** 2
         self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
-        near = states.T @ states + PRIOR * len(states) * np.eye(states.shape[1])
-        self.variance = np.linalg.solve(near, states.T @ np.log(squares + np.exp(self.least)))
-        self.variance[-1] += np.log(np.mean(squares / np.exp(states @ self.variance), axis=0))
+        self.spread.fit(states, np.log(squares + np.exp(self.least)))
+        self.spread.intercept_ += np.log(np.mean(squares / np.exp(self.spread.predict(states)), axis=0))
 
     def begin(self) -> None:
         """Forget the past."""
@@ -213,8 +211,8 @@ class Settling:
         left = np.hstack([seen.senses, seen.commands[:, :-1]]) - step.expected
         left[:, : self.reader.size] *= seen.seen
         state = np.tanh(step.mu[0])
-        variance = np.exp(np.maximum(np.append(state, 1.0) @ self.variance, self.least))
-        error = left[0] / np.sqrt(variance) * (len(self.rows) > 1)
+        spread = np.exp(0.5 * np.maximum(self.spread.coef_ @ state + self.spread.intercept_, self.least))
+        error = left[0] / spread * (len(self.rows) > 1)
         self.c, self.energy = step.traces, self.energy + SMOOTH * (0.5 * self.members @ error**2 - self.energy)
         return state, error, self.energy / self.ceilings
 
