@@ -10,6 +10,7 @@ from asm_gym.detection.contact_limits import MOMENTUM, ContactLimits, Pace, heal
 from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
+from asm_gym.policies import make_policy
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.robots import robots_of
@@ -42,6 +43,37 @@ def test_a_hand_that_rams_the_table_is_stopped_by_default(lift):
     speeds = [i["asm"]["severity"]["speed"] for i in said]
     assert max(speeds) < 0.19
     assert np.isnan(lift.unwrapped.measured).sum() == 0
+
+
+def test_a_held_cube_that_is_slammed_on_the_table_and_pressed_is_an_alarm_and_held(lift):
+    env, expert = NeuralASMSafety(lift, NeuralASM.pretrained("panda")), make_policy("scripted", lift, seed=0)
+    observation, _ = env.reset(seed=1000)
+    action, state = np.array([0, 0, -1, 0, 0, 0, 1], np.float32), None
+    while lift.unwrapped.simulation.data.body("cube_main").xpos[2] < 0.9:
+        up, state = expert.predict(observation, state, np.array([state is None]))
+        observation, *_ = env.step(up)
+    said = []
+    while not (said and said[-1]["asm"]["intervened"]):
+        said.append(env.step(action)[4])
+    felt = [i["asm"]["severity"]["force"] for i in said]
+    assert said[-2]["asm"]["reason"] == "contact"
+    assert sum(force > 40.0 for force in felt) * 0.05 < 0.4
+    assert max(i["contact_force"] for i in said) < 120.0
+
+
+def test_fingers_of_a_held_arm_close_no_further_while_it_presses(lift):
+    def closed(limits):
+        """How far the fingers' targets move in a step in which the arm is held while they are closing."""
+        lift.reset(seed=0)
+        arm = lift.unwrapped
+        arm.contact_limits, close = limits, np.array([0, 0, 0, 0, 0, 0, 1], np.float32)
+        lift.step(close)
+        before, arm.holding = arm.simulation.data.ctrl[7:9].copy(), True
+        lift.step(close)
+        return np.abs(arm.simulation.data.ctrl[7:9] - before).max()
+
+    assert closed(ContactLimits(1e-6, 1e-6)) == 0.0
+    assert closed(ContactLimits(1e3, 1e3)) > 0.001
 
 
 def test_limits_are_forgotten_by_reset_and_change_nothing_of_gentle_motion(lift):

@@ -156,6 +156,15 @@ def test_what_would_lose_what_it_is_is_no_action(action):
         env.step(action)
 
 
+def test_an_environment_that_cannot_tell_speed_says_so_and_is_held_at_an_alarm():
+    env = NeuralASMSafety(FakeEnv(), CueMonitor([3]), "hold", contact_limits=ContactLimits(hand_speed=0.05))
+    env.reset(seed=0)
+    said = [env.step(np.full(3, 0.9, np.float32))[4]["asm"] for _ in range(5)]
+    assert {(s["severity"]["speed"], s["severity"]["predicted_force"], s["slowed"]) for s in said} == {(None, None, 0)}
+    assert [s["intervened"] for s in said] == [False] * 4 + [True]
+    np.testing.assert_array_equal(env.unwrapped.actions[-1][:2], [0, 0])
+
+
 def test_steps_in_alarm_are_counted_for_wrappers_outside_that_skip_some():
     env = NeuralASMSafety(FakeEnv(), CueMonitor([1, 2, 6]), on_alarm="monitor")
     env.reset(seed=0)

@@ -188,14 +188,14 @@ def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
         NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
 
 
-def weighed(loads):
+def weighed(loads, speed=np.nan):
     """Force, impulse, and whether it presses, in rows (T,) of what a wrist bears along its axis [N]."""
-    spec = StreamSpec((Channel("wrist_force", 3, "N"),), 0.05)
+    spec = StreamSpec((Channel("wrist_force", 3, "N"), Channel("hand_velocity", 3, "m/s")), 0.05)
     estimator = SeverityEstimator(1, spec, (), Arbiter(1, GuardOptions().rule(True, 0.05, 1), 10.0))
-    calm, yes, no = Surprise(np.zeros(1), np.zeros((1, 3))), np.ones(1, bool), np.zeros(1, bool)
+    calm, yes, no = Surprise(np.zeros(1), np.zeros((1, 6))), np.ones(1, bool), np.zeros(1, bool)
     found = []
     for load in loads:
-        row = np.array([[0.0, 0.0, load]], np.float32)
+        row = np.array([[0.0, 0.0, load, 0.0, 0.0, speed]], np.float32)
         severity = estimator.weigh(row, nothing_felt(1, 0), no, calm, yes, no.copy())[0]
         found.append((*severity.numbers[0, :2], severity.presses[0]))
     return np.array(found)
@@ -210,6 +210,11 @@ def test_the_weight_of_the_hand_is_no_contact_and_hides_none():
 def test_who_leans_again_and_again_presses_though_he_lets_go_for_a_moment():
     assert weighed([0.0] * 20 + [60.0, 60.0, 60.0, 0.0] * 6)[-4:, 2].any()
     assert not weighed([0.0] * 20 + [60.0, 0.0, 0.0, 0.0] * 6)[:, 2].any()
+
+
+def test_who_leans_hard_with_a_slow_hand_presses_sooner_than_one_whose_own_inertia_that_may_be():
+    slow, fast, gentle = (weighed([0.0] * 20 + [force] * 12, v)[20:, 2] for force, v in ((76, 0), (76, 0.3), (42, 0)))
+    assert (np.argmax(slow), np.argmax(fast), np.argmax(gentle)) == (2, 10, 8)
 
 
 def test_an_impulse_that_ends_the_episode_is_an_alarm():

@@ -69,7 +69,7 @@ class Simulation:
     def begin_episode(self) -> None:
         """Take up the controllers, which robosuite makes anew in every reset."""
         self._done = self._row_began = 0
-        self._force_before = 0.0
+        self._force_before, self._pressed = 0.0, False
         self._fresh = False
         self.controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self.parts]
         """Robosuite's, of each arm."""
@@ -111,7 +111,7 @@ class Simulation:
         """Begin a control step under ``limits`` of the ``limited`` channels."""
         self._done = self._row_began = 0
         self._limits.state[:] = 0, 0, 0, -1, 0
-        self._limits.load[0] = 0.0
+        self._pressed, self._limits.load[0] = self.load > 1.0, 0.0
         if limits is not None:
             if limits is not self._limits_set:
                 self._limits.most[self._limited], self._limits_set = limits.most(limited), limits
@@ -131,7 +131,7 @@ class Simulation:
             self._goals.held[:] = 0
         self._goals.action[:] = action
         self._fresh = True
-        if self.compiled:
+        if self.compiled and not (hold and self._pressed):  # fingers that close on a table would lift the hand
             for grip in self._grips:
                 grip(action)
 

@@ -47,8 +47,8 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         self.row_hooks: list[Callable[[NDArray[np.float32]], None]] = []
         """Called with every row of the stream within a control step but the last; a hook may call ``command()``."""
         self.holding = False
-        """Set, the arms stay in the next control step, and the grippers keep their command, whatever action arrives;
-        from within a hook, in the rest of the step. The step unsets it."""
+        """Set, the arms stay in the next control step, and the grippers keep their command, or their target where a
+        limit was passed, whatever action arrives; from within a hook, in the rest of the step. The step unsets it."""
         self.keeps_holding = False
         """Set, ``holding`` lasts until both are unset, however many steps a wrapper in between makes of one."""
         self.contact_limits: ContactLimits | None = None

@@ -26,6 +26,7 @@ BLOW = 2900.0  # first blow on a table for each m/s of the hand [N s/m]; measure
 LEANS_S = 0.5
 """More than ``FREE_FORCE`` for longer than this is no blow: the arm leans on something [s]. Healthy motion of six tasks
 did so for 0.35 s, once 0.45; ISO/TS 15066 calls contact quasi-static from half a second on."""
+SLOW, TWICE = 0.1, 15.0  # a slow hand [m/s] feels no inertia: time counts twice so far beyond ``FREE_FORCE`` [N]
 
 HEAVIEST, WEIGHED_S = 15.0, 5.0
 """What a wrist bears without a contact, its hand's weight, is at most so much [N]; it is averaged over so long [s]."""
@@ -179,9 +180,11 @@ def _weigh(
         if force != force:
             force = contact_force(rows[n], wrists, torques, weights[1, n], WEIGHED_S / dt)
         more = max(force - FREE_FORCE, 0.0) if np.isfinite(force) else 0.0
+        speed = largest_norm(rows[n], hands, nothing)
         pressed[0, n] += more * dt
-        pressed[1, n] = max(pressed[1, n] + (dt if more > 0.0 else -dt), 0.0)  # a moment below does not end it
-        numbers[n, 0], numbers[n, 1], numbers[n, 2] = force, pressed[0, n], largest_norm(rows[n], hands, nothing)
+        leant = dt * (1.0 + (more / TWICE if speed < SLOW else 0.0)) if more > 0.0 else -dt
+        pressed[1, n] = min(max(pressed[1, n] + leant, 0.0), 2.0 * leans_s)  # a moment below does not end it
+        numbers[n, 0], numbers[n, 1], numbers[n, 2] = force, pressed[0, n], speed
         leans = pressed[1, n] > leans_s / (1.0 + AGAIN * counts[STRIKES, n])
         # What ends the episode is an alarm too.
         presses[n] = load > 1.0 or np.isfinite(left_s) or leans or pressed[0, n] > most_impulse
