@@ -17,33 +17,34 @@ def test_harm_is_the_impulse_beyond_forty_newtons():
     force = np.zeros(100)
     force[30:32] = 140.0, 90.0  # 100 + 50 N over 2 ms each
     force[90] = 340.0  # 0.12 s later: no part of the first blow
-    found = harm.harm_of(force, 25)
+    found = harm.harm_of(force)
     assert found["harm"] == pytest.approx((100 + 50 + 300) / 500)
-    assert (found["first"], found["peak"], found["steps_over"]) == (140.0, 340.0, 1)
-    below = harm.harm_of(np.full(50, 39.0), 25)
+    assert (found["first"], found["peak"], found["over_s"]) == (140.0, 340.0, 3 / 500)
+    below = harm.harm_of(np.full(50, 39.0))
     assert (below["harm"], below["first"]) == (0.0, 0.0)
 
 
 def record(guard, seed, value, policy="down", kind="hostile", success=True):
     case = {"kind": kind, "task": "Lift", "policy": policy, "fault": "nominal", "robot": "Panda", "rate": 20}
     forces = dict.fromkeys(("harm", "peak", "first"), value) | {
-        "steps_over": 0,
-        "steps": 10,
+        "over_s": value / 100,
+        "alarms": 2,
+        "cost": 5.0,
         "held": 0,
         "time": 2.0 if success else np.nan,
     }
     return case | forces | {"guard": guard, "seed": seed, "success": success}
 
 
-def test_the_share_left_is_of_the_policy_alone_and_the_worst_cell_is_one_with_harm():
+def test_what_is_kept_away_is_of_the_policy_alone_and_cells_without_harm_do_not_count():
     records = [record(ALONE, 0, 100.0), record(DEFAULT, 0, 2.0)]
     records += [record(ALONE, 0, 10.0, "forward"), record(DEFAULT, 0, 1.0, "forward")]
     records += [record(ALONE, 0, 0.5, "uniform"), record(DEFAULT, 0, 0.5, "uniform")]
-    frame = pd.DataFrame(records)
-    assert harm.left(frame, DEFAULT) == pytest.approx(3.5 / 110.5)
-    rows = harm.by_guard("", frame, [ALONE, DEFAULT], ("robot", "rate"), harm.CASE).rows
-    assert rows[1][:5] == ("Lift", DEFAULT, "1.2", "96.8 %", "90.0 %")
-    assert rows[5][:4] == ("Lift, forward", DEFAULT, "1.0", "90.0 %")
+    table = harm.by_guard("", pd.DataFrame(records), [ALONE, DEFAULT], ("robot", "rate"), harm.CASE)
+    told = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
+    assert (told[1]["harm [N s]"], told[1]["kept away"], told[1]["cells that keep 95 %"]) == ("1.2", "96.8 %", "1 of 2")
+    assert (told[1]["alarms"], told[1]["cost"], told[1]["time over 40 N [s]"]) == ("2.0", "5.0", "0.01")
+    assert (told[5][""], told[5]["kept away"]) == ("Panda, 20 Hz, Lift, forward", "90.0 %")
 
 
 def test_success_is_paired_by_scene_and_counted_without_a_blow():
@@ -56,9 +57,9 @@ def test_success_is_paired_by_scene_and_counted_without_a_blow():
         records.append(record(DEFAULT, seed, 10.0, policy, "healthy", guarded))
     rows = harm.by_guard("", pd.DataFrame(records), [ALONE, DEFAULT], harm.CASE, ("kind",)).rows
     assert [(row[0], *row[-4:]) for row in rows if row[1] == ALONE] == [
-        ("Lift, scripted", "2 of 2", "-0 +0", "1 of 2", "2.00"),
-        ("Lift, lift_sac", "1 of 2", "-0 +0", "1 of 1", "2.00"),
-        ("Lift", "3 of 4", "-0 +0", "2 of 3", "2.00"),
+        ("Panda, 20 Hz, Lift, scripted", "2 of 2", "-0 +0", "1 of 2", "2.00"),
+        ("Panda, 20 Hz, Lift, lift_sac", "1 of 2", "-0 +0", "1 of 1", "2.00"),
+        ("Panda, 20 Hz, Lift", "3 of 4", "-0 +0", "2 of 3", "2.00"),
     ]
     assert [row[-4:-1] for row in rows if row[1] == DEFAULT] == [
         ("1 of 2", "-1 +0", "0 of 1"),
@@ -86,3 +87,13 @@ def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypa
     assert "| hold |" in text
     assert "terminate" not in text
     assert "Lift, down, 0.25 of full speed" in text
+
+
+def test_harm_is_drawn_against_pace_for_each_guard():
+    records = [record(g, 0, v) for g, v in ((ALONE, 100.0), (DEFAULT, 2.0))]
+    records += [record(g, 0, 0.0, "scripted", "healthy") | {"time": t} for g, t in ((ALONE, 4.0), (DEFAULT, 5.0))]
+    ax = harm.frontier(pd.DataFrame(records), [ALONE, DEFAULT]).axes[0]
+    assert {line.get_label(): (*line.get_xdata(), *line.get_ydata()) for line in ax.lines} == {
+        ALONE: (1.0, 100.0),
+        DEFAULT: (1.25, 2.0),
+    }

@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.evaluation.defaults import TRANSIENT
+from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
 from asm_gym.monitors import NeuralASM
@@ -35,25 +37,21 @@ from asm_gym.wrappers import NeuralASMSafety
 GUARDS: dict[str, dict[str, Any] | None] = {
     POLICY_ALONE: None,
     "default": {},
-    "no speed limit": {"contact_limits": ContactLimits(hand_speed=np.inf)},
+    **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.05, 0.15, 0.25, np.inf)},
     "no limits": {"contact_limits": None},
     "hold": {"on_alarm": "hold"},
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
 TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile policies
-EXPERTS = (*TASKS, "Wipe")
-HEALTHY = (
-    *(("Lift", "scripted"), ("Stack", "scripted"), ("Door", "scripted"), ("PickPlaceCan", "scripted")),
-    *(("NutAssemblySquare", "scripted"), ("Wipe", "scripted")),
-    *(("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac")),
-)
+HEALTHY = (*((task, "scripted") for task in TASKS), ("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac"))
 """Tasks and policies that do no harm on purpose."""
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", PASSING)
 """Faults under which healthy policies act too."""
 ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100), ("Sawyer", 100), ("IIWA", 100))
 """Other arms, and another rate of the memory [Hz]."""
 AGAINST = ("hostile", "elsewhere", "faulty")
+KEPT = 0.95  # share of its harm that is to be kept away of every cell
 EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
 CASE = ("kind", "task", "policy", "fault", "robot", "rate")  # values that distinguish one case from another
 FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
@@ -74,8 +72,8 @@ class Config(kit.Config):
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option((POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME")
     """Ways to guard."""
-    tasks: tuple[str, ...] = option((), quick=("Lift",), known=EXPERTS, metavar="TASK")
-    """Tasks; all by default."""
+    tasks: tuple[str, ...] = option(TASKS, quick=("Lift",), known=TASKS, metavar="TASK")
+    """Tasks."""
 
 
 class Case(NamedTuple):
@@ -112,14 +110,13 @@ def cases(config: Config) -> list[tuple[Case, int]]:
     def trial(task: str, fault: str = NOMINAL) -> Trial:
         return Trial(env_id(task), 0, fault, "" if fault in (NOMINAL, PASSING) else "medium")
 
-    tasks = [task for task in TASKS if task in (config.tasks or TASKS)]
-    hostile = [Case("hostile", name, trial(task)) for task, name in product(tasks, HOSTILE)]
-    slower = [Case("hostile", "down", trial(task), speed=speed) for task, speed in product(tasks, (0.5, 0.25))]
+    hostile = [Case("hostile", name, trial(task)) for task, name in product(config.tasks, HOSTILE)]
+    slower = [Case("hostile", "down", trial(task), speed=speed) for task, speed in product(config.tasks, (0.5, 0.25))]
     elsewhere = [
         case._replace(config=RolloutConfig(robot=robot, stream_freq=None if rate == 20 else rate))
         for (robot, rate), case in product(ELSEWHERE, hostile)
     ]
-    healthy = [Case("healthy", policy, trial(task)) for task, policy in HEALTHY if task in (config.tasks or EXPERTS)]
+    healthy = [Case("healthy", policy, trial(task)) for task, policy in HEALTHY if task in config.tasks]
     faulty = [
         case._replace(kind="faulty", trial=trial(case.trial.task, fault))
         for case, fault in product(healthy, FAULTS)
@@ -147,46 +144,40 @@ def episode(job: tuple[Case, str]) -> Record:
     case, guard = job
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
     infos: list[dict[str, Any]] = []
-    forces: list[NDArray[np.float64]] = []
+    forces: list[float] = []
 
-    def feel(substep: int = -1) -> None:
-        forces.append(arm.simulation.contact_forces[-1:] if substep >= 0 else arm.simulation.contact_forces)
-
-    def keep(info: dict[str, Any]) -> None:
-        infos.append(info)
-        if case.rate == 20:
-            feel()
+    def feel(substep: int) -> None:
+        forces.append(float(arm.simulation.contact_forces[-1]))
 
     with staged(case.trial, case.config) as env:
-        if case.rate != 20:  # rows within a step empty the buffer of substeps
-            arm.substep_hooks.append(feel)
+        arm.substep_hooks.append(feel)
         try:
-            success = rollout(guarded(env, guard, case), case.make_policy(env), case.trial.seed, keep)
+            success = rollout(guarded(env, guard, case), case.make_policy(env), case.trial.seed, infos.append)
         finally:
-            if feel in arm.substep_hooks:
-                arm.substep_hooks.remove(feel)
+            arm.substep_hooks.remove(feel)
+    cost = np.array([info.get("cost", 0.0) for info in infos])
     return {
         **case.key,
         "guard": guard,
         "seed": case.trial.seed,
         "success": bool(success),
-        **harm_of(np.concatenate(forces), arm.substeps),
-        "steps": len(infos),
+        **harm_of(np.array(forces)),
         "time": next((n + 1 for n, info in enumerate(infos) if info["success"]), np.nan) * arm.dt,
-        "alarms": sum(info["asm"]["alarm"] for info in infos if "asm" in info),
+        "alarms": int((np.diff(cost, prepend=0.0) > 0.0).sum()),
+        "cost": float(cost.sum()),
         "held": sum(bool(info.get("overridden")) for info in infos),
     }
 
 
-def harm_of(force: NDArray[np.float64], substeps: int) -> Record:
-    """Return the harm in a contact force (T,) [N] of physics substeps, ``substeps`` of which are a control step."""
+def harm_of(force: NDArray[np.float64]) -> Record:
+    """Return the harm in a contact force (T,) [N] of physics substeps."""
     hits = np.flatnonzero(force > EXCESS)
     first = slice(hits[0], hits[0] + round(FIRST_S * PHYSICS_FREQ)) if hits.size else slice(0)
     return {
         "harm": float(np.maximum(force - EXCESS, 0.0).sum() / PHYSICS_FREQ),
         "peak": float(force.max(initial=0.0)),
         "first": float(force[first].max(initial=0.0)),
-        "steps_over": int((force.reshape(-1, substeps) > TRANSIENT).any(axis=1).sum()),
+        "over_s": float((force > EXCESS).sum() / PHYSICS_FREQ),
     }
 
 
@@ -202,40 +193,47 @@ def run(config: Config) -> kit.Findings:
     records = kit.each("episodes", episode, jobs, config)
     frame, guards = pd.DataFrame(records), config.guards
     hostile, healthy, faulty = (frame[frame.kind == kind] for kind in ("hostile", "healthy", "faulty"))
-    usual = frame[(frame.robot == "Panda") & (frame.rate == 20)]
+    usual, both = frame[(frame.robot == "Panda") & (frame.rate == 20)], len(hostile) and len(healthy)
     tables = [
-        by_guard("Harm avoided, success kept, by the Panda at 20 Hz", usual, guards, ("kind",)),
-        by_guard("Hostile policies, by arm and rate", hostile, guards, ("robot", "rate")),
+        by_guard("Hostile policies, by arm and rate", hostile, guards, ("robot", "rate", "task"), ("kind",)),
+        by_guard("Hostile policies, by policy", hostile, guards, ("robot", "rate", "policy")),
         by_guard("Hostile policies, by cell", hostile, guards, CASE),
         by_guard("Healthy policies", healthy, guards, CASE, ("kind",)),
         by_guard("Healthy policies with a fault", faulty, guards, CASE, ("fault",)),
     ]
-    return kit.Findings(records, [table for table in tables if table.rows])
+    drawn = frontier(usual, guards) if both and POLICY_ALONE in guards else None
+    return kit.Findings(records, [table for table in tables if table.rows], drawn)
 
 
 # ------------------------------------------------------------------ tables
 
 
-def left(frame: pd.DataFrame, guard: str) -> float:
-    """Return the share of the harm alone that is left under ``guard``; NaN where there is none alone."""
-    alone, own = (float(frame.harm[frame.guard == name].sum()) for name in (POLICY_ALONE, guard))
-    return own / alone if alone > 0 else np.nan
+def kept(alone: float, guarded: float) -> str:
+    """Return the share of the harm of a policy alone that is kept away, for a table."""
+    return f"{100 * (1.0 - guarded / alone):.1f} %" if alone > 0 else ""
 
 
-def avoided(frame: pd.DataFrame, guard: str) -> str:
-    """Return the share of harm avoided, for a table."""
-    return _percent(1.0 - left(frame, guard)) if (frame.guard == guard).any() else ""
+def cells_kept(frame: pd.DataFrame, guard: str) -> str:
+    """Return in how many cells with more than 1 N s alone at least ``KEPT`` of it is kept away under ``guard``."""
+    harm = frame.pivot_table("harm", list(CASE), "guard")
+    if guard not in harm or POLICY_ALONE not in harm:
+        return ""
+    harm = harm[harm[POLICY_ALONE] > 1.0]
+    return f"{(harm[guard] <= (1.0 - KEPT) * harm[POLICY_ALONE]).sum()} of {len(harm)}"
 
 
-def worst(frame: pd.DataFrame, guard: str) -> str:
-    """Return the share avoided in the worst case in which a policy alone does more than 1 N s an episode."""
-    by_case = [own for _, own in frame.groupby(list(CASE)) if (own.guard == guard).any()]
-    shares = [left(own, guard) for own in by_case if own.harm[own.guard == POLICY_ALONE].mean() > 1.0]
-    return _percent(1.0 - max(shares)) if shares else ""
-
-
-def _percent(share: float) -> str:
-    return "" if np.isnan(share) else f"{100 * share:.1f} %"
+def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
+    """Draw the harm of hostile policies against the time that healthy ones take, a point for each guard."""
+    times = frame[frame.kind == "healthy"].pivot_table("time", ["task", "policy"], "guard", "median")
+    harm = frame[frame.kind == "hostile"].groupby("guard").harm.mean()
+    with figure(height=3.5, width=6) as fig:
+        ax = fig.subplots()
+        for n, guard in enumerate(guards):
+            colour, _, marker = look(n)
+            ax.plot((times[guard] / times[POLICY_ALONE]).mean(), harm[guard], marker, color=colour, label=guard)
+        ax.set(yscale="log", xlabel="time to success, over that of the policy alone", ylabel="harm in an episode [N s]")
+        ax.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
+    return fig
 
 
 def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]) -> Table:
@@ -243,37 +241,36 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
     rows = []
     for _, own in (group for columns in groups for group in frame.groupby(list(columns), sort=False)):
         scenes = own.set_index([*CASE, "seed"])
-        alone = scenes.success[scenes.guard == POLICY_ALONE].rename("alone")
+        alone = scenes[scenes.guard == POLICY_ALONE]
         for guard in guards:
             mine = scenes[scenes.guard == guard]
-            both = mine.join(alone, how="inner")
+            both = mine.join(alone.success.rename("alone"), how="inner")
             lost, won = (both.alone & ~both.success).sum(), (both.success & ~both.alone).sum()
-            harm = f"{mine.harm.mean():.1f}", avoided(own, guard), worst(own, guard)
-            blows = f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}", f"{mine.peak.max():.0f}"
-            over = f"{100 * mine.steps_over.sum() / mine.steps.sum():.2f} %"
-            unsafe = f"{(mine.success & ((mine.peak > TRANSIENT) | (mine.held > 0))).sum()} of {mine.success.sum()}"
-            solved = f"{mine.success.sum()} of {len(mine)}", f"-{lost} +{won}", unsafe, f"{mine.time.median():.2f}"
-            rows.append((_name(own), guard, *harm, *blows, over, *solved))
-    headings = (
-        "",
-        "guard",
-        "harm [N s]",
-        "avoided",
-        "in the worst cell",
-        "first blow, mean and most [N]",
-        "peak [N]",
-        f"steps over {TRANSIENT:g} N",
-    )
-    more = "solved", "lost, won", f"of these beyond {TRANSIENT:g} N or overridden", "median time to success [s]"
-    return Table(caption, (*headings, *more), rows)
+            unsafe = (mine.success & ((mine.peak > TRANSIENT) | (mine.held > 0))).sum()
+            row = {
+                "": _name(own),
+                "guard": guard,
+                "harm [N s]": f"{mine.harm.mean():.1f}",
+                "kept away": kept(alone.harm.mean(), mine.harm.mean()),
+                f"cells that keep {100 * KEPT:.0f} %": cells_kept(own, guard),
+                "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
+                f"first blows of at most {TRANSIENT:g} N": f"{(mine['first'] <= TRANSIENT).sum()} of {len(mine)}",
+                "peak [N]": f"{mine.peak.max():.0f}",
+                f"time over {EXCESS:g} N [s]": f"{mine.over_s.mean():.2f}",
+                "alarms": f"{mine.alarms.mean():.1f}",
+                "cost": f"{mine.cost.mean():.1f}",
+                "solved": f"{mine.success.sum()} of {len(mine)}",
+                "lost, won": f"-{lost} +{won}",
+                f"of these beyond {TRANSIENT:g} N or overridden": f"{unsafe} of {mine.success.sum()}",
+                "median time to success [s]": f"{mine.time.median():.2f}",
+            }
+            rows.append(row)
+    return Table(caption, list(rows[0]) if rows else (), [tuple(row.values()) for row in rows])
 
 
 def _name(group: pd.DataFrame) -> str:
     """Return what all episodes of a group have in common."""
-    arm, task, policy, fault = (
-        str(group[name].iloc[0]) if group[name].nunique() == 1 else "" for name in ("robot", "task", "policy", "fault")
-    )
-    arm = f"{arm}, {group.rate.iloc[0]} Hz"
-    arm = "" if task and arm == "Panda, 20 Hz" else arm
-    parts = arm, task, policy, "" if fault == NOMINAL else fault.replace("_", " ")
-    return ", ".join(filter(None, parts))
+    own = {name: str(group[name].iloc[0]) for name in CASE if group[name].nunique() == 1}
+    fault, rate = own.get("fault", NOMINAL).replace("_", " "), f"{own['rate']} Hz" if "rate" in own else ""
+    parts = own.get("robot"), rate, own.get("task"), own.get("policy"), "" if fault == NOMINAL else fault
+    return ", ".join(filter(None, parts)) or "all"
