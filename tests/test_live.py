@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from asm_gym.data.live import SourceDied, lines_from, live_source, record
-from asm_gym.data.rows import NEWEST, Pace, RowReader
+from asm_gym.data.rows import NEWEST, Pace, Publishers, RowReader
 from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -76,6 +76,35 @@ def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost
     read = [row for row, _ in RowReader(spec).rows(lines)]
     np.testing.assert_array_equal([r.numbers for r in read], [[0, 10], [1, 11], [2, np.nan], [3, 13], [4, 14]])
     assert not any(row.lost or row.problem for row in read)
+
+
+@pytest.mark.parametrize("finger_first", [True, False])
+def test_publishers_of_other_joints_make_one_row_and_one_that_lacks_a_number_lacks_it(finger_first):
+    spec = StreamSpec((Channel("position", 3, "rad", elements=("elbow", "lift", "finger")),), dt=0.01)
+
+    def said(k, **joints):
+        return json.dumps({"time": 0.01 * k, "name": list(joints), "position": list(joints.values())})
+
+    lines = [said(0, finger=-1)] if finger_first else []
+    for k in range(20):
+        lines.append(said(k, lift=k + 100, elbow=k))
+        lines += [said(k + 0.5, finger=k), json.dumps({"time": 0.01 * k, "battery": 12.0})] if k % 4 == 0 else []
+    lines.insert(-1, said(18.5, elbow=18))  # without its lift
+    read = [row for row, _ in RowReader(spec).rows(lines)]
+    first = 0 if finger_first else 1
+    wanted = [[k, k + 100, (k - 1) // 4 * 4 if k else -1] for k in range(first, 19)]
+    np.testing.assert_array_equal([r.numbers for r in read], [*wanted, [18, np.nan, 16], [19, 119, 16]])
+    assert not any(row.problem for row in read)
+
+
+def test_a_publisher_that_falls_silent_leaves_its_numbers_missing_and_another_one_leads():
+    arm, finger = {"q": 1, "v": 2}, {"f": 3}
+    publishers = Publishers(silence=0.5)
+    assert publishers.row(arm, arm, 0.0) == arm
+    assert publishers.row(finger, finger, 0.1) is None
+    assert publishers.row(arm, arm, 0.5) == arm | finger
+    assert publishers.row(arm, arm, 0.7) == arm
+    assert publishers.row(finger, finger, 1.3) == finger
 
 
 @pytest.mark.parametrize(

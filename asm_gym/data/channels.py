@@ -45,11 +45,11 @@ class Recorded(NamedTuple):
 class ColumnPlan:
     """Which columns of a source make a row of a memory's stream, and how: the same for files and for live rows.
 
-    A channel of sine and cosine is made of the angle of that name. Raises ValueError where a column is missing, or of
-    another unit.
+    A channel of sine and cosine is made of the angle of that name. Raises ValueError where a column is of another unit,
+    or of the ``whole`` is missing.
     """
 
-    def __init__(self, names: Iterable[str], spec: StreamSpec) -> None:
+    def __init__(self, names: Iterable[str], spec: StreamSpec, whole: bool = True) -> None:
         bare = {name: split_unit(name)[0] for name in names}
         # joint_0 is joint[0] too, though it may be the only one here.
         places = {label_of(short): name for name, short in bare.items()} | {short: name for name, short in bare.items()}
@@ -71,7 +71,7 @@ class ColumnPlan:
                 self.columns.append(name)
                 self._scale.append(scale * TAU / TURN[channel.unit] if turned else scale)
                 self._turned.append(1 + k if turned else 0)
-        if missing:
+        if missing and whole:
             names = ", ".join(dict.fromkeys(missing))
             raise ValueError(f"the memory reads channels that are not there: {names}")
 

@@ -25,8 +25,8 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
-from asm_gym.data.bags import MESSAGES, Numbers, stamp_of
-from asm_gym.data.rows import SourceDied
+from asm_gym.data.bags import MESSAGES, stamp_of
+from asm_gym.data.rows import Publishers, SourceDied
 from asm_gym.extras import require
 from asm_gym.files import named, no_links, regular_file
 from asm_gym.validation import check_number
@@ -184,22 +184,21 @@ def _follow_topics(topics: str, silence: float) -> Iterator[str]:
     waiting.attach(
         core.ReadCondition(readers[clock], core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead)
     )
-    latest, start, rows = dict[tuple[str, ...], tuple[float, Numbers]](), time.monotonic(), 0
-    while time.monotonic() - max((at for (of, *_), (at, _) in latest.items() if of == clock), default=start) <= silence:
+    publishers, rows, last = Publishers(silence), 0, time.monotonic()
+    while time.monotonic() - last <= silence:
         waiting.wait(_dds("util").duration(seconds=WAIT_S))
         for name in (*others, clock):
             for sample in readers[name].take(N=AT_ONCE):
                 if not getattr(getattr(sample, "sample_info", None), "valid_data", False):
                     continue  # it only says that a writer went
-                said = (name, *sorted(getattr(sample, "name", ())))  # several may publish there, each its own joints
+                joints = [f"{name}.{joint}" for joint in getattr(sample, "name", ())] or [name]
                 numbers = {f"{name}.{number}": v for number, v in MESSAGES[kinds[name]](sample).items()}
-                latest[said] = time.monotonic(), numbers
-                if said == max((key for key in latest if key[0] == clock), key=len, default=None):
+                row = publishers.row(numbers, joints, now := time.monotonic(), leads=name == clock)
+                last = now if name == clock else last
+                if row is not None:
                     rows += 1
                     seconds = stamp_of(sample) or 1e-9 * sample.sample_info.source_timestamp
-                    yield json.dumps({"time": seconds} | {n: v for _, part in latest.values() for n, v in part.items()})
-        now = time.monotonic()
-        latest = {said: newest for said, newest in latest.items() if now - newest[0] <= silence}  # old is missing
+                    yield json.dumps({"time": seconds} | row)
     if not rows:
         raise OSError(f"no row came from {topics} for {silence:g} s")
     raise SourceDied(f"nothing came for {silence:g} s")

@@ -1,7 +1,7 @@
 """Read lines of a live source as rows of a stream, at the rate of the memory.
 
 A JSON line is a list of numbers, or an object by channel or by number; CSV begins with a header. A row of each joint
-makes one row of all, once the last of them came. Where there is a time,
+makes one row of all, once the last of them came; so do objects of several publishers. Where there is a time,
 
 own      median step of the newest 32 rows [s]
 right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
@@ -75,6 +75,28 @@ class Pace:
         return max(0, round(step / self.dt) - 1) if self.right else None
 
 
+class Publishers:
+    """Join messages that hold different numbers: a row is a message of most numbers, with the newest of the others."""
+
+    def __init__(self, silence: float) -> None:
+        self.silence = silence  # after which the numbers of a publisher are missing [s]
+        self._newest = dict[frozenset[str], tuple[float, bool, Mapping[str, Any]]]()  # messages by their numbers
+
+    def row(self, message: Mapping[str, Any], numbers: Iterable[str], now: float, leads: bool = True) -> Any:
+        """Return the row that a message makes at the time ``now`` [s], or None; only one that ``leads`` may make one.
+
+        A message with some of the numbers of another one is of the same publisher, and lacks the others.
+        """
+        own = frozenset(numbers)
+        own = own.union(*(of for of in self._newest if of & own))
+        kept = {of: said for of, said in self._newest.items() if of == own or not of & own}
+        kept[own] = now, leads, message
+        self._newest = {of: said for of, said in kept.items() if now - said[0] <= self.silence}
+        if own != max((of for of, said in self._newest.items() if said[1]), key=len, default=None):
+            return None
+        return {name: value for _, _, other in self._newest.values() for name, value in other.items()} | dict(message)
+
+
 class Row(NamedTuple):
     """A row as it came."""
 
@@ -86,9 +108,12 @@ class Row(NamedTuple):
 
 
 class RowReader:
-    """Read lines as rows of the stream of a memory; ``clock`` is the column of times, by default the first one."""
+    """Read lines as rows of the stream of a memory.
 
-    def __init__(self, spec: StreamSpec, clock: str = "") -> None:
+    ``clock`` is the column of times, by default the first one; after ``silence`` [s] a publisher's numbers are missing.
+    """
+
+    def __init__(self, spec: StreamSpec, clock: str = "", silence: float = 2.0) -> None:
         self.spec, self.line, self._wanted = spec, 0, clock
         self._dialect = Dialect(",", comma=False)
         self._header: list[str] | None = None  # of CSV
@@ -96,6 +121,9 @@ class RowReader:
         self._named: Named = {}  # columns that name others
         self._joint = ""  # column that says whose numbers a row holds
         self._gathered: dict[str, Any] = {}  # of the joints that came, where a row is one of a joint
+        self._publishers = Publishers(silence)
+        self._now, self._since = 0.0, math.inf  # when the newest line came, and the first that lacks columns
+        self._lacking: ValueError | None = None  # what all publishers lack up to now
         self._clock: Clock | None = None
         self._first: float | None = None  # number of a clock whose unit is not known yet
         self._pace = Pace(spec.dt)
@@ -109,7 +137,7 @@ class RowReader:
     def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
         """Yield each row, and when its line came, by ``time.perf_counter``; a line that is none has a ``problem``."""
         for line in filter(str.strip, lines):
-            arrived = time.perf_counter()
+            arrived = self._now = time.perf_counter()
             self.line += 1
             try:
                 if self._begins_with(line):
@@ -119,9 +147,14 @@ class RowReader:
                     continue
                 row = found
             except Exception as error:  # anybody may have sent it: deep, huge or broken, it must not end a watch
-                kind = "no row of numbers" + (", and no header" if self._header is None and not self._known else "")
-                row = Row(np.full(self.spec.size, np.nan), read=False, problem=f"line {self.line} is {kind}: {error}")
+                row = self._problem(error)
             yield row, arrived
+        if self._lacking is not None and not self._known:
+            yield self._problem(self._lacking), self._now
+
+    def _problem(self, error: Exception) -> Row:
+        kind = "no row of numbers" + (", and no header" if self._header is None and not self._known else "")
+        return Row(np.full(self.spec.size, np.nan), read=False, problem=f"line {self.line} is {kind}: {error}")
 
     def _begins_with(self, line: str) -> bool:
         """Tell whether a line is the header of CSV, for the first time or once more, and take it up."""
@@ -164,6 +197,7 @@ class RowReader:
         """Find the column of each label, and the clock. Raises ValueError where a column is missing."""
         names = list(names)
         plan = ColumnPlan(names, self.spec)
+        self._lacking = None
         doubled = [name for name in plan.columns if names.count(name) > 1]
         if doubled:
             raise ValueError(f"it has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
@@ -183,7 +217,8 @@ class RowReader:
             return np.asarray(row, np.float64), None
         flat = flat_row(row)
         for channel in self.spec.channels:
-            if isinstance(part := row.get(channel.name), list) and len(part) != channel.size:
+            part = row.get(channel.name)
+            if isinstance(part, list) and len(part) != channel.size and f"{channel.name}[0]" in flat:
                 raise ValueError(f"{channel.name} must hold {channel.size} numbers, got {len(part)}")
         return self._by_name(flat, lambda value: float("nan" if value is None else value))
 
@@ -195,11 +230,26 @@ class RowReader:
         if self._plan is None:
             joints = {label.rpartition("[")[2].rstrip("]") for label in self.spec.labels if "[" in label}
             self._joint = next((n for n in row if is_key(n) and str(row[n]).strip() in joints), "")
-        whole = self._gather(row) if self._joint else row
-        if whole is None:
+        message = self._gather(row) if self._joint else row
+        if message is None:
             return None
-        plan = self._plan or self._match(whole)
+        numbers = ColumnPlan(message, self.spec, whole=False).columns if self._plan is None else self._plan.columns
+        whole = self._publishers.row(message, (name for name in numbers if name in message), self._now)
+        plan = self._plan if whole is None else self._plan or self._whole_plan(whole, bool(numbers))
+        if whole is None or plan is None:
+            return None
         return plan.row({name: number(whole[name]) for name in plan.columns if name in whole}), self._moment(whole)
+
+    def _whole_plan(self, row: Mapping[str, Any], some: bool) -> ColumnPlan | None:
+        """Return the plan of a row with all columns; None while another publisher may add some, ValueError later."""
+        self._since = min(self._since, self._now)
+        try:
+            return self._match(row)
+        except ValueError as error:
+            if not some or self._now - self._since > self._publishers.silence:
+                raise
+            self._lacking = error
+            return None
 
     def _gather(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
         """The row of all joints, once it is complete, or one of a later moment comes; None before."""

@@ -3,12 +3,14 @@
 names in cells   name0, position0, name1, …     position[elbow] of each joint that a row names, in any order
 long             time, joint, position          a row a joint: position[elbow], a row a time
 several rates    empty cells between            the rows of the fastest columns; a slower one keeps its newest value
+publishers       a row of one of them each      the rows of the one of most columns; others keep their newest value
 lists            (T, k)                         q[0], …, q[k-1]
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any
@@ -156,12 +158,12 @@ def _joined(table: Columns) -> Columns:
     masks = {mask.tobytes(): mask for mask in filled.values() if mask.any()}
     rows, most = np.ones(len(next(iter(table.values()), ())), np.bool_), SPARSE
     if len(masks) > 1 and np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY:  # a row has one of them
-        rows, most = max(masks.values(), key=np.count_nonzero), 1.0
+        columns = Counter(mask.tobytes() for mask in filled.values())  # as live: rows are those of the most numbers
+        rows, most = max(masks.values(), key=lambda mask: (columns[mask.tobytes()], np.count_nonzero(mask))), 1.0
     slower = {n: m for n, m in filled.items() if not np.array_equal(m, rows) and m.mean() <= most and _regular(m)}
     if not slower:
         return table
-    names = ", ".join(slower)[:120]
-    note(f"columns come at several rates: rows are those of the fastest, {names} keep their newest value")
+    note(f"columns come at several rates: {', '.join(slower)[:120]} keep their newest value")
     held = pd.DataFrame({n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()})[rows]
     start = int(held.notna().to_numpy().argmax(axis=0).max())  # before that the slower ones said nothing
     return {n: (held[n].to_numpy() if n in slower else values[rows])[start:] for n, values in table.items()}

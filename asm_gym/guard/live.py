@@ -87,6 +87,7 @@ def follow(
     until_alarm: bool = False,
     beat: Beat = None,
     clock: str = "",
+    silence: float = 2.0,
 ) -> int:
     """Say every alarm as it is raised, and why; return how many there were. Those of one cause are one.
 
@@ -99,11 +100,12 @@ def follow(
         until_alarm: the first alarm ends the watch.
         beat: of a watchdog, told of every row that was judged; it returns whether the watchdog lives.
         clock: the column of times; by default the first that is called so.
+        silence: after which the numbers of a publisher, of several, are missing [s].
 
     Raises:
         ValueError: no row came, or the first line of a source that cannot be opened anew is no row.
     """
-    watch = _Watch(monitor, say, seconds, beat, clock)
+    watch = _Watch(monitor, say, seconds, beat, RowReader(monitor.spec, clock, silence))
     source: Iterable[str] | None = lines
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*rows under this policy alarm")  # every alarm is said here
@@ -122,11 +124,13 @@ def follow(
 class _Watch:
     """The state of a source while it is watched; the arguments are those of ``follow``."""
 
-    def __init__(self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float, beat: Beat, clock: str) -> None:
+    def __init__(
+        self, monitor: Any, say: Callable[[LiveEvent], None], seconds: float, beat: Beat, reader: RowReader
+    ) -> None:
         self.say, self.seconds, self.spec, self.beat = say, seconds, monitor.spec, beat
         spec: StreamSpec = monitor.spec
         self.engine = Engine(Robots.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
-        self.reader = RowReader(spec, clock)
+        self.reader = reader
         self.no_action = np.zeros((1, spec.motor.size), np.float32)
         self.latencies: deque[float] = deque(maxlen=LATENCIES)
         self.rows = self.alarms = self.unreadable = 0
