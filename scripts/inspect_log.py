@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.data.inspection import Inspection, inspected
-from asm_gym.data.logs import Source, first_tables, read_tables
+from asm_gym.data.logs import LIKE, Source, first_tables, read_tables
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.tables import Columns
 from asm_gym.evaluation import figures
@@ -97,9 +97,9 @@ def differences(first: Inspection, other: Inspection) -> str:
     """Say why two logs of a folder could not be learned from together; empty where they can."""
     mine, theirs = ({c.name for c in log.columns if c.read} for log in (first, other))
     if mine != theirs:
-        return f"{other.name} has other columns than {first.name}: {', '.join(sorted(mine ^ theirs)[:6])}"
+        return f"{other.name} has other columns than {first.name}: {', '.join(sorted(mine ^ theirs)[:6])}; {LIKE}"
     if first.rate and other.rate and abs(first.rate / other.rate - 1) > 0.01:
-        return f"{other.name} comes at {other.rate:.5g} Hz and {first.name} at {first.rate:.5g}: say --rate"
+        return f"{other.name} comes at {other.rate:.5g} Hz and {first.name} at {first.rate:.5g}: say --rate; {LIKE}"
     return ""
 
 

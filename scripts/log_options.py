@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from asm_gym.data.columns import LogLayout
@@ -29,11 +30,13 @@ class LogOptions(Checked):
     """Columns that mark faulty rows, beside those with usual names; marked rows are not learned from."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
+    like: Path | None = option(None, metavar="FILE")
+    """Log of one robot: of a folder with logs of several robots, read only those with its columns and its rate."""
 
     def layout(self, **more: Any) -> LogLayout:
         """Return how to read logs; ``more`` are other fields of it."""
         said = {"channels": self.channels, "labels": self.label, "columns": self.columns, "ignore": self.ignore}
-        return LogLayout(**{"rate": self.rate, "clock": self.clock} | said | more)
+        return LogLayout(**{"rate": self.rate, "clock": self.clock, "like": self.like} | said | more)
 
 
 def ended(notes: Sequence[str], code: int = DONE) -> int:

@@ -45,7 +45,7 @@ from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
 LIVE_ONLY = ("until_alarm", "json", "hook", "watchdog", "policy")  # options
-RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
+RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns", "like")
 KINDS = "a live source", "a recording"
 SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
 
@@ -163,7 +163,8 @@ def watch(args: Args, console: Console) -> int:
     lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
     with _watchdog(args, monitor.spec.dt) as watchdog:
         beat = None if watchdog is None else watchdog.beat
-        alarms = follow(lines, monitor, say, bridge, again, args.wait, args.until_alarm, beat, args.clock)
+        how = args.wait, args.until_alarm, beat, args.clock, args.silence
+        alarms = follow(lines, monitor, say, bridge, again, *how)
     return BAD_NEWS if alarms else DONE
 
 

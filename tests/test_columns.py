@@ -211,6 +211,14 @@ def test_alarms_of_one_cause_are_one_and_missing_data_are_apart():
     assert sensed_peak(trace) == 2.0
 
 
+def test_columns_that_the_first_log_lacks_are_said(tmp_path):
+    pd.DataFrame(HEALTHY).to_csv(tmp_path / "0.csv", index=False)
+    pd.DataFrame(HEALTHY | {"seventh": Q * Q}).to_csv(tmp_path / "1.csv", index=False)
+    with noted() as notes:
+        assert len({log.episode.spec for log in read_logs(tmp_path)}) == 1
+    assert any("seventh" in line for line in notes)
+
+
 def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_in_time(tmp_path, capsys):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "x.parquet").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
@@ -218,9 +226,18 @@ def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_i
     assert "git lfs pull" in capsys.readouterr().err
     (tmp_path / "b").mkdir()
     pd.DataFrame(arm_table(0)).to_csv(tmp_path / "b" / "0.csv", index=False)
-    pd.DataFrame(HEALTHY).to_csv(tmp_path / "b" / "1.csv", index=False)
+    other = tmp_path / "b" / "1.csv"
+    pd.DataFrame(HEALTHY).to_csv(other, index=False)
     assert main(["fit", str(tmp_path / "b")]) == 2
-    assert "1.csv: the memory reads channels that are not there: torque" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "1.csv: the memory reads channels that are not there: torque" in said
+    assert f"or {other}" in said
+    pd.DataFrame(HEALTHY | {"time": 3 * HEALTHY["time"]}).to_csv(tmp_path / "b" / "2.csv", index=False)  # at its rate
+    logs = read_logs(tmp_path / "b", LogLayout(like=other))
+    assert [log.name for log in logs] == ["1.csv"]
+    how = ["--out", str(tmp_path / "m.asm"), "--monitor", "kalman", "--split", "0.2", "--false-alarm-rate", "0.2"]
+    assert main(["fit", str(tmp_path / "b"), *how, "--like", str(other)]) == 0
+    assert main(["inspect", str(tmp_path / "b"), "--out", str(tmp_path / "i"), "--like", str(other)]) == 0
     (tmp_path / "file").write_text("")
     assert main(["fit", str(tmp_path / "b"), "--out", str(tmp_path / "file" / "m.asm")]) == 2
     assert str(tmp_path / "file") in capsys.readouterr().err

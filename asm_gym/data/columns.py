@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,6 +61,7 @@ class LogLayout:
     by_name: bool = False  # without an ``action``, columns that are called so were commanded
     ignore: Sequence[str] = ()  # patterns of the columns that are left out
     clock: str = ""  # the column of times, perhaps with a unit behind it; by default the steadiest
+    like: Path | None = None  # of a folder only logs with the columns and the rate of this one are read
     nominal: float | None = None  # rows a second that somebody meant them to have, where no clock says it [Hz]
 
 

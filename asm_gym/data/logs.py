@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
@@ -16,14 +17,15 @@ from typing import NamedTuple
 from asm_gym.checkpoint import read_arrays
 from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
-from asm_gym.data.channels import clock_of, read_recorded
+from asm_gym.data.channels import RESAMPLED, clock_of, read_recorded
 from asm_gym.data.columns import LogLayout
 from asm_gym.data.datasets import INFO, METADATA, read_dataset, read_lerobot
 from asm_gym.data.episode import Episode, load_episode
+from asm_gym.data.names import is_label
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.tables import Columns, laid_out
 from asm_gym.data.text import read_json_lines, read_text
-from asm_gym.data.timing import recordings
+from asm_gym.data.timing import recordings, timing_of
 from asm_gym.files import regular_file
 from asm_gym.validation import typed
 
@@ -45,6 +47,7 @@ ASKED_FOR = (".txt", ".dat", ".data", ".log")  # read where they are named, and 
 POINTER = b"version https://git-lfs.github.com"
 FIRST_TABLES = 20  # by how many of a folder's tables it is decided what columns are,
 FIRST_NUMBERS = 20_000_000  # or by how many numbers of these
+LIKE = "--like FILE reads only logs with the columns and the rate of FILE"
 
 
 class Log(NamedTuple):
@@ -76,6 +79,7 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
     if (Path(path) / INFO).is_file():
         layout = replace(layout, action=layout.action or ("action*",))
     sources, first = first_tables(read_tables(path, layout))
+    robot, known, one = layout.spec, list(first[0]) if first else [], ""
     for source in sources:
         episode = source.episode
         if episode is None:
@@ -83,9 +87,12 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
                 others = [] if layout.spec else [other for other in first if other is not source.columns]
                 found = read_recorded(source.columns, replace(layout, nominal=source.rate), others)
             except ValueError as error:
-                raise ValueError(f"{source.file or source.name}: {error}") from error
+                hint = f"; {LIKE}, such as {one} or {source.file}" if layout.spec is not robot else ""
+                raise ValueError(f"{source.file or source.name}: {error}{hint}") from error
+            if robot is None and (more := [name for name in source.columns if not (name in known or is_label(name))]):
+                note(f"not read, as the first log lacks it: {', '.join(more)[:120]}; {LIKE}")
             episode = Episode(found.stream, found.spec, success=source.success, faults=found.faults)
-        layout = replace(layout, spec=layout.spec or episode.spec)  # the others are read as the first one was
+        layout, one = replace(layout, spec=layout.spec or episode.spec), one or source.file  # others are read as it
         yield Log(source.name, episode)
 
 
@@ -107,6 +114,11 @@ def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
     """
     path = Path(path)
     files = _files_at(path)
+    if layout.like is not None:
+        like, layout = layout.like, replace(layout, like=None)
+        robot = next(read_tables(like, layout))
+        yield from (source for source in read_tables(path, layout) if _alike(source, robot, layout))
+        return
     if (path / INFO).is_file():
         for n, (columns, rate, success) in enumerate(read_lerobot(path)):
             yield from _parts(Source(f"episode {n}", columns, None, rate, success), layout)
@@ -130,6 +142,21 @@ def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
             note(UNREAD + troubles[-1])
         else:
             yield from parts
+
+
+def _alike(source: Source, other: Source, layout: LogLayout) -> bool:
+    """Whether two recordings may be of one robot: they have the same columns, and come at about the same rate."""
+    own, its = _period(source, layout), _period(other, layout)
+    at_one_rate = own is None or its is None or 1 / RESAMPLED <= own / its <= RESAMPLED
+    return at_one_rate and set(source.columns) == set(other.columns)
+
+
+def _period(source: Source, layout: LogLayout) -> float | None:
+    """How far apart rows are [s]; None where no clock tells."""
+    with suppress(ValueError):
+        clock = clock_of(source.columns, layout)
+        return None if clock is None else timing_of(source.columns, clock).dt
+    return None
 
 
 def _read(name: str, file: Path, layout: LogLayout) -> Iterator[Source]:
