@@ -37,7 +37,8 @@ from asm_gym.wrappers import NeuralASMSafety
 GUARDS: dict[str, dict[str, Any] | None] = {
     POLICY_ALONE: None,
     "default": {},
-    **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.05, 0.15, 0.25, np.inf)},
+    **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.05, 0.15, 0.25)},
+    "no speed limit": {"contact_limits": ContactLimits(hand_speed=np.inf)},
     "no limits": {"contact_limits": None},
     "hold": {"on_alarm": "hold"},
     "terminate": {"on_alarm": "terminate"},
