@@ -30,7 +30,8 @@ MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 
 OWN_PACE = 40  # healthy episodes of a task, from which on its pace is its own: at a bin others may go down fast
 FAR = 100  # cells; hands further away are not learned of
 CELL = 0.04, 0.04, 0.02  # edges of the cells by which pace is learned [m]
-FASTER = 1.25  # so much faster than healthy hands one may be commanded to go, but down: about 0.8 of it is reached
+FASTER = 1.25  # a hand may be commanded to go so many times as fast as healthy ones did: about 0.8 of it is reached
+DOWN = 1.05  # the same of a hand that goes down, where what it meets is hard
 SLACK = np.array([0.03] * 3 + [0.15] * 3)  # and by so much more [m/s], [rad/s]
 STILL = 1e-9  # no speed is divided by less [m/s]
 MOMENTUM = 1.5  # of an arm along its hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
@@ -111,7 +112,7 @@ class Pace:
         seen = self.seen(arm, place)
         along = FASTER * np.where(twists > 0.0, seen[0], seen[1])
         known = ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1)
-        known = np.minimum(known, np.clip(seen[1, 2], SLACK[2], usual) / np.maximum(-twists[:, 2], STILL))
+        known = np.minimum(known, np.clip(DOWN * seen[1, 2], SLACK[2], usual) / np.maximum(-twists[:, 2], STILL))
         return np.maximum(np.minimum(usual / speeds, MOMENTUM / np.maximum(momenta, STILL)), known)
 
 
