@@ -79,6 +79,12 @@ def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost
 
 
 @pytest.mark.parametrize("finger_first", [True, False])
+def test_equal_columns_of_one_name_are_read_as_one_as_in_a_file():
+    row = [0.5, 1.5, 3, 4]
+    header = "q_0,q_1,torque,cmd,q_1"
+    assert read([header, "0.5,1.5,3,4,1.5", header, "0.5,1.5,3,4,1.5"]) == [(row, 0), (row, 0)]
+
+
 def test_publishers_of_other_joints_make_one_row_and_one_that_lacks_a_number_lacks_it(finger_first):
     spec = StreamSpec((Channel("position", 3, "rad", elements=("elbow", "lift", "finger")),), dt=0.01)
 
@@ -114,7 +120,7 @@ def test_a_publisher_that_falls_silent_leaves_its_numbers_missing_and_another_on
             ["time,q_0,q_1,torque", "1,2,3,4"],
             "line 1 is no row of numbers, and no header: the memory reads channels that are not there: cmd",
         ),
-        (["q_0,q_0,q_1,torque,cmd", "1,2,3,4,5"], "columns of the same name"),
+        (["q_0,q_0,q_1,torque,cmd", "1,1,3,4,5", "1,2,3,4,5"], "line 3 .* columns of the same name differ: 'q_0'"),
         (["[1, 2]"], r"line 1 is no row of numbers.*: it must hold 4 numbers, got the shape \(2,\)"),
         (["{"], "line 1 is no row of numbers"),
         (['{"q": [1, 2]}'], "line 1 is no row of numbers.*: the memory reads channels that are not there: torque, cmd"),

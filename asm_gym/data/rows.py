@@ -25,7 +25,7 @@ from asm_gym.data.channels import RESAMPLED, ColumnPlan
 from asm_gym.data.clock import EPOCHS, SLOWEST_WITHOUT_UNIT, UNITS, Clock, clock_called, clocks_among
 from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.tables import Named, is_key, named_columns, named_row
-from asm_gym.data.text import Dialect, check_cells, flat_row, header_of
+from asm_gym.data.text import DOUBLED, Dialect, check_cells, flat_row, header_of
 from asm_gym.spec import StreamSpec
 
 NEWEST = 32  # rows that tell the rate, and after which it is told again
@@ -60,7 +60,7 @@ class Pace:
         step = self.dt if before is None else stamp - before
         if not 0 < step <= LEAP_S:
             what = "leapt" if step > 0 else "must increase"
-            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
+            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s (--clock NAME chooses another)")
         self._before, self._rows = stamp, self._rows + 1
         if before is None:
             return 0
@@ -116,7 +116,8 @@ class RowReader:
     def __init__(self, spec: StreamSpec, clock: str = "", silence: float = 2.0) -> None:
         self.spec, self.line, self._wanted = spec, 0, clock
         self._dialect = Dialect(",", comma=False)
-        self._header: list[str] | None = None  # of CSV
+        self._header: list[str] | None = None  # of CSV, as a file's: a name that comes again has a number
+        self._header_line, self._doubled = "", list[tuple[str, str]]()  # names with a number, and without
         self._plan: ColumnPlan | None = None  # of rows by name
         self._named: Named = {}  # columns that name others
         self._joint = ""  # column that says whose numbers a row holds
@@ -159,11 +160,14 @@ class RowReader:
     def _begins_with(self, line: str) -> bool:
         """Tell whether a line is the header of CSV, for the first time or once more, and take it up."""
         if self._header is not None:
-            return self._dialect.cells(line) == self._header
+            return line.strip() == self._header_line
         if self._known or line.lstrip()[0] in "[{":
             return False
         self._dialect = Dialect.of(line)
-        header = header_of(self._dialect.cells(line))
+        header, self._header_line = list[str](), line.strip()
+        for k, name in enumerate(given := header_of(self._dialect.cells(line))):
+            header.append(f"{name}{DOUBLED}{given[:k].count(name) + 1}" if name in header else name)
+        self._doubled = [(own, name) for own, name in zip(header, given, strict=True) if own != name]
         self._named = named_columns(header)
         if not self._named and not any(map(is_key, header)):
             self._match(header)
@@ -198,9 +202,6 @@ class RowReader:
         names = list(names)
         plan = ColumnPlan(names, self.spec)
         self._lacking = None
-        doubled = [name for name in plan.columns if names.count(name) > 1]
-        if doubled:
-            raise ValueError(f"it has columns of the same name: {', '.join(map(repr, doubled[:8]))}")
         found = [clock_called(self._wanted, names)] if self._wanted else clocks_among(names)
         self._clock = next((c for c in found if not set(plan.columns) & set(c.columns)), None)
         self._plan = plan
@@ -211,7 +212,11 @@ class RowReader:
         if self._header is not None:
             cells = self._dialect.cells(line)
             check_cells(cells, len(self._header), "it has")
-            return self._by_name(dict(zip(self._header, cells, strict=False)), self._dialect.number)
+            row = dict(zip(self._header, cells, strict=False))
+            for name, first in self._doubled:
+                if row[name] != row[first] and self._plan is not None and name not in self._plan.columns:
+                    raise ValueError(f"its columns of the same name differ: {first!r}")
+            return self._by_name(row, self._dialect.number)
         row: Any = json.loads(line)
         if isinstance(row, list):
             return np.asarray(row, np.float64), None
