@@ -212,11 +212,11 @@ class RowReader:
         if self._header is not None:
             cells = self._dialect.cells(line)
             check_cells(cells, len(self._header), "it has")
-            row = dict(zip(self._header, cells, strict=False))
+            given = dict(zip(self._header, cells, strict=False))
             for name, first in self._doubled:
-                if row[name] != row[first] and self._plan is not None and name not in self._plan.columns:
+                if given[name] != given[first] and self._plan is not None and name not in self._plan.columns:
                     raise ValueError(f"its columns of the same name differ: {first!r}")
-            return self._by_name(row, self._dialect.number)
+            return self._by_name(given, self._dialect.number)
         row: Any = json.loads(line)
         if isinstance(row, list):
             return np.asarray(row, np.float64), None
