@@ -78,13 +78,13 @@ def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost
     assert not any(row.lost or row.problem for row in read)
 
 
-@pytest.mark.parametrize("finger_first", [True, False])
 def test_equal_columns_of_one_name_are_read_as_one_as_in_a_file():
     row = [0.5, 1.5, 3, 4]
     header = "q_0,q_1,torque,cmd,q_1"
     assert read([header, "0.5,1.5,3,4,1.5", header, "0.5,1.5,3,4,1.5"]) == [(row, 0), (row, 0)]
 
 
+@pytest.mark.parametrize("finger_first", [True, False])
 def test_publishers_of_other_joints_make_one_row_and_one_that_lacks_a_number_lacks_it(finger_first):
     spec = StreamSpec((Channel("position", 3, "rad", elements=("elbow", "lift", "finger")),), dt=0.01)
 

@@ -60,7 +60,7 @@ class Pace:
         step = self.dt if before is None else stamp - before
         if not 0 < step <= LEAP_S:
             what = "leapt" if step > 0 else "must increase"
-            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s (--clock NAME chooses another)")
+            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
         self._before, self._rows = stamp, self._rows + 1
         if before is None:
             return 0
@@ -191,7 +191,7 @@ class RowReader:
         except ClockWentBack as error:
             if aside is None or not 0 < stamp - aside <= LEAP_S:  # one row that came late is left out
                 self._aside = stamp
-                return Row(numbers, read=False, problem=f"{error}: the row is left out")
+                return Row(numbers, read=False, problem=f"{error}: the row is left out (--clock NAME chooses)")
             self.begin()
             self._pace.lost(stamp)
             return Row(numbers, problem=str(error))
