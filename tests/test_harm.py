@@ -90,9 +90,12 @@ def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypa
 
 
 def test_harm_is_drawn_against_pace_for_each_guard():
-    records = [record(g, 0, v) for g, v in ((ALONE, 100.0), (DEFAULT, 2.0))]
-    records += [record(g, 0, 0.0, "scripted", "healthy") | {"time": t} for g, t in ((ALONE, 4.0), (DEFAULT, 5.0))]
-    ax = harm.frontier(pd.DataFrame(records), [ALONE, DEFAULT]).axes[0]
+    records = [record(g, 0, v) for g, v in ((ALONE, 100.0), (DEFAULT, 2.0), ("hold", 1.0))]
+    times = (ALONE, 4.0), (DEFAULT, 5.0), ("hold", np.nan)  # nothing was solved under the last
+    records += [record(g, 0, 0.0, "scripted", "healthy") | {"time": t} for g, t in times]
+    ax = harm.frontier(pd.DataFrame(records), [ALONE, DEFAULT, "hold"]).axes[0]
+    assert np.isnan(ax.lines[2].get_xdata()).all()
+    ax.lines[2].remove()
     assert {line.get_label(): (*line.get_xdata(), *line.get_ydata()) for line in ax.lines} == {
         ALONE: (1.0, 100.0),
         DEFAULT: (1.25, 2.0),

@@ -37,7 +37,7 @@ from asm_gym.wrappers import NeuralASMSafety
 GUARDS: dict[str, dict[str, Any] | None] = {
     POLICY_ALONE: None,
     "default": {},
-    **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.05, 0.15, 0.25)},
+    **{f"{v:g} m/s": {"contact_limits": ContactLimits(hand_speed=v)} for v in (0.1, 0.15, 0.25)},
     "no speed limit": {"contact_limits": ContactLimits(hand_speed=np.inf)},
     "no limits": {"contact_limits": None},
     "hold": {"on_alarm": "hold"},
@@ -225,7 +225,7 @@ def cells_kept(frame: pd.DataFrame, guard: str) -> str:
 
 def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
     """Draw the harm of hostile policies against the time that healthy ones take, a point for each guard."""
-    times = frame[frame.kind == "healthy"].pivot_table("time", ["task", "policy"], "guard", "median")
+    times = frame[frame.kind == "healthy"].pivot_table("time", ["task", "policy"], "guard", "median", dropna=False)
     harm = frame[frame.kind == "hostile"].groupby("guard").harm.mean()
     with figure(height=3.5, width=6) as fig:
         ax = fig.subplots()
