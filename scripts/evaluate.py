@@ -26,7 +26,7 @@ from asm_gym.faults.suite import SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.registry import check_monitor_name
 from asm_gym.rollouts.collect import record_missing
-from asm_gym.rollouts.corpus import VERSION, skill_files
+from asm_gym.rollouts.corpus import SKILLS, VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
@@ -49,13 +49,7 @@ _QUICK = (
 class Args(Options):
     """Options of a comparison: tasks × monitors × faults."""
 
-    tasks: tuple[str, ...] = option(
-        ("Lift", "Stack", "PickPlaceCan", "Door"),
-        quick=("Lift", "Stack", "Door"),
-        least=1,
-        check=env_id,
-        metavar="TASK",
-    )
+    tasks: tuple[str, ...] = option(SKILLS, quick=("Lift", "Stack", "Door"), least=1, check=env_id, metavar="TASK")
     """Names of tasks; or one Gymnasium id with Box spaces, such as Pusher-v5 or gymnasium_robotics:FetchReach-v4."""
     robot: str = option("Panda", known=ROBOTS)
     """The arm, for robosuite's tasks."""
@@ -84,7 +78,7 @@ class Args(Options):
     out: Path = option(Path("runs/evaluate"), metavar="FOLDER")
     """Folder of the run."""
     corpus: Path | None = option(None, metavar="FOLDER")
-    """Score the recordings of asm-gym corpus instead; only --fit-episodes then limits them."""
+    """Score the recordings of asm-gym corpus instead; only --tasks and --fit-episodes then limit them."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,7 +154,7 @@ def evaluate(args: Args, console: Console) -> None:
     timed = partial(stage, console=console, seconds=seconds)
     claim: dict[str, Any] = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
     if args.corpus is not None:
-        files = skill_files(args.corpus, fit=args.fit_episodes)
+        files = skill_files(args.corpus, args.fit_episodes, args.tasks)
         claim["corpus"] = VERSION
     else:
         trials = [trial for task in args.tasks for trial in trials_of(args, task)]

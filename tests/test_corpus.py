@@ -125,3 +125,11 @@ def test_monitors_are_judged_by_a_corpus(pushed, tmp_path):
 def test_fewer_episodes_to_learn_from_leave_all_others_as_they_are(pushed):
     roles = [file.parent.name for file in skill_files(pushed, fit=2)]
     assert [roles.count(role) for role in ("fit", "calibration", "nominal", "faulty")] == [2, 24, 8, 4]
+
+
+def test_only_the_tasks_that_are_asked_for_are_judged(pushed):
+    asked = skill_files(pushed, tasks=("Lift",))
+    assert asked == [file for file in skill_files(pushed) if "Lift" in file.parts]
+    assert not skill_files(pushed, tasks=("Door",))
+    with pytest.raises(ValueError, match="Lift"):
+        skill_files(pushed, tasks=("Lfit",))

@@ -26,6 +26,7 @@ from asm_gym.rollouts.parallel import Progress
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
+from asm_gym.validation import check_choice
 
 VERSION = 2  # version of the recordings
 SEED = 2026  # seed of the corpus; no shipped memory has learned from its episodes
@@ -87,11 +88,13 @@ class Corpus:
         return [load_episode(self.folder / path) for path in chosen.index]
 
 
-def skill_files(folder: Path, fit: int | None = None) -> list[Path]:
+def skill_files(folder: Path, fit: int | None = None, tasks: Sequence[str] = SKILLS) -> list[Path]:
     """Return the files of the experts' skills, by kind and severity; of each task at most ``fit`` to learn from."""
+    for task in tasks:
+        check_choice("task of the corpus", task, SKILLS)
     files = Corpus.open(folder).files
     order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
-    chosen = files[(files.policy == "scripted") & files.task.isin(SKILLS)]
+    chosen = files[(files.policy == "scripted") & files.task.isin(tasks)]
     if fit is not None:
         chosen = chosen[(chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)]
     chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
