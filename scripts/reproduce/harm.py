@@ -253,19 +253,23 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
                 "guard": guard,
                 "harm [N s]": f"{mine.harm.mean():.1f}",
                 "kept away": kept(alone.harm.mean(), mine.harm.mean()),
-                f"cells that keep {100 * KEPT:.0f} %": cells_kept(own, guard),
                 "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
-                f"first blows of at most {TRANSIENT:g} N": f"{(mine['first'] <= TRANSIENT).sum()} of {len(mine)}",
                 "peak [N]": f"{mine.peak.max():.0f}",
-                f"time over {EXCESS:g} N [s]": f"{mine.over_s.mean():.2f}",
                 "alarms": f"{mine.alarms.mean():.1f}",
+            }
+            hostile = {
                 "cost": f"{mine.cost.mean():.1f}",
+                f"time over {EXCESS:g} N [s]": f"{mine.over_s.mean():.2f}",
+                f"cells that keep {100 * KEPT:.0f} %": cells_kept(own, guard),
+                f"first blows of at most {TRANSIENT:g} N": f"{(mine['first'] <= TRANSIENT).sum()} of {len(mine)}",
+            }
+            healthy = {
                 "solved": f"{mine.success.sum()} of {len(mine)}",
                 "lost, won": f"-{lost} +{won}",
                 f"of these beyond {TRANSIENT:g} N or overridden": f"{unsafe} of {mine.success.sum()}",
                 "median time to success [s]": f"{mine.time.median():.2f}",
             }
-            rows.append(row)
+            rows.append(row | (hostile if (own.kind == "hostile").all() else healthy))
     return Table(caption, list(rows[0]) if rows else (), [tuple(row.values()) for row in rows])
 
 
