@@ -78,6 +78,7 @@ STUCK, PUSHED, TWINS, ALARMS = "encoders stuck", "pushed", "twins", "share over 
 ALIKE = ("PickPlaceCan", "PickPlaceMilk")
 TWO_FIT = ("objects hidden for a second: one of Can and Milk", "the right one", "rows until right, once seen")
 CHANGED = ("another skill begins: right after a second", "rows until right")
+SHORT = ("Lift", "Stack", "Can", "Milk", "Door", "Nut")
 Note = Callable[[str, str, object, float], None]
 """Notes a measure of a model in a condition."""
 
@@ -340,7 +341,7 @@ def drawn(records: Sequence[Record], energies: dict[str, Floats]) -> Figure:
         for n, model in enumerate((OURS, *CELLS, ACTS)):
             solved = [kit.over_seeds(records, "value", measure="solved", model=model, at=s).mean for s in SKILLS]
             first.bar(np.arange(len(SKILLS)) + 0.2 * n - 0.3, solved, 0.2, color=look(n)[0], label=model)
-        first.set_xticks(range(len(SKILLS)), [s.removeprefix("PickPlace")[:5] for s in SKILLS], fontsize=7)
+        first.set_xticks(range(len(SKILLS)), SHORT, fontsize=7)
         told = product((OURS, FOREST), ("named", "named blind"))
         for n, (model, measure) in enumerate(told):
             right = [kit.over_seeds(records, "value", measure=measure, model=model, at=str(r)).mean for r in ROWS]
