@@ -121,6 +121,7 @@ def pairs(wheel: Path) -> str:
 
 MATRIX = ("3.11 numpy<2", "3.12 numpy<2", "3.11 numpy>=2", "3.12 numpy>=2", "3.13 numpy>=2")
 """Pythons and NumPys; NumPy 1.26 has no build for Python 3.13."""
+OURS = "PYTHONPATH", "VIRTUAL_ENV", "MAKEFLAGS"  # variables that a fresh environment must not see
 
 
 def matrix(asked: str = "") -> int:
@@ -141,7 +142,7 @@ def matrix(asked: str = "") -> int:
                 "touch tree/.venv/.installed",
                 "make -C tree test",
             )
-            there = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+            there = {key: value for key, value in os.environ.items() if key not in OURS}
             failed = next((s for s in steps if subprocess.run(s, shell=True, cwd=folder, env=there).returncode), None)
         print(f"{name:<14} {failed or 'ok'}", flush=True)
         wrong += failed is not None
