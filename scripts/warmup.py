@@ -30,7 +30,7 @@ class Args:
 
 
 def warm_up(args: Args, console: Console) -> None:
-    """Compile the memory and the simulation side by side, guard a little, and print where the code is kept."""
+    """Compile memory and simulation in two processes (plain ones: the core has no loky), and print where it is kept."""
     seconds: dict[str, float] = {}
     with stage("compiling", console, seconds) as progress, ProcessPoolExecutor(2, get_context("spawn")) as processes:
         for done, part in enumerate(as_completed(map(processes.submit, (_learn, _step))), 1):
