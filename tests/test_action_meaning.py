@@ -9,7 +9,7 @@ import pytest
 from asm_gym.data.action_meaning import ACTIONS, ActionMeaning, found_meaning
 from asm_gym.monitors import Surprise
 from asm_gym.policies.reflexes import Hold
-from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
+from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 
 JOINTS, STEPS = 3, 150
 
@@ -148,6 +148,44 @@ def test_a_held_arm_stays_where_it_is_whatever_its_actions_mean(case, told):
     held, before = travel(guarded(env, env.means if told else None), env.means)
     assert held < 0.03
     assert before > 0.1
+
+
+@pytest.mark.parametrize("lie", [1.0, -0.4, -99999.0, np.nan])
+@pytest.mark.parametrize("many", [False, True])
+@pytest.mark.parametrize("case", ["targets", "targets that lag", "targets in degrees", "a mixture"])
+def test_a_held_arm_stays_though_the_sense_of_its_place_lies(case, many, lie):
+    class Lying(Arm):
+        def observe(self):
+            sensed = super().observe()
+            sensed[0] += lie if self.t > 40 else 0.0
+            return sensed
+
+    like = CASES[case]
+    found, means, arms = found_meaning(recorded(like)), like.means, []
+
+    def make():
+        arms.append(Lying(means, lag=like.lag, unit=like.unit))
+        return arms[-1]
+
+    if many:
+        made = gym.vector.SyncVectorEnv([make, make])
+        env = VectorNeuralASMSafety(made, Surprised(StreamRecorder(make()).stream_spec, 40, found), "hold")
+    else:
+        env = NeuralASMSafety(make(), Surprised(StreamRecorder(make()).stream_spec, 40, found), "hold")
+    env.reset(seed=5)
+    places = []
+    for t in range(70):
+        action = policy(means, t, np.arange(3.0), unit=like.unit)
+        env.step(np.stack([action, action]) if many else action)
+        places.append(arms[0].q.copy())
+    assert np.ptp(places[41:], axis=0).max() < 0.05
+    assert np.ptp(places[10:41], axis=0).max() > 0.1
+
+
+@pytest.mark.parametrize("reflex", ["retract", "comply"])
+def test_a_reflex_that_would_move_a_target_arm_is_refused_by_name(reflex):
+    with pytest.raises(ValueError, match=f"{reflex} needs an environment whose controller"):
+        guarded(Arm(SAME), on_alarm=reflex)
 
 
 def test_a_hold_is_refused_where_nothing_tells_what_actions_mean_and_the_option_is_named():

@@ -95,14 +95,23 @@ class ActionMeaning:
                 'safe_action=...), another policy, on_alarm="terminate" or "monitor"'
             )
 
-    def staying(self, row: NDArray[np.floating[Any]], executed: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    def staying(
+        self,
+        row: NDArray[np.floating[Any]],
+        before: NDArray[np.floating[Any]],
+        executed: NDArray[np.floating[Any]],
+    ) -> NDArray[np.float32]:
         """Return the action (A,) for which a robot stays where it is sensed to be in ``row`` (D,).
 
-        A target whose sense is not known or not finite stays at what was ``executed`` (A,) last, as does what is kept;
-        all else stays at 0.
+        An arm that pursues what was ``executed`` (A,) is between that and where it was in the row ``before``: a sense
+        that says otherwise has failed, and is believed up to there. A target whose sense is not known or not finite
+        stays at what was executed last, as does what is kept; all else stays at 0.
         """
         senses, stays = np.array(self.senses, np.intp), np.isin(self.means, (TARGET, KEPT))
-        sensed = np.where(senses >= 0, np.array(self.offsets) + np.array(self.slopes) * row[senses], np.nan)
+        slopes, offsets = np.array(self.slopes), np.array(self.offsets)
+        sensed, was = (np.where(senses >= 0, offsets + slopes * x[senses], np.nan) for x in (row, before))
+        between = np.clip(sensed, np.minimum(was, executed), np.maximum(was, executed))
+        sensed = np.where(np.isfinite(between), between, sensed)
         return np.where(stays, np.where(np.isfinite(sensed), sensed, executed), 0.0).astype(np.float32)
 
 

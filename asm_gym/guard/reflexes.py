@@ -47,15 +47,18 @@ class Places:
         self.executed = np.tile(rest, (count, 1))  # (n, A) last before the override
         self._actions = np.full((count, rest.size), np.nan, np.float32)
         self._rows: NDArray[np.float32] = np.zeros((count, 0), np.float32)  # (n, D) newest that were finite
+        self._before = self._rows  # (n, D) those before them
 
     def begin(self, which: NDArray[np.bool_]) -> None:
         """New episodes of the robots of ``which`` (n,)."""
-        self.executed[which], self._actions[which], self._rows[which] = self._rest, np.nan, np.nan
+        self.executed[which], self._actions[which] = self._rest, np.nan
+        self._rows[which] = self._before[which] = np.nan
 
     def sense(self, rows: NDArray[np.float32]) -> None:
         """Take in the newest rows (n, D)."""
         if self._meaning is not None:
-            self._rows = np.where(np.isfinite(rows), rows, self._rows if self._rows.size else np.float32(np.nan))
+            self._before = self._rows if self._rows.size else np.full_like(rows, np.nan)
+            self._rows = np.where(np.isfinite(rows), rows, self._before)
 
     def start(self, robot: int, executed: NDArray[np.float32]) -> None:
         """An override begins, after the robot has ``executed`` (A,)."""
@@ -67,7 +70,7 @@ class Places:
             return self._rest.copy()
         action = self._actions[robot]
         if not np.isfinite(action).all() and self._rows.size:
-            found = self._meaning.staying(self._rows[robot], self.executed[robot])
+            found = self._meaning.staying(self._rows[robot], self._before[robot], self.executed[robot])
             action[:] = np.where(np.isfinite(action), action, found)
         return np.where(np.isfinite(action), action, self._rest)
 
