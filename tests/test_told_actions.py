@@ -8,9 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import ClipAction, RecordEpisodeStatistics
+from gymnasium.wrappers.vector import RecordEpisodeStatistics as CountMany
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
+from asm_gym.spec import flat
+from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 from tests.needs import needs
 
@@ -89,6 +91,83 @@ def test_a_counting_wrapper_that_would_not_see_ends_is_refused():
         with pytest.raises(ValueError, match=r"RecordEpisodeStatistics\(NeuralASMSafety"):
             watched(RecordEpisodeStatistics, on_alarm=on_alarm)
     watched(lambda env: ClipAction(RecordEpisodeStatistics(env)), on_alarm="monitor")
+
+
+def test_what_counts_inside_a_guard_of_many_is_refused_and_outside_it_sees_every_end():
+    class Cued(FadingMonitor):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            return state, surprise._replace(value=np.where(state.steps == 3, 10.0, 0.0))
+
+    def counted():
+        return RecordEpisodeStatistics(FakeEnv(6))
+
+    for kind in (gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv):
+        for on_alarm, made in (("terminate", kind([counted] * 2)), ("hold", CountMany(kind([FakeEnv] * 2)))):
+            with pytest.raises(ValueError, match=r"RecordEpisodeStatistics\(VectorNeuralASMSafety"):
+                VectorNeuralASMSafety(made, Cued(), on_alarm)
+            VectorNeuralASMSafety(made, Cued(), "monitor").close()
+    many = CountMany(VectorNeuralASMSafety(gym.vector.SyncVectorEnv([FakeEnv] * 2), Cued(), "terminate"))
+    many.reset(seed=0)
+    steps = [many.step(np.zeros((2, 3), np.float32)) for _ in range(16)]
+    lengths = [found[4]["episode"]["l"].tolist() for found in steps if "episode" in found[4]]
+    assert sum(int((found[2] | found[3]).sum()) for found in steps) == 2 * len(lengths) == 8
+    assert lengths == [[3, 3]] * 4
+
+
+def test_a_guard_of_many_tells_whose_action_was_overridden():
+    class Cued(FadingMonitor):
+        def observe(self, state, stream):
+            state, surprise = super().observe(state, stream)
+            return state, surprise._replace(value=np.array([0.0, 10.0]) * (state.steps == 3))
+
+    many = VectorNeuralASMSafety(gym.vector.SyncVectorEnv([FakeEnv] * 2), Cued(), "hold", release_after=2)
+    many.reset(seed=0)
+    told = np.array([many.step(np.full((2, 3), 0.5, np.float32))[4]["overridden"] for _ in range(7)])
+    np.testing.assert_array_equal(told, np.array([[False, 3 <= t < 5] for t in range(7)]))
+
+
+SPACES = {
+    "whole numbers": gym.spaces.Box(-5, 5, (2,), np.int64),
+    "bytes": gym.spaces.Box(0, 255, (2,), np.uint8),
+    "a dict": gym.spaces.Dict(arm=gym.spaces.Box(-1, 1, (2,), np.float32), grip=gym.spaces.Discrete(2)),
+    "a tuple": gym.spaces.Tuple((gym.spaces.Discrete(3), gym.spaces.Box(-1, 1, (1,), np.float32))),
+    "several choices": gym.spaces.MultiDiscrete([3, 2]),
+}
+
+
+def parts(action):
+    return list(action.values()) if isinstance(action, dict) else list(action)
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("on_alarm", ["monitor", "terminate"])
+def test_actions_of_any_space_are_recorded_watched_and_reach_the_environment_in_their_type(space, on_alarm):
+    class Strict(FakeEnv):
+        def __init__(self):
+            super().__init__(8, own_stream=False)
+            self.action_space = SPACES[space]
+
+        def step(self, action):
+            assert self.action_space.contains(action)
+            return *super().step(np.zeros(3))[:4], {}
+
+    recorder = StreamRecorder(Strict())
+    recorder.reset(seed=0)
+    actions = [recorder.action_space.sample() for _ in range(8)]
+    for action in actions:
+        recorder.step(action)
+    (episode,) = recorder.episodes
+    np.testing.assert_array_equal(
+        episode.stream[:, 2:], [flat(SPACES[space], action).astype(np.float32) for action in actions]
+    )
+    env = NeuralASMSafety(Strict(), CueMonitor((3,), recorder.stream_spec), on_alarm)
+    env.reset(seed=0)
+    for step, action in enumerate(actions[:4]):
+        _, _, terminated, _, info = env.step(action)
+        done = info["asm"]["executed_action"]
+        assert all(np.array_equal(x, y) for x, y in zip(parts(done), parts(action), strict=True))
+        assert terminated == (step == 3 and on_alarm == "terminate")
 
 
 def test_success_is_told_by_the_name_that_learners_read():

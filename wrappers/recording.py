@@ -68,7 +68,9 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         rows = np.array(self._source.rows(observation, action, info))
         faults = [bool(info.get("fault"))] * len(rows)
         self._observations.append(deepcopy(observation))
-        self._steps.append((np.array(np.atleast_1d(as_float32(action))), float(reward), rows, faults))
+        space = self.env.action_space
+        numbers = flat(space, action) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else action
+        self._steps.append((np.array(np.atleast_1d(as_float32(numbers))), float(reward), rows, faults))
         success = info.get("success", info.get("is_success"))
         self._success = self._success if success is None else bool(self._success or success)
         self._terminated = bool(terminated)

@@ -27,6 +27,8 @@ from asm_gym.validation import as_float32, short_repr
 
 DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
 
+COUNTS = "episode_returns"  # attribute of wrappers that count episodes, Gymnasium's and Stable-Baselines3's
+
 AnyEnv = gym.Env[Any, Any] | VectorEnv[Any, Any, Any]
 
 
@@ -54,6 +56,31 @@ class Members:
             return tuple(self._env.unwrapped.call(name, argument))
         owner = self._env if hasattr(self._env, name) else self._env.unwrapped
         return (getattr(owner, name)(argument),)
+
+
+def as_action(space: gym.spaces.Space[Any] | None, action: Any) -> Any:
+    """Return an action, or several, in the type of their space: whole numbers where a Box holds these."""
+    whole = isinstance(space, gym.spaces.Box) and space.dtype.kind in "iu"
+    return np.rint(action).astype(space.dtype) if whole and space is not None else action
+
+
+def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
+    """Raise ValueError if a wrapper inside counts episodes: it would miss those that the guard ends, or its numbers."""
+    ends, layer = not (isinstance(on_alarm, str) and on_alarm == "monitor"), env
+    while isinstance(layer, gym.Wrapper | VectorWrapper):
+        own = vars(layer).get("info_keywords", ())  # of Stable-Baselines3's Monitor
+        if COUNTS in vars(layer) and (ends or any(key.startswith(("asm", "cost")) for key in own)):
+            name, usual = type(layer).__name__, "make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))"
+            raise ValueError(
+                f"{name} inside the guard would miss the episodes that the guard ends, and what it reports: put it "
+                f"outside, as in {name}({guard}(env, monitor)); with Stable-Baselines3, {usual}"
+            )
+        layer = layer.env
+    if isinstance(env, VectorEnv) and ends and any(Members(env).call("has_wrapper_attr", COUNTS)):
+        raise ValueError(
+            "wrappers of the members that count episodes would miss those that the guard ends: use "
+            f"gymnasium.wrappers.vector.RecordEpisodeStatistics({guard}(envs, monitor))"
+        )
 
 
 def askable(envs: VectorEnv[Any, Any, Any]) -> Any:

@@ -8,7 +8,6 @@ from typing import Any, Literal, SupportsFloat
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.wrappers import RecordEpisodeStatistics
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeans
@@ -22,9 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself, changed_by, outside
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.robots import Guarding, body_memory, felt_by, sensed_row
-
-COUNTS = "stable_baselines3.common.monitor"  # module of a wrapper that counts episodes
+from asm_gym.wrappers.robots import Guarding, as_action, body_memory, felt_by, refuse_counts, sensed_row
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -125,8 +122,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if self._box is None and not (isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
-        if not (isinstance(on_alarm, str) and on_alarm == "monitor"):
-            _check_counts(env)
+        refuse_counts(env, "NeuralASMSafety", on_alarm)
         self._source = StreamSource(env)
         self._spec = self._source.spec
         self._rows_per_step = self._source.rows_per_step
@@ -238,7 +234,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             if self._holds:
                 inner.keeps_holding = True
             overridden = self._box is not None and self._command(self._executed)
-            return overridden, stepped(self.env, self._executed)
+            return overridden, stepped(self.env, as_action(self._box, self._executed))
         finally:
             if self._holds:
                 inner.keeps_holding, inner.holding = kept, held
@@ -283,19 +279,3 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
         info["asm_intervened"] = np.bool_(intervened)
         info["cost_sum"] = np.float64(self._alarms)
-
-
-def _check_counts(env: gym.Env[Any, Any]) -> None:
-    """Raise ValueError if a wrapper inside counts episodes: it would miss those that the guard ends."""
-    while isinstance(env, gym.Wrapper):
-        own = any(kind.__module__ == COUNTS for kind in type(env).__mro__)
-        if own or isinstance(env, RecordEpisodeStatistics):
-            name = type(env).__name__
-            usual = (
-                "; with Stable-Baselines3, make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))" if own else ""
-            )
-            raise ValueError(
-                f"{name} inside the guard would miss the episodes that the guard ends: put it outside, as in "
-                f"{name}(NeuralASMSafety(env, monitor)){usual}"
-            )
-        env = env.env

@@ -21,7 +21,16 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
-from asm_gym.wrappers.robots import Guarding, Members, askable, body_memory, felt_by, sensed_row
+from asm_gym.wrappers.robots import (
+    Guarding,
+    Members,
+    as_action,
+    askable,
+    body_memory,
+    felt_by,
+    refuse_counts,
+    sensed_row,
+)
 
 Mask = NDArray[np.bool_]
 
@@ -30,9 +39,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     """Guard the n members of a vector environment, with one batched ``observe`` for all of them.
 
     Other arguments and reports are those of ``NeuralASMSafety``. The arrays in ``info["asm"]`` have a first axis of
-    length n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]`` and ``info["asm_intervened"]`` have
-    the shape (n,). If the monitor raises, all environments are in alarm. In the first step of an episode surprise is 0
-    and ``executed_action`` NaN.
+    length n, and ``info["cost"]``, ``info["asm_surprise"]``, ``info["asm_alarm"]``, ``info["asm_intervened"]`` and,
+    after a step, ``info["overridden"]`` have the shape (n,). If the monitor raises, all environments are in alarm. In
+    the first step of an episode surprise is 0 and ``executed_action`` NaN.
 
     Args:
         env: from ``gym.make_vec``, with ``AutoresetMode.NEXT_STEP`` or ``DISABLED``. Without ``info["stream"]``,
@@ -75,6 +84,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
         refuse_running_statistics(env, "VectorNeuralASMSafety")
+        refuse_counts(env, "VectorNeuralASMSafety", on_alarm)
         options = on_alarm, release_after, max_override, try_after, truncate
         self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold, action_means=action_means)
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
@@ -146,9 +156,11 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if chosen.shape != self.env.action_space.shape:
             raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
         begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
-        executed = self._command(chosen, begun)
-        observations, rewards, terminated, truncated, infos = self.env.step(executed.copy())
+        executed, overridden = self._command(chosen, begun)
+        told = as_action(self.env.single_action_space, executed.copy())
+        observations, rewards, terminated, truncated, infos = self.env.step(told)
         infos = dict(infos)
+        infos["overridden"], infos["_overridden"] = overridden | infos.get("overridden", False), np.ones_like(begun)
         if self._forced.any():
             forced = self._forced
             observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
@@ -172,8 +184,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._ended = terminated | truncated
         return self._observations, rewards, terminated, truncated, infos
 
-    def _command(self, chosen: NDArray[np.float32], begun: Mask) -> NDArray[np.float32]:
-        """Return (n, A) what is done."""
+    def _command(self, chosen: NDArray[np.float32], begun: Mask) -> tuple[NDArray[np.float32], Mask]:
+        """Return (n, A) what is done, and (n,) where it is not what the policy wanted."""
 
         def seen(robot: int) -> Any:
             return list(iterate(self.observation_space, self._observations))[robot]
@@ -184,7 +196,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if brakes or self._holding:
             self._members.set_attr("holding", command.brakes.tolist())
         self._holding = brakes
-        return command.actions.reshape(chosen.shape)
+        return command.actions.reshape(chosen.shape), command.overridden.copy()
 
     def _sensed(
         self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any]

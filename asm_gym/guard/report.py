@@ -115,7 +115,7 @@ def report(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: An
         "case": caused.case,  # the row of the table of responses that says so
         # How bad it is, see ``Severity``; None for what is not known, so that a report equals itself.
         "severity": {k: v if v == v else None for k, v in last.severity.named(robot).items()},
-        "executed_action": None if executed is None else np.array(executed),  # after the limit of the hand's speed
+        "executed_action": deepcopy(executed),  # after the limit of the hand's speed
         "attribution": dict(zip(spec.labels, shares, strict=True)),  # what each number adds to the largest surprise
         "surprises": surprises,  # (k,) of all rows in this step
         "completed": last.repairs.get(robot, ()),  # the sensors that are not believed now
