@@ -216,6 +216,7 @@ def fit(args: Args, console: Console) -> int:
     left_out = ", ".join(f"{count} {why}" for why, count in reasons.items())
     if not found:
         hint = "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
+        hint += "; --ignore a column that is wrongly taken for a label" if reasons["with a fault"] else ""
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     parts, cuts = parts_between_gaps(args, with_shared_noise(found))
     fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live)

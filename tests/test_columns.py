@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -67,10 +68,15 @@ def test_an_angle_that_turns_over_is_found(turn, low):
 
 
 def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat():
-    for code in (-99999.0, 9999.0, -1e38):
+    for code in (-99999.0, 9999.0, -1e38, 6553.5):
         coded = Q.copy()
         coded[[5, 60, 61, 150]] = code
         assert code_of(coded) == code
+    for code, rest in ((-1.0, 200 + Q), (0.0, 5 + 0.1 * Q), (9.99, 0.1 * Q)):  # a small one stands in single rows
+        coded = rest.copy()
+        coded[7::15] = code
+        assert code_of(coded) == code
+        assert np.isnan(code_of(np.where(T > 2, code, rest)))
     assert np.isnan(code_of(Q))
     assert np.isnan(code_of(np.where(T > 3.5, 2.0, Q)))  # a stop
     assert np.isnan(code_of(np.where(np.arange(ROWS) == 9, 500.0, Q)))  # once: a glitch
@@ -85,6 +91,9 @@ ASIDE = {
     "nothing": (np.full(ROWS, np.nan), "empty"),
     "frame_id": (np.array(["base"] * ROWS, object), "words"),
     "y_true": (np.zeros(ROWS), "label"),
+    "remaining": (5000 - np.arange(ROWS), "counter"),
+    "time_left": (60 - T, "counter"),
+    "packet": ((65_400 + 2 * np.arange(ROWS)) % 65_536, "counter"),
     "stamp_nsec": ((1e9 * T).astype(np.int64), "clock"),
 }
 
@@ -100,9 +109,36 @@ def test_what_is_no_sense_is_set_aside_and_changes_nothing(name):
     assert found.spec.labels == ("q[0]", "q[1]")
     later = table | {name: values + 30_000 if values.dtype.kind in "iuf" else values}
     np.testing.assert_array_equal(read_recorded(later, LogLayout(found.spec)).stream, found.stream)
-    if role in ("counter", "constant", "copy", "clock"):
+    if role in ("counter", "constant", "copy", "clock", "label"):
         assert "--channels" in columns[name].why
         assert name in Episode.from_table(table, channels=["q*", name]).spec.labels
+
+
+def test_a_label_that_is_constant_in_training_is_said_and_changes_nothing_when_it_marks_later():
+    for name in ("y_true", "is_anomaly", "ground_truth", "fault_id"):
+        healthy = HEALTHY | {name: np.zeros(ROWS)}
+        with noted() as notes:
+            spec = read_recorded(healthy, LogLayout()).spec
+        assert any(name in line and "--channels" in line for line in notes)
+        marked = HEALTHY | {name: np.where(T > 2, 3.0, 0.0)}
+        np.testing.assert_array_equal(
+            read_recorded(marked, LogLayout(spec)).stream, read_recorded(healthy, LogLayout(spec)).stream
+        )
+        assert read_recorded(marked, LogLayout()).faults.sum() == (T > 2).sum()
+
+
+def test_a_sense_that_is_called_as_a_label_is_is_read_and_one_of_whole_numbers_where_the_user_says_so():
+    current = HEALTHY | {"fault_current": Q * Q}
+    found = read_recorded(current, LogLayout())
+    assert "fault_current" in found.spec.labels
+    assert not found.faults.any()
+    steps = HEALTHY | {"fault_current": np.rint(500 + 100 * Q)}
+    assert read_recorded(steps, LogLayout()).faults.all()
+    assert not read_recorded(steps, LogLayout(ignore=("fault*",))).faults.any()
+    asked = read_recorded(steps, LogLayout(channels=("q*", "fault_current")))
+    assert "fault_current" in asked.spec.labels
+    assert not asked.faults.any()
+    assert read_recorded(current, LogLayout(labels=("fault*",))).faults.all()
 
 
 def test_tables_of_one_robot_have_one_spec_though_a_column_stands_still_in_some():
@@ -155,6 +191,11 @@ def test_clocks_that_disagree_are_said_and_the_user_chooses():
     )
     with pytest.warns(LogWarning, match="by --rate 500 it is not read"):
         assert Episode.from_table(HEALTHY, rate=500).spec.dt == pytest.approx(0.002)
+    with pytest.warns(LogWarning, match="'time' and 'stamp' disagree, 50 and 49"):
+        Episode.from_table(HEALTHY | {"stamp": 1.02 * T + 7})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", LogWarning)  # one of them jitters, as a clock of arrival does
+        Episode.from_table(HEALTHY | {"recv_time": T + 0.004 * np.random.default_rng(1).random(ROWS)})
     both = {"time_s": T, "time_us": 1e6 * T, "q": Q}  # no pair: each counts all the time
     assert Episode.from_table(both).spec.dt == pytest.approx(0.02)
     backwards = HEALTHY | {"time": T[::-1]}

@@ -162,6 +162,14 @@ def test_clocks_of_every_unit_tell_the_rate_and_are_no_sense(name, times):
     assert len(episode) == 40
 
 
+@pytest.mark.parametrize("how", ["%m/%d/%Y %H:%M:%S.%f", "%d/%m/%Y %H:%M:%S.%f", "%d.%m.%y %H:%M:%S.%f"])
+@pytest.mark.parametrize("date", ["2026-11-05 23:59:59", "2026-11-24 10:00:00", "2026-12-31 23:59:59"])
+def test_dates_that_begin_with_the_day_or_the_month_are_read_over_midnight(date, how):
+    moments = pd.to_datetime(date) + pd.to_timedelta(np.arange(200) / 100, unit="s")
+    episode = Episode.from_table({"time": moments.strftime(how).to_numpy(object), "q": np.sin(np.arange(200) / 30)})
+    assert (len(episode), episode.spec.dt) == (200, pytest.approx(0.01))
+
+
 def test_a_clock_without_a_unit_is_read_by_plausible_rates_by_the_memory_and_by_velocities_and_that_is_said():
     t = np.arange(0, 2000, 50)
     with pytest.warns(LogWarning, match="'t' goes on by 50 from row to row and says no unit: read in ms"):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import Clock, find_clock
 from asm_gym.data.columns import Column, LogLayout, decide
-from asm_gym.data.names import TAU, TURN, TURNED, factor, is_command, is_label, label_of, split_unit
+from asm_gym.data.names import TAU, TURN, TURNED, factor, is_command, label_of, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import Columns, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
@@ -106,7 +106,7 @@ def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ())
     spec = layout.spec or described(columns, layout)
     plan = ColumnPlan(table, spec)
     rows = plan.rows(table)
-    labels = [v for n, v in table.items() if n not in plan.columns and is_label(split_unit(n)[0], layout.labels)]
+    labels = [v for n, v in table.items() if n not in plan.columns and layout.marks(split_unit(n)[0], v)]
     faults = np.logical_or.reduce([_marked(values) for values in labels]) if labels else np.zeros(0, np.bool_)
     timing = None
     with suppress(ValueError) if layout.rate is not None else nullcontext():
@@ -226,7 +226,7 @@ def with_noise(spec: StreamSpec, noise: NDArray[np.float64]) -> StreamSpec:
 
 def _note_columns(columns: Sequence[Column]) -> None:
     """Say what is left out, and why."""
-    for role in dict.fromkeys(c.role for c in columns if not c.read and c.role not in ("clock", "label", "ignored")):
+    for role in dict.fromkeys(c.role for c in columns if not c.read and c.role not in ("clock", "ignored")):
         same = [c for c in columns if c.role == role]
         names = ", ".join(c.name for c in same[:6]) + (f" and {len(same) - 6} others" if len(same) > 6 else "")
         note(f"left out: {names}: {same[0].why}")

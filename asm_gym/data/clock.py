@@ -4,7 +4,7 @@ unit       behind the name; or else by what a number since 1970 would be, by vel
            positions, by the memory's rate, and by the unit that gives 1 to 1000 rows a second
 pair       columns of seconds and of nanoseconds are one clock
 choice     the steadiest of those called so; a clock in whole seconds gives way to a counter that agrees with it
-text       ISO 8601, 24/11/2026 10:00:00.5, 10:00:00.5
+text       ISO 8601, 24/11/2026 10:00:00.5, 11/24/2026 10:00:00.5, 10:00:00.5
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ SLOWEST_WITHOUT_UNIT = 2.0  # step from which on a clock without a unit is not b
 UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
 DAY, LEAST_DATE, BRIEF = 86400.0, 3e4, 1e-4  # [s]; Excel and MATLAB count days, from 1982 on so many, in steps so short
 MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: they were written twice
+DISAGREE = 0.01  # how far two clocks may be off each other, as a share, before that is said
 ALIKE = 0.2  # how far two clocks, or a clock and a memory, may be off, as a share, and tell each other's unit
 
 FEWEST, ALIKE_MOTION = 8, 0.9  # rows from which on velocities tell the unit, and how well they must explain positions
@@ -100,13 +101,26 @@ def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDA
     if text.str.fullmatch(r"\d{1,2}:\d\d:\d\d(\.\d+)?").fillna(True).all():
         day = (pd.to_timedelta(text) / pd.Timedelta(seconds=1)).to_numpy(np.float64)
         return day + 86400.0 * np.concatenate([[0], np.cumsum(np.diff(day) < -43200)]), 1.0
-    for how in ({"format": "ISO8601"}, {"format": "mixed", "dayfirst": True}):
+    # 11/05/2026 may begin with the day or the month: read so that the whole takes the least time.
+    ends = text.dropna().iloc[[0, -1]]
+    orders = sorted((True, False), key=lambda order: _span(ends, order))
+    for how in ({"format": "ISO8601"}, *({"format": "mixed", "dayfirst": order} for order in orders)):
         with suppress(ValueError, TypeError):
             moments = pd.to_datetime(text, utc=True, **how).dt.as_unit("ns")
             since = moments.astype(np.int64)
             return (since if moments.notna().all() else since.where(moments.notna())).to_numpy(), 1e-9
     odd = next(str(cell) for cell in text[numbers.isna() & text.notna()])
     raise ValueError(f"the clock {column!r} must hold a time, got {odd[:40]!r}: --rate HZ reads the rows without it")
+
+
+def _span(ends: Any, day_first: bool) -> float:
+    """How far apart two dates are [s]; infinite where they cannot be read, or the second comes first."""
+    import pandas as pd
+
+    with suppress(ValueError, TypeError):
+        first, last = pd.to_datetime(ends, utc=True, format="mixed", dayfirst=day_first)
+        return float((last - first).total_seconds()) if last >= first else np.inf
+    return np.inf
 
 
 def _moment(column: str, unit: float | None, cell: str) -> float:
@@ -202,8 +216,8 @@ def _unsteadiness(times: Floats) -> tuple[float, float]:
 
 def _note_others(table: Mapping[str, NDArray[Any]], best: Clock, *others: Clock) -> None:
     for other in others if len(table[best.columns[0]]) > 2 else ():
-        own, step = (float(np.median(np.diff(clock.seconds(table)))) for clock in (best, other))
-        if own > 0 and step > 0 and abs(step / own - 1) > ALIKE:
+        own, step = (float(np.ptp(clock.seconds(table))) / (len(table[best.columns[0]]) - 1) for clock in (best, other))
+        if own > 0 and step > 0 and abs(step / own - 1) > DISAGREE:
             rates = f"{1 / own:.4g} and {1 / step:.4g} rows a second"
             note(f"{best.name!r} and {other.name!r} disagree, {rates}: the former is read; --clock NAME chooses")
 

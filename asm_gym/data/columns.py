@@ -1,14 +1,15 @@
 """Decide for every column of a log what it is, once, by its name and by how it behaves in the first recordings.
 
-    label       by its name, or --label                command   by its name
+    label       by its name and whole numbers or       command   by its name
+                words, or --label
     clock       the chosen one, and others             copy      equals another column
     constant    never moves, and stands alone          empty     holds no number
     words       text; with some numbers it is refused  ignored   --ignore, or not among --channels
     counter     whole numbers that rise by one and the same step, but for lost rows and where they begin anew; or
-                max |x - (a + b t)| <= PACE range(x), and x never falls: a second clock
-    sense       all others; with a code for missing data: whole numbers at an end of the range that repeat, CODE_APART
-                ranges away from all others; as an angle that turns over: |x_i - x_{i-1} ∓ P| < P/4 at every jump, and x
-                reaches both ends of a turn of P = 360 or 2π
+                max |x - (a + b t)| <= PACE range(x), and x never falls: a second clock; or -x does so
+    sense       all others; with a code for missing data: a number at an end of the range that repeats, CODE_APART
+                ranges away from all others, and large, or mostly in single rows; as an angle that turns over:
+                |x_i - x_{i-1} ∓ P| < P/4 at every jump, and x reaches both ends of a turn of P = 360 or 2π
 
 ``--channels`` brings back what was set aside by its behaviour.
 """
@@ -45,7 +46,8 @@ STEADY = 0.9  # share of steps that must be the usual one in a counter
 PACE = 2e-3  # how far a second clock is off a straight line, as a share of its range
 CODE_APART = 5.0  # how many ranges of all others a code for missing data is away from them
 CODES_AT_MOST = 0.5  # share of rows that may hold one
-LEAST_CODE = 99.0  # a code is at least so large
+LEAST_CODE = 99.0  # a code is at least so large,
+SINGLE = 0.8  # or at least this share of it stands in single rows
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,13 @@ class LogLayout:
     clock: str = ""  # the column of times, perhaps with a unit behind it; by default the steadiest
     like: Path | None = None  # of a folder only logs with the columns and the rate of this one are read
     nominal: float | None = None  # rows a second that somebody meant them to have, where no clock says it [Hz]
+
+    def marks(self, name: str, values: NDArray[Any]) -> bool:
+        """Tell whether a column says which rows are faulty; one of fractions measures something."""
+        if any(fnmatchcase(name, pattern) for pattern in self.ignore):
+            return False
+        whole = not is_numeric(values) or bool((known(values) == np.rint(known(values))).all())
+        return (is_label(name) and whole) or any(fnmatchcase(name, pattern) for pattern in self.labels)
 
 
 class Column(NamedTuple):
@@ -147,7 +156,11 @@ def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None
     rules = (
         (left_out, "ignored", "by --ignore"),
         (clock is not None and header in clock.columns, "clock", "tells the rate"),
-        (is_label(column.name, layout.labels), "label", "rows it marks are not learned from"),
+        (
+            layout.marks(column.name, column.values) and column.name not in layout.channels,
+            "label",
+            f"rows it marks are not learned from{BACK}",
+        ),
         (bool(layout.channels) and not asked_for, "ignored", "not among --channels"),
         (is_stamp and not layout.channels, "clock", f"another clock{BACK}"),
         (
@@ -186,8 +199,10 @@ def _by_behaviour(
         return "sense", ""
     moving = [values for values in every if not is_constant(values)]
     fewest = 2 if column.name.lower() in COUNTERS else FEWEST
-    if all(counts(v, fewest) or any(len(v) == len(t) and follows(v, t) for t in times) for v in moving):
-        return "counter", f"rises by a constant{BACK}"
+    for way, sign in (("rises", 1.0), ("falls", -1.0)):
+        going = [sign * values for values in moving]
+        if all(counts(v, fewest) or any(len(v) == len(t) and follows(v, t) for t in times) for v in going):
+            return "counter", f"{way} by a constant{BACK}"
     return "sense", ""
 
 
@@ -267,8 +282,8 @@ def code_of(values: NDArray[Any]) -> float:
     for code in (found.min(), found.max()) if len(found) else ():
         others = found[found != code]
         often = len(found) - len(others)
-        whole = (code == np.rint(code) and abs(code) >= LEAST_CODE) or abs(code) > 1e30
-        if not whole or not 2 <= often <= CODES_AT_MOST * len(values):
+        single = often >= FEWEST and np.mean(np.diff(np.flatnonzero(values == code)) > 1) >= SINGLE
+        if not (abs(code) >= LEAST_CODE or single) or not 2 <= often <= CODES_AT_MOST * len(values):
             continue
         if float(np.abs(others - code).min()) > CODE_APART * float(np.ptp(others)) > 0:
             return float(code)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from functools import cache
 from typing import NamedTuple
 
@@ -148,9 +146,9 @@ def is_clock(name: str) -> bool:
     return bare != "T" and CLOCK.fullmatch(bare if unit in LONGER else name.strip()) is not None
 
 
-def is_label(name: str, patterns: Sequence[str] = ()) -> bool:
-    """Tell whether a column says what is wrong, and senses nothing."""
-    return LABEL.fullmatch(name) is not None or any(fnmatchcase(name, pattern) for pattern in patterns)
+def is_label(name: str) -> bool:
+    """Tell whether a column is called as one that says what is wrong."""
+    return LABEL.fullmatch(name) is not None
 
 
 def is_command(name: str) -> bool:
