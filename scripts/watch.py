@@ -25,7 +25,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asm_gym.data.live import lines_from, live_source
+from asm_gym.data.live import lines_from, live_source, publisher
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.timing import SURPRISING, bridge_of, bridged
@@ -44,7 +44,7 @@ from asm_gym.scripts.log_options import LogOptions, ended
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
-LIVE_ONLY = ("until_alarm", "json", "hook", "watchdog", "policy")  # options
+LIVE_ONLY = ("until_alarm", "json", "hook", "topic", "watchdog", "policy")  # options
 RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns", "like")
 KINDS = "a live source", "a recording"
 SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
@@ -70,6 +70,8 @@ class Args(LogOptions):
     """Print events of a live source as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
     hook: str | None = option(None, metavar="COMMAND")
     """Shell command to run at every alarm of a live source; it gets the alarm as JSON on its standard input."""
+    topic: str = option("", metavar="TOPIC")
+    """Topic of ROS 2 on which every alarm of a live source is published, as JSON in a std_msgs/String."""
     watchdog: float | None = option(None, check=partial(check_number, "watchdog", above=0.0), metavar="SECONDS")
     """Also run the hook from a second process: after this time without a row, and if this process dies."""
     policy: int | None = option(None, least=1, metavar="PID")
@@ -152,10 +154,13 @@ def watch(args: Args, console: Console) -> int:
     if live is None:
         return review(args, monitor, console)
     opened = partial(lines_from, args.source, sys.stdin, args.silence)
+    publish_alarm = publisher(args.topic) if args.topic else None
 
     def say(event: LiveEvent) -> None:
         text = event.to_json() if args.json else str(event)
         console.print(text, soft_wrap=True, highlight=False, markup=False)
+        if publish_alarm and event.kind == ALARM:
+            publish_alarm(event.to_json())
         if args.hook and event.kind == ALARM:
             run_hook(args.hook, event)
 

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from asm_gym.data.episode import Episode
 from asm_gym.data.live import SourceDied, lines_from
 from asm_gym.data.rows import RowReader
+from asm_gym.monitors import make_monitor
+from asm_gym.scripts.cli import main
 from asm_gym.spec import Channel, StreamSpec
 from tests.needs import needs
 
@@ -168,3 +171,42 @@ def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_r
     steps = np.diff([row.numbers[0] for row in read])
     assert (steps == 1 + np.array([row.lost for row in read[1:]])).all()
     assert sum(not row.read for row in rows) in (1, 2)  # late, and sent twice
+
+
+def test_alarms_are_published_on_a_topic_and_who_joins_late_gets_the_last_one(tmp_path, monkeypatch, capsys):
+    core, sub = needs("cyclonedds.core"), needs("cyclonedds.sub")
+    rng = np.random.default_rng(0)
+    spec = StreamSpec((Channel("q", 2, noise=1e-3),), 0.01)
+    rows = np.sin(np.arange(300)[:, None] / [20, 30]) + 1e-3 * rng.normal(size=(40, 300, 2))
+    episodes = [Episode.from_stream(each, spec) for each in rows.astype(np.float32)]
+    monitor = make_monitor("kalman", spec).fit(episodes[:20]).calibrate(episodes[20:], false_alarm_rate=0.05)
+    monitor.save(tmp_path / "m.asm")
+    live = rows[0].copy()
+    live[100:, 0] += 1.0
+    participant = domain.DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
+    alarms = topic.Topic(participant, "rt/asm_gym/alarms", Text)
+    kept = core.Policy.Durability.TransientLocal, core.Policy.Reliability.Reliable(1_000_000_000)
+    listener = sub.DataReader(participant, alarms)  # as ROS makes one by default
+    found = []
+
+    def read(reader: object) -> list[str]:
+        return [sample.data for sample in reader.take(N=100) if hasattr(sample, "data")]
+
+    def lines() -> Iterator[str]:
+        for row in live:
+            yield json.dumps(row.tolist())
+        late, until = sub.DataReader(participant, alarms, qos=core.Qos(*kept)), time.monotonic() + 5
+        while not (found and found[0] and found[1]) and time.monotonic() < until:
+            time.sleep(0.02)
+            found[:] = [
+                [*before, *new] for before, new in zip(found or ([], []), (read(listener), read(late)), strict=True)
+            ]
+
+    monkeypatch.setattr("asm_gym.scripts.watch.lines_from", lambda *_: lines())
+    assert main(["watch", "-", "--monitor", str(tmp_path / "m.asm"), "--topic", "/asm_gym/alarms", "--json"]) == 1
+    printed = [line for line in capsys.readouterr().out.splitlines() if '"kind": "alarm"' in line]
+    assert [json.loads(text) for text in found[1]] == [json.loads(printed[-1])]
+    assert json.loads(found[0][-1])["kind"] == "alarm"
+    assert json.loads(printed[0])["channel"] == "q[0]"
+    assert main(["watch", str(tmp_path), "--monitor", str(tmp_path / "m.asm"), "--topic", "/a"]) == 2
+    assert "--topic is for a live source" in capsys.readouterr().err

@@ -220,7 +220,7 @@ def test_the_page_on_info_names_every_field():
     assert [name for name in (*said, *said["severity"], "alarms", "slowed") if f"`{name}`" not in page] == []
 
 
-SLOW = ("film_an_alarm", "live_udp", "own_task")
+SLOW = ("film_an_alarm", "live_udp")
 
 
 @pytest.mark.parametrize(

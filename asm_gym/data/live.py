@@ -46,6 +46,7 @@ FIELDS: dict[str, dict[str, str]] = {
     "geometry_msgs/msg/Vector3": dict.fromkeys("xyz", "float64"),
     "geometry_msgs/msg/Wrench": dict.fromkeys(("force", "torque"), "geometry_msgs/msg/Vector3"),
     "geometry_msgs/msg/WrenchStamped": {"header": "std_msgs/msg/Header", "wrench": "geometry_msgs/msg/Wrench"},
+    "std_msgs/msg/String": {"data": "str"},
     "std_msgs/msg/MultiArrayDimension": {"label": "str", "size": "uint32", "stride": "uint32"},
     "std_msgs/msg/MultiArrayLayout": {"dim": "[std_msgs/msg/MultiArrayDimension]", "data_offset": "uint32"},
     "std_msgs/msg/Float64MultiArray": {"layout": "std_msgs/msg/MultiArrayLayout", "data": "[float64]"},
@@ -157,6 +158,26 @@ def _type_name(name: str) -> str:
     return f"{package}::{kind}::dds_::{last}_"
 
 
+def _participant() -> Any:
+    """Join the domain of ROS. Raises ValueError where ROS_DOMAIN_ID is no number."""
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not domain.isdigit():
+        raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
+    return _dds("domain").DomainParticipant(int(domain))
+
+
+def publisher(topic: str) -> Callable[[str], None]:
+    """Return what publishes a text on a topic of ROS 2, as std_msgs/msg/String; who joins late gets the last one too.
+
+    Raises ValueError where ROS_DOMAIN_ID is no number.
+    """
+    policy, kind, participant = _dds("core").Policy, message("std_msgs/msg/String"), _participant()
+    lasting = policy.Reliability.Reliable(0), policy.Durability.TransientLocal, policy.History.KeepLast(1)
+    there = _dds("topic").Topic(participant, f"rt/{topic.strip('/')}", kind)
+    writer = _dds("pub").DataWriter(participant, there, qos=_dds("core").Qos(*lasting))
+    return lambda text: writer.write(kind(text))
+
+
 def _follow_topics(topics: str, silence: float) -> Iterator[str]:
     """Yield rows of topics, ``/joint_states`` or several with commas between, as JSON lines, with their times [s].
 
@@ -167,12 +188,9 @@ def _follow_topics(topics: str, silence: float) -> Iterator[str]:
         OSError: nobody publishes one of them, or no first row came.
     """
     names = [name.strip().strip("/") for name in topics.split(",")]
-    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not all(names):
         raise ValueError(f"dds takes topics, as in dds:/joint_states, got {topics!r}")
-    if not domain.isdigit():
-        raise ValueError(f"ROS_DOMAIN_ID must be a number, got {domain!r}")
-    core, participant = _dds("core"), _dds("domain").DomainParticipant(int(domain))
+    core, participant = _dds("core"), _participant()
     kinds = {name: _kind(participant, name) for name in names}
     quality = core.Qos(core.Policy.Reliability.BestEffort, core.Policy.History.KeepLast(AT_ONCE))
     readers = {}
