@@ -104,7 +104,8 @@ def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDA
     # 11/05/2026 may begin with the day or the month: read so that the whole takes the least time.
     ends = text.dropna().iloc[[0, -1]]
     orders = sorted((True, False), key=lambda order: _span(ends, order))
-    for how in ({"format": "ISO8601"}, *({"format": "mixed", "dayfirst": order} for order in orders)):
+    ways: list[dict[str, Any]] = [{"format": "mixed", "dayfirst": order} for order in orders]
+    for how in ({"format": "ISO8601"}, *ways):
         with suppress(ValueError, TypeError):
             moments = pd.to_datetime(text, utc=True, **how).dt.as_unit("ns")
             since = moments.astype(np.int64)
