@@ -106,7 +106,7 @@ def test_what_presses_decides_whatever_the_cause_is_taken_for(family):
 
     env = NeuralASMSafety(Pressing(), Judge({9}, family), release_after=2)
     said = infos(env, 12)
-    assert (said[9]["case"], said[9]["response"], said[9]["reason"]) == ("pressing", "hold", "contact")
+    assert (said[9]["case"], said[9]["response"], said[9]["reason"]) == ("pressing", DEFAULT["pressing"], "contact")
     assert said[9]["cause"]["family"] == {"joint": "actuator", "command": "action"}.get(family, family)
     assert said[9]["severity"]["presses"]
     assert [s["intervened"] for s in said[8:12]] == [False, False, True, True]

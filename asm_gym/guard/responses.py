@@ -33,12 +33,13 @@ DEFAULT: dict[str, str] = {
     "action": "hold",
     "object": "go on",
     "unknown": "hold",
-    PRESSING: "hold",
+    PRESSING: "retract",
     f"lasting {PRESSING}": "comply",
 }
 """What ``on_alarm="graded"`` does. What presses comes first: then only its two rows count, and neither may let the
-policy go on. Below that, the policy may go on where the cause is sure, the hand is not faster than any healthy one, for
-a bounded time, and where a sense of force says that it presses with no more than 40 N; else the robot holds."""
+policy go on; the arm goes back the way it came, which ends the force at once. Below that, the policy may go on where
+the cause is sure, the hand is not faster than any healthy one, for a bounded time, and where a sense of force says that
+it presses with no more than 40 N; else the robot holds."""
 
 
 class Response(NamedTuple):

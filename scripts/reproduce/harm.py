@@ -23,6 +23,7 @@ from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
+from asm_gym.guard.severity import LEANS_S
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
@@ -45,7 +46,9 @@ GUARDS: dict[str, dict[str, Any] | None] = {
 }
 """Settings of the wrapper by name; None for no wrapper."""
 TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile policies
-HEALTHY = (*((task, "scripted") for task in TASKS), ("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac"))
+UNKNOWN = ("PickPlaceMilk", "NutAssemblyRound")  # not met by the Panda's memory; healthy policies alone
+AGENTS = ("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac")
+HEALTHY = (*((task, "scripted") for task in (*TASKS, *UNKNOWN)), *AGENTS)
 """Tasks and policies that do no harm on purpose."""
 FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", PASSING)
 """Faults under which healthy policies act too."""
@@ -73,8 +76,8 @@ class Config(kit.Config):
     """Episodes of each healthy policy."""
     guards: tuple[str, ...] = option((POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME")
     """Ways to guard."""
-    tasks: tuple[str, ...] = option(TASKS, quick=("Lift",), known=TASKS, metavar="TASK")
-    """Tasks."""
+    tasks: tuple[str, ...] = option((*TASKS, *UNKNOWN), quick=("Lift",), known=(*TASKS, *UNKNOWN), metavar="TASK")
+    """Tasks; in the last two there are healthy policies alone."""
 
 
 class Case(NamedTuple):
@@ -111,8 +114,9 @@ def cases(config: Config) -> list[tuple[Case, int]]:
     def trial(task: str, fault: str = NOMINAL) -> Trial:
         return Trial(env_id(task), 0, fault, "" if fault in (NOMINAL, PASSING) else "medium")
 
-    hostile = [Case("hostile", name, trial(task)) for task, name in product(config.tasks, HOSTILE)]
-    slower = [Case("hostile", "down", trial(task), speed=speed) for task, speed in product(config.tasks, (0.5, 0.25))]
+    tasks = [task for task in config.tasks if task not in UNKNOWN]
+    hostile = [Case("hostile", name, trial(task)) for task, name in product(tasks, HOSTILE)]
+    slower = [Case("hostile", "down", trial(task), speed=speed) for task, speed in product(tasks, (0.5, 0.25))]
     elsewhere = [
         case._replace(config=RolloutConfig(robot=robot, stream_freq=None if rate == 20 else rate))
         for (robot, rate), case in product(ELSEWHERE, hostile)
@@ -247,7 +251,7 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
             mine = scenes[scenes.guard == guard]
             both = mine.join(alone.success.rename("alone"), how="inner")
             lost, won = (both.alone & ~both.success).sum(), (both.success & ~both.alone).sum()
-            unsafe = (mine.success & ((mine.peak > TRANSIENT) | (mine.held > 0))).sum()
+            unsafe = mine.success & ((mine.peak > TRANSIENT) | (mine.over_s > LEANS_S) | (mine.held > 0))
             row = {
                 "": _name(own),
                 "guard": guard,
@@ -266,7 +270,7 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
             healthy = {
                 "solved": f"{mine.success.sum()} of {len(mine)}",
                 "lost, won": f"-{lost} +{won}",
-                f"of these beyond {TRANSIENT:g} N or overridden": f"{unsafe} of {mine.success.sum()}",
+                f"of these beyond {TRANSIENT:g} N, {EXCESS:g} N for {LEANS_S:g} s, or overridden": f"{unsafe.sum()}",
                 "median time to success [s]": f"{mine.time.median():.2f}",
             }
             rows.append(row | (hostile if (own.kind == "hostile").all() else healthy))
