@@ -51,20 +51,20 @@ def test_success_is_paired_by_scene_and_counted_without_a_blow():
     records = []
     for policy, seed, alone, guarded, blow in (
         *(("scripted", 1, True, True, 10.0), ("scripted", 2, True, False, 300.0)),
-        *(("lift_sac", 1, False, True, 10.0), ("lift_sac", 2, True, True, 300.0)),
+        *(("lift_sac", 1, False, True, 10.0), ("lift_sac", 2, True, True, 60.0)),  # the last leans for 0.6 s
     ):
         records.append(record(ALONE, seed, blow, policy, "healthy", alone))
         records.append(record(DEFAULT, seed, 10.0, policy, "healthy", guarded))
     rows = harm.by_guard("", pd.DataFrame(records), [ALONE, DEFAULT], harm.CASE, ("kind",)).rows
     assert [(row[0], *row[-4:]) for row in rows if row[1] == ALONE] == [
-        ("Panda, 20 Hz, Lift, scripted", "2 of 2", "-0 +0", "1 of 2", "2.00"),
-        ("Panda, 20 Hz, Lift, lift_sac", "1 of 2", "-0 +0", "1 of 1", "2.00"),
-        ("Panda, 20 Hz, Lift", "3 of 4", "-0 +0", "2 of 3", "2.00"),
+        ("Panda, 20 Hz, Lift, scripted", "2 of 2", "-0 +0", "1", "2.00"),
+        ("Panda, 20 Hz, Lift, lift_sac", "1 of 2", "-0 +0", "1", "2.00"),
+        ("Panda, 20 Hz, Lift", "3 of 4", "-0 +0", "2", "2.00"),
     ]
     assert [row[-4:-1] for row in rows if row[1] == DEFAULT] == [
-        ("1 of 2", "-1 +0", "0 of 1"),
-        ("2 of 2", "-0 +1", "0 of 2"),
-        ("3 of 4", "-1 +1", "0 of 3"),
+        ("1 of 2", "-1 +0", "0"),
+        ("2 of 2", "-0 +1", "0"),
+        ("3 of 4", "-1 +1", "0"),
     ]
 
 
