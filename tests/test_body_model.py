@@ -223,11 +223,15 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
 
 def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
     columns = {f"{n}_{k}": v for n, c in recorded(60).items() for k, v in enumerate(c.T if c.ndim > 1 else [c])}
+    columns["finger_position"] = 0.02 * np.sin(3 * columns["time_0"])  # of a gripper that tells no speed
     pd.DataFrame(columns).rename(columns={"time_0": "time"}).to_csv(tmp_path / "log.csv", index=False)
     (tmp_path / "arm.urdf").write_text(arm())
     command = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "x.asm"), "--split", "1", "--quick"]
     command += ["--urdf", str(tmp_path / "arm.urdf")]
-    assert main([*command, "--monitor", "association_values+evidence", "--false-alarm-rate", "0.1"]) == 0
+    command += ["--monitor", "association_values+evidence", "--false-alarm-rate", "0.1"]
+    assert main(command) == 2
+    assert "4 numbers are angles and 3 are speeds; leave out others, as --ignore '*finger*'" in capsys.readouterr().err
+    assert main([*command, "--ignore", "*finger*"]) == 0
     said = capsys.readouterr().out
     assert "position[0] for lift, position[1] for shoulder, position[2] for elbow" in said
     expected, most = load_monitor(tmp_path / "x.asm").promise.hourly(30 / 3600)  # 30 pieces of 1 s

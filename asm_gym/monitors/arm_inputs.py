@@ -52,7 +52,7 @@ class Derived(NamedTuple):
         if urdf and not len(moving) == J > 0:
             raise ValueError(
                 f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; by their names "
-                f"{J} numbers are angles and {len(moving)} are speeds"
+                f"{J} numbers are angles and {len(moving)} are speeds; leave out others, as --ignore '*finger*' does"
             )
         if urdf:
             links = BodyModel.of(urdf, [spec.labels[i] for i in angles])
