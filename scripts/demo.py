@@ -33,7 +33,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
-from asm_gym.scripts.command import Options, option, run
+from asm_gym.scripts.command import Options, option, origin, run
 from asm_gym.tasks import TASKS, env_id
 
 PUSHED = "robot0_link5"  # link that is pushed
@@ -126,7 +126,7 @@ def demonstrate(args: Args, console: Console) -> None:
     )
     console.print(result)
     examples = [typical(m.watched) for m in rows]
-    details = asdict(args) | versions("numba") | {"window_s": WINDOW_S}
+    details = origin() | asdict(args) | versions("numba") | {"window_s": WINDOW_S}
     drawn = {"Surprise over time in a typical episode of each condition": figures.surprise_figure(examples)}
     intro = (
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "

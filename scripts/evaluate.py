@@ -31,7 +31,7 @@ from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.rollouts.trial import RolloutConfig, Trial, evaluation_trials
-from asm_gym.scripts.command import Options, one_line, option, run
+from asm_gym.scripts.command import Options, one_line, option, origin, run
 from asm_gym.stream_source import StreamSource
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 from asm_gym.validation import check_choice, check_number
@@ -168,7 +168,7 @@ def evaluate(args: Args, console: Console) -> None:
             how = args.false_alarm_rate, WINDOW_S, args.seed
             result = benchmark(args.out, files, args.monitors, *how, each)
         with timed("drawing"):
-            details = json.loads(json.dumps(asdict(args), default=str))
+            details = origin() | json.loads(json.dumps(asdict(args), default=str))
             details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
             publish(args.out, result, details)
     tables = [brief_monitors_table(result), kept_table(result)]

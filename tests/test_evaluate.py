@@ -9,6 +9,7 @@ import pytest
 from asm_gym.data.episode import EpisodeLabel, load_episode
 from asm_gym.scripts import command
 from asm_gym.scripts.evaluate import Args, main, trials_of
+from asm_gym.version import __version__
 
 MONITORS = ("neural_asm", "kalman+evidence", "association_linear", "force_limit")
 SMALL = [
@@ -35,6 +36,7 @@ def test_it_writes_a_table_a_row_for_each_episode_and_a_report(run):
     assert all(r["ideal_delay_s"] == pytest.approx(0.05) for r in push)
     report = (run / "report.html").read_text()
     assert "ideal observer" in report
+    assert f"asm-gym {__version__}" in report
     assert "http" not in report.replace("http://www.w3.org", "")
 
 

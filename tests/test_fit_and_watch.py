@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import html
 import io
 import json
 import re
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from asm_gym.evaluation.alarms import alarms_of, traces_of
 from asm_gym.guard.live import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.scripts.cli import main
+from asm_gym.version import __version__
 from tests.streams import arm_table as log
 
 RATE, ROWS = 50.0, 80  # of ``arm_table``
@@ -201,7 +204,8 @@ def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsy
     assert load_monitor(out).promise.per == "hour"
 
 
-def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memory, tmp_path, capsys):
+def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memory, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["asm-gym", "watch", "a log.csv", "--bridge", "0.1"])
     write_csv(tmp_path / "good.csv", log(100))
     stuck = log(101)
     stuck["q_1"][40:] = stuck["q_1"][40]
@@ -216,7 +220,14 @@ def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memor
     alarms = read_text(tmp_path / "out" / "alarms.csv")
     assert 40 / RATE < alarms["from [s]"][0] < 60 / RATE
     assert alarms["thresholds"].min() > 1
-    assert "stuck.csv" in (tmp_path / "out" / "report.html").read_text()
+    report = html.unescape((tmp_path / "out" / "report.html").read_text())
+    for said in (
+        "stuck.csv",
+        "asm-gym watch 'a log.csv' --bridge 0.1",
+        f"asm-gym {__version__}",
+        f"{date.today():%Y-%m-%d}T",
+    ):
+        assert said in report
 
 
 def streamed(monitor, columns, form=lambda row: json.dumps(row.tolist())):

@@ -70,6 +70,16 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces, tmp_path: Path):
         assert figures.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
 
+def test_a_figure_says_where_data_are_missing(traces):
+    def legend(trace: ScoredEpisode) -> set[str]:
+        return {text.get_text() for text in figures.surprise_figure([trace]).legends[0].get_texts()}
+
+    whole = traces[0]
+    lost = np.zeros((len(whole), 1), np.float32)
+    lost[10:14] = np.nan
+    assert legend(dataclasses.replace(whole, stream=lost)) - legend(whole) == {"missing data"}
+
+
 def test_the_most_surprising_channels_come_first(traces):
     trace = next(t for t in traces if t.delay is not None)
     order = np.argsort(-trace.attribution[20:].max(axis=0))[:3]

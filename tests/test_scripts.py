@@ -13,6 +13,7 @@ from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts import command, demo
 from asm_gym.scripts.cli import main
+from asm_gym.version import __version__
 
 LIFT = "asm_gym/Lift-v0"
 TINY = {"fit_episodes": 6, "calibration_episodes": 19, "nominal_episodes": 2, "faulty_episodes": 1, "epochs": 3}
@@ -53,6 +54,7 @@ def test_the_demo_writes_everything_it_promises(folder):
     written = {p.name for p in folder.iterdir()}
     assert written == {"report.html", "lift.asm"}
     report = (folder / "report.html").read_text()
+    assert f"asm-gym {__version__}" in report
     assert all(f"<th>{condition}</th>" in report for condition in CONDITIONS)
     assert "<dt>robosuite</dt><dd>1.5.2</dd>" in report
 
