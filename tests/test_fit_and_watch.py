@@ -6,7 +6,6 @@ import html
 import io
 import json
 import re
-from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -221,13 +220,9 @@ def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memor
     assert 40 / RATE < alarms["from [s]"][0] < 60 / RATE
     assert alarms["thresholds"].min() > 1
     report = html.unescape((tmp_path / "out" / "report.html").read_text())
-    for said in (
-        "stuck.csv",
-        "asm-gym watch 'a log.csv' --bridge 0.1",
-        f"asm-gym {__version__}",
-        f"{date.today():%Y-%m-%d}T",
-    ):
+    for said in ("stuck.csv", "asm-gym watch 'a log.csv' --bridge 0.1", f"asm-gym {__version__}"):
         assert said in report
+    assert re.search(r"date</dt><dd>\d{4}-\d\d-\d\dT\d\d:", report)
 
 
 def streamed(monitor, columns, form=lambda row: json.dumps(row.tolist())):

@@ -33,3 +33,8 @@ def test_an_old_gymnasium_is_one_line_that_says_what_to_do():
     found = subprocess.run([sys.executable, "-c", OLD], capture_output=True, text=True)
     last = found.stderr.strip().splitlines()[-1]
     assert last == "ImportError: asm-gym needs Gymnasium 1.1 or newer, got 0.29.1: pip install --upgrade gymnasium"
+
+
+def test_an_id_with_its_package_needs_no_import():
+    make = 'import gymnasium as gym; print(gym.make("asm_gym:asm_gym/SyntheticArm-v0").reset(seed=0)[0].shape)'
+    assert subprocess.run([sys.executable, "-c", make], capture_output=True, text=True).stdout.startswith("(")
