@@ -52,6 +52,67 @@ def test_the_action_that_is_told_moves_the_bare_environment_in_the_same_way(scal
     bare.close()
 
 
+@pytest.mark.parametrize("controller", ["OSC_POSE", "OSC_POSITION", "JOINT_POSITION"])
+@pytest.mark.parametrize("stream_freq", [20, 100])
+def test_under_every_controller_that_scales_actions_the_one_that_is_told_moves_the_bare_environment(
+    controller, stream_freq
+):
+    how = {"controller": controller, "stream_freq": stream_freq}
+    env, bare = gym.make("asm_gym/Lift-v0", **how), gym.make("asm_gym/Lift-v0", **how)
+    guarded = NeuralASMSafety(env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=LIMITS)
+    guarded.reset(seed=0)
+    bare.reset(seed=0)
+    acted, braked = set(), []
+    for k in (0, 1, 3) if controller == "JOINT_POSITION" else (0, 1, 2):
+        action = np.zeros(guarded.action_space.shape, np.float32)
+        action[k] = -1.0
+        for _ in range(3):
+            info = guarded.step(action)[4]
+            bare.step(info["asm"]["executed_action"])
+            if not any(braked) and not info["braked"]:
+                acted.add(info["asm"]["slowed"] > 0)
+                np.testing.assert_array_equal(joints(guarded), joints(bare))
+            braked.append(info["braked"])
+    assert True in acted
+    assert all(0 <= share <= 1 for share in braked)
+    guarded.close()
+    bare.close()
+
+
+@pytest.mark.parametrize(("controller", "quiet"), [("OSC_POSE", 3), ("IK_POSE", 0)])
+def test_steps_in_which_the_brake_slowed_the_arm_are_told_and_no_others_differ_from_the_bare_environment(
+    controller, quiet
+):
+    env, bare = (gym.make("asm_gym/Lift-v0", controller=controller) for _ in range(2))
+    guarded = NeuralASMSafety(env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=LIMITS)
+    guarded.reset(seed=0)
+    bare.reset(seed=0)
+    braked = []
+    for t in range(6):
+        action = np.zeros(guarded.action_space.shape, np.float32)
+        action[0 if t < quiet else 3] = -1.0  # the hand turns faster than it may move
+        info = guarded.step(action)[4]
+        bare.step(info["asm"]["executed_action"])
+        braked.append(info["braked"])
+        assert np.array_equal(joints(guarded), joints(bare)) == (max(braked) == 0.0)
+    assert [share > 0 for share in braked] == [t >= quiet for t in range(6)]
+    guarded.close()
+    bare.close()
+
+
+def test_where_a_wrapper_inside_changes_actions_what_was_slowed_is_unknown_and_no_zero():
+    env = gym.make("asm_gym/Lift-v0")
+    spec, inside = env.unwrapped.stream_spec, gym.wrappers.RescaleAction(env, np.float32(-2), np.float32(2))
+    guarded = NeuralASMSafety(inside, CueMonitor(spec=spec), "hold", contact_limits=LIMITS)
+    guarded.reset(seed=0)
+    assert np.isnan(guarded.step(guarded.action_space.high)[4]["asm"]["slowed"])
+    outside = gym.wrappers.RescaleAction(lift(), np.float32(-2), np.float32(2))
+    outside.reset(seed=0)
+    assert outside.step(outside.action_space.high)[4]["asm"]["slowed"] > 0.5
+    guarded.close()
+    outside.close()
+
+
 def test_many_environments_tell_it_as_one_does():
     envs = gym.make_vec("asm_gym/Lift-v0", num_envs=2)
     monitor = FadingMonitor(spec=envs.get_attr("stream_spec")[0])

@@ -342,6 +342,7 @@ class Guarding:
 
     def _watch_with(self, monitor: Monitor) -> None:
         """Take up a monitor, and all that depends on it."""
+        refuse_counts(self.env, type(self).__name__, self._options.on_alarm)
         check_answer(monitor)
         check_monitor(monitor, self._spec, str(Members(self.env).first("controller", "")))
         found = getattr(monitor, "about", {}).get(ACTIONS)

@@ -21,7 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.policies.reflexes import HoldsItself, changed_by, outside
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.robots import Guarding, as_action, body_memory, felt_by, refuse_counts, sensed_row
+from asm_gym.wrappers.robots import Guarding, as_action, body_memory, felt_by, sensed_row
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -122,7 +122,6 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if self._box is None and not (isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
-        refuse_counts(env, "NeuralASMSafety", on_alarm)
         self._source = StreamSource(env)
         self._spec = self._source.spec
         self._rows_per_step = self._source.rows_per_step

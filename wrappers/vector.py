@@ -21,16 +21,7 @@ from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
-from asm_gym.wrappers.robots import (
-    Guarding,
-    Members,
-    as_action,
-    askable,
-    body_memory,
-    felt_by,
-    refuse_counts,
-    sensed_row,
-)
+from asm_gym.wrappers.robots import Guarding, Members, as_action, askable, body_memory, felt_by, sensed_row
 
 Mask = NDArray[np.bool_]
 
@@ -84,7 +75,6 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
         refuse_running_statistics(env, "VectorNeuralASMSafety")
-        refuse_counts(env, "VectorNeuralASMSafety", on_alarm)
         options = on_alarm, release_after, max_override, try_after, truncate
         self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold, action_means=action_means)
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))

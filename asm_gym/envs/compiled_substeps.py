@@ -24,6 +24,7 @@ from asm_gym.envs.control import HELD, control, read_arm, set_goal, slow_down
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
+    BRAKED,
     FELT,
     JOINTS,
     PASSED_IN,
@@ -154,7 +155,7 @@ def brake_beneath(
             control(views, nominal, arms, goals, work, a)
         else:
             read_arm(views, nominal, arms, work, a)
-            slow_down(views, arms, limits, work, a)
+            limits.state[BRAKED] += slow_down(views, arms, limits, work, a)
 
 
 @compiled
@@ -188,7 +189,7 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
                 set_goal(views, arms, goals, work, a)
             control(views, nominal, arms, goals, work, a)
             if goals.held[a] == 0:
-                slow_down(views, arms, limits, work, a)
+                limits.state[BRAKED] += slow_down(views, arms, limits, work, a)
         _step2(views.model, views.data)
         sample(views, nominal, arms, k, samples)  # the place for all that is measured in every substep
         feel(arms.joints, limits, goals.held, k, samples)

@@ -267,8 +267,11 @@ def fastest_point(views: Views, arms: Arms, a: int) -> float:
 
 
 @partial(inner, inlined=True)
-def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: int) -> None:
-    """Brake arm ``a``, of which M and v are known, along its own motion while its fastest point passes its limit."""
+def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: int) -> bool:
+    """Brake arm ``a``, of which M and v are known, along its own motion while its fastest point passes its limit.
+
+    Return whether it does.
+    """
     limit = limits.speed[a]
     speed = fastest_point(views, arms, a) if limit < np.inf else 0.0
     if speed > limit:
@@ -279,6 +282,7 @@ def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: in
             m = arms.motors[a, i]
             command = views.ctrl[m] - work.tau[i]
             views.ctrl[m] = min(max(command, views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
+    return speed > limit
 
 
 @partial(inner, inlined=True)

@@ -134,13 +134,14 @@ class SubstepLimits(NamedTuple):
 
     most: Floats  # (A, FELT) [N m], [N]
     load: Floats  # (1,) the largest share of a limit that was reached since the control step began
-    state: Ints  # (5,) see below
+    state: Ints  # (6,) see below
     speed: Floats  # (A,) of the fastest point of an arm, from which on it is slowed down; infinite for none [m/s]
 
 
-ARMED, ACTS, SUBSTEPS, PASSED_IN, STAYED = range(5)
+ARMED, ACTS, SUBSTEPS, PASSED_IN, STAYED, BRAKED = range(6)
 """Of ``SubstepLimits.state``: whether limits are compared; whether the arms stay once one is passed; substeps since the
-control step began; the first of them in which a limit was passed, -1 for none; whether the arms were stopped."""
+control step began; the first of them in which a limit was passed, -1 for none; whether the arms were stopped;
+in how many of them, counted for each arm, it was slowed down."""
 
 
 @structref.register

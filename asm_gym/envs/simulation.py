@@ -18,6 +18,7 @@ from asm_gym.envs.control import HELD, REACHES
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
+    BRAKED,
     FELT,
     JOINTS,
     PASSED_IN,
@@ -57,7 +58,7 @@ class Simulation:
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
         self.speed_limits = np.full(n, np.inf)
         """(A,) speed of the fastest point of an arm, from which on it is slowed down [m/s]."""
-        self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(5, np.int64), self.speed_limits)
+        self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(6, np.int64), self.speed_limits)
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.contact_force = 0.0
         """The largest net contact force on an arm within the control step [N]. In the sum over its bodies a grasp's own
@@ -90,7 +91,7 @@ class Simulation:
                 self.arms.scaling[a, :, :size] = scaling_of(controller, size)
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
-        self._limits.state[:] = 0, 0, 0, -1, 0
+        self._limits.state[:] = 0, 0, 0, -1, 0, 0
         self._limits_set: ContactLimits | None = None
         # Arm and index in the limits of each number that limits apply to, and its column in a sample.
         self._limited = np.nonzero([[i >= JOINTS or i < count for i in range(FELT)] for count in self.arms.joints])
@@ -110,7 +111,7 @@ class Simulation:
     def begin(self, limits: ContactLimits | None = None, limited: Sequence[Channel] = ()) -> None:
         """Begin a control step under ``limits`` of the ``limited`` channels."""
         self._done = self._row_began = 0
-        self._limits.state[:] = 0, 0, 0, -1, 0
+        self._limits.state[:] = 0, 0, 0, -1, 0, 0
         self._pressed, self._limits.load[0] = self.load > 1.0, 0.0
         if limits is not None:
             if limits is not self._limits_set:
@@ -184,6 +185,11 @@ class Simulation:
     def load(self) -> float:
         """The largest share of a contact limit that was reached in the control step; infinite for NaN."""
         return float(self._limits.load[0])
+
+    @property
+    def braked(self) -> float:
+        """The share of the control step's substeps in which an arm was slowed down beneath its controller."""
+        return float(self._limits.state[BRAKED]) / max(1, self._done * len(self.parts))
 
     @property
     def felt(self) -> NDArray[np.float64]:

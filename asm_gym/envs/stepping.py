@@ -54,7 +54,8 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         self.contact_limits: ContactLimits | None = None
         """Limits of load and hand speed in this episode; ``reset`` removes them. ``info`` then holds ``contact_load``,
         the largest share of a limit that was reached within the step, ``contact_left_s``, when in it a limit was passed
-        [s], infinite where none was, and ``contact_felt``, the step's mean load."""
+        [s], infinite where none was, ``contact_felt``, the step's mean load, and ``braked``, the share of its substeps
+        in which an arm was slowed down beneath its controller."""
         self._limits_of_guards: dict[str, ContactLimits | None] = {}
 
     @property
@@ -133,6 +134,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         found: dict[str, Any] = {"contact_force": np.nan if unstable else sim.contact_force}
         if self.contact_limits is not None:
             passed = sim.passed_limit
+            found["braked"] = sim.braked
             found["contact_load"] = np.inf if unstable else sim.load
             found["contact_left_s"] = np.inf if passed is None else (passed + 1) / PHYSICS_FREQ
             found["contact_felt"] = sim.felt.mean(axis=0)

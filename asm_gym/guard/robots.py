@@ -63,9 +63,10 @@ class Robots:
         told = rows[:, self.efference]
         return np.where(np.isfinite(told), told, commanded)
 
-    @staticmethod
-    def slowed(commanded: NDArray[np.float32], executed: NDArray[np.float32]) -> float:
-        """Return the greatest share of a number of the action (A,) that was taken from it: 0 none, 1 all."""
+    def slowed(self, commanded: NDArray[np.float32], executed: NDArray[np.float32]) -> float:
+        """Return the greatest share of a number of the action (A,) that was taken from it; NaN where nobody knows."""
+        if self.limits_contact and self.efference is None:  # a wrapper inside changes actions
+            return np.nan
         asked, done = commanded.ravel(), executed.ravel()
         moved = np.abs(asked) > SMALLEST
         taken = 1.0 - done[moved] / asked[moved]
