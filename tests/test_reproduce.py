@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,3 +101,14 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
     assert [row[2].split()[0] for row in table.rows] == ["2.0", "5.0"]  # peaks 5 and 6; peaks 2 to 6
     assert [row[-2:] for row in table.rows] == [("50 % of 2", "0 % of 1"), ("100 % of 2", "100 % of 1")]
+
+
+def test_promises_over_halves_come_true_where_all_hours_are_alike():
+    rng = np.random.default_rng(0)
+    solved = [replace(ten_minutes(n, 0.0), surprise=rng.exponential(size=600)) for n in range(240)]  # 40 hours
+    faults = [ten_minutes(0, 99.0, 200, "strong"), ten_minutes(1, 0.5, 200, "strong")]
+    table = hours.splits_table([Marks("scripted", solved, [], DetectionMetrics("", faults, solved, 1.0))])
+    assert "40.0 healthy hours" in table.caption
+    came = [float(cell.split()[0]) for cell in table.rows[0]]
+    np.testing.assert_allclose(came, hours.PROMISES, rtol=0.25)
+    assert all("50.0 ± 0.0 % found" in cell for cell in table.rows[0])

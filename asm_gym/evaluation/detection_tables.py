@@ -191,7 +191,7 @@ def splits_table(result: BenchmarkResult) -> Table:
         by_hour = Blocks(*(np.concatenate(both) for both in zip(known[:2], of[:2], strict=True)))
         maxima = np.concatenate([m.calibration.maxima, [t.surprise.max() for t in m.nominal]])
         units = {EPISODE: Blocks(maxima, np.ones(len(maxima))), HOUR: by_hour}
-        rows.append((m.name, *(_over_splits(m, units[p.per], p) for p in promises)))
+        rows.append((m.name, *(over_splits(m, units[p.per], p) for p in promises)))
     return Table(
         f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where {SPLITS} random halves "
         "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD.",
@@ -200,7 +200,8 @@ def splits_table(result: BenchmarkResult) -> Table:
     )
 
 
-def _over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
+def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
+    """Return the false alarms that came, and faults found, where random halves of ``units`` set the threshold."""
     rng, windows, came, found = np.random.default_rng(0), Windows(m.faulty, m.window_s), [], []
     for _ in range(SPLITS):
         half = np.zeros(len(units.maxima), bool)

@@ -9,12 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from asm_gym.detection.conformal import HOUR, Blocks
 from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.detection_tables import kept_rate
+from asm_gym.evaluation.detection_tables import SPLITS, kept_rate, over_splits
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
+from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.pretraining.exam import SEVERITIES, Exam, Marks, card, examine, usual_force
 from asm_gym.scripts.command import option
@@ -42,20 +44,32 @@ def run(config: Config) -> Findings:
     memory, corpus = NeuralASM.pretrained(config.memory), Corpus.open(config.corpus)
     thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES}
     exams = corpus.files[["policy", "task"]].drop_duplicates().to_numpy().tolist()
-    marks, records = [], []
+    marks: list[Marks] = []
+    known: list[Marks] = []
     with kit.stage("examining") as tell:
         for n, (policy, task) in enumerate(exams):
             tell(n, len(exams))
-            if policy == EXPERT and task in memory.about["tasks"]:
-                continue
             own = list(corpus.episodes(policies=(policy,), tasks=(task,)))
             usual = usual_force(list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100]))
-            marks.append(examine(memory, Exam(task, policy, known=False).name, own, WINDOW_S, usual))
-    for promised, threshold in thresholds.items():
-        for m in marks:
-            rate = hourly_alarms(m.at(threshold).solved)
-            records.append({"promised": promised, "exam": m.name, "alarms": rate.k, "hours": rate.hours})
-    return Findings(records, [kept_table(marks, thresholds), card(marks, memory, WINDOW_S)])
+            exam = Exam(task, policy, known=policy == EXPERT and task in memory.about["tasks"])
+            (known if exam.known else marks).append(examine(memory, exam.name, own, WINDOW_S, usual))
+    came = {(r, m.name): hourly_alarms(m.at(thresholds[r]).solved) for r in PROMISES for m in marks}
+    records = [{"promised": r, "exam": name, "alarms": c.k, "hours": c.hours} for (r, name), c in came.items()]
+    tables = kept_table(marks, thresholds), card(marks, memory, WINDOW_S), splits_table([*marks, *known])
+    return Findings(records, list(tables))
+
+
+def splits_table(marks: Sequence[Marks]) -> Table:
+    """Return what each promise comes to over random halves of all healthy hours, known tasks included."""
+    solved = [t for m in marks for t in m.solved]
+    units = Blocks.of([t.surprise for t in solved], solved[0].dt)
+    found = DetectionMetrics("", [t for m in marks for t in m.metrics.faulty], [], WINDOW_S)
+    caption = (
+        f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory has met too: one "
+        "half sets the threshold, in the other so many false alarms came, mean ± SD."
+    )
+    rows = [[over_splits(found, units, AlarmRate(rate, HOUR)) for rate in PROMISES]]
+    return Table(caption, [f"promised {rate:g}/h" for rate in PROMISES], rows)
 
 
 def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:

@@ -129,12 +129,10 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     )
     columns = dict(COLUMNS)
     for name in ("faults/h", "found"):
-        columns[f"{name}, adaptive"] = partial(_adapted, COLUMNS[name], about["false_alarms_per_hour"])
+        columns[f"{name}, adaptive"] = partial(
+            lambda own, m: own(m.adapted(about["false_alarms_per_hour"])), COLUMNS[name]
+        )
     return tabulate(caption, columns, marks)
-
-
-def _adapted(column: Callable[[Marks], str], per_hour: float, marks: Marks) -> str:
-    return column(marks.adapted(per_hour))
 
 
 def summary(marks: Sequence[Marks]) -> str:
