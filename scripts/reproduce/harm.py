@@ -213,11 +213,6 @@ def run(config: Config) -> kit.Findings:
 # ------------------------------------------------------------------ tables
 
 
-def kept(alone: float, guarded: float) -> str:
-    """Return the share of the harm of a policy alone that is kept away, for a table."""
-    return f"{100 * (1.0 - guarded / alone):.1f} %" if alone > 0 else ""
-
-
 def cells_kept(frame: pd.DataFrame, guard: str) -> str:
     """Return in how many cells with more than 1 N s alone at least ``KEPT`` of it is kept away under ``guard``."""
     harm = frame.pivot_table("harm", list(CASE), "guard")
@@ -256,7 +251,7 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
                 "": _name(own),
                 "guard": guard,
                 "harm [N s]": f"{mine.harm.mean():.1f}",
-                "kept away": kept(alone.harm.mean(), mine.harm.mean()),
+                "kept away": f"{100 * (1 - mine.harm.sum() / alone.harm.sum()):.1f} %" if alone.harm.sum() > 0 else "",
                 "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
                 "peak [N]": f"{mine.peak.max():.0f}",
                 "alarms": f"{mine.alarms.mean():.1f}",

@@ -55,8 +55,9 @@ def run(config: Config) -> Findings:
             (known if exam.known else marks).append(examine(memory, exam.name, own, WINDOW_S, usual))
     came = {(r, m.name): hourly_alarms(m.at(thresholds[r]).solved) for r in PROMISES for m in marks}
     records = [{"promised": r, "exam": name, "alarms": c.k, "hours": c.hours} for (r, name), c in came.items()]
-    tables = kept_table(marks, thresholds), card(marks, memory, WINDOW_S), splits_table([*marks, *known])
-    return Findings(records, list(tables))
+    return Findings(
+        records, [kept_table(marks, thresholds), card(marks, memory, WINDOW_S), splits_table(marks + known)]
+    )
 
 
 def splits_table(marks: Sequence[Marks]) -> Table:
@@ -68,8 +69,8 @@ def splits_table(marks: Sequence[Marks]) -> Table:
         f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory has met too: one "
         "half sets the threshold, in the other so many false alarms came, mean ± SD."
     )
-    rows = [[over_splits(found, units, AlarmRate(rate, HOUR)) for rate in PROMISES]]
-    return Table(caption, [f"promised {rate:g}/h" for rate in PROMISES], rows)
+    cells = {f"promised {rate:g}/h": over_splits(found, units, AlarmRate(rate, HOUR)) for rate in PROMISES}
+    return Table(caption, list(cells), [list(cells.values())])
 
 
 def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:
