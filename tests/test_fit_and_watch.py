@@ -136,6 +136,23 @@ def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkey
     assert "cannot be read: time must increase" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("rows", [0, 1, ROWS])
+@pytest.mark.parametrize("suffix", [".csv", ".parquet", ".npz", ".jsonl"])
+def test_what_holds_no_number_is_refused_by_inspect_as_by_fit(suffix, rows, tmp_path, capsys):
+    table = pd.DataFrame({"time": np.arange(rows) / 50, "q_1": np.full(rows, np.nan)})
+    path = tmp_path / f"x{suffix}"
+    {
+        ".csv": lambda: table.to_csv(path, index=False),
+        ".parquet": lambda: table.to_parquet(path),
+        ".npz": lambda: np.savez(path, **{name: table[name].to_numpy() for name in table}),
+        ".jsonl": lambda: table.to_json(path, orient="records", lines=True),
+    }[suffix]()
+    assert main(["inspect", str(path), "--out", str(tmp_path / "out")]) != 0
+    assert main(["fit", str(path), "--out", str(tmp_path / "m.asm")]) == 2
+    assert "x" in capsys.readouterr().err
+    assert not (tmp_path / "m.asm").exists()
+
+
 def test_logs_of_one_name_in_several_folders_are_drawn_each(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -70,6 +70,7 @@ def inspected(
         trouble = "" if layout.rate else str(error)
     columns = decide([table, *others], layout, clock)
     refused = [f"{c.name} {c.why}" for c in columns if c.role in ("mixed", "double")]
+    refused += [] if any(c.read for c in columns) or refused else ["no column of numbers is left"]
     rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
     unread: dict[str, Any] = {"times": rows / (rate or 1.0), "rate": rate, "trouble": trouble or "; ".join(refused)}
     return Inspection(name, columns, [_facts(c) for c in columns], **unread | found)
