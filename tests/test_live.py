@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from asm_gym.data.columns import LogLayout
 from asm_gym.data.live import SourceDied, lines_from, live_source, record
+from asm_gym.data.logs import read_logs
 from asm_gym.data.rows import NEWEST, Pace, Publishers, RowReader
 from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -64,6 +66,19 @@ def test_nested_json_and_units_are_read_as_from_a_file():
     first, second = (row.numbers for row, _ in RowReader(spec).rows(lines))
     np.testing.assert_allclose(first, [np.pi, np.pi / 2, 0.5])
     np.testing.assert_allclose(second, [0.0, np.nan, 0.001])
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_text_of_any_encoding_is_read_as_from_a_file(encoding, tmp_path):
+    path = tmp_path / "x.csv"
+    rows = [f"{k / 50:.2f};{90 * np.sin(k / 9):.3f};{k % 7}".replace(".", ",") for k in range(60)]
+    path.write_bytes("\n".join(["Zeit [s];Achse 1 [°];Öl", *rows, ""]).encode(encoding))
+    ((_, episode),) = read_logs(path, LogLayout(clock="Zeit"))
+    followed = lines_from(f"tail:{path}", io.StringIO(), 1.0)
+    lines = [line for _, line in zip(range(61), followed, strict=False)]
+    live = [row.numbers for row, _ in RowReader(episode.spec, "Zeit").rows(lines)]
+    assert episode.spec.labels == ("Achse 1", "Öl")
+    np.testing.assert_allclose(live, episode.stream, rtol=1e-6)
 
 
 @pytest.mark.parametrize("as_json", [True, False])

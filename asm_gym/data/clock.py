@@ -103,7 +103,7 @@ def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDA
         return day + 86400.0 * np.concatenate([[0], np.cumsum(np.diff(day) < -43200)]), 1.0
     # 11/05/2026 may begin with the day or the month: read so that the whole takes the least time.
     ends = text.dropna().iloc[[0, -1]]
-    orders = sorted((True, False), key=lambda order: _span(ends, order))
+    orders = sorted((True, False), key=lambda order: _span(ends, order) if len(text) > 1 else 0)
     ways: list[dict[str, Any]] = [{"format": "mixed", "dayfirst": order} for order in orders]
     for how in ({"format": "ISO8601"}, *ways):
         with suppress(ValueError, TypeError):

@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, TextIO
 
 from asm_gym.data.bags import MESSAGES, stamp_of
 from asm_gym.data.rows import Publishers, SourceDied
+from asm_gym.data.text import decoded
 from asm_gym.extras import require
 from asm_gym.files import named, no_links, regular_file
 from asm_gym.validation import check_number
@@ -261,9 +262,9 @@ def _lines(more: Callable[[], bytes | None], silence: float, first: float) -> It
         *whole, rest = (rest + found).split(b"\n")
         rest = rest[: LONGEST + 1]  # what is longer is no row, and costs no memory
         for line in whole:
-            yield f"a line of more than {LONGEST} bytes" if len(line) > LONGEST else line.decode(errors="replace")
+            yield f"a line of more than {LONGEST} bytes" if len(line) > LONGEST else decoded(line)[0]
     if rest.strip():
-        yield rest.decode(errors="replace")
+        yield decoded(rest)[0]
 
 
 def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:

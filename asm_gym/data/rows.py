@@ -212,7 +212,7 @@ class RowReader:
         if self._header is not None:
             cells = self._dialect.cells(line)
             check_cells(cells, len(self._header), "it has")
-            given = dict(zip(self._header, cells, strict=False))
+            given = dict(zip(self._header, map(self._dialect.plain, cells), strict=False))
             for name, first in self._doubled:
                 if given[name] != given[first] and self._plan is not None and name not in self._plan.columns:
                     raise ValueError(f"its columns of the same name differ: {first!r}")

@@ -187,8 +187,7 @@ def laid_out(frame: Any) -> Columns:
     check_width(len(table))
     lengths = {name: len(values) for name, values in table.items()}
     if not any(lengths.values()):
-        found = f"no row of {', '.join(table)[:200]}" if table else "nothing"
-        raise ValueError(f"a table must hold columns of numbers, got {found}")
+        raise ValueError(f"a table must hold a row of numbers, got none of {', '.join(table)[:200] or 'any column'}")
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
     return _joined(_pivoted(_with_names(table)))

@@ -68,7 +68,11 @@ class Dialect(NamedTuple):
         text = cell.strip().lower() or "nan"
         if text in FLAGS:
             return FLAGS[text]
-        return float(text.replace(",", ".") if self.comma and "." not in text else text)
+        return float(self.plain(text))
+
+    def plain(self, cell: str) -> str:
+        """Return a cell with a point before its decimals."""
+        return cell.replace(",", ".") if self.comma and "." not in cell else cell
 
     def is_number(self, cell: str) -> bool:
         """Tell whether a cell is a number, a flag, or empty."""
@@ -187,7 +191,7 @@ def _lines(path: Path) -> tuple[pd.Series[str], bool]:
         raw = raw.rstrip(b"\x00")
     if b"\x00" in raw[:LONGEST_LINE]:
         raise ValueError("it is no text")
-    found = [_decoded(line) for line in re.split(rb"\r\n?|\n", raw.removeprefix(b"\xef\xbb\xbf"))]
+    found = [decoded(line) for line in re.split(rb"\r\n?|\n", raw)]
     if any(other for _, other in found):
         note(f"{path} is not in UTF-8 throughout: other characters are read as Windows-1252")
     lines = pd.Series([line for line, _ in found], range(1, len(found) + 1), dtype=object)
@@ -199,10 +203,10 @@ def _lines(path: Path) -> tuple[pd.Series[str], bool]:
     return lines, raw.endswith((b"\n", b"\r"))
 
 
-def _decoded(line: bytes) -> tuple[str, bool]:
-    """A line as text, and whether it is not in UTF-8 but in Windows-1252."""
+def decoded(line: bytes) -> tuple[str, bool]:
+    """A line as text without a byte-order mark, and whether it is not in UTF-8 but in Windows-1252."""
     with suppress(UnicodeDecodeError):
-        return line.decode(), False
+        return line.decode("utf-8-sig"), False
     return line.decode("cp1252", "replace"), True
 
 
