@@ -36,12 +36,13 @@ class Config(kit.Config):
     corpus: Path = option(Path("runs/corpus"), metavar="FOLDER")
     """Folder of asm-gym corpus."""
     memory: str = option("panda", metavar="NAME")
-    """Shipped memory, of the arm of the corpus."""
+    """Shipped memory, or the file of one (.asm), of the arm of the corpus."""
 
 
 def run(config: Config) -> Findings:
     """Examine the memory, at its shipped thresholds, in every policy and task that it has not met."""
-    memory, corpus = NeuralASM.pretrained(config.memory), Corpus.open(config.corpus)
+    find = NeuralASM.load if config.memory.endswith(".asm") else NeuralASM.pretrained
+    memory, corpus = find(config.memory), Corpus.open(config.corpus)
     thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES}
     exams = corpus.files[["policy", "task"]].drop_duplicates().to_numpy().tolist()
     marks: list[Marks] = []
