@@ -7,6 +7,7 @@ import pytest
 from asm_gym import Episode, collect
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import MOMENTUM, ContactLimits, Pace, healthy_forces
+from asm_gym.envs.actions import BESIDE
 from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
@@ -187,6 +188,28 @@ def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_heal
     forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
     assert most(forward, elsewhere)[0] < 1.2 * MOMENTUM < most(forward, None)[0] / 1.5
     assert most(sideways, elsewhere)[1] == pytest.approx(most(sideways, None)[1], rel=0.05)
+
+
+def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():
+    env = gym.make("asm_gym/Lift-v0", robot="Sawyer", horizon=150)
+    env.reset(seed=0)
+    arm, found = env.unwrapped, []
+    arm.contact_limits = ContactLimits()
+
+    def feel(_):
+        simulation = arm.simulation
+        hand, base = simulation.views.site_xpos[simulation.arms.site[0]], np.array([-0.56, 0.0, 0.912])
+        speed = simulation.hand_speeds(simulation.hand_twist(0)[None])[0]
+        found.append((np.hypot(*(hand - base)[:2]), speed, simulation.contact_forces[-1]))
+
+    arm.substep_hooks.append(feel)
+    for _ in range(150):
+        env.step(np.float32([-1, 0, -0.3, 0, 0, 0, 0]))  # towards itself
+    env.close()
+    distance, speed, force = np.array(found).T
+    assert speed[distance > BESIDE + 0.05].max() > 0.12
+    assert speed[distance < BESIDE - 0.05].max() < 0.1
+    assert 20.0 < force.max() < 280.0
 
 
 def test_what_is_fixed_to_the_world_belongs_to_it(lift):

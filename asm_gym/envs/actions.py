@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.robots import CHANGES, SLOWED, gripper_actions
 from asm_gym.envs.simulation import Simulation
 from asm_gym.validation import as_float32
+
+BESIDE = 0.3  # nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m]
 
 
 class Actions:
@@ -46,7 +49,11 @@ class Actions:
         """
         slow, rest, scaled = action, None, self.scaled(action)
         for a, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
-            simulation.speed_limits[a] = limits.hand_speed
+            views, arms = simulation.views, simulation.arms
+            place, base = views.site_xpos[arms.site[a]], views.xpos[arms.root[a]]
+            beside = math.dist(place[:2], base[:2]) < BESIDE
+            own = limits.stricter(1.0, limits.hand_speed / 2) if beside else limits
+            simulation.speed_limits[a] = own.hand_speed
             if controller.name not in SLOWED or controller.input_type != "delta":
                 continue
             least, most, middle, scale, offset = simulation.arms.scaling[a, :, : part.stop - part.start]
@@ -54,10 +61,10 @@ class Actions:
             delta = delta * (controller.kp / controller.kd)[: len(delta)]
             asked = simulation.hand_twist(a, delta, in_joints=controller.name == "JOINT_POSITION")
             twists = np.stack((asked, simulation.hand_twist(a)))
-            speeds, place = simulation.hand_speeds(twists), simulation.views.site_xpos[simulation.arms.site[a]]
-            share, now = limits.shares(a, place, twists, speeds, simulation.hand_momenta(a, twists))
+            speeds = simulation.hand_speeds(twists)
+            share, now = own.shares(a, place, twists, speeds, simulation.hand_momenta(a, twists))
             most = min(speeds[0] * share, speeds[1] * now if now < 1.0 else np.inf)
-            simulation.speed_limits[a] = max(limits.hand_speed, most)
+            simulation.speed_limits[a] = max(own.hand_speed, most)
             if share < 1.0:
                 rest = self.resting(simulation, action) if rest is None else rest
                 slow = slow.copy()
