@@ -63,7 +63,7 @@ class Args(LogOptions):
     bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
     """Longest gap without an alarm, by default two rows; rows in a gap are not judged."""
     wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
-    """How long to wait for the first row of a live source, or for one that died to return."""
+    """How long to wait for the first row of a live source, or for UDP or ROS 2 that died to return."""
     until_alarm: bool = False
     """End at the first alarm of a live source, with exit code 1: asm-gym watch ... --until-alarm || stop."""
     json: bool = False
@@ -168,6 +168,7 @@ def watch(args: Args, console: Console) -> int:
     lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
     with _watchdog(args, monitor.spec.dt) as watchdog:
         beat = None if watchdog is None else watchdog.beat
+        print(f"asm-gym: watching {args.source}{', guarded by a watchdog' if beat else ''}", file=sys.stderr)
         how = args.wait, args.until_alarm, beat, args.clock, args.silence
         alarms = follow(lines, monitor, say, bridge, again, *how)
     return BAD_NEWS if alarms else DONE
