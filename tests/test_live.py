@@ -69,6 +69,7 @@ def test_nested_json_and_units_are_read_as_from_a_file():
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+@pytest.mark.filterwarnings("ignore:.*Windows-1252")
 def test_text_of_any_encoding_is_read_as_from_a_file(encoding, tmp_path):
     path = tmp_path / "x.csv"
     rows = [f"{k / 50:.2f};{90 * np.sin(k / 9):.3f};{k % 7}".replace(".", ",") for k in range(60)]

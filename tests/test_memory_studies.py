@@ -80,11 +80,11 @@ def test_the_network_as_published_memorises_what_it_reads_side_by_side(monkeypat
     monkeypatch.setattr(memorise_and_recall, "PUBLISHED_RATE", 3e-3)
     train = copybook(repertoire(2, np.random.default_rng(0)), 1, np.random.default_rng(1))
     means, errors = mean_demonstrations(train), {}
-    for epochs in (1, 60):
-        model = memorise_and_recall.as_published(train, epochs, np.random.default_rng(2))
-        assert model.network.hidden_size == 32
-        errors[epochs] = recalled(model, train, means, STEPS)[0]
-    assert errors[60] < 0.5 * errors[1]
+    for epochs in (1, 120):
+        models = [memorise_and_recall.as_published(train, epochs, np.random.default_rng(seed)) for seed in (2, 3, 4)]
+        assert models[0].network.hidden_size == 32
+        errors[epochs] = np.median([recalled(model, train, means, STEPS)[0] for model in models])
+    assert errors[120] < 0.5 * errors[1]
 
 
 def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finite_differences():
