@@ -81,10 +81,10 @@ def observed_by(asm, state, rows):
     now = rows[:, senses]
     again, steps = now == before.row, evidence_steps(counted[:2])
     added = steps[before.again.astype(int), again.astype(int), np.arange(len(senses))]
-    unlikely = np.clip(before.unlikely + added, 0.0, counted[2] + 24.0)
+    unlikely = np.clip(before.unlikely + added, 0.0, counted[2] + 27.0)
     repetition = Repetition(now, again, unlikely)
     attribution, stuck = np.zeros(rows.shape), np.zeros(rows.shape)
-    attribution[:, senses], stuck[:, senses] = parts, repetition.ratios(counted[2])
+    attribution[:, senses], stuck[:, senses] = parts, repetition.ratios(counted[2] + 3.0)
     total = attribution.sum(axis=1, keepdims=True)
     pooled = pool(np.hstack([total, stuck]))[1]
     attribution = attribution * (pooled[:, :1] / np.maximum(total, TINY)) + pooled[:, 1:]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
 from asm_gym.detection.evidence import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, TINY, Evidence, ceilings, pool
-from asm_gym.detection.repetition import MOST_BEYOND, Repetition, count_repetitions, evidence_steps
+from asm_gym.detection.repetition import MOST_BEYOND, RARER, Repetition, count_repetitions, evidence_steps
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
 
@@ -99,7 +99,8 @@ class EvidenceDetection:
             raise ValueError(
                 f"the repetition of evidence should be {shape} numbers of at least 0, found {short_repr(counted)}"
             )
-        self.repeating = evidence_steps(counted[:2]), counted[2] + MOST_BEYOND, counted[2]
+        offset = counted[2] + RARER
+        self.repeating = evidence_steps(counted[:2]), offset + MOST_BEYOND, offset
         self.learned_, self.detector_ = learned, detector
         return self
 

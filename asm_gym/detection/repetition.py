@@ -3,6 +3,7 @@
     p_i = P(x_t,i = x_{t-1,i}), counted separately after a repetition and after a change
     n_t = max(0, n_{t-1} + log ρ/p) after a repetition, max(0, n_{t-1} + log (1 - ρ)/(1 - p)) after a change,
           and at most n_0 + 24, so that a sense that works again is believed within about ten rows
+    n_0 = 15, or where nominal episodes had more, 3 more than their largest: one twentieth as likely
     r_t = exp(ξ_0 (n_t - n_0)) where n_t > 0, else 0                 pooled with the ratios of ``evidence``
 
 n_t is the evidence for "it repeats itself with probability ρ" against "with p" (CUSUM). A sense is not watched if its
@@ -26,7 +27,8 @@ from asm_gym.detection.evidence import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
-REPETITION_OFFSET = 12.0  # n_0: one in 160,000, which among a hundred senses happens once in some thousand rows
+REPETITION_OFFSET = 12.0  # one in 160,000, which among a hundred senses happens once in some thousand rows
+RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal episodes
 MOST_BEYOND = 24.0  # largest n - n_0
 UNMOVED = 0.5  # noise below this many steps of the resolution leaves a reading where it is
 RESTS = 0.5  # a sense that repeats itself this often after a repetition is at rest now and then
@@ -73,7 +75,7 @@ def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.boo
 
 
 def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> Floats:
-    """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0.
+    """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0 - 3.
 
     ``streams`` are the senses (T, X) in nominal episodes, ``noisy`` (X,) those with declared noise.
     """

@@ -48,7 +48,7 @@ class Source(NamedTuple):
 
 
 PARTS: dict[str, tuple[Source, ...]] = {
-    "skills": tuple(Source(task, "scripted", 40, 100, 335, faults=True) for task in SKILLS),
+    "skills": tuple(Source(task, "scripted", 100, 100, 335, faults=True) for task in SKILLS),
     "hours": (
         *(Source("Lift", "lift_sac", nominal=1190), Source("Stack", "stack_sac", nominal=790)),
         *(Source("Door", "door_sac", nominal=790), Source("NutAssemblySquare", nominal=450)),

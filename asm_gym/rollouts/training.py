@@ -2,12 +2,15 @@
 
     cloning    L = mean (tanh μ(o) - a)²   over the expert's steps (Pomerleau 1991)
 
-The actor learns more slowly than the critics, so that cloned behaviour is improved and not forgotten.
+So that cloned behaviour is improved and not forgotten, critics first learn the value of the clone; they have layer
+normalisation, without which their values explode on actions that no demonstration shows (Ball et al. 2023, RLPD); the
+actor learns more slowly than they do; and an update of cloning follows each of its steps.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import itertools
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +24,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.sac.policies import SACPolicy
 
 from asm_gym.data.episode import Episode
 from asm_gym.policies.network import NetworkPolicy, describe
@@ -28,8 +32,9 @@ from asm_gym.rollouts.parallel import Progress
 
 ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
 ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
-BATCH, LOG_STD, CLONING_RATE = 256, -3.5, 1e-3
-"""Of cloning: batch size; the actor's log standard deviation before tanh; learning rate."""
+CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
+BATCH, LOG_STD, CLONING_RATE, ANCHOR_RATE = 256, -3.5, 1e-3, 3e-4
+"""Of cloning: batch size; the actor's log standard deviation before tanh; learning rate, before and while it acts."""
 
 Floats = NDArray[np.float32]
 
@@ -45,6 +50,19 @@ class Standardised(gym.ObservationWrapper[Floats, Any, Any]):
     def observation(self, observation: Any) -> Floats:
         """Return the standardised observation."""
         return np.asarray((observation - self.mean) / self.scale, np.float32)
+
+
+class NormalisedCritic(SACPolicy):
+    """SAC's policy, with critics that have layer normalisation after each hidden layer."""
+
+    def make_critic(self, features_extractor: Any = None) -> Any:
+        """Return the critics."""
+        critic: Any = super().make_critic(features_extractor)
+        for n, q in enumerate(critic.q_networks):
+            parts = [(p, torch.nn.LayerNorm(p.out_features)) if getattr(p, "out_features", 1) > 1 else (p,) for p in q]
+            critic.q_networks[n] = torch.nn.Sequential(*itertools.chain(*parts))
+            critic.add_module(f"qf{n}", critic.q_networks[n])
+        return critic
 
 
 class GuardedSAC(SAC):
@@ -65,7 +83,7 @@ class GuardedSAC(SAC):
 def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:
     """Return a learner whose actor is going to be cloned."""
     return GuardedSAC(
-        "MlpPolicy",
+        NormalisedCritic,
         env,
         learning_rate=3e-4,
         buffer_size=300_000,
@@ -106,8 +124,9 @@ def train(
         formats = ["csv"] + ["tensorboard"] * (importlib.util.find_spec("tensorboard") is not None)
         learner.set_logger(configure(str(out / "log"), formats))
         fill_buffer(learner, demonstrations, view)
-        clone(learner, cloning_updates, seed, progress)
+        anchor = clone(learner, cloning_updates, seed, progress)
         if steps:
+            warm_critics(learner, min(CRITIC_UPDATES, cloning_updates))
             judge = EvalCallback(
                 Monitor(Standardised(other, *standard)),
                 n_eval_episodes=evaluation_episodes,
@@ -118,11 +137,12 @@ def train(
             )
             judge.eval_env.seed(seed + 1)
 
-            def show(own: dict[str, Any], _: Any) -> bool:
+            def follow(own: dict[str, Any], _: Any) -> bool:
+                anchor()
                 progress(min(own["self"].num_timesteps, steps), steps)
                 return True
 
-            learner.learn(steps, [judge, ConvertCallback(show)])
+            learner.learn(steps, [judge, ConvertCallback(follow)])
         if steps >= evaluate_every:
             learner.set_parameters(str(out / "best_model.zip"))
         return export(learner, view)
@@ -153,12 +173,14 @@ def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -
             learner.replay_buffer.add(*row, [info])
 
 
-def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda done, total: None) -> None:
-    """Fit a learner's actor to the actions in its replay buffer."""
+def clone(
+    learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda done, total: None
+) -> Callable[[], None]:
+    """Fit a learner's actor to the actions in its replay buffer; return what makes one update more."""
     buffer, actor = learner.replay_buffer, learner.actor
     assert buffer is not None
-    observations = torch.as_tensor(buffer.observations[: buffer.size(), 0])
-    actions = torch.as_tensor(buffer.actions[: buffer.size(), 0])
+    observations = torch.as_tensor(buffer.observations[: buffer.size(), 0].copy())
+    actions = torch.as_tensor(buffer.actions[: buffer.size(), 0].copy())
     head: Any = actor.log_std
     with torch.no_grad():
         head.weight.zero_()
@@ -166,15 +188,28 @@ def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda
     optimiser = torch.optim.Adam([p for name, p in actor.named_parameters() if "log_std" not in name], lr=CLONING_RATE)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
     batches = torch.Generator().manual_seed(seed)
-    for n in range(updates):
+
+    def update() -> None:
         drawn = torch.randint(len(actions), (BATCH,), generator=batches)
         mean = torch.tanh(actor.get_action_dist_params(observations[drawn])[0])
-        loss = ((mean - actions[drawn]) ** 2).mean()
         optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        ((mean - actions[drawn]) ** 2).mean().backward()
         optimiser.step()
+
+    for n in range(updates):
+        update()
         decay.step()
         progress(n + 1, updates)
+    for group in optimiser.param_groups:
+        group["lr"] = ANCHOR_RATE
+    return update
+
+
+def warm_critics(learner: SAC, updates: int) -> None:
+    """Teach the critics the value of the actor, while the actor stays as it is."""
+    learner.actor.requires_grad_(False)
+    learner.train(updates, BATCH)
+    learner.actor.requires_grad_(True)
 
 
 def export(learner: SAC, view: Standardised) -> NetworkPolicy:
