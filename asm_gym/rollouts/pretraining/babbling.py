@@ -45,7 +45,7 @@ SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 NOISE = 0.02, 0.2  # range of s, up to about the exploration of a half-trained agent [action units]
 SPEED, WEIGHT = (0.5, 1.5), (0.7, 1.4)  # speed of the expert, relative to its usual one; factor of an object's mass
 PAUSE, PAUSED = 0.01, (5, 60)  # probability per step that the arm stops, and for how many steps
-DRIFT, DRIFTED, DRIFTING = 0.01, (5, 60), (0.05, 0.5)
+DRIFT, DRIFTED, DRIFTING = 0.015, (5, 60), (0.05, 1.0)
 """Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
 PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
 """Probability per step that an object gripped for ``HELD`` steps is pressed, steps, and command [action units]."""
