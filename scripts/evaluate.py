@@ -63,7 +63,7 @@ class Args(Options):
     """Kinds of fault, by default all; development or test for one half of the suite."""
     severities: tuple[str, ...] = option(SEVERITIES, quick=("strong",), least=1, known=SEVERITIES)
     """Severities of each fault."""
-    fit_episodes: int = option(60, quick=16, least=1)
+    fit_episodes: int = option(100, quick=16, least=1)
     """Nominal episodes of each task to learn from."""
     calibration_episodes: int = option(60, quick=10, least=1)
     """Other nominal episodes of each task, which set one threshold for all tasks."""

@@ -52,7 +52,12 @@ PARTS: dict[str, tuple[Source, ...]] = {
     "hours": (
         *(Source("Lift", "lift_sac", nominal=1190), Source("Stack", "stack_sac", nominal=790)),
         *(Source("Door", "door_sac", nominal=790), Source("NutAssemblySquare", nominal=450)),
-        *(Source("PickPlaceBread", nominal=400), Source("PickPlaceCereal", nominal=400)),
+        *(
+            Source(f"PickPlace{kind}", f"{kind.lower()}_clone", nominal=400)
+            for kind in ("Can", "Milk", "Bread", "Cereal")
+        ),
+        *(Source(f"NutAssembly{kind}", f"{kind.lower()}_clone", nominal=400) for kind in ("Round", "Square")),
+        *(Source(f"PickPlace{kind}", nominal=400) for kind in ("Bread", "Cereal")),
     ),
 }
 """Six skills of experts, to learn, to calibrate and to test on; and healthy motion of agents and in other tasks."""
