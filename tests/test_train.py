@@ -87,6 +87,14 @@ def test_an_agent_is_cloned_improved_and_judged(tmp_path):
         train(partial(gym.make, "MountainCarContinuous-v0"), tmp_path, linear_expert(), **how)
 
 
+@pytest.mark.slow
+def test_what_was_cloned_is_not_lost_while_it_is_improved(tmp_path):
+    few = ["--demonstrations", "60", "--cloning-updates", "4000", "--final-episodes", "20"]
+    judged = ["--steps", "400", "--evaluate-every", "200", "--evaluation-episodes", "4"]
+    assert main(["train", "Lift", *few, *judged, "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "result.json").read_text())["success"] >= 0.5  # 0 where SAC destroys the clone
+
+
 def test_the_command_clones_an_expert(tmp_path):
     assert main(["train", "Lift", "--quick", "--steps", "0", "--out", str(tmp_path)]) == 0
     assert json.loads((tmp_path / "result.json").read_text())["episodes"] == 2

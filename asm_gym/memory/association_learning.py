@@ -40,7 +40,7 @@ from asm_gym.memory.linear import inverse_of, learn_from_past, learn_linear
 
 FEEDBACK_GAIN = 1e-3  # initial gain of B
 DECAY = 0.3  # share of its step size by which a synapse of U or B decays
-UPDATES, PASSES, BATCH = 6000, 40, 256  # largest number of batches, and of passes over the rows; rows of a batch
+UPDATES, PASSES, BATCH = 20_000, 40, 256  # largest number of batches, and of passes over the rows; rows of a batch
 RATE, WARM_UP = 5e-3, 0.1  # step size, and share of the updates in which it rises; after that it falls along a cosine
 TICKS = 20  # progress reports of one learning of the hidden units
 ROWS_PER_INPUT = 12  # with fewer rows for each input, the senses are not predicted from each other

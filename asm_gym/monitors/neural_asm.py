@@ -87,7 +87,7 @@ class NeuralASM(CalibratedMonitor):
         self,
         spec: StreamSpec,
         hidden_size: int = 256,
-        association_size: int = 240,
+        association_size: int = 480,
         epochs: int = 40,
         free_running_probability: float = 0.0,
         habituates: bool = True,
