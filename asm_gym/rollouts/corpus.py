@@ -52,11 +52,9 @@ PARTS: dict[str, tuple[Source, ...]] = {
     "hours": (
         *(Source("Lift", "lift_sac", nominal=1190), Source("Stack", "stack_sac", nominal=790)),
         *(Source("Door", "door_sac", nominal=790), Source("NutAssemblySquare", nominal=450)),
-        *(
-            Source(f"PickPlace{kind}", f"{kind.lower()}_clone", nominal=400)
-            for kind in ("Can", "Milk", "Bread", "Cereal")
-        ),
-        *(Source(f"NutAssembly{kind}", f"{kind.lower()}_clone", nominal=400) for kind in ("Round", "Square")),
+        *(Source("PickPlaceCan", "can_clone", nominal=300), Source("PickPlaceMilk", "milk_clone", nominal=300)),
+        *(Source("PickPlaceBread", "bread_clone", nominal=300), Source("PickPlaceCereal", "cereal_clone", nominal=400)),
+        Source("NutAssemblySquare", "square_clone", nominal=400),
         *(Source(f"PickPlace{kind}", nominal=400) for kind in ("Bread", "Cereal")),
     ),
 }
