@@ -15,8 +15,7 @@ sys.path.insert(0, str(HERE.parent))
 from asm_gym import __version__  # noqa: E402
 from asm_gym.scripts.cli import COMMANDS  # noqa: E402
 
-project = "asm-gym"
-author = "the asm-gym authors"
+project = html_title = "asm-gym"
 release = version = __version__
 
 extensions = ["myst_parser", "sphinx.ext.apidoc", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
@@ -36,17 +35,13 @@ apidoc_modules = [
     }
 ]
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}
-napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
 html_theme = "furo"
-html_title = "asm-gym"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_show_copyright = False
 
 
 def write_commands(app: Sphinx) -> None:

@@ -2,9 +2,8 @@
 
     cloning    L = mean (tanh μ(o) - a)²   over the expert's steps (Pomerleau 1991)
 
-So that cloned behaviour is improved and not forgotten, critics first learn the value of the clone; they have layer
-normalisation, without which their values explode on actions that no demonstration shows (Ball et al. 2023, RLPD); the
-actor learns more slowly than they do; and an update of cloning follows each of its steps.
+So that the clone is not forgotten, critics learn its value first, with layer normalisation, or values explode where no
+action was shown (Ball et al. 2023, RLPD); the actor learns slowly, and an update of cloning follows each of its steps.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ from asm_gym.rollouts.parallel import Progress
 ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
 ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
 CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
-BATCH, LOG_STD, CLONING_RATE, ANCHOR_RATE = 256, -3.5, 1e-3, 3e-4
-"""Of cloning: batch size; the actor's log standard deviation before tanh; learning rate, before and while it acts."""
+BATCH, LOG_STD = 256, -3.5  # of cloning, and the actor's log standard deviation before tanh
+CLONING_RATE, ANCHOR_RATE = 1e-3, 3e-4  # learning rates of cloning, before and while the agent learns from its steps
 
 Floats = NDArray[np.float32]
 
@@ -126,7 +125,9 @@ def train(
         fill_buffer(learner, demonstrations, view)
         anchor = clone(learner, cloning_updates, seed, progress)
         if steps:
-            warm_critics(learner, min(CRITIC_UPDATES, cloning_updates))
+            learner.actor.requires_grad_(False)
+            learner.train(min(CRITIC_UPDATES, cloning_updates), BATCH)
+            learner.actor.requires_grad_(True)
             judge = EvalCallback(
                 Monitor(Standardised(other, *standard)),
                 n_eval_episodes=evaluation_episodes,
@@ -173,9 +174,7 @@ def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -
             learner.replay_buffer.add(*row, [info])
 
 
-def clone(
-    learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda done, total: None
-) -> Callable[[], None]:
+def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda *_: None) -> Callable[[], None]:
     """Fit a learner's actor to the actions in its replay buffer; return what makes one update more."""
     buffer, actor = learner.replay_buffer, learner.actor
     assert buffer is not None
@@ -193,23 +192,15 @@ def clone(
         drawn = torch.randint(len(actions), (BATCH,), generator=batches)
         mean = torch.tanh(actor.get_action_dist_params(observations[drawn])[0])
         optimiser.zero_grad()
-        ((mean - actions[drawn]) ** 2).mean().backward()
+        ((mean - actions[drawn]) ** 2).mean().backward()  # type: ignore[no-untyped-call]
         optimiser.step()
 
     for n in range(updates):
         update()
         decay.step()
         progress(n + 1, updates)
-    for group in optimiser.param_groups:
-        group["lr"] = ANCHOR_RATE
+    optimiser.param_groups[0]["lr"] = ANCHOR_RATE
     return update
-
-
-def warm_critics(learner: SAC, updates: int) -> None:
-    """Teach the critics the value of the actor, while the actor stays as it is."""
-    learner.actor.requires_grad_(False)
-    learner.train(updates, BATCH)
-    learner.actor.requires_grad_(True)
 
 
 def export(learner: SAC, view: Standardised) -> NetworkPolicy:
