@@ -40,7 +40,7 @@ autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-mo
 napoleon_use_ivar = True
 
 html_theme = "furo"
-html_static_path = ["_static"]
+html_static_path, html_show_copyright = ["_static"], False
 html_css_files = ["site.css"]
 
 
