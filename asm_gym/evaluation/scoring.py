@@ -16,15 +16,18 @@ from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.evidence import FEWEST_EPISODES
+from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
-from asm_gym.monitors.calibration import AlarmRate
+from asm_gym.monitors.calibration import AlarmRate, learn_ceilings
 from asm_gym.version import __version__
 
+FOR_CEILINGS = 3
 NOMINAL_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
@@ -100,9 +103,16 @@ def benchmark(
 def judged(
     name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float, window_s: float
 ) -> DetectionMetrics:
-    """Calibrate a fitted monitor, and score the nominal and faulty episodes."""
-    monitor.calibrate(by_role["calibration"], rate)
-    rates = sorted({rate, *(r for r in RATES if len(by_role["calibration"]) >= conformal_episodes(r))})
+    """Calibrate a fitted monitor, and score the nominal and faulty episodes.
+
+    One in ``FOR_CEILINGS`` calibration episodes sets the ceilings of senses, where there are enough.
+    """
+    fresh = by_role["calibration"]
+    if isinstance(monitor.detection, EvidenceDetection) and len(fresh[::FOR_CEILINGS]) >= FEWEST_EPISODES:
+        learn_ceilings(monitor, fresh[::FOR_CEILINGS])
+        fresh = [episode for n, episode in enumerate(fresh) if n % FOR_CEILINGS]
+    monitor.calibrate(fresh, rate)
+    rates = sorted({rate, *(r for r in RATES if len(fresh) >= conformal_episodes(r))})
     hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
     promises = [AlarmRate(r, EPISODE) for r in rates] + [AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0]
     calibration = Calibration(
