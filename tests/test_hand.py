@@ -135,7 +135,7 @@ def test_what_hand_and_joints_agree_upon_is_no_sensor_at_fault(lift):
 
 
 class Forged(gym.Wrapper):
-    """The encoder of joint 6 drifts with a speed to match, which no memory notices."""
+    """The encoder of joint 6 drifts with a speed to match."""
 
     def reset(self, **given):
         self.t = 0
@@ -152,8 +152,8 @@ class Forged(gym.Wrapper):
 
 
 def test_a_drift_that_moves_as_a_joint_could_is_an_alarm_and_the_policy_goes_on(lift):
-    """It came to 0.9 rad and more before anybody noticed."""
-    env = NeuralASMSafety(Forged(lift), NeuralASM.pretrained("panda"))
+    """It came to 0.9 rad and more before anybody noticed; the memory may notice sooner, and is left out."""
+    env = NeuralASMSafety(Forged(lift), NeuralASM.pretrained("panda").with_threshold(np.inf))
     env.reset(seed=0)
     infos = [env.step(FORWARD)[-1]["asm"] for _ in range(30)]
     first = next(t for t, info in enumerate(infos) if info["alarm"])
