@@ -153,7 +153,7 @@ class Forged(gym.Wrapper):
 
 def test_a_drift_that_moves_as_a_joint_could_is_an_alarm_and_the_policy_goes_on(lift):
     """It came to 0.9 rad and more before anybody noticed; the memory may notice sooner, and is left out."""
-    env = NeuralASMSafety(Forged(lift), NeuralASM.pretrained("panda").with_threshold(np.inf))
+    env = NeuralASMSafety(Forged(lift), NeuralASM.pretrained("panda").with_threshold(1e9))
     env.reset(seed=0)
     infos = [env.step(FORWARD)[-1]["asm"] for _ in range(30)]
     first = next(t for t, info in enumerate(infos) if info["alarm"])
