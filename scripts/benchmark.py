@@ -9,7 +9,6 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, repeat
@@ -93,8 +92,6 @@ def measure_monitor(args: Args, console: Console) -> Table:
     spec, rng = StreamSpec((*senses, Channel("action", 7, group=MOTOR)), dt=0.05), np.random.default_rng(args.seed)
     learned = [Episode.from_stream(rng.normal(size=(60, spec.size)), spec) for _ in range(60)]  # enough for all parts
     memory = NeuralASM(spec, epochs=1).fit(learned)
-    sure = deepcopy(memory)
-    sure.model.restore({**sure.model.learned_, "R": np.zeros((0, len(sure.model.learned_["R"])), np.float32)})
     gru = make_monitor("gru+evidence", spec, hidden_size=256).fit(learned[:8])
 
     def observing(monitor: Any, batch: int = 1) -> Callable[[], None]:
@@ -107,8 +104,7 @@ def measure_monitor(args: Args, console: Console) -> Table:
         return call
 
     many, rival = "neural_asm, each of 64 streams", "gru+evidence"
-    ours = {"neural_asm, one stream": observing(memory), "the same without doubt": observing(sure)}
-    rivals = {**ours, many: observing(memory, 64), rival: observing(gru)}
+    rivals = {"neural_asm, one stream": observing(memory), many: observing(memory, 64), rival: observing(gru)}
     with threadpool_limits(1):
         seconds = take_turns(rivals, 5 * args.steps, args.seed, console)
     seconds[many] /= 64

@@ -17,7 +17,6 @@ from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.detection.evidence import FEWEST_EPISODES
-from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
@@ -27,7 +26,7 @@ from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_
 from asm_gym.monitors.calibration import AlarmRate, learn_ceilings
 from asm_gym.version import __version__
 
-FOR_CEILINGS = 3
+FOR_CEILINGS = 3  # one in so many calibration episodes
 NOMINAL_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
@@ -103,12 +102,9 @@ def benchmark(
 def judged(
     name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float, window_s: float
 ) -> DetectionMetrics:
-    """Calibrate a fitted monitor, and score the nominal and faulty episodes.
-
-    One in ``FOR_CEILINGS`` calibration episodes sets the ceilings of senses, where there are enough.
-    """
+    """Calibrate a fitted monitor, its ceilings by some of the episodes if there are enough, and score all others."""
     fresh = by_role["calibration"]
-    if isinstance(monitor.detection, EvidenceDetection) and len(fresh[::FOR_CEILINGS]) >= FEWEST_EPISODES:
+    if hasattr(monitor.detection, "with_ceilings") and len(fresh[::FOR_CEILINGS]) >= FEWEST_EPISODES:
         learn_ceilings(monitor, fresh[::FOR_CEILINGS])
         fresh = [episode for n, episode in enumerate(fresh) if n % FOR_CEILINGS]
     monitor.calibrate(fresh, rate)

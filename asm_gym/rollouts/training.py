@@ -8,10 +8,10 @@ action was shown (Ball et al. 2023, RLPD); the actor learns slowly, and an updat
 
 from __future__ import annotations
 
-import importlib.util
 import itertools
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -120,8 +120,7 @@ def train(
         standard = observations.mean(axis=0), np.where(spread > 1e-3, spread, 1.0).astype(np.float32)
         view = Standardised(env, *standard)
         learner = make_learner(Monitor(view), seed)
-        formats = ["csv"] + ["tensorboard"] * (importlib.util.find_spec("tensorboard") is not None)
-        learner.set_logger(configure(str(out / "log"), formats))
+        learner.set_logger(configure(str(out / "log"), ["csv", *["tensorboard"] * bool(find_spec("tensorboard"))]))
         fill_buffer(learner, demonstrations, view)
         anchor = clone(learner, cloning_updates, seed, progress)
         if steps:
