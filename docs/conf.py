@@ -40,8 +40,9 @@ autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-mo
 napoleon_use_ivar = True
 
 html_theme = "furo"
-html_static_path, html_show_copyright = ["_static"], False
+html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_show_copyright = False
 
 
 def write_commands(app: Sphinx) -> None:

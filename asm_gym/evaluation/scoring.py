@@ -14,9 +14,9 @@ import numpy as np
 
 from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
-from asm_gym.detection import conformal_episodes
-from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.detection.conformal import EPISODE, HOUR, conformal_episodes
 from asm_gym.detection.evidence import FEWEST_EPISODES
+from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
@@ -104,7 +104,7 @@ def judged(
 ) -> DetectionMetrics:
     """Calibrate a fitted monitor, its ceilings by some of the episodes if there are enough, and score all others."""
     fresh = by_role["calibration"]
-    if hasattr(monitor.detection, "with_ceilings") and len(fresh[::FOR_CEILINGS]) >= FEWEST_EPISODES:
+    if isinstance(monitor.detection, EvidenceDetection) and len(fresh[::FOR_CEILINGS]) >= FEWEST_EPISODES:
         learn_ceilings(monitor, fresh[::FOR_CEILINGS])
         fresh = [episode for n, episode in enumerate(fresh) if n % FOR_CEILINGS]
     monitor.calibrate(fresh, rate)

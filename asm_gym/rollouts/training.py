@@ -8,7 +8,6 @@ action was shown (Ball et al. 2023, RLPD); the actor learns slowly, and an updat
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from importlib.util import find_spec
@@ -59,7 +58,7 @@ class NormalisedCritic(SACPolicy):
         critic: Any = super().make_critic(features_extractor)
         for n, q in enumerate(critic.q_networks):
             parts = [(p, torch.nn.LayerNorm(p.out_features)) if getattr(p, "out_features", 1) > 1 else (p,) for p in q]
-            critic.q_networks[n] = torch.nn.Sequential(*itertools.chain(*parts))
+            critic.q_networks[n] = torch.nn.Sequential(*(layer for some in parts for layer in some))
             critic.add_module(f"qf{n}", critic.q_networks[n])
         return critic
 
