@@ -128,16 +128,8 @@ def _fill_settings(arms: Arms, a: int, model: mujoco.MjModel, controller: Any) -
 
 
 def _carried_dofs(model: mujoco.MjModel, robot: Any) -> Ints:
-    """Return the dofs of the arm and of everything fixed to it."""
-    first = min(robot._ref_joint_vel_indexes)
-    found = []
-    for dof in range(model.nv):
-        j = dof
-        while j > first:
-            j = model.dof_parentid[j]
-        if j == first:
-            found.append(dof)
-    return np.array(found, np.int64)
+    """Return the dofs of the robot and of everything fixed to it: MuJoCo numbers each tree of bodies that move."""
+    return np.flatnonzero(model.dof_treeid == model.dof_treeid[robot._ref_joint_vel_indexes[0]]).astype(np.int64)
 
 
 def _padded(rows: list[Ints]) -> Ints:
@@ -157,7 +149,8 @@ def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[C
         joints = np.asarray(robot._ref_joint_indexes)
         body = model.body(robot.robot_model.eef_name[arm]).id
         turns = model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_HINGE)
-        if set(_joints_between(model, body)) != set(joints.tolist()) or not turns.all():
+        between = np.flatnonzero(np.isin(model.jnt_bodyid, _links(model, body)))  # joints from world to hand
+        if set(between.tolist()) != set(joints.tolist()) or not turns.all():
             continue
         turn = data.xmat[body].reshape(3, 3)
         hand = np.stack([data.site_xpos[robot.eef_site_id[arm]], turn[:, 0], turn[:, 1]])
@@ -166,16 +159,6 @@ def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[C
         late = 1.0 / PHYSICS_FREQ
         found.append(Chain(prefix, data.xaxis[joints].copy(), data.xanchor[joints].copy(), hand, late, max(noise, 1.0)))
     return tuple(found)
-
-
-def _joints_between(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the joints between a body and the world."""
-    found: list[int] = []
-    while body:
-        first = int(model.body_jntadr[body])
-        found += range(first, first + int(model.body_jntnum[body])) if first >= 0 else ()
-        body = int(model.body_parentid[body])
-    return found
 
 
 class NominalDynamics:
