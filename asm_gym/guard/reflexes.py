@@ -85,7 +85,7 @@ class Reflexes:
     def __init__(self, robots: Robots, spec: StreamSpec, on_alarm: str) -> None:
         n, actions = robots.count, robots.rest.size
         wanted = ("hold", "retract", "comply") if on_alarm == GRADED else (on_alarm,)
-        self.torques = named(spec, "external_torque")  # (J,) columns of external torques
+        self.torques = named(spec.channels, "external_torque")  # (J,) columns of external torques
         lacks = dict(robots.refused)
         if not self.torques.size:
             lacks.setdefault("comply", NO_TORQUE)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -22,9 +22,9 @@ SMALLEST = 1e-6  # of a number of an action that can be slowed
 NOTHING: Mapping[int, Any] = MappingProxyType({})  # where there is nothing to say of any robot
 
 
-def named(spec: StreamSpec, channel: str) -> NDArray[np.intp]:
-    """Return (N,) the columns of a channel, of all arms."""
-    return np.array([i for i, label in enumerate(spec.labels) if label.split("[")[0].endswith(channel)], np.intp)
+def named(channels: Sequence[Channel], ending: str, size: int | None = None) -> NDArray[np.intp]:
+    """Return (N,) the columns of channels whose names end so, of all arms; of a ``size`` alone where one is given."""
+    return np.flatnonzero([c.name.endswith(ending) and size in (None, c.size) for c in channels for _ in range(c.size)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.guard.arbiter import CALM, FREE, MOSTLY_AFTER, POLICY, ROWS, SINCE, STRIKES, Arbiter
+from asm_gym.guard.robots import named
 from asm_gym.monitors import Surprise
 from asm_gym.spec import Channel, StreamSpec
 
@@ -84,21 +85,9 @@ class Severity(NamedTuple):
         return Severity(felt, numbers, self.presses & known, self.held & known)
 
 
-def _columns(channels: Sequence[Channel], ending: str) -> list[NDArray[np.intp]]:
-    """Return where the numbers of the channels stand whose names end so, in the order of ``channels``."""
-    ends = np.cumsum([0, *(c.size for c in channels)])
-    return [np.arange(ends[i], ends[i + 1]) for i, c in enumerate(channels) if c.name.endswith(ending)]
-
-
-def _vectors(channels: Sequence[Channel], ending: str) -> NDArray[np.intp]:
-    """Return (N, 3) the columns of such channels that are vectors."""
-    return np.array([own for own in _columns(channels, ending) if own.size == 3], np.intp).reshape(-1, 3)
-
-
 def _forces(channels: Sequence[Channel]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the columns that tell of a contact force: (W, 3) forces at wrists, and (J,) external torques."""
-    torques = np.concatenate([np.zeros(0, np.intp), *_columns(channels, "external_torque")])
-    return _vectors(channels, "wrist_force"), torques.astype(np.intp)
+    return named(channels, "wrist_force", 3).reshape(-1, 3), named(channels, "external_torque")
 
 
 @inner
@@ -216,7 +205,8 @@ class SeverityEstimator:
     """
 
     def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], arbiter: Arbiter) -> None:
-        columns = *_forces(felt), *_forces(spec.channels), _vectors(spec.channels, "hand_velocity")
+        hands = named(spec.channels, "hand_velocity", 3).reshape(-1, 3)
+        columns = *_forces(felt), *_forces(spec.channels), hands
         self._pressed, self._no_excuse = np.zeros((2, count)), np.zeros(count, np.int8)
         self._weights = np.zeros((2, count, max(len(columns[0]), len(columns[2])), 4))  # by what is felt, and by rows
         state = self._pressed, self._weights, np.zeros((len(columns[4]), 4))
