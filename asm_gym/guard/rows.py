@@ -217,31 +217,14 @@ class StaleSenses:
 
 
 @partial(compiled, calls=("detection", "."))
-def _take_in(
-    rows: Any,
-    history: Any,
-    end: int,
-    seen: Any,
-    at: Any,
-    axes: Any,
-    anchors: Any,
-    hand: Any,
-    late: Any,
-    weights: Any,
-    gain: float,
-    cap: float,
-    limit: float,
-    mean: Any,
-    size: Any,
-    whole: Any,
-    recent: Any,
-    kept: Any,
-    good: Any,
-) -> int:
+def _take_in(rows: Any, history: Any, end: int, seen: Any, at: Any, *known: Any) -> int:
     """Write rows (n, D) into what is kept of each robot (n, T, D), and compare the hand of the first arm.
 
+    Args:
+        at, known: of ``compare``.
+
     Returns:
-        1 where a number is not finite, and 2 more where ``compare``, whose arguments begin with ``at``, says so.
+        1 where a number is not finite, and 2 more where ``compare`` says so.
     """
     finite = True
     for n in range(len(rows)):
@@ -250,8 +233,6 @@ def _take_in(
             history[n, end, i] = rows[n, i]
             finite = finite and np.isfinite(rows[n, i])
     found = 0 if finite else 1
-    if len(at) and compare(
-        rows, at, axes, anchors, hand, late, weights, gain, cap, limit, mean, size, whole, recent, kept, good
-    ):
+    if len(at) and compare(rows, at, *known):
         found += 2
     return found
