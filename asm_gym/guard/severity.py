@@ -127,40 +127,21 @@ def contact_force(numbers: Any, wrists: Any, torques: Any, weights: Any, steps: 
 
 
 @partial(compiled, calls=("detection", "."))
-def _weigh(
-    rows: Any,
-    felt: Any,
-    felt_wrists: Any,
-    felt_torques: Any,
-    wrists: Any,
-    torques: Any,
-    hands: Any,
-    dt: float,
-    leans_s: float,
-    most_impulse: float,
-    pressed: Any,
-    weights: Any,
-    nothing: Any,
-    value: Any,
-    raw: Any,
-    excuse: Any,
-    threshold: Any,
-    state: Any,
-    counts: Any,
-    largest: Any,
-    active: Any,
-    decides: Any,
-    numbers: Any,
-    presses: Any,
-    over: Any,
-    event: Any,
-) -> int:
+def _weigh(rows: Any, felt: Any, how: Any, judged: Any, counted: Any, active: Any, decides: Any, written: Any) -> int:
     """Judge rows (n, D), and count those about which there is nothing to decide; return how many there are to decide.
 
-    The impulse and the time that each arm has leant, ``pressed`` (2, n), and ``weights`` (2, n, W, 4) move on;
-    ``decides`` (n,) gets more, and
-    ``numbers``, ``presses``, ``over`` and ``event`` are written.
+    Args:
+        how: columns, times and limits. The impulse and the time that each arm has leant, ``pressed`` (2, n), and
+            ``weights`` (2, n, W, 4) move on.
+        judged: (n,) surprise, the same before anything excused it, and what did.
+        counted: by the arbiter, which goes on counting.
+        decides: (n,) gets more.
+        written: the numbers (n, 3) of ``Severity``, and (n,) what presses, is over its threshold, and is excused.
     """
+    felt_wrists, felt_torques, wrists, torques, hands, dt, leans_s, most_impulse, pressed, weights, nothing = how
+    value, raw, excuse = judged
+    threshold, state, counts, largest = counted
+    numbers, presses, over, event = written
     some = 0
     for n in range(len(rows)):
         load, left_s = felt[n, 0], felt[n, 1]
@@ -237,6 +218,6 @@ class SeverityEstimator:
         value, raw, excuse, empty, n = surprise.value, surprise.raw, surprise.excuse, np.empty, len(rows)
         numbers, presses, over, event = empty((n, 3)), empty(n, bool), empty(n, bool), empty(n, np.int8)
         judged: tuple[Any, ...] = value, value if raw is None else raw, self._no_excuse if excuse is None else excuse
-        arguments = *self._how, *judged, *self._arbiter, active, decides, numbers, presses, over, event
-        some = _weigh(rows, felt, *arguments)
+        written = numbers, presses, over, event
+        some = _weigh(rows, felt, self._how, judged, self._arbiter, active, decides, written)
         return Severity(felt, numbers, presses, held), over, event, some
