@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from asm_gym.memory.learning import Trajectory
 from asm_gym.monitors.baselines.networks import adam, descend
@@ -34,12 +35,8 @@ class Batch(NamedTuple):
 
 def side_by_side(trajectories: Sequence[Trajectory]) -> Batch:
     """Stack episodes along a new second axis; those that end before the longest are NaN from then on."""
-    longest = max(len(t.senses) for t in trajectories)
-
-    def whole(rows: Array) -> Array:
-        return np.pad(rows, ((0, longest - len(rows)), (0, 0)), constant_values=np.nan)
-
-    return Batch(*(np.stack([whole(getattr(t, name)) for t in trajectories], axis=1) for name in Batch._fields))
+    rows = ([torch.from_numpy(getattr(t, name)) for t in trajectories] for name in Batch._fields)
+    return Batch(*(pad_sequence(own, padding_value=np.nan).numpy() for own in rows))
 
 
 def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> list[Batch]:
