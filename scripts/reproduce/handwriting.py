@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 import string
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ DT = 1.0 / STEPS  # control period [s]: a letter takes 1 s at normal speed
 NOISE = 0.02  # standard deviation of the pen's sensed position [cm]; letters are about 5 cm large
 MU = -1.75  # mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset
 WOBBLE = 0.04  # variation of a stroke between writings, as a share of its length and in radians of its direction
+STROKES = (2.0, -math.pi, -2.5, -0.02, 0.25), (5.0, math.pi, 2.5, 0.02, 0.4)
+"""Bounds of what is drawn of a stroke, as ``Letter`` holds it; its onset goes on by 0.19 s."""
 FINE = 8  # samples of the velocity in a step, whose mean is commanded
 PEN = StreamSpec(
     (
@@ -42,23 +44,11 @@ PEN = StreamSpec(
 )
 
 
-@dataclass(frozen=True)
-class Stroke:
-    """A stroke: length [cm], direction and turn [rad], onset [s], and σ."""
-
-    length: float
-    direction: float
-    turn: float
-    onset: float
-    sigma: float
-
-
-@dataclass(frozen=True)
-class Letter:
+class Letter(NamedTuple):
     """A skill: overlapping strokes."""
 
     name: str
-    strokes: tuple[Stroke, ...]
+    strokes: NDArray[np.float64]  # (S, 5) of each its length [cm], direction and turn [rad], onset [s], and σ
 
 
 check_letters = partial(check_number, "letters", low=1, high=len(NAMES), whole=True)
@@ -67,48 +57,32 @@ check_letters = partial(check_number, "letters", low=1, high=len(NAMES), whole=T
 def repertoire(count: int, rng: np.random.Generator) -> list[Letter]:
     """Return ``count`` letters drawn at random, four strokes each; ValueError for more than there are names."""
     check_letters(count)
-
-    def stroke(number: int) -> Stroke:
-        return Stroke(
-            length=float(rng.uniform(2.0, 5.0)),
-            direction=float(rng.uniform(-math.pi, math.pi)),
-            turn=float(rng.uniform(-2.5, 2.5)),
-            onset=0.19 * number + float(rng.uniform(-0.02, 0.02)) - 0.05,
-            sigma=float(rng.uniform(0.25, 0.4)),
-        )
-
-    return [Letter(name, tuple(stroke(n) for n in range(4))) for name in NAMES[:count]]
+    strokes = rng.uniform(*STROKES, (count, 4, 5))
+    strokes[:, :, 3] = 0.19 * np.arange(4) + strokes[:, :, 3] - 0.05
+    return [Letter(name, own) for name, own in zip(NAMES[:count], strokes, strict=True)]
 
 
 def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the velocity (T, 2) [cm/s] of the pen at times (T,) [s] since the letter began."""
     total = np.zeros((len(time), 2))
-    for s in letter.strokes:
-        since = np.maximum(time - s.onset, 1e-9)
-        place = (np.log(since) - MU) / s.sigma
-        speed = s.length * np.exp(-0.5 * place**2) / (since * s.sigma * math.sqrt(2 * math.pi))
-        angle = s.direction + s.turn * 0.5 * (1 + erf(place / math.sqrt(2)))
+    for length, direction, turn, onset, sigma in letter.strokes:
+        since = np.maximum(time - onset, 1e-9)
+        place = (np.log(since) - MU) / sigma
+        speed = length * np.exp(-0.5 * place**2) / (since * sigma * math.sqrt(2 * math.pi))
+        angle = direction + turn * 0.5 * (1 + erf(place / math.sqrt(2)))
         total += speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return total
 
 
 def written(letter: Letter, rng: np.random.Generator, speed: float = 1.0, wobble: float = WOBBLE) -> Episode:
     """Write the letter once, ``speed`` times as fast as usual."""
-
-    def varied(s: Stroke) -> Stroke:
-        length, direction, turn, _, onset = wobble * rng.standard_normal(5)
-        return replace(
-            s,
-            length=s.length * (1 + length),
-            direction=s.direction + direction,
-            turn=s.turn + turn,
-            onset=s.onset + 0.1 * onset,
-        )
-
-    letter = replace(letter, strokes=tuple(map(varied, letter.strokes)))
+    strokes = letter.strokes.copy()
+    length, direction, turn, _, onset = wobble * rng.standard_normal(strokes.shape).T
+    strokes[:, 0] *= 1 + length
+    strokes[:, 1:4] += np.stack([direction, turn, 0.1 * onset], axis=1)
     steps = round(STEPS / speed)
     time = (np.arange(FINE * steps) + 0.5) * DT * speed / FINE  # the position is the integral, not a sum of samples
-    v = speed * velocity(letter, time).reshape(steps, FINE, 2).mean(axis=1)
+    v = speed * velocity(Letter(letter.name, strokes), time).reshape(steps, FINE, 2).mean(axis=1)
     position = np.cumsum(v, axis=0) * DT + NOISE * rng.standard_normal((steps, 2))
     return Episode.from_stream(np.hstack([position, v]), PEN, info={"skill": letter.name})
 
