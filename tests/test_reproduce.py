@@ -18,17 +18,6 @@ from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import STUDIES, hours, kit, memorise_and_recall
 
 
-def test_a_difference_is_paired_by_seed_and_has_students_interval():
-    records = [
-        {"seed": s, "m": m, "x": x} for m, values in (("a", (3, 9, 6)), ("b", (2, 7, 3))) for s, x in enumerate(values)
-    ]
-    records.append({"seed": 3, "m": "a", "x": 100})  # nobody to compare it with
-    found = kit.paired(records, "x", {"m": "a"}, {"m": "b"})
-    half = 4.302653 / math.sqrt(3)  # of differences 1, 2 and 3, with two degrees of freedom
-    assert found == pytest.approx((2.0, 2.0 - half, 2.0 + half))
-    assert kit.paired(records[:1] + records[3:4], "x", {"m": "a"}, {"m": "b"}) == (1.0, -math.inf, math.inf)
-
-
 def test_spread_is_over_seeds_and_not_over_measurements():
     records = [{"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs]
     assert kit.over_seeds(records, "x", kind="a") == pytest.approx((4.0, math.sqrt(8)))

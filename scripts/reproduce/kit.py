@@ -20,11 +20,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
-from scipy.stats import ttest_1samp
 from threadpoolctl import threadpool_limits
 
 from asm_gym.evaluation.figures import look, save
-from asm_gym.evaluation.statistics import Estimate, Spread
+from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.files import write_text, written_whole
 from asm_gym.rollouts import progress
@@ -133,16 +132,6 @@ def over_seeds(records: Sequence[Record], value: str, **values: Any) -> Spread:
     """Return mean and spread of the means of each seed, over the records with these values; NaN without records."""
     means = by_seed(records, value, **values)
     return Spread(float(means.mean()), float(means.std()))
-
-
-def paired(records: Sequence[Record], value: str, one: Record, other: Record, **values: Any) -> Estimate:
-    """Return the mean difference of ``one`` minus ``other``, seed by seed, with Student's 95 % interval."""
-    first, second = (by_seed(records, value, **values | chosen) for chosen in (one, other))
-    difference = (first - second).dropna()
-    if len(difference) < 2:
-        return Estimate(float(difference.mean()), -np.inf, np.inf)
-    low, high = ttest_1samp(difference, 0.0).confidence_interval()
-    return Estimate(float(difference.mean()), float(low), float(high))
 
 
 # ------------------------------------------------------------------ tables and figures
