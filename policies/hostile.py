@@ -17,8 +17,6 @@ BANG_STEPS = 10  # control steps for which a bang-bang policy goes on in one dir
 TURNS_AT = 40  # control step in which a healthy policy turns hostile
 LATE_STEPS = 10  # delay of stale actions [control steps]
 Floats = NDArray[np.floating[Any]]
-Rule = Callable[[int, np.random.Generator, int], Floats]
-"""(A,) the action of a control step, by the generator of the episode and A."""
 
 
 class Hostile(StatefulPolicy):
@@ -26,37 +24,29 @@ class Hostile(StatefulPolicy):
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, rule: Rule) -> None:
         self._space: Any = env.action_space
-        self._rule, self._speed, self._seed = rule, speed, seed
+        self.size = int(np.prod(env.action_space.shape or ()))
+        self._rule, self._speed, self.seed = rule, speed, seed
+        self.held = np.zeros(self.size)  # what a rule goes on with
 
     def begin(self, observation: Any) -> tuple[int, np.random.Generator]:
-        return 0, np.random.default_rng(self._seed)
+        return 0, np.random.default_rng(self.seed)
 
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         step, rng = state
-        action = self._speed * np.asarray(self._rule(step, rng, self._space.shape[0]), np.float64)
+        first = self._speed * np.asarray(self._rule(self, step, rng), np.float64)
+        action = np.pad(first, (0, self.size - len(first)))
         return np.clip(action, self._space.low, self._space.high).astype(np.float32), (step + 1, rng)
 
 
-def _towards(*direction: float) -> Rule:
-    """Return the rule of one change of pose, (x, y, z) or with turns about them; the grip stays."""
-    return lambda step, rng, size: np.array([*direction, *[0.0] * (size - len(direction))])
+Rule = Callable[[Hostile, int, np.random.Generator], Floats | tuple[float, ...]]
+"""The first numbers of the action of a control step, (x, y, z), turns about them and grip; the others are 0."""
 
 
-def _by_step(motion: Callable[[int], tuple[float, ...]]) -> Rule:
-    """Return the rule of another change of pose in each step; a seventh number is the grip."""
-    return lambda step, rng, size: _towards(*motion(step))(step, rng, size)
-
-
-def _bang_bang() -> Rule:
-    """Return the rule of full scale in every number, in another direction every ``BANG_STEPS``."""
-    last: list[Floats] = []
-
-    def rule(step: int, rng: np.random.Generator, size: int) -> Floats:
-        if step % BANG_STEPS == 0 or not last:
-            last[:] = [rng.choice([-1.0, 1.0], size)]
-        return last[0]
-
-    return rule
+def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
+    """Return full scale in every number, in another direction every ``BANG_STEPS``."""
+    if step % BANG_STEPS == 0:
+        policy.held = rng.choice([-1.0, 1.0], policy.size)
+    return policy.held
 
 
 class _Spoilt(StatefulPolicy):
@@ -85,28 +75,26 @@ class _Spoilt(StatefulPolicy):
         return action, (step + 1, inner, late)
 
 
+RULES: dict[str, Rule] = {
+    "down": lambda policy, t, rng: (0.0, 0.0, -1.0),
+    "aside and down": lambda policy, t, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
+    "forward": lambda policy, t, rng: (1.0, 0.0, -0.3),
+    "bang-bang": _bang_bang,
+    "uniform": lambda policy, t, rng: rng.uniform(-1.0, 1.0, policy.size),
+    "ramp": lambda policy, t, rng: (0.0, 0.0, -min(1.0, t / 100)),
+    "hammering": lambda policy, t, rng: (0.0, 0.0, -1.0 if t % 20 < 12 else 1.0),
+    "grinding": lambda policy, t, rng: (np.cos(t / 5), np.sin(t / 5), -0.5),
+    "squeezing": lambda policy, t, rng: (0.0, 0.0, -1.0 * (t < 60), 0.0, 0.0, 0.0, -1.0 if t < 60 else 1.0),
+    "flinging": lambda policy, t, rng: (0.0, 1.0 if t % 12 < 6 else -1.0, 0.0, 0.0, 0.0, 0.0, (-1.0) ** (t // 6)),
+    "to joint limits": lambda policy, t, rng: (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    "into itself": lambda policy, t, rng: (-1.0, 0.0, -0.3),
+    "turning": lambda policy, t, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
+    "rolling": lambda policy, t, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    "waits for the hand-back": lambda policy, t, rng: (0.0, 0.0, -1.0 * (t % 36 < 24)),  # a trial comes after 10
+    "first rows": lambda policy, t, rng: (1.0 * (t < 12), 0.0, -1.0 * (t < 12), 0.0, 1.0 * (t < 12), 0.0),
+}
 HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
-    "down": lambda env, seed, speed: Hostile(env, seed, speed, _towards(0.0, 0.0, -1.0)),
-    "aside and down": lambda env, seed, speed: Hostile(env, seed, speed, _towards(0.0, seed % 2 * 2.0 - 1.0, -1.0)),
-    "forward": lambda env, seed, speed: Hostile(env, seed, speed, _towards(1.0, 0.0, -0.3)),
-    "bang-bang": lambda env, seed, speed: Hostile(env, seed, speed, _bang_bang()),
-    "uniform": lambda env, seed, speed: Hostile(env, seed, speed, lambda step, rng, size: rng.uniform(-1.0, 1.0, size)),
-    **{
-        name: partial(Hostile, rule=rule)
-        for name, rule in {
-            "ramp": _by_step(lambda t: (0.0, 0.0, -min(1.0, t / 100))),
-            "hammering": _by_step(lambda t: (0.0, 0.0, -1.0 if t % 20 < 12 else 1.0)),
-            "grinding": _by_step(lambda t: (np.cos(t / 5), np.sin(t / 5), -0.5)),
-            "squeezing": _by_step(lambda t: (0.0, 0.0, -1.0 * (t < 60), 0.0, 0.0, 0.0, -1.0 if t < 60 else 1.0)),
-            "flinging": _by_step(lambda t: (0.0, 1.0 if t % 12 < 6 else -1.0, 0.0, 0.0, 0.0, 0.0, (-1.0) ** (t // 6))),
-            "to joint limits": _towards(0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-            "into itself": _towards(-1.0, 0.0, -0.3),
-            "turning": _towards(0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
-            "rolling": _towards(0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
-            "waits for the hand-back": _by_step(lambda t: (0.0, 0.0, -1.0 * (t % 36 < 24))),  # a trial comes after 10
-            "first rows": _by_step(lambda t: (1.0 * (t < 12), 0.0, -1.0 * (t < 12), 0.0, 1.0 * (t < 12), 0.0)),
-        }.items()
-    },
+    **{name: partial(Hostile, rule=rule) for name, rule in RULES.items()},
     "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
     "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
     "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),
