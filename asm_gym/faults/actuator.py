@@ -19,11 +19,6 @@ class MotorFault(JointFault, EditingFault):
         *("joint_velocity", "joint_position"),
     )
 
-    def dof(self, env: RobosuiteEnv) -> int:
-        """Return the joint's index among the velocities."""
-        model = env.simulation.model
-        return int(model.jnt_dofadr[model.actuator_trnid[env.simulation.motors[self.joint], 0]])
-
 
 class WeakJoint(MotorFault):
     """Reduce the torque of a ``joint``'s motor to a share ``strength``; 0 is a dead motor."""
@@ -45,7 +40,7 @@ class JointFriction(MotorFault):
     viscous: float = within(2.0, low=0, high=1e4)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        model, dof = env.simulation.model, self.dof(env)
+        model, dof = env.simulation.model, int(env.simulation.dofs[self.joint])
         return [
             (model.dof_frictionloss, [dof], lambda friction: friction + self.newton_metres),
             (model.dof_damping, [dof], lambda damping: damping + self.viscous),
