@@ -137,6 +137,7 @@ class Arbiter:
     ) -> None:
         self.running = None if adaptive is None else adaptive.start(threshold)
         self._rule, self._acts = rule or ReleaseRule(), rule is not None
+        self.most_impulse = self._rule.impulse  # that an arm may press with in an episode [N s]
         self.threshold = np.full(count, threshold)  # (n,) of the episodes that run
         self.state = np.zeros(count, np.int8)  # (n,) who acts next, a place in ``STATES``
         self.confirmed = np.zeros(count, bool)
@@ -159,11 +160,6 @@ class Arbiter:
         self.confirmed[which] = self._on_trial[which] = False
         self._wait[which] = self._rule.try_after
         self.response[:] = ["" if new else name for new, name in zip(which, self.response, strict=True)]
-
-    @property
-    def most_impulse(self) -> float:
-        """How much an arm may press in an episode [N s]."""
-        return self._rule.impulse
 
     def may_go_on(self, robot: int) -> bool:
         """Return whether the policy may go on in alarm, for all the time that it did."""

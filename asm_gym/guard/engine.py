@@ -84,25 +84,18 @@ class Engine:
         self._limits = EpisodeLimits(robots, limits, acts=name != "monitor" and robots.rest.size > 0)
         self.running = self._arbiter.running
         """The threshold that follows a policy; None where it does not."""
+        self.threshold = self._arbiter.threshold
+        """(n,) what surprise must exceed for an alarm in the episodes that run."""
         self.confirmed = self._arbiter.confirmed
         """(n,) an alarm in this episode was no false one."""
         self._nothing_felt = nothing_felt(n, robots.felt_size)
         self._everyone, self._nobody = np.ones(n, bool), self._motions.nobody
-        self._held = self._nobody  # whose reflex acts next
+        self.overriding = self._nobody
+        """(n,) whose reflex acts next."""
         self._command = Command(np.zeros((n, robots.rest.size), np.float32), self._nobody, self._nobody, NOTHING)
         self._refused = self._nobody  # whose policy's action was none, in the step that runs
         self._unsaid: Mapping[int, str] = NOTHING  # what failed when the command was chosen, by robot
         self._warned: set[tuple[int, str]] = set()
-
-    @property
-    def threshold(self) -> NDArray[np.float64]:
-        """(n,) what surprise must exceed for an alarm in the episodes that run."""
-        return self._arbiter.threshold
-
-    @property
-    def overriding(self) -> Mask:
-        """(n,) whose reflex acts next."""
-        return self._held
 
     @property
     def latency(self) -> float:
@@ -121,7 +114,7 @@ class Engine:
             part.begin(which)
         for i in np.flatnonzero(which).tolist():
             self._diagnostician.begin(i)
-        self._held = self._arbiter.state == REFLEX
+        self.overriding = self._arbiter.state == REFLEX
         self._warned = {(i, who) for i, who in self._warned if not which[i]}
         return self.nothing()
 
@@ -153,10 +146,10 @@ class Engine:
         """
         names = self._arbiter.response if self._graded else [self._name] * self._count
         idle = self._nobody if idle is None else idle
-        self._command, self._refused = self._motions.choose(actions, self._held, idle, names, seen)
+        self._command, self._refused = self._motions.choose(actions, self.overriding, idle, names, seen)
         self._unsaid = self._command.failures
         if self._refused is not self._nobody:
-            self._held = self._arbiter.state == REFLEX
+            self.overriding = self._arbiter.state == REFLEX
         return self._command
 
     def judge(
@@ -179,7 +172,7 @@ class Engine:
             active: (n,) whose rows count; all by default.
         """
         active = self._everyone if active is None else active
-        held, refused, self._refused = self._held, self._refused, self._nobody
+        held, refused, self._refused = self.overriding, self._refused, self._nobody
         refused = refused if refused is self._nobody else refused & active
         failed = self._failures(failures or NOTHING, refused, active)
         unsaid, self._unsaid = self._unsaid, NOTHING
@@ -212,7 +205,7 @@ class Engine:
         if some or self._rows.repairs:
             found = believed, observed, over, executed, refused
             outcomes = {i: self._decide(i, report, *found) for i in np.flatnonzero(decides).tolist()}
-            self._held = self._arbiter.state == REFLEX
+            self.overriding = self._arbiter.state == REFLEX
             report = self._completed(report, outcomes, self._forget(outcomes, active))
             self._rows.drop_repairs()
         if some or not self._limits.steady:
