@@ -30,7 +30,7 @@ class Registry(dict[str, Row]):
     def __init__(self, what: str, where: str, rows: Mapping[str, Row] | None = None) -> None:
         super().__init__(rows or {})
         self.what = what
-        self._own = frozenset(self)
+        self.own = frozenset(self)  # names of the rows that it was made with
         _REGISTRIES[where] = self
 
     def register(self, name: str, row: Row) -> None:
@@ -44,15 +44,11 @@ class Registry(dict[str, Row]):
         check_choice(self.what, name, self)
         return self[name]
 
-    @property
-    def added(self) -> dict[str, Row]:
-        """Rows that were added after the registry was made."""
-        return {name: row for name, row in self.items() if name not in self._own}
-
 
 def added() -> Added:
     """Return the rows that were added to each registry of this process."""
-    return {where: rows for where, registry in _REGISTRIES.items() if (rows := registry.added)}
+    new = {at: {n: row for n, row in rows.items() if n not in rows.own} for at, rows in _REGISTRIES.items()}
+    return {where: rows for where, rows in new.items() if rows}
 
 
 def knowing(rows: Added, task: Callable[[Any], Result], item: Any) -> Result:
