@@ -43,11 +43,8 @@ class Swaying(StatefulPolicy):
 
     def intended(self, observation: Any) -> Floats:
         """Return the action (A,) before noise."""
-        return self.middle + self.half * self.width * self.sine()
-
-    def sine(self) -> Floats:
-        """Return the present sines (A,)."""
-        return np.sin(2 * np.pi * self.frequency * self.t + self.phase)
+        sines = np.sin(2 * np.pi * self.frequency * self.t + self.phase)  # (A,)
+        return self.middle + self.half * self.width * sines
 
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the action and the state as it was."""
