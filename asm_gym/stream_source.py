@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -73,12 +74,18 @@ def stepped(env: gym.Env[Any, Any], action: Any) -> tuple[Any, SupportsFloat, bo
     return found
 
 
+def layers(env: Any) -> Iterator[Any]:
+    """Yield the wrappers around an environment, or around many, the outermost first."""
+    while isinstance(env, gym.Wrapper | VectorWrapper):
+        yield env
+        env = env.env
+
+
 def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:
     """Raise ValueError for a wrapper, of one or many, by which the same sense reads differently the longer it runs."""
-    while isinstance(env, gym.Wrapper | VectorWrapper):
-        if isinstance(env, NormalizeObservation | VectorNormalizeObservation) and env.update_running_mean:
+    for layer in layers(env):
+        if isinstance(layer, NormalizeObservation | VectorNormalizeObservation) and layer.update_running_mean:
             raise ValueError(
                 "NormalizeObservation inside the guard changes its scaling over time: put it outside, as in "
                 f"NormalizeObservation({guard}(env, monitor)), or set its update_running_mean to False"
             )
-        env = env.env

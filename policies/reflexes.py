@@ -7,9 +7,11 @@ from typing import Any, Protocol, runtime_checkable
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import VectorActionWrapper
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import DELTA, VELOCITY
+from asm_gym.stream_source import layers
 
 
 @runtime_checkable
@@ -100,26 +102,22 @@ def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     bounded = np.isfinite(space.low) & np.isfinite(space.high)
     middle = 0.5 * (np.where(bounded, space.low, 0.0) + np.where(bounded, space.high, 0.0))
     for candidate in (nearest_to_rest(space), middle.astype(np.float32)):
-        arrives, wrapper = candidate, env
-        while isinstance(wrapper, gym.Wrapper):
+        arrives = candidate
+        for wrapper in layers(env):
             if isinstance(wrapper, gym.wrappers.TransformAction):  # a function of the action alone, so it may be asked
                 arrives = np.asarray(wrapper.action(arrives))
             elif isinstance(wrapper, gym.ActionWrapper):
                 raise ValueError(outside(wrapper, "hold"))
-            wrapper = wrapper.env
         if not np.any(arrives):
             return candidate
     changed = changed_by(env)
     raise ValueError(outside(changed, "hold") if changed else no_rest(space))
 
 
-def changed_by(env: gym.Env[Any, Any]) -> gym.ActionWrapper[Any, Any, Any] | None:
-    """Return the outermost wrapper that changes actions; None where there is none."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, gym.ActionWrapper) and not isinstance(env, gym.wrappers.ClipAction):
-            return env
-        env = env.env
-    return None
+def changed_by(env: Any) -> Any:
+    """Return the outermost wrapper, of one or many, that changes actions; None where there is none."""
+    changing = (layer for layer in layers(env) if isinstance(layer, gym.ActionWrapper | VectorActionWrapper))
+    return next((layer for layer in changing if not isinstance(layer, gym.wrappers.ClipAction)), None)
 
 
 def outside(wrapper: Any, reflex: str, guard: str = "NeuralASMSafety") -> str:

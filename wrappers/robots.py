@@ -10,7 +10,7 @@ from uuid import uuid4
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import VectorActionWrapper, VectorEnv, VectorWrapper
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ACTIONS, MEANINGS, TARGET, ActionMeaning, ActionMeans
@@ -23,6 +23,7 @@ from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.reflexes import Hold, changed_by, nearest_to_rest, no_rest, outside, resting_action
 from asm_gym.spec import StreamSpec, control_period
+from asm_gym.stream_source import layers
 from asm_gym.validation import as_float32, short_repr
 
 DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
@@ -66,8 +67,8 @@ def as_action(space: gym.spaces.Space[Any] | None, action: Any) -> Any:
 
 def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
     """Raise ValueError if a wrapper inside counts episodes: it would miss those that the guard ends, or its numbers."""
-    ends, layer = not (isinstance(on_alarm, str) and on_alarm == "monitor"), env
-    while isinstance(layer, gym.Wrapper | VectorWrapper):
+    ends = not (isinstance(on_alarm, str) and on_alarm == "monitor")
+    for layer in layers(env):
         own = vars(layer).get("info_keywords", ())  # of Stable-Baselines3's Monitor
         if COUNTS in vars(layer) and (ends or any(key.startswith(("asm", "cost")) for key in own)):
             name, usual = type(layer).__name__, "make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))"
@@ -75,7 +76,6 @@ def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
                 f"{name} inside the guard would miss the episodes that the guard ends, and what it reports: put it "
                 f"outside, as in {name}({guard}(env, monitor)); with Stable-Baselines3, {usual}"
             )
-        layer = layer.env
     if isinstance(env, VectorEnv) and ends and any(Members(env).call("has_wrapper_attr", COUNTS)):
         raise ValueError(
             "wrappers of the members that count episodes would miss those that the guard ends: use "
@@ -232,15 +232,8 @@ def robots_of(
 
 def _changed(env: AnyEnv) -> str:
     """Return why no reflex can know what reaches the robots; empty where it can."""
-    if not isinstance(env, VectorEnv):
-        wrapper = changed_by(env)
-        return "" if wrapper is None else outside(wrapper, "a reflex", "NeuralASMSafety")
-    changed, layer = "", env
-    while isinstance(layer, VectorWrapper):
-        if isinstance(layer, VectorActionWrapper):
-            changed = outside(layer, "a reflex", "VectorNeuralASMSafety")
-        layer = layer.env
-    return changed
+    wrapper, guard = changed_by(env), "VectorNeuralASMSafety" if isinstance(env, VectorEnv) else "NeuralASMSafety"
+    return "" if wrapper is None else outside(wrapper, "a reflex", guard)
 
 
 def _staying(
