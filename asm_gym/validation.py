@@ -103,11 +103,9 @@ def check_flag(name: str, value: object) -> bool:
 def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
     """Raise ValueError unless ``got`` is one of ``known``, naming them all and the nearest."""
     names = list(known)
-    try:
+    with suppress(ValueError):  # of arrays, which compare number by number
         if got in names:
             return
-    except ValueError:  # of arrays, which compare number by number
-        pass
     near = difflib.get_close_matches(got[:SHOWN], map(str, names), 1, 0.75) if isinstance(got, str) else []
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(map(str, names))}{hint}")

@@ -18,6 +18,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,11 +96,9 @@ class LeRobotGuard:
         self._motors = [_motor_of(label) for label in self._spec.labels]
         self._told, self._watchdog = action_means, watchdog
         self._rows_lately = max(2, round(STALL_S / self._spec.dt))
-        try:
+        with suppress(ImportError):
             from lerobot.processor import ProcessorStep
-        except ImportError:
-            pass
-        else:
+
             ProcessorStep.register(type(self))
         self.reset()
 

@@ -9,6 +9,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
@@ -177,10 +178,8 @@ class Observer:
 
     def amend(self, rows: NDArray[np.float32]) -> None:
         """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
-        try:
+        with suppress(Exception):  # the state stays as it is: the next row is judged from there
             self._state, _ = self._monitor.observe(self._before, rows)
-        except Exception:  # the state stays as it is: the next row is judged from there
-            return
 
     def forget(self, acted_on: Mask) -> str:
         """Let the evidence begin anew in the streams of ``acted_on`` (n,); return what failed."""
