@@ -279,11 +279,9 @@ class RowReader:
         if first is None or self._clock.units != (None,) or stamp >= EPOCHS[-1][0]:
             return stamp
         step = stamp - first
-        unit = (
-            min(UNITS, key=lambda unit: abs(np.log(step * unit / self.spec.dt)))
-            if step >= SLOWEST_WITHOUT_UNIT
-            else 1.0
-        )
+        unit = 1.0
+        if step >= SLOWEST_WITHOUT_UNIT:
+            unit = min(UNITS, key=lambda unit: abs(np.log(step * unit / self.spec.dt)))
         self._clock = Clock(self._clock.columns, (unit,))
         if unit != 1.0:
             self.begin()

@@ -113,11 +113,9 @@ class Workspace:
             return np.asarray(self.read("cubeB_pos") + np.array([0.0, 0.0, 0.045]))
         if self.skill == "NutAssemblySquare":
             return np.array(env.sim.data.body_xpos[env.peg1_body_id])
-        return (
-            self.start + np.array([0.0, 0.0, 0.1])
-            if self.skill == "Lift"
-            else np.array(env.target_bin_placements[env.object_id])
-        )
+        if self.skill == "Lift":
+            return np.asarray(self.start + np.array([0.0, 0.0, 0.1]))
+        return np.array(env.target_bin_placements[env.object_id])
 
     def row(self) -> Floats:
         """Return what is sensed now, and what was commanded (D,)."""
