@@ -145,6 +145,32 @@ def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(
     assert made == []  # it is there already
 
 
+def test_in_some_lessons_the_hand_is_slowed_down_now_and_then_as_by_a_guard():
+    lessons = curriculum(["Lift", "Door"], 90, seed=0, reaching=True)
+    learned = [n for n in lessons if not held_out(n.number)]
+    assert 0.25 < np.mean([n.limited for n in learned]) < 0.4
+    assert not any(n.limited for n in lessons if held_out(n.number))
+    env, found = gym.make("asm_gym/Lift-v0"), {}
+    for limited in (False, True):
+        lesson = Lesson("Lift", 0, seed=3, speed=1.5, limited=limited)
+        rows = [(info.get("braked", 0.0), env.unwrapped.contact_limits) for info in steps_of(env, lesson)]
+        found[limited] = rows
+    env.close()
+    assert {limits for _, limits in found[False]} == {None}
+    speeds = [limits.hand_speed for _, limits in found[True]]
+    assert len(set(speeds)) > 2
+    assert 0.05 <= min(speeds) <= max(speeds) <= 1.0
+    assert max(braked for braked, _ in found[True]) > 0.5
+
+
+def steps_of(env, lesson):
+    """Yield what is said of each step."""
+    policy, (observation, _) = Babbler(env, lesson), env.reset(seed=lesson.seed)
+    for _ in range(90):
+        observation, *_, info = env.step(policy.predict(observation)[0])
+        yield info
+
+
 ARM = StreamSpec((Channel("external_torque_peak", 2, "N m"), Channel("action", 1, group="action")), dt=0.05)
 
 

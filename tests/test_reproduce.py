@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from asm_gym.detection.conformal import Blocks
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.rollouts.pretraining.exam import Marks
@@ -101,3 +102,21 @@ def test_promises_over_halves_come_true_where_all_hours_are_alike():
     came = [float(cell.split()[0]) for cell in table.rows[0]]
     np.testing.assert_allclose(came, hours.PROMISES, rtol=0.25)
     assert all("50.0 ± 0.0 % found" in cell for cell in table.rows[0])
+
+
+def test_an_e_detector_alarms_no_more_often_than_promised_and_lets_weak_evidence_add_up():
+    rng = np.random.default_rng(0)
+    peaks = rng.exponential(size=200_000)
+    detector, alarms = hours.EDetector(Blocks(peaks[:100_000], np.full(100_000, 0.01)), rate=2.0), 0
+    for peak in peaks[100_000:]:
+        alarms += peak > detector.value
+        detector.follow(peak)
+    assert 0.2 < alarms / 1000 / 2.0 < 1.0  # in 1,000 hours of the same policy
+    fresh = hours.EDetector(Blocks(peaks[:100_000], np.full(100_000, 0.01)), rate=2.0)
+    thresholds = []
+    for _ in range(5):
+        thresholds.append(fresh.value)
+        fresh.follow(5.0)  # such as one block in 150 reaches
+    assert np.diff(thresholds)[: int(np.argmax(np.array(thresholds) < 5.0))].max() < 0
+    assert min(thresholds) < 5.0  # the alarm comes, though no episode alone would raise it
+    assert thresholds[0] > np.quantile(peaks, 1 - 1 / 50)  # what the hourly threshold of this promise is

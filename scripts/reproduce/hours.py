@@ -1,6 +1,15 @@
 """False alarms per hour of a shipped memory, in healthy hours of policies and tasks that it never met.
 
 Only episodes that solved the task count as healthy. Surprise that a knock or a stop explains is counted apart.
+
+Three alarms are compared: the hourly threshold, one that follows each policy, and an e-detector, which bounds the mean
+time between false alarms at whatever time one looks, and lets weak evidence add up from episode to episode:
+
+    M_k = (M_{k-1} + 1) e(p_k)     alarm at M_k >= c; then M_k = 0      e(p) = (1 - p + p ln p) / (p ln² p)
+
+p_k is the rank of the greatest surprise of episode k among n blocks of calibration, and c the number of blocks between
+the false alarms that are promised. Sources: Shin, Ramdas and Rinaldo 2024 (NEJSDS 2(2), arXiv 2203.03532) for the
+detector of Shiryaev and Roberts' form; Vovk and Wang 2021 (Annals of Statistics 49(3)) for e(p).
 """
 
 from __future__ import annotations
@@ -9,11 +18,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from asm_gym.detection.conformal import HOUR, Blocks
 from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.detection_tables import SPLITS, kept_rate, over_splits
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
+from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibration import AlarmRate
@@ -57,15 +69,74 @@ def run(config: Config) -> Findings:
     came = {(r, m.name): hourly_alarms(m.at(thresholds[r]).solved) for r in PROMISES for m in marks}
     records = [{"promised": r, "exam": name, "alarms": c.k, "hours": c.hours} for (r, name), c in came.items()]
     return Findings(
-        records, [kept_table(marks, thresholds), card(marks, memory, WINDOW_S), splits_table(marks + known)]
+        records,
+        [
+            kept_table(marks, thresholds),
+            card(marks, memory, WINDOW_S),
+            rules_table(marks, memory, memory.about["false_alarms_per_hour"]),
+            splits_table(marks + known),
+        ],
     )
+
+
+class EDetector:
+    """An e-detector as a threshold: what the next episode's greatest surprise must exceed for an alarm.
+
+    Args:
+        blocks: of calibration.
+        rate: promised false alarms per hour.
+    """
+
+    def __init__(self, blocks: Blocks, rate: float) -> None:
+        self._maxima, self._evidence = np.sort(blocks.maxima)[::-1], 0.0
+        self._enough = len(blocks.maxima) / blocks.total / rate
+        p = np.arange(1, len(self._maxima) + 1) / (len(self._maxima) + 1)
+        self._e_values = (1 - p + p * np.log(p)) / (p * np.log(p) ** 2)  # of what 0, 1, … maxima exceed
+
+    @property
+    def value(self) -> float:
+        """The present threshold; infinite where no surprise would be evidence enough."""
+        ranks = int(((self._evidence + 1.0) * self._e_values >= self._enough).sum())
+        return float(self._maxima[ranks - 1]) if ranks else np.inf
+
+    def follow(self, largest: float) -> None:
+        """Take an episode of this greatest surprise as evidence; an alarm ends all evidence."""
+        rank = min(int((self._maxima >= largest).sum()), len(self._maxima) - 1)
+        self._evidence = (self._evidence + 1.0) * float(self._e_values[rank])
+        if self._evidence >= self._enough:
+            self._evidence = 0.0
+
+
+def together(marks: Sequence[Marks]) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
+    """Return the healthy and the faulty episodes of all exams."""
+    return [t for m in marks for t in m.solved], [t for m in marks for t in m.metrics.faulty]
+
+
+def rules_table(marks: Sequence[Marks], memory: NeuralASM, rate: float) -> Table:
+    """Return a row for each rule of alarm at the same promise."""
+    blocks = memory.blocks_
+    assert blocks is not None
+    rules = {
+        "hourly threshold": list(marks),
+        "threshold that follows": [m.adapted(rate) for m in marks],
+        "e-detector": [m.under(EDetector(blocks, rate)) for m in marks],
+    }
+    rows = []
+    for name, judged in rules.items():
+        came = [hourly_alarms(m.solved) for m in judged]
+        above = sum(c.interval[0] > rate for c in came)
+        healthy, faulty = together(judged)
+        found = percent(DetectionMetrics("", faulty, [], WINDOW_S).detected)
+        rows.append((name, hourly_alarms(healthy).text, f"{above} of {len(came)}", f"{found} of {len(faulty)}"))
+    caption = f"Three rules of alarm that promise {rate:g} false alarms an hour, and what they find of all faults."
+    return Table(caption, ("rule", "false alarms an hour", "policies above it beyond chance", "found"), rows)
 
 
 def splits_table(marks: Sequence[Marks]) -> Table:
     """Return what each promise comes to over random halves of all healthy hours, known tasks included."""
-    solved = [t for m in marks for t in m.solved]
+    solved, faulty = together(marks)
     units = Blocks.of([t.surprise for t in solved], solved[0].dt)
-    found = DetectionMetrics("", [t for m in marks for t in m.metrics.faulty], [], WINDOW_S)
+    found = DetectionMetrics("", faulty, [], WINDOW_S)
     caption = (
         f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory has met too: one "
         "half sets the threshold, in the other so many false alarms came, mean ± SD."
@@ -78,8 +149,7 @@ def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Tab
     """Return a row for each promise: alarms that came, and faults found."""
     rows = []
     for promised, threshold in thresholds.items():
-        at = [m.at(threshold) for m in marks]
-        healthy, faulty = [t for m in at for t in m.solved], [t for m in at for t in m.metrics.faulty]
+        healthy, faulty = together([m.at(threshold) for m in marks])
         shares = [
             DetectionMetrics("", [t for t in faulty if t.severity in severities], [], WINDOW_S).detected
             for severities in (SEVERITIES, ("mild",))
@@ -87,7 +157,7 @@ def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Tab
         excused = (f"{hourly_alarms(healthy, event).value:.1f}" for event in (KNOCK, STOP))
         cells = kept_rate(hourly_alarms(healthy), promised), *excused
         rows.append((f"{promised:g}", f"{threshold:.3g}", *cells, *(f"{percent(s)} of {s.n}" for s in shares)))
-    hours = sum(len(t) * t.dt for m in marks for t in m.solved) / 3600
+    hours = sum(len(t) * t.dt for t in together(marks)[0]) / 3600
     caption = (
         f"Alarms per hour in {hours:.2f} healthy hours of policies and tasks that the memory never met, with 95 % "
         "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the promise. Found: "

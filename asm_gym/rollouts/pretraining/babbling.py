@@ -5,8 +5,9 @@
 Each lesson is one episode. One in three is the expert's own, and sets the threshold. The others are led by the expert
 at many speeds, by the expert under noise, or by noise alone (or a hand that reaches for one place after another); under
 noise the arm also drifts now and then, as agents do once they have done their task. With reaching, some lessons more
-have the expert press what it holds. The noise is weak enough that most of a lesson is free of impacts: those would
-teach the memory to expect them.
+have the expert press what it holds. In some, the speed of the hand is limited as a guard limits it, for a slowed arm
+feels otherwise. The noise is weak enough that most of a lesson is free of impacts: those would teach the memory to
+expect them.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling;
 Rolf et al. 2010 (IEEE TAMD 2(3)) for goals in place of random commands.
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from asm_gym.data.episode import save_episode
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.base import StatefulPolicy
@@ -49,6 +51,8 @@ DRIFT, DRIFTED, DRIFTING = 0.015, (5, 60), (0.05, 1.0)
 """Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
 PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
 """Probability per step that an object gripped for ``HELD`` steps is pressed, steps, and command [action units]."""
+LIMITED, CHANGED, LIMITS = 1 / 3, 0.05, (0.05, 1.0)
+"""Share of lessons whose hand is slowed down, probability per step that its limit changes, and limits [m/s]."""
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
@@ -72,6 +76,7 @@ class Lesson(NamedTuple):
     weight: float = 1.0  # of the task's object, relative to what is usual
     drift: float = 0.0  # probability per step that the arm drifts for a while
     press: float = 0.0  # probability per step that it presses what it holds for a while
+    limited: bool = False  # the speed of the hand, as by a guard
 
     @property
     def trial(self) -> Trial:
@@ -116,6 +121,7 @@ def _lesson(task: str, number: int, seed: int, lead: str) -> Lesson:
         pause=PAUSE * float(rng.random() < 0.5),
         weight=float(np.exp(rng.uniform(*np.log(WEIGHT)))) if rng.random() < 0.5 else 1.0,
         drift=DRIFT * (lead != LED),
+        limited=bool(rng.random() < LIMITED) and not held_out(number),
     )
 
 
@@ -128,18 +134,28 @@ class Babbler(StatefulPolicy):
             self._guide = Reaching(env, lesson.seed, lesson.speed)
         elif lesson.guide:
             self._guide = make_policy(lesson.guide, env, seed=lesson.seed, style=Style(speed=lesson.speed))
+        self._arm: Any = env.unwrapped
         self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
+        self._limits = np.random.default_rng([lesson.seed, 4])
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
         self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
         self._noisy_grip = bool(self._rng.random() < 0.5)
         self._left, self._course, self._grasp, self._held = 0, np.zeros_like(self._noise), 1.0, 0
 
     def begin(self, observation: Any) -> Any:
+        if self._lesson.limited:
+            self._limit_speed()
         return None
+
+    def _limit_speed(self) -> None:
+        speed = float(np.exp(self._limits.uniform(*np.log(LIMITS))))
+        self._arm.contact_limits = ContactLimits(hand_speed=speed, stays=False)
 
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the next action (A,)."""
         lesson, rng = self._lesson, self._rng
+        if lesson.limited and self._limits.random() < CHANGED:
+            self._limit_speed()
         fresh = rng.standard_normal(self._noise.shape)
         self._noise = lesson.smoothness * self._noise + np.sqrt(1.0 - lesson.smoothness**2) * fresh
         action = lesson.noise * self._noise  # (A,)

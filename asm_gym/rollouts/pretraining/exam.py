@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -53,6 +53,17 @@ class Exam(NamedTuple):
         ]
 
 
+class Follows(Protocol):
+    """A threshold that each episode moves."""
+
+    @property
+    def value(self) -> float:
+        """Its present value."""
+
+    def follow(self, largest: float) -> None:
+        """Move after an episode of this greatest surprise."""
+
+
 class Marks(NamedTuple):
     """The result of one exam."""
 
@@ -73,7 +84,11 @@ class Marks(NamedTuple):
             return self
         hours = sum(len(t) * t.dt for t in self.solved) / 3600
         share = min(per_hour * hours / len(self.solved), MOST_IN_ALARM)
-        running, solved = AdaptiveThreshold(share).start(self.solved[0].threshold), []
+        return self.under(AdaptiveThreshold(share).start(self.solved[0].threshold))
+
+    def under(self, running: Follows) -> Marks:
+        """Return the result under a threshold that healthy episodes move; faults are judged by its last value."""
+        solved = []
         for trace in self.solved:
             solved.append(trace.at(running.value))
             running.follow(float(trace.surprise.max()))
