@@ -227,7 +227,7 @@ def fit(args: Args, console: Console) -> int:
     monitor.save(args.out)
     for line in [*notes, *notes_on_columns(args, spec), *notes_on_body(args, monitor), *mute_channels(fitting)]:
         say(f"Note: {line}.")
-    rows, hours = sum(map(len, fitting)), hours_of(calibration)
+    rows, hours, used = sum(map(len, fitting)), monitor.blocks_.total, len(monitor.maxima_)
     say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
     for line in [f"Left out: {left_out}."] * bool(left_out) + cuts:
         say(line)
@@ -235,7 +235,8 @@ def fit(args: Args, console: Console) -> int:
     if args.promise.per == EPISODE:
         promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
     modelled = ", by a model of the tail of their maxima, as they are few" if monitor.promise.modelled else ""
-    say(f"Threshold {monitor.threshold:.4g}, from {len(calibration)} other episodes: {promise}{modelled}.")
+    ceilings = f"; {len(calibration) - used} more say how far each sense goes" if used < len(calibration) else ""
+    say(f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}{modelled}{ceilings}.")
     expected, most = monitor.promise.hourly(hours)
     more = "" if expected <= 1.0 else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
     say(

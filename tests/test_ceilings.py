@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from asm_gym import Episode, NeuralASM
-from asm_gym.detection.evidence import FEWEST_EPISODES, HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
+from asm_gym.detection.evidence import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX
 from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.monitors import calibration, make_monitor
-from asm_gym.monitors.calibration import learn_ceilings
-from tests.memories import SMALL, sine_memory
+from asm_gym.monitors.training_data import hashes_of
+from tests.memories import sine_memory
 from tests.streams import sine_episodes, sine_spec
 
 
@@ -31,53 +31,64 @@ def shaken(episodes, column=3, by=4.0):
         yield Episode.from_stream(stream, episode.spec)
 
 
-def test_a_share_of_the_hours_stays_below_each_ceiling_and_tails_are_those_that_were_learned(asm):
-    hours = list(shaken(sine_episodes(150, seed=20)))
+def test_of_many_episodes_a_third_sets_ceilings_and_the_others_the_threshold(asm):
+    hours = list(shaken(sine_episodes(450, seed=20)))
     before, detection = asm.detection.detector_, asm.detection
-    maxima = calibration._worst_of(asm, detection, hours)
-    learn_ceilings(asm, hours)
-    np.testing.assert_allclose((maxima <= asm.detection.detector_.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
-    np.testing.assert_allclose(asm.detection.detector_.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
-    np.testing.assert_array_equal(asm.detection.detector_.whitening, before.whitening)
-    assert asm.threshold_ is None
+    maxima = calibration._worst_of(asm, detection, hours[::3])
+    asm.calibrate(hours, false_alarm_rate=0.05)
+    after = asm.detection.detector_
+    np.testing.assert_allclose((maxima <= after.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)
+    np.testing.assert_allclose(after.tail, before.tail * HOURS_TAIL_INDEX / TAIL_INDEX)
+    np.testing.assert_array_equal(after.whitening, before.whitening)
+    assert set(asm.ceilings_from_) == set(hashes_of(hours[::3]))
+    others = [e for n, e in enumerate(hours) if n % 3]
+    np.testing.assert_allclose(asm.maxima_, [s.value.max() for s in asm.score_episodes(others)])
+    np.testing.assert_allclose(asm.calibrate(hours, false_alarm_rate=0.05).detection.detector_.tail, after.tail)
     again = asm.fit(sine_episodes(50)).detection.detector_  # anew: nothing is left of hours
     for name in ("ceiling", "tail"):
         np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
 
 
+def test_a_group_gives_a_third_of_its_own(asm):
+    hours = sine_episodes(330, seed=20)
+    asm.calibrate(hours, false_alarm_rate=0.05, each=["a"] * 300 + ["b"] * 30)
+    assert set(asm.ceilings_from_) == set(hashes_of([*hours[:300:3], *hours[300::3]]))
+    assert sorted(asm.blocks_.group.tolist()) == [0] * 200 + [1] * 20
+
+
+@pytest.mark.parametrize("asked", [{"false_alarm_rate": 0.004}, {"false_alarms_per_hour": 6.0}])
+def test_none_are_taken_where_the_promise_needs_all(asm, asked):
+    hours = sine_episodes(300, seed=20)
+    assert 1.0 < 6.0 * sum(len(e) * e.spec.dt for e in hours) / 3600 < 1.5
+    asm.calibrate(hours, **asked)
+    assert asm.ceilings_from_ is None
+    assert len(asm.maxima_) == 300
+    asm.calibrate(hours[:200], false_alarm_rate=0.05)  # too few
+    assert asm.ceilings_from_ is None
+    other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0)).calibrate(hours, 0.05)
+    assert len(other.maxima_) == 300  # its detection has no ceilings
+
+
 def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(asm):
-    hours = list(shaken(sine_episodes(700, seed=22)))
+    hours = list(shaken(sine_episodes(525, seed=22)))
     faults = [
         Episode.from_stream(e.stream + np.r_[np.zeros(7), 2.0, np.zeros(6)] * (np.arange(len(e))[:, None] > 20), e.spec)
         for e in sine_episodes(60, seed=23)
     ]
 
-    def found():
-        asm.calibrate(hours[350:], false_alarm_rate=0.02)
+    def found(episodes):
+        asm.calibrate(episodes, false_alarm_rate=0.02)
         return np.mean([(s.value > asm.threshold).any() for s in asm.score_episodes(faults)])
 
-    as_it_was = found()
-    learn_ceilings(asm, hours[:350])
-    assert found() > as_it_was + 0.1
+    as_it_was = found(hours[:290])
+    assert asm.ceilings_from_ is None
+    assert found(hours) > as_it_was + 0.1
 
 
-def test_what_ceilings_are_of_is_not_calibrated_on_by_the_hour(asm):
-    hours = sine_episodes(120, seed=28)
+def test_what_ceilings_are_of_sets_no_threshold_by_the_hour(asm):
+    hours = sine_episodes(300, seed=28)
+    asm.calibrate(hours, false_alarms_per_hour=60.0)
     with pytest.raises(ValueError, match="was learned from"):
-        learn_ceilings(asm, hours).calibrate(hours, false_alarms_per_hour=60.0)
-
-
-def test_bad_input_is_named(asm):
-    with pytest.raises(ValueError, match=f"{FEWEST_EPISODES} healthy episodes or more, got 3"):
-        learn_ceilings(asm, sine_episodes(3, seed=0))
-    with pytest.raises(ValueError, match="episode 119 was learned from"):
-        learn_ceilings(asm, [*sine_episodes(119, seed=3), sine_episodes(50)[0]])
-    with pytest.raises(ValueError, match="episodes 0 and 120 are the same"):
-        learn_ceilings(asm, [*(hours := sine_episodes(120, seed=3)), hours[0]])
-    with pytest.raises(RuntimeError, match="call fit"):
-        learn_ceilings(NeuralASM(sine_spec(), **SMALL), sine_episodes(120, seed=0))
-    other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0))
-    with pytest.raises(TypeError, match="mahalanobis has no ceilings"):
-        learn_ceilings(other, sine_episodes(120, seed=0))
+        asm.calibrate(hours[:150], false_alarms_per_hour=60.0)
     with pytest.raises(ValueError, match="tail_index must be"):
         EvidenceDetection(sine_spec(), tail_index=0.0)

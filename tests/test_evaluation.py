@@ -45,12 +45,9 @@ from asm_gym.evaluation.metrics import (
 from asm_gym.evaluation.resampling import Calibration, Windows, Wins, interval, resample
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.scoring import fitted
-from asm_gym.evaluation.scoring import judged as judge
 from asm_gym.evaluation.statistics import Rate, Share, auroc
 from asm_gym.evaluation.tables import Table, tabulate
-from asm_gym.monitors import make_monitor
 from asm_gym.monitors.calibration import AlarmRate
-from asm_gym.monitors.training_data import hashes_of
 from tests.streams import sine_episodes
 
 
@@ -383,21 +380,6 @@ def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
     kept.write_bytes(kept.read_bytes()[:100])
     fitted(tmp_path, "kalman", recordings(), 0)
     assert kept.stat().st_size > 1000
-
-
-def test_a_third_of_many_calibration_episodes_sets_ceilings_and_no_threshold():
-    monitor = make_monitor("kalman+evidence", recordings()[0].spec).fit(recordings())
-    fresh = [
-        replace(e, label=EpisodeLabel("sines", "calibration", seed=n)) for n, e in enumerate(sine_episodes(300, 9))
-    ]
-    found = judge("kalman+evidence", monitor, {"calibration": fresh}, 0.05, 1.0)
-    assert set(monitor.ceilings_from_) == set(hashes_of(fresh[::3]))
-    np.testing.assert_array_equal(
-        np.sort(found.calibration.maxima),
-        np.sort([s.value.max() for s in monitor.score_episodes([e for n, e in enumerate(fresh) if n % 3])]),
-    )
-    few = make_monitor("kalman+evidence", recordings()[0].spec).fit(recordings())
-    assert len(judge("kalman+evidence", few, {"calibration": fresh[:200]}, 0.05, 1.0).calibration.maxima) == 200
 
 
 # ------------------------------------------------------------------ tables

@@ -15,18 +15,15 @@ import numpy as np
 from asm_gym.data.crashes import crashes
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import EPISODE, HOUR, conformal_episodes
-from asm_gym.detection.evidence import FEWEST_EPISODES
-from asm_gym.detection.evidence_detection import EvidenceDetection
 from asm_gym.evaluation.comparison import BenchmarkResult, detectability_of
 from asm_gym.evaluation.defaults import PER_HOUR, RATES
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.resampling import Calibration
 from asm_gym.evaluation.scored_episode import NOMINAL, InterventionOutcome, ScoredEpisode, onset_row
 from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_class
-from asm_gym.monitors.calibration import AlarmRate, learn_ceilings
+from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.version import __version__
 
-FOR_CEILINGS = 3  # one in so many calibration episodes
 NOMINAL_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
@@ -102,13 +99,10 @@ def benchmark(
 def judged(
     name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float, window_s: float
 ) -> DetectionMetrics:
-    """Calibrate a fitted monitor, its ceilings by some of the episodes if there are enough, and score all others."""
-    fresh = by_role["calibration"]
-    if isinstance(monitor.detection, EvidenceDetection) and len(fresh[::FOR_CEILINGS]) >= FEWEST_EPISODES:
-        learn_ceilings(monitor, fresh[::FOR_CEILINGS])
-        fresh = [episode for n, episode in enumerate(fresh) if n % FOR_CEILINGS]
-    monitor.calibrate(fresh, rate)
-    rates = sorted({rate, *(r for r in RATES if len(fresh) >= conformal_episodes(r))})
+    """Calibrate a fitted monitor, and score all other episodes."""
+    monitor.calibrate(by_role["calibration"], rate)
+    fresh = 0 if monitor.maxima_ is None else len(monitor.maxima_)
+    rates = sorted({rate, *(r for r in RATES if fresh >= conformal_episodes(r))})
     hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
     promises = [AlarmRate(r, EPISODE) for r in rates] + [AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0]
     calibration = Calibration(

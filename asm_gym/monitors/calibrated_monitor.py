@@ -14,13 +14,13 @@ from threadpoolctl import threadpool_limits
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.action_meaning import ACTIONS, found_meaning
 from asm_gym.data.episode import CONTROLLER, Episode
-from asm_gym.detection import Blocks, Detection, ModelOutput, Nominal
+from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import Pace, healthy_forces
 from asm_gym.monitors.base import Progress, State, Surprise
-from asm_gym.monitors.calibration import LOG, AlarmRate, require_sight
+from asm_gym.monitors.calibration import LOG, AlarmRate, apart_for_ceilings, require_sight, with_ceilings
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
 from asm_gym.monitors.stream_model import (
     StreamModel,
@@ -53,7 +53,8 @@ class CalibratedMonitor:
 
     Attributes:
         about: JSON values to save with it, such as its ``name``.
-        learned_from_, ceilings_from_: hashes of the episodes of ``fit`` and of ``learn_ceilings``; None before.
+        learned_from_, ceilings_from_: hashes of the episodes of ``fit``, and of those of ``calibrate`` that set
+            ceilings; None before, or without such.
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
         blocks_: the same by the hour, as ``detection.conformal`` counts it.
@@ -201,6 +202,9 @@ class CalibratedMonitor:
         Give one rate; ``threshold_at`` returns the threshold of any other rate. If fewer than five of the episodes'
         maxima may exceed the threshold, their tail is modelled, and ``promise.modelled`` is true.
 
+        Of 300 episodes or more, one in three says how far each sense goes at its worst, where the detection is that of
+        evidence and the others suffice for the rate; they alone set the threshold. Few faults are found without that.
+
         Args:
             episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
             false_alarm_rate: largest probability of an alarm in a nominal episode, in (0, 1).
@@ -218,16 +222,24 @@ class CalibratedMonitor:
         if each and len(each) != len(episodes):
             raise ValueError(f"each must name a group for each episode, got {len(each)} for {len(episodes)} episodes")
         asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
+        evidence = isinstance(self.detection, EvidenceDetection)
+        apart = apart_for_ceilings(episodes, asked, each) if evidence else np.zeros(len(episodes), np.bool_)
         try:
-            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
+            check_fresh(episodes, self.learned_from_, None if apart.any() else self.ceilings_from_)
         except ValueError as error:
             if asked.per == HOUR:
                 raise
             LOG.warning("%s; with it the promised rate does not hold", error)
-        new = self._balanced(episodes)
-        values = [s.value for s in new.score_episodes(episodes)]
+        new, fresh = self._copy(), [e for e, is_apart in zip(episodes, apart, strict=True) if not is_apart]
+        if apart.any():
+            of = [e for e, is_apart in zip(episodes, apart, strict=True) if is_apart]
+            new.detection, new.ceilings_from_ = with_ceilings(self, of), hashes_of(of)
+            new.detections[new.detection.name] = new.detection
+            each = [name for name, is_apart in zip(each, apart, strict=bool(each)) if not is_apart]
+        new = new._balanced(fresh)
+        values = [s.value for s in new.score_episodes(fresh)]
         threshold = asked.threshold_of(values, self.spec.dt, each)
-        require_sight(self.detection, self.model.error_columns, self.spec, threshold)
+        require_sight(new.detection, self.model.error_columns, self.spec, threshold)
         vars(self).update(vars(new))
         self.threshold_, self.promised_ = threshold, asked.per
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)

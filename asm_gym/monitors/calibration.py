@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -17,15 +18,14 @@ from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_ho
 from asm_gym.detection.events import Excuses
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors.stream_model import model_outputs
-from asm_gym.monitors.training_data import check_fresh, check_nominal, hashes_of
 from asm_gym.spec import StreamSpec
-from asm_gym.validation import typed
 
 if TYPE_CHECKING:
     from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 
 LOG = logging.getLogger("asm_gym.monitors")
 
+FOR_CEILINGS = 3  # one in so many episodes sets ceilings
 AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 MOST_NAMED = 6  # channels that a message names
@@ -55,6 +55,12 @@ class AlarmRate(NamedTuple):
     def named(self) -> dict[str, float]:
         """The argument of ``calibrate``."""
         return {"false_alarms_per_hour" if self.per == HOUR else "false_alarm_rate": self.rate}
+
+    def possible(self, episodes: Sequence[Episode]) -> bool:
+        """Return whether so many nominal episodes are enough to promise this rate."""
+        if self.per == EPISODE:
+            return len(episodes) >= conformal_episodes(self.rate)
+        return self.rate * sum(len(e) * e.spec.dt for e in episodes) / 3600 >= 1.0
 
     def check_hours(self, hours: float) -> None:
         """Raise ValueError where the hours are too few for a rate by the hour."""
@@ -109,36 +115,31 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
     LOG.warning(message)
 
 
-@typed
-def learn_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> CalibratedMonitor:
-    """Learn from healthy hours how far each sense goes at its worst, and return the monitor.
+def apart_for_ceilings(episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()) -> NDArray[np.bool_]:
+    """Return which nominal episodes (n,) are to set ceilings, and not the threshold: one in three of each group.
 
-    The episodes it was fitted to, babbling say, are not like hours of operation. It has no threshold then: calibrate it
-    on other hours of the same policies and tasks.
-
-    Args:
-        monitor: fitted, under the detection of evidence; it is changed.
-        episodes: healthy ones that ``fit`` has not seen, 100 at least, and one hit or so in each 50 at most.
-
-    Raises:
-        ValueError: too few, or bad ones; one given twice, or that ``fit`` has learned from.
-        TypeError: its detection is not that of evidence.
+    None are where they would be fewer than ``FEWEST_EPISODES``, or the others too few for the rate that is asked for.
     """
-    monitor._require_fitted()
-    if not isinstance(monitor.detection, EvidenceDetection):
-        raise TypeError(f"the detection {monitor.detection.name} has no ceilings: use the detection evidence")
-    check_nominal(episodes, monitor.spec, monitor.model.shortest)
-    if len(episodes) < FEWEST_EPISODES:
-        raise ValueError(f"ceilings take {FEWEST_EPISODES} healthy episodes or more, got {len(episodes)}")
-    check_fresh(episodes, monitor.learned_from_)
+    groups: defaultdict[str, list[int]] = defaultdict(list)
+    for n, name in enumerate(each or [""] * len(episodes)):
+        groups[name].append(n)
+    apart = np.zeros(len(episodes), np.bool_)
+    for own in groups.values():
+        apart[own[::FOR_CEILINGS]] = True
+        if not asked.possible([episodes[n] for n in own if not apart[n]]):
+            return np.zeros(len(episodes), np.bool_)
+    return apart if apart.sum() >= FEWEST_EPISODES else np.zeros(len(episodes), np.bool_)
+
+
+def with_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> EvidenceDetection:
+    """Return a monitor's detection with ceilings by how far each sense goes at its worst in healthy episodes.
+
+    Episodes that were learned from, babbling say, are not like hours of operation, and are predicted too well.
+    """
+    assert isinstance(monitor.detection, EvidenceDetection)
     with threadpool_limits(1):
         maxima = _worst_of(monitor, monitor.detection, episodes)
-    learned = monitor.detection.with_ceilings(maxima, anew=monitor.ceilings_from_ is None)
-    monitor.detection = learned
-    monitor.detections = {**monitor.detections, learned.name: learned}
-    monitor.ceilings_from_ = hashes_of(episodes)
-    monitor._uncalibrate()
-    return monitor
+    return monitor.detection.with_ceilings(maxima, anew=monitor.ceilings_from_ is None)
 
 
 def _worst_of(

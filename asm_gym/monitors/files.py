@@ -23,7 +23,7 @@ from asm_gym.validation import check_choice, check_number
 
 MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks", "learned_from", "ceilings_from"
 PACE, MOTION, COMMANDS = "pace", "motion", "commands"
-"""Names of the arrays that ``calibrate``, ``fit`` and ``learn_ceilings`` keep in a checkpoint."""
+"""Names of the arrays that ``calibrate`` and ``fit`` keep in a checkpoint."""
 BITS, SCALE, ROOT = ".bits", ".scale", ".root"
 """Ends of the names of packed arrays; shipped memories also hold covariances C = s² K Kᵀ, by a root K of 16 bits."""
 WEIGHTS = "V", "U", "W_S", "W_C", "W_D", "W_F"  # of association and of the traces' network

@@ -2,7 +2,7 @@
 
 row → memory: errors, context → whiten → accumulate → value, attribution
 
-Further functions take a memory as an argument: ``skills``, ``calibration.learn_ceilings``, ``shipped``.
+Further functions take a memory as an argument: ``skills``, ``shipped``.
 """
 
 from __future__ import annotations

@@ -10,18 +10,17 @@ import numpy as np
 
 from asm_gym.data.crashes import CRASH, peak_force, peak_torques
 from asm_gym.data.episode import Episode, spans
+from asm_gym.detection.conformal import HOUR
 from asm_gym.detection.contact_limits import Pace, healthy_forces
-from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.calibration import learn_ceilings
+from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.spec import StreamSpec
 
 HELD_OUT = 3  # one in so many lessons of a task sets the threshold, and is not learned from
 LEARNED_UP_TO, DISTURBED_UP_TO = CRASH, 1.0
 """Learned: up to so many times what an undisturbed expert usually feels at most, in an undisturbed and a disturbed
 lesson. In the latter contact is an accident: a memory that knows it detects no push."""
-FOR_CEILINGS = 10  # one in so many healthy episodes of a task sets the ceilings of senses, where that makes enough
 AROUND_S = 0.2  # left out before and after a hit [s]
 SHORTEST = 20  # least steps of a stretch that is learned from
 PASSES, HIDDEN = 4, 32
@@ -133,30 +132,17 @@ def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress
 
 
 def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
-    """Set the threshold for so many false alarms per hour of healthy episodes, crashes included.
+    """Set ceilings and threshold for so many false alarms per hour of healthy episodes, crashes included.
 
-    By the hours of each task, where all have the hours that it takes; one in ``FOR_CEILINGS`` sets the ceilings of
-    senses, where there are enough. The forces of healthy motion are those without crashes.
+    By the hours of each task, where all have the hours that it takes. The forces of healthy motion are those without
+    crashes.
     """
-    whole, for_ceilings = for_threshold([*lessons.whole, *hours])
-    if for_ceilings:
-        learn_ceilings(memory, for_ceilings)
-    tasks = [episode.labelled.task for episode in whole]
-    duration: defaultdict[str, float] = defaultdict(float)
-    for episode, task in zip(whole, tasks, strict=True):
-        duration[task] += len(episode) * episode.spec.dt / 3600
-    each = tasks if min(duration.values()) * per_hour >= 1.0 else []
-    memory.calibrate(whole, false_alarms_per_hour=per_hour, each=each)
+    whole, asked = [*lessons.whole, *hours], AlarmRate(per_hour, HOUR)
+    by_task: defaultdict[str, list[Episode]] = defaultdict(list)
+    for episode in whole:
+        by_task[episode.labelled.task].append(episode)
+    tasks = [episode.labelled.task for episode in whole] if all(map(asked.possible, by_task.values())) else []
+    memory.calibrate(whole, false_alarms_per_hour=per_hour, each=tasks)
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
     memory.pace_ = Pace.by_task([*lessons.calibration, *hours], memory.spec)
     return memory
-
-
-def for_threshold(whole: Sequence[Episode]) -> tuple[list[Episode], list[Episode]]:
-    """Return those that set the threshold, and those that set ceilings; none of the latter where they are too few."""
-    number: defaultdict[str, int] = defaultdict(int)
-    parts: tuple[list[Episode], list[Episode]] = [], []
-    for episode in whole:
-        number[episode.labelled.task] += 1
-        parts[number[episode.labelled.task] % FOR_CEILINGS == 0].append(episode)
-    return parts if len(parts[1]) >= FEWEST_EPISODES else (list(whole), [])
