@@ -135,7 +135,7 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     """Set ceilings and threshold for so many false alarms per hour of healthy episodes, crashes included.
 
     By the hours of each task, where all have the hours that it takes. The forces of healthy motion are those without
-    crashes.
+    crashes, and its pace is that of the hours, as experts in lessons go faster than usual.
     """
     whole, asked = [*lessons.whole, *hours], AlarmRate(per_hour, HOUR)
     by_task: defaultdict[str, list[Episode]] = defaultdict(list)
@@ -144,5 +144,5 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     tasks = [episode.labelled.task for episode in whole] if all(map(asked.possible, by_task.values())) else []
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=tasks)
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
-    memory.pace_ = Pace.by_task([*lessons.calibration, *hours], memory.spec)
+    memory.pace_ = Pace.by_task(hours or lessons.calibration, memory.spec)
     return memory
