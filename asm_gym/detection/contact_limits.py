@@ -24,6 +24,7 @@ from asm_gym.validation import check_flag, check_number
 FELT = "external_torque", "wrist_force"  # ends of the names of the channels that limits are about
 Floats = NDArray[np.float64]
 LEFT_OUT = 0.05  # share of healthy episodes that no limit makes room for: those that pressed hardest, or went fastest
+ODD = 0.002  # share of all healthy episodes that may be odd at any one place
 MOST = 2.5  # what was seen counts up to so many times the usual limits: 200 N, 100 N m
 
 
@@ -35,6 +36,7 @@ DOWN = 1.05  # the same of a hand that goes down, where what it meets is hard
 SLACK = np.array([0.03] * 3 + [0.15] * 3)  # and by so much more [m/s], [rad/s]
 STILL = 1e-9  # no speed is divided by less [m/s]
 MOMENTUM = 1.5  # of an arm along its hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
+MOMENTUM_ASTRAY = 1.35  # the same in a task whose own pace is known
 
 
 class Pace:
@@ -43,16 +45,17 @@ class Pace:
     Args:
         cells: (N, 16) arm; place in cells; greatest twist along the axes of the world and against them. The greatest
             counts where a place is given twice.
+        momentum: limit of an arm's, along its hand's motion, where no healthy hand was [N s].
 
     Raises:
         ValueError: numbers that are none of these.
     """
 
-    def __init__(self, cells: NDArray[np.floating[Any]]) -> None:
+    def __init__(self, cells: NDArray[np.floating[Any]], momentum: float = MOMENTUM) -> None:
         near = cells.ndim == 2 and cells.shape[1] == 16 and len(cells) > 0 and (np.abs(cells[:, :4]) <= FAR).all()
         if not (near and (cells[:, 0] >= 0).all() and (cells[:, 4:] >= 0).all()):
             raise ValueError(f"pace must be rows of 16 numbers, places within {FAR} cells, got {cells.shape}")
-        self.cells, at = cells, cells[:, :4].astype(np.intp)
+        self.cells, self.momentum, at = cells, momentum, cells[:, :4].astype(np.intp)
         self._low = at.min(axis=0) - (0, 1, 1, 1)
         grid = np.zeros((*(at.max(axis=0) - self._low + (1, 2, 2, 2)), 12), np.float32)
         np.maximum.at(grid, tuple((at - self._low).T), cells[:, 4:])
@@ -63,8 +66,9 @@ class Pace:
     @classmethod
     def of(cls, known: Mapping[str, NDArray[np.floating[Any]]], task: str = "") -> Self | None:
         """Return the pace of a task, by cells of each; of all tasks where it is not ``known``, None where none is."""
-        cells = [known[task]] if task in known else list(known.values())
-        return cls(np.concatenate(cells)) if cells else None
+        if task in known:
+            return cls(known[task], MOMENTUM_ASTRAY)
+        return cls(np.concatenate(list(known.values()))) if known else None
 
     @classmethod
     def by_task(cls, episodes: Sequence[Episode], spec: StreamSpec) -> dict[str, NDArray[np.float32]]:
@@ -80,7 +84,8 @@ class Pace:
     def learned(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> NDArray[np.float32] | None:
         """Return the cells of healthy streams (T, D); None where these do not tell how hands move.
 
-        The fastest ``LEFT_OUT`` of the episodes at a place do not count there.
+        The fastest ``LEFT_OUT`` of the episodes at a place, and ``ODD`` of all more, do not count there: of hundreds of
+        episodes an odd one sets no pace where few others go.
         """
         found = []
         names = [c.name.removesuffix("position") for c in spec.channels if c.name.endswith("hand_position")]
@@ -96,9 +101,10 @@ class Pace:
             fastest = np.zeros((len(visits), 12))
             np.maximum.at(fastest, which.ravel(), np.hstack((rows[:, 4:], -rows[:, 4:])))
             places, which = np.unique(visits[:, 1:], axis=0, return_inverse=True)
-            ordered = (np.sort(fastest[which.ravel() == n], axis=0) for n in range(len(places)))
-            seen = [own[-1 - int(LEFT_OUT * len(own))] for own in ordered]
-            found.append(np.column_stack((np.full(len(places), arm), places, seen)))
+            ordered = (np.sort(fastest[which.ravel() == n], axis=0)[::-1] for n in range(len(places)))
+            kept = [own[int(LEFT_OUT * len(own) + ODD * len(streams)) :] for own in ordered]
+            seen = [(arm, *place, *own[0]) for place, own in zip(places, kept, strict=True) if len(own)]
+            found.append(np.array(seen).reshape(-1, 16))
         return np.concatenate(found).astype(np.float32) if found else None
 
     def seen(self, arm: int, place: Floats) -> NDArray[np.floating[Any]]:
@@ -113,7 +119,7 @@ class Pace:
         along = FASTER * np.where(twists > 0.0, seen[0], seen[1])
         known = ((along + SLACK) / np.maximum(np.abs(twists), STILL)).min(axis=1)
         known = np.minimum(known, np.clip(DOWN * seen[1, 2], SLACK[2], usual) / np.maximum(-twists[:, 2], STILL))
-        return np.maximum(np.minimum(usual / speeds, MOMENTUM / np.maximum(momenta, STILL)), known)
+        return np.maximum(np.minimum(usual / speeds, self.momentum / np.maximum(momenta, STILL)), known)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,9 @@
 
 Each lesson is one episode. One in three is the expert's own, and sets the threshold. The others are led by the expert
 at many speeds, by the expert under noise, or by noise alone (or a hand that reaches for one place after another); under
-noise the arm also drifts now and then, as agents do once they have done their task. With reaching, some lessons more
-have the expert press what it holds. In some, the speed of the hand is limited as a guard limits it, for a slowed arm
-feels otherwise. The noise is weak enough that most of a lesson is free of impacts: those would teach the memory to
-expect them.
+noise the arm also drifts now and then, as agents do once they have done their task. Some lessons more limit the speed
+of the hand as a guard does, for a slowed arm feels otherwise; with reaching, some have the expert press what it holds.
+The noise is weak enough that most of a lesson is free of impacts: those would teach the memory to expect them.
 
 Sources: Laskey et al. 2017 (CoRL, DART) for noise on an expert's commands; Saegusa et al. 2009 (ROBIO) for babbling;
 Rolf et al. 2010 (IEEE TAMD 2(3)) for goals in place of random commands.
@@ -51,8 +50,8 @@ DRIFT, DRIFTED, DRIFTING = 0.015, (5, 60), (0.05, 1.0)
 """Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
 PRESS, PRESSED, PRESSING, HELD = 0.04, (8, 40), (0.1, 0.6), 10
 """Probability per step that an object gripped for ``HELD`` steps is pressed, steps, and command [action units]."""
-LIMITED, CHANGED, LIMITS = 1 / 3, 0.05, (0.05, 1.0)
-"""Share of lessons whose hand is slowed down, probability per step that its limit changes, and limits [m/s]."""
+CHANGED, LIMITS = 0.05, (0.05, 1.0)
+"""Probability per step that the limit of a hand's speed changes, in a lesson that has one, and limits [m/s]."""
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
@@ -76,7 +75,7 @@ class Lesson(NamedTuple):
     weight: float = 1.0  # of the task's object, relative to what is usual
     drift: float = 0.0  # probability per step that the arm drifts for a while
     press: float = 0.0  # probability per step that it presses what it holds for a while
-    limited: bool = False  # the speed of the hand, as by a guard
+    limit: float = 0.0  # probability per step that the limit of the hand's speed changes; 0 for no limit
 
     @property
     def trial(self) -> Trial:
@@ -92,16 +91,18 @@ class Lesson(NamedTuple):
 def curriculum(tasks: Sequence[str], episodes: int, seed: int, reaching: bool = False) -> list[Lesson]:
     """Return ``episodes`` of each task; all follow from ``seed``, and fewer are the first of more.
 
-    ``reaching``: the hand reaches for places where noise alone would lead, and one lesson more for each three presses.
+    One lesson more for each three is at a limited speed. ``reaching``: the hand reaches for places where noise alone
+    would lead, and one lesson more for each three presses.
     """
     check_number("episodes", episodes, low=1, whole=True)
-    lessons = []
+    lessons, beside = [], range(0, episodes, HELD_OUT)
+    leading = [REACHING if reaching and lead == ALONE else lead for lead in LEADING]
     for task in tasks:
         for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes)):
-            lead = LED if held_out(number) else LEADING[number % len(LEADING)]
-            lessons.append(_lesson(task, number, drawn, REACHING if reaching and lead == ALONE else lead))
-    beside = range(0, episodes if reaching else 0, HELD_OUT)
-    for task in tasks:
+            lessons.append(_lesson(task, number, drawn, LED if held_out(number) else leading[number % len(leading)]))
+        for number, drawn in zip(beside, role_seeds(seed, task, "limit", len(beside)), strict=True):
+            lessons.append(_lesson(task, number, drawn, leading[number % len(leading)])._replace(limit=CHANGED))
+    for task in tasks if reaching else ():
         for number, drawn in zip(beside, role_seeds(seed, task, "press", len(beside)), strict=True):
             driven = _lesson(task, number, drawn, DRIVEN)
             lessons.append(driven._replace(noise=NOISE[0], pause=0.0, drift=0.0, press=PRESS))
@@ -121,7 +122,6 @@ def _lesson(task: str, number: int, seed: int, lead: str) -> Lesson:
         pause=PAUSE * float(rng.random() < 0.5),
         weight=float(np.exp(rng.uniform(*np.log(WEIGHT)))) if rng.random() < 0.5 else 1.0,
         drift=DRIFT * (lead != LED),
-        limited=bool(rng.random() < LIMITED) and not held_out(number),
     )
 
 
@@ -143,7 +143,7 @@ class Babbler(StatefulPolicy):
         self._left, self._course, self._grasp, self._held = 0, np.zeros_like(self._noise), 1.0, 0
 
     def begin(self, observation: Any) -> Any:
-        if self._lesson.limited:
+        if self._lesson.limit:
             self._limit_speed()
         return None
 
@@ -154,7 +154,7 @@ class Babbler(StatefulPolicy):
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
         """Return the next action (A,)."""
         lesson, rng = self._lesson, self._rng
-        if lesson.limited and self._limits.random() < CHANGED:
+        if self._limits.random() < lesson.limit:
             self._limit_speed()
         fresh = rng.standard_normal(self._noise.shape)
         self._noise = lesson.smoothness * self._noise + np.sqrt(1.0 - lesson.smoothness**2) * fresh
