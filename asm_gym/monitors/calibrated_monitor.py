@@ -202,8 +202,9 @@ class CalibratedMonitor:
         Give one rate; ``threshold_at`` returns the threshold of any other rate. If fewer than five of the episodes'
         maxima may exceed the threshold, their tail is modelled, and ``promise.modelled`` is true.
 
-        Of 300 episodes or more, one in three says how far each sense goes at its worst, where the detection is that of
-        evidence and the others suffice for the rate; they alone set the threshold. Few faults are found without that.
+        Of 300 episodes or more, one in three (or ten) says how far each sense goes at its worst, where the detection is
+        that of evidence and the others suffice for the rate; they alone set the threshold. Without that fewer faults
+        are found.
 
         Args:
             episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.

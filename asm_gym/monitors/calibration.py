@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("asm_gym.monitors")
 
-FOR_CEILINGS = 3  # one in so many episodes sets ceilings
+ONE_IN = 3, 10  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
 AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 MOST_NAMED = 6  # channels that a message names
@@ -116,19 +116,20 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
 
 
 def apart_for_ceilings(episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()) -> NDArray[np.bool_]:
-    """Return which nominal episodes (n,) are to set ceilings, and not the threshold: one in three of each group.
+    """Return which nominal episodes (n,) are to set ceilings, and not the threshold: one in so many of each group.
 
     None are where they would be fewer than ``FEWEST_EPISODES``, or the others too few for the rate that is asked for.
     """
     groups: defaultdict[str, list[int]] = defaultdict(list)
     for n, name in enumerate(each or [""] * len(episodes)):
         groups[name].append(n)
-    apart = np.zeros(len(episodes), np.bool_)
-    for own in groups.values():
-        apart[own[::FOR_CEILINGS]] = True
-        if not asked.possible([episodes[n] for n in own if not apart[n]]):
-            return np.zeros(len(episodes), np.bool_)
-    return apart if apart.sum() >= FEWEST_EPISODES else np.zeros(len(episodes), np.bool_)
+    for one_in in ONE_IN:
+        apart = np.zeros(len(episodes), np.bool_)
+        apart[[n for own in groups.values() for n in own[::one_in]]] = True
+        others = ([episodes[n] for n in own if not apart[n]] for own in groups.values())
+        if apart.sum() >= FEWEST_EPISODES and all(map(asked.possible, others)):
+            return apart
+    return np.zeros(len(episodes), np.bool_)
 
 
 def with_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> EvidenceDetection:
