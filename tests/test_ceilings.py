@@ -56,6 +56,13 @@ def test_a_group_gives_a_third_of_its_own(asm):
     assert sorted(asm.blocks_.group.tolist()) == [0] * 200 + [1] * 20
 
 
+def test_a_tenth_where_a_third_is_too_many(asm):
+    hours = sine_episodes(1000, seed=20)
+    asm.calibrate(hours, false_alarm_rate=0.00125)  # which takes 799
+    assert set(asm.ceilings_from_) == set(hashes_of(hours[::10]))
+    assert len(asm.maxima_) == 900
+
+
 @pytest.mark.parametrize("asked", [{"false_alarm_rate": 0.004}, {"false_alarms_per_hour": 6.0}])
 def test_none_are_taken_where_the_promise_needs_all(asm, asked):
     hours = sine_episodes(300, seed=20)
