@@ -64,10 +64,11 @@ def test_a_tenth_where_a_third_is_too_many(asm):
 
 
 @pytest.mark.parametrize("asked", [{"false_alarm_rate": 0.004}, {"false_alarms_per_hour": 6.0}])
-def test_none_are_taken_where_the_promise_needs_all(asm, asked):
+def test_none_are_taken_where_the_promise_needs_all_which_is_said(asm, asked, caplog):
     hours = sine_episodes(300, seed=20)
     assert 1.0 < 6.0 * sum(len(e) * e.spec.dt for e in hours) / 3600 < 1.5
     asm.calibrate(hours, **asked)
+    assert "takes all 300 episodes" in caplog.text
     assert asm.ceilings_from_ is None
     assert len(asm.maxima_) == 300
     asm.calibrate(hours[:200], false_alarm_rate=0.05)  # too few

@@ -129,6 +129,12 @@ def apart_for_ceilings(episodes: Sequence[Episode], asked: AlarmRate, each: Sequ
         others = ([episodes[n] for n in own if not apart[n]] for own in groups.values())
         if apart.sum() >= FEWEST_EPISODES and all(map(asked.possible, others)):
             return apart
+    if len(episodes) >= ONE_IN[0] * FEWEST_EPISODES:
+        LOG.warning(
+            "the rate that is asked for takes all %d episodes, so that none say how far each sense goes at its worst, "
+            "and fewer faults are found: record more, or ask for a higher rate",
+            len(episodes),
+        )
     return np.zeros(len(episodes), np.bool_)
 
 
