@@ -6,6 +6,7 @@ continues it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -61,6 +62,8 @@ class Args(Options):
     """Rows of the stream per second; by default one per control step."""
     healthy_episodes: int = option(60, quick=0, least=0)
     """Expert episodes of each task to calibrate on, beside held-out lessons."""
+    healthy_hours: float | None = option(None, least=0, metavar="HOURS")
+    """Hours of each task in their place: fewer episodes of tasks that take longer."""
     corpus: Path | None = option(None, metavar="FOLDER")
     """Folder of asm-gym corpus, to calibrate also on its healthy hours of experts."""
     exam_episodes: int = option(60, quick=0, least=0)
@@ -80,8 +83,15 @@ class Args(Options):
             check_choice("task of one arm with a gripper", name, _GRIPPED)
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
-        each = sum(map(held_out, range(self.episodes))) + self.healthy_episodes
-        check_hours(self.false_alarms_per_hour, each * sum(task_spec(t).horizon for t in self.shown) / USUAL / 3600)
+        lessons = sum(map(held_out, range(self.episodes)))
+        steps = sum((lessons + self.healthy(t)) * task_spec(t).horizon for t in self.shown)
+        check_hours(self.false_alarms_per_hour, steps / USUAL / 3600)
+
+    def healthy(self, task: str) -> int:
+        """Return how many episodes of a task's expert are recorded to calibrate on."""
+        if self.healthy_hours is None:
+            return self.healthy_episodes
+        return math.ceil(3600 * USUAL * self.healthy_hours / task_spec(task).horizon)
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -114,7 +124,7 @@ def learn(args: Args, console: Console) -> NeuralASM:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress)
     lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
-    seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy_episodes) for task in args.shown}
+    seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy(task)) for task in args.shown}
     trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
     with stage("healthy hours", console, {}) as progress:
         files = record_missing(trials, args.config, args.out / "hours", args.workers, progress)
