@@ -258,7 +258,7 @@ def test_the_command_refuses_what_makes_no_sense(given, why):
 def test_hours_are_the_same_in_each_task_and_episodes_fewer_where_they_are_longer():
     by_hours = Args(tasks=("Lift", "Stack"), healthy_hours=1.0)
     assert [by_hours.healthy(task) for task in by_hours.tasks] == [720, 360]  # of 5 and 10 s
-    assert Args(tasks=("Lift", "Stack"), healthy_episodes=9).healthy("Stack") == 9
+    assert Args(tasks=("Lift", "Stack"), healthy_episodes=90).healthy("Stack") == 90
     with pytest.raises(ValueError, match="healthy_hours must be at least 0"):
         Args(healthy_hours=-1.0)
 
