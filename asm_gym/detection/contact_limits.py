@@ -66,7 +66,7 @@ class Pace:
     @classmethod
     def of(cls, known: Mapping[str, NDArray[np.floating[Any]]], task: str = "") -> Self | None:
         """Return the pace of a task, by cells of each; of all tasks where it is not ``known``, None where none is."""
-        if task in known:
+        if task and task in known:
             return cls(known[task], MOMENTUM_ASTRAY)
         return cls(np.concatenate(list(known.values()))) if known else None
 

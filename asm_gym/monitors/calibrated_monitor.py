@@ -231,12 +231,12 @@ class CalibratedMonitor:
             if asked.per == HOUR:
                 raise
             LOG.warning("%s; with it the promised rate does not hold", error)
-        new, fresh = self._copy(), [e for e, is_apart in zip(episodes, apart, strict=True) if not is_apart]
-        if apart.any():
-            of = [e for e, is_apart in zip(episodes, apart, strict=True) if is_apart]
-            new.detection, new.ceilings_from_ = with_ceilings(self, of), hashes_of(of)
+        new = self._copy()
+        chosen, fresh = ([episodes[n] for n in np.flatnonzero(part).tolist()] for part in (apart, ~apart))
+        if chosen:
+            new.detection, new.ceilings_from_ = with_ceilings(self, chosen), hashes_of(chosen)
             new.detections[new.detection.name] = new.detection
-            each = [name for name, is_apart in zip(each, apart, strict=bool(each)) if not is_apart]
+            each = [each[n] for n in np.flatnonzero(~apart).tolist()] if each else ()
         new = new._balanced(fresh)
         values = [s.value for s in new.score_episodes(fresh)]
         threshold = asked.threshold_of(values, self.spec.dt, each)
