@@ -53,7 +53,8 @@ PARTS: dict[str, tuple[Source, ...]] = {
         *(Source("Lift", "lift_sac", nominal=1190), Source("Stack", "stack_sac", nominal=790)),
         *(Source("Door", "door_sac", nominal=790), Source("NutAssemblySquare", nominal=450)),
         *(Source(f"PickPlace{o}", f"{o.lower()}_clone", nominal=300) for o in ("Can", "Milk", "Bread")),
-        *(Source("PickPlaceCereal", "cereal_clone", 0, 0, 400), Source("NutAssemblySquare", "square_clone", 0, 0, 400)),
+        Source("PickPlaceCereal", "cereal_clone", nominal=400),
+        Source("NutAssemblySquare", "square_clone", nominal=400),
         *(Source(f"PickPlace{o}", nominal=400) for o in ("Bread", "Cereal")),
     ),
 }
