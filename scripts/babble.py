@@ -28,7 +28,16 @@ from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.collect import environment, record_missing
 from asm_gym.rollouts.corpus import Corpus
 from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.exam import Exam, Marks, card, examine, summary, usual_force
+from asm_gym.rollouts.pretraining.exam import (
+    PROMISES,
+    Exam,
+    Marks,
+    card,
+    examine,
+    promises_table,
+    summary,
+    usual_force,
+)
 from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions
@@ -175,12 +184,13 @@ def babble(args: Args, console: Console) -> None:
         memory = learn(args, console)
         marks = examined(args, memory, console) if args.exam_episodes else []
         if marks:
-            table = card(marks, memory, WINDOW_S)
-            adapted = summary([m.adapted(args.false_alarms_per_hour) for m in marks])
-            said = f"{summary(marks)}\nWith an adaptive threshold: {adapted}"
-            write_text(args.out / "card.md", f"{markdown(table)}\n\n{said}\n")
-            console.print(table)
-            console.print(said)
+            own = args.false_alarms_per_hour
+            rates = [*(r for r in PROMISES if r > own), own]
+            thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in rates}
+            tables = card(marks, memory, WINDOW_S), promises_table(marks, thresholds, WINDOW_S)
+            said = f"{summary(marks)}\nWith an adaptive threshold: {summary([m.adapted(own) for m in marks])}"
+            write_text(args.out / "card.md", "\n\n".join([*map(markdown, tables), said]) + "\n")
+            console.print(*tables, said, sep="\n")
     console.print(
         f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it"
     )

@@ -21,21 +21,27 @@ from pathlib import Path
 import numpy as np
 
 from asm_gym.detection.conformal import HOUR, Blocks
-from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.detection_tables import SPLITS, kept_rate, over_splits
+from asm_gym.evaluation.detection_tables import SPLITS, over_splits
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
-from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.pretraining.exam import SEVERITIES, Exam, Marks, card, examine, usual_force
+from asm_gym.rollouts.pretraining.exam import (
+    PROMISES,
+    Exam,
+    Marks,
+    card,
+    examine,
+    promises_table,
+    together,
+    usual_force,
+)
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings
 
-PROMISES = (10.0, 5.0, 3.0, 1.0)  # false alarms per hour that a threshold promises
 EXPERT = "scripted"
 
 
@@ -71,7 +77,7 @@ def run(config: Config) -> Findings:
     return Findings(
         records,
         [
-            kept_table(marks, thresholds),
+            promises_table(marks, thresholds, WINDOW_S),
             card(marks, memory, WINDOW_S),
             rules_table(marks, memory, thresholds),
             splits_table(marks + known),
@@ -107,11 +113,6 @@ class EDetector:
             self._evidence = 0.0
 
 
-def together(marks: Sequence[Marks]) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
-    """Return the healthy and the faulty episodes of all exams."""
-    return [t for m in marks for t in m.solved], [t for m in marks for t in m.metrics.faulty]
-
-
 def rules_table(marks: Sequence[Marks], memory: NeuralASM, thresholds: Mapping[float, float]) -> Table:
     """Return a row for each promise and rule of alarm."""
     blocks, rows = memory.blocks_, []
@@ -145,25 +146,3 @@ def splits_table(marks: Sequence[Marks]) -> Table:
     )
     cells = {f"promised {rate:g}/h": over_splits(found, units, AlarmRate(rate, HOUR)) for rate in PROMISES}
     return Table(caption, list(cells), [list(cells.values())])
-
-
-def kept_table(marks: Sequence[Marks], thresholds: Mapping[float, float]) -> Table:
-    """Return a row for each promise: alarms that came, and faults found."""
-    rows = []
-    for promised, threshold in thresholds.items():
-        healthy, faulty = together([m.at(threshold) for m in marks])
-        shares = [
-            DetectionMetrics("", [t for t in faulty if t.severity in severities], [], WINDOW_S).detected
-            for severities in (SEVERITIES, ("mild",))
-        ]
-        excused = (f"{hourly_alarms(healthy, event).value:.1f}" for event in (KNOCK, STOP))
-        cells = kept_rate(hourly_alarms(healthy), promised), *excused
-        rows.append((f"{promised:g}", f"{threshold:.3g}", *cells, *(f"{percent(s)} of {s.n}" for s in shares)))
-    hours = sum(len(t) * t.dt for t in together(marks)[0]) / 3600
-    caption = (
-        f"Alarms per hour in {hours:.2f} healthy hours of policies and tasks that the memory never met, with 95 % "
-        "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the promise. Found: "
-        f"faults that an ideal observer could see, within {WINDOW_S:g} s."
-    )
-    found = (f"{' and '.join(SEVERITIES)} found", "mild found")
-    return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *found), rows)

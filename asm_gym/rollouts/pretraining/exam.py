@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -14,7 +14,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.events import KNOCK, STOP
 from asm_gym.evaluation.comparison import detectability_of, visible_kinds
-from asm_gym.evaluation.detection_tables import milliseconds
+from asm_gym.evaluation.detection_tables import kept_rate, milliseconds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
 from asm_gym.evaluation.scored_episode import NOMINAL, ScoredEpisode
 from asm_gym.evaluation.scoring import traces_of
@@ -25,6 +25,7 @@ from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
+PROMISES = (10.0, 5.0, 3.0, 1.0)  # false alarms per hour that a threshold promises
 SEVERITIES = "medium", "strong"  # of the faults in an examination; mild ones are hardly detectable
 MOST_IN_ALARM = 0.5  # of episodes, that an adaptive threshold may aim for
 SCENES = 12  # faults happen in the first so many scenes
@@ -150,9 +151,38 @@ def card(marks: Sequence[Marks], memory: CalibratedMonitor, window: float) -> Ta
     return tabulate(caption, columns, marks)
 
 
+def together(marks: Sequence[Marks]) -> tuple[list[ScoredEpisode], list[ScoredEpisode]]:
+    """Return the healthy and the faulty episodes of all exams."""
+    return [t for m in marks for t in m.solved], [t for m in marks for t in m.metrics.faulty]
+
+
+def promises_table(marks: Sequence[Marks], thresholds: Mapping[float, float], window: float) -> Table:
+    """Return a row for each promise: its threshold, alarms that came, and faults found within ``window`` [s]."""
+    rows = []
+    for promised, threshold in thresholds.items():
+        healthy, faulty = together([m.at(threshold) for m in marks])
+        shares = [
+            DetectionMetrics("", [t for t in faulty if t.severity in severities], [], window).detected
+            for severities in (SEVERITIES, ("mild",))
+        ]
+        excused = (f"{hourly_alarms(healthy, event).value:.1f}" for event in (KNOCK, STOP))
+        cells = kept_rate(hourly_alarms(healthy), promised), *excused
+        rows.append(
+            (f"{promised:g}", f"{threshold:.3g}", *cells, *(f"{percent(s)} of {s.n}" if s.n else "" for s in shares))
+        )
+    hours = sum(len(t) * t.dt for t in together(marks)[0]) / 3600
+    caption = (
+        f"By promise: alarms per hour in the {hours:.2f} healthy hours of these exams, with 95 % Poisson intervals; "
+        "alarms within a minute count once. Broken: the interval lies above the promise. Found: faults that an ideal "
+        f"observer could see, within {window:g} s."
+    )
+    found = (f"{' and '.join(SEVERITIES)} found", "mild found")
+    return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *found), rows)
+
+
 def summary(marks: Sequence[Marks]) -> str:
     """Return one line: alarms, and faults found, in all exams together."""
-    solved = [t for m in marks for t in m.solved]
+    solved, _ = together(marks)
     fault, knock, stop = (hourly_alarms(solved, event) for event in ("", KNOCK, STOP))
     found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
     return (
