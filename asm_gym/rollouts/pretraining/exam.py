@@ -158,26 +158,25 @@ def together(marks: Sequence[Marks]) -> tuple[list[ScoredEpisode], list[ScoredEp
 
 def promises_table(marks: Sequence[Marks], thresholds: Mapping[float, float], window: float) -> Table:
     """Return a row for each promise: its threshold, alarms that came, and faults found within ``window`` [s]."""
+    solved, faults = together(marks)
+    severities = {f"{' and '.join(SEVERITIES)} found": SEVERITIES, "mild found": ("mild",)}
+    shown = {n: which for n, which in severities.items() if any(t.severity in which for t in faults)}
     rows = []
     for promised, threshold in thresholds.items():
         healthy, faulty = together([m.at(threshold) for m in marks])
-        shares = [
-            DetectionMetrics("", [t for t in faulty if t.severity in severities], [], window).detected
-            for severities in (SEVERITIES, ("mild",))
-        ]
         excused = (f"{hourly_alarms(healthy, event).value:.1f}" for event in (KNOCK, STOP))
-        cells = kept_rate(hourly_alarms(healthy), promised), *excused
+        own = ([t for t in faulty if t.severity in which] for which in shown.values())
+        found = (f"{percent(DetectionMetrics('', ts, [], window).detected)} of {len(ts)}" for ts in own)
         rows.append(
-            (f"{promised:g}", f"{threshold:.3g}", *cells, *(f"{percent(s)} of {s.n}" if s.n else "" for s in shares))
+            (f"{promised:g}", f"{threshold:.3g}", kept_rate(hourly_alarms(healthy), promised), *excused, *found)
         )
-    hours = sum(len(t) * t.dt for t in together(marks)[0]) / 3600
+    hours = sum(len(t) * t.dt for t in solved) / 3600
     caption = (
         f"By promise: alarms per hour in the {hours:.2f} healthy hours of these exams, with 95 % Poisson intervals; "
         "alarms within a minute count once. Broken: the interval lies above the promise. Found: faults that an ideal "
         f"observer could see, within {window:g} s."
     )
-    found = (f"{' and '.join(SEVERITIES)} found", "mild found")
-    return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *found), rows)
+    return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *shown), rows)
 
 
 def summary(marks: Sequence[Marks]) -> str:
