@@ -14,7 +14,7 @@ import pytest
 from asm_gym.detection.conformal import Blocks
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.rollouts.pretraining.exam import Marks
+from asm_gym.rollouts.pretraining.exam import Marks, promises_table
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import STUDIES, hours, kit, memorise_and_recall
 
@@ -86,11 +86,13 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     severities = [(2.5, "strong"), (9.0, "medium"), (2.0, "mild")]
     faults = [ten_minutes(n, peak, 200, severity) for n, (peak, severity) in enumerate(severities)]
     marks = [Marks("lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0))]
-    table = hours.kept_table(marks, {1.0: 4.5, 5.0: 1.5})
+    table = promises_table(marks, {1.0: 4.5, 5.0: 1.5}, 1.0)
     assert "in 1.00 healthy hours" in table.caption
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
     assert [row[2].split()[0] for row in table.rows] == ["2.0", "5.0"]  # peaks 5 and 6; peaks 2 to 6
     assert [row[-2:] for row in table.rows] == [("50 % of 2", "0 % of 1"), ("100 % of 2", "100 % of 1")]
+    severe = [marks[0]._replace(metrics=DetectionMetrics("", faults[:2], solved, 1.0))]
+    assert [row[-1] for row in promises_table(severe, {1.0: 4.5, 5.0: 1.5}, 1.0).rows] == ["50 % of 2", "100 % of 2"]
 
 
 def test_promises_over_halves_come_true_where_all_hours_are_alike():
