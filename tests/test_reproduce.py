@@ -87,7 +87,7 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     faults = [ten_minutes(n, peak, 200, severity) for n, (peak, severity) in enumerate(severities)]
     marks = [Marks("lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0))]
     table = promises_table(marks, {1.0: 4.5, 5.0: 1.5}, 1.0)
-    assert "in 1.00 healthy hours" in table.caption
+    assert "1.00 healthy hours" in table.caption
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
     assert [row[2].split()[0] for row in table.rows] == ["2.0", "5.0"]  # peaks 5 and 6; peaks 2 to 6
     assert [row[-2:] for row in table.rows] == [("50 % of 2", "0 % of 1"), ("100 % of 2", "100 % of 1")]
