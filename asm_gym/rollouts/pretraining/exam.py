@@ -83,8 +83,7 @@ class Marks(NamedTuple):
         """Return the result under a threshold that follows the policy; faults are judged by its last value."""
         if not self.solved:
             return self
-        hours = sum(len(t) * t.dt for t in self.solved) / 3600
-        share = min(per_hour * hours / len(self.solved), MOST_IN_ALARM)
+        share = min(per_hour * hourly_alarms(self.solved).hours / len(self.solved), MOST_IN_ALARM)
         return self.under(AdaptiveThreshold(share).start(self.solved[0].threshold))
 
     def under(self, running: Follows) -> Marks:
@@ -170,11 +169,10 @@ def promises_table(marks: Sequence[Marks], thresholds: Mapping[float, float], wi
         rows.append(
             (f"{promised:g}", f"{threshold:.3g}", kept_rate(hourly_alarms(healthy), promised), *excused, *found)
         )
-    hours = sum(len(t) * t.dt for t in solved) / 3600
     caption = (
-        f"By promise: alarms per hour in the {hours:.2f} healthy hours of these exams, with 95 % Poisson intervals; "
-        "alarms within a minute count once. Broken: the interval lies above the promise. Found: faults that an ideal "
-        f"observer could see, within {window:g} s."
+        f"By promise: alarms per hour in the {hourly_alarms(solved).hours:.2f} healthy hours of these exams, with 95 % "
+        "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the promise. Found: "
+        f"faults that an ideal observer could see, within {window:g} s."
     )
     return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *shown), rows)
 
