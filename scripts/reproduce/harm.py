@@ -230,7 +230,9 @@ def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
         ax = fig.subplots()
         for n, guard in enumerate(guards):
             colour, _, marker = look(n)
-            ax.plot((times[guard] / times[POLICY_ALONE]).mean(), harm[guard], marker, color=colour, label=guard)
+            slower = (times[guard] / times[POLICY_ALONE]).mean()
+            label = guard if np.isfinite(slower) else f"{guard}: solves nothing"
+            ax.plot(slower, harm[guard], marker, color=colour, label=label)
         ax.set(yscale="log", xlabel="time to success, over that of the policy alone", ylabel="harm in an episode [N s]")
         ax.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
     return fig
