@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.detection.kinematics import Chain
-from asm_gym.guard.hand import HandAgainstJoints, compare
+from asm_gym.guard.hand_check import HandChecks, compare_hands
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -54,18 +54,21 @@ class Check:
     """One arm's hand against its joints."""
 
     def __init__(self, lift):
-        self.hands = HandAgainstJoints((lift.unwrapped.hand_chains[0],), lift.unwrapped.stream_spec)
+        self.all = HandChecks(1, ((lift.unwrapped.hand_chains[0],),), lift.unwrapped.stream_spec)
+        self.hands = self.all.arms[0]
 
     def read(self, row, missing):
-        some = compare(row[None].astype(np.float32), *self.hands.arguments)
-        return self.hands.contradiction(0, missing) if self.hands.contradicting(some) else None
+        some = compare_hands(row[None].astype(np.float32), self.all.geometry, self.all.state)
+        self.hands.close_cases()
+        assert some == self.hands.contradicts(0)
+        return self.hands.contradiction(0, missing) if some else None
 
     def reset(self):
-        self.hands.begin(np.ones(1, bool))
+        self.all.begin(np.ones(1, bool))
 
     @property
     def vouched(self):
-        return self.hands.vouched(0)
+        return self.hands.right(0)
 
 
 def said(check, stream, since=0, missing=None):
@@ -98,7 +101,7 @@ def test_an_encoder_that_is_five_thousandths_off_is_named_and_its_angle_found_by
     assert check.hands.accused(0)[cause.columns].all()
     guessed = stream[50].copy()
     guessed[joint] += 0.03  # what a memory may be off
-    found = check.hands.refined(0, guessed, missing, np.full(spec.size, 0.05))
+    found = check.hands.refine(0, guessed, missing, np.full(spec.size, 0.05))
     assert abs(found[joint] - angles[50, joint]) < 0.002
 
 

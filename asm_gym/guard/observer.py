@@ -1,117 +1,20 @@
-"""Asks a monitor for the surprise of rows; whatever goes wrong with that is infinite surprise.
-
-Before, it is checked that the monitor can watch such rows.
-"""
+"""Asks a monitor for the surprise of rows; whatever goes wrong with that is infinite surprise."""
 
 from __future__ import annotations
 
-import logging
-import math
 import time
-from collections.abc import Mapping
 from contextlib import suppress
-from copy import deepcopy
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import CONTROLLER
-from asm_gym.guard.rows import Rows
-from asm_gym.monitors import (
-    CalibratedMonitor,
-    ExpectsActions,
-    ExplainsItself,
-    ForgetsEvidence,
-    Monitor,
-    NeuralASM,
-    Surprise,
-)
-from asm_gym.monitors.diagnosis import Diagnosis
-from asm_gym.spec import StreamSpec
-from asm_gym.validation import check_number, short_repr
+from asm_gym.compilation import Bound
+from asm_gym.guard.robot_table import Mask
+from asm_gym.monitors import ExpectsActions, ForgetsEvidence, Monitor, NeuralASM, Surprise
+from asm_gym.monitors.row_kernel import RowKernel, uninitialised
 
-LOG = logging.getLogger("asm_gym.safety")
-
-UNNAMED = {"", "spaces", "table"}  # sources of streams that do not say whose they are
-
-STALE = "monitor: it was fitted while it watched; reset() takes it over"
-
-Mask = NDArray[np.bool_]
-
-
-class Fitted(NamedTuple):
-    """A monitor as it was when it was taken up."""
-
-    monitor: Monitor
-    threshold: float
-    parts: tuple[Any, ...]  # what ``fit`` replaces, compared by identity
-
-    @classmethod
-    def of(cls, monitor: Monitor, spec: StreamSpec) -> Self:
-        """Return a monitor that can watch such a stream. Raises what ``check_monitor`` does."""
-        return cls(monitor, check_monitor(monitor, spec), _parts(monitor))
-
-    @property
-    def stale(self) -> bool:
-        """Whether it was fitted since."""
-        return any(now is not then for now, then in zip(_parts(self.monitor), self.parts, strict=True))
-
-    def differs(self, other: Fitted) -> bool:
-        """Return whether it is another monitor, or was fitted or calibrated in between."""
-        same = all(a is b for a, b in zip(self.parts, other.parts, strict=True))
-        return not same or self.threshold != other.threshold
-
-
-def _parts(monitor: Monitor) -> tuple[Any, ...]:
-    if isinstance(monitor, NeuralASM):
-        return monitor, monitor.model.completion_, monitor.model.senses_
-    return monitor, getattr(monitor, "diagnosis_", None), None
-
-
-def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -> float:
-    """Return the monitor's threshold, once it can watch such a stream of a body under a ``controller``.
-
-    Raises:
-        ValueError: it is for another stream, robot or controller (the message names both), or would never alarm.
-        RuntimeError: it is not calibrated.
-    """
-    if not all(callable(getattr(monitor, name, None)) for name in ("initial_state", "observe")):
-        raise TypeError(f"monitor must have initial_state() and observe(), got {short_repr(monitor)}")
-    monitor.spec.require(watched, "the monitor")
-    learned = getattr(monitor, "about", {}).get(CONTROLLER, "")
-    for what, mine, theirs in ("robot", monitor.spec.source, watched.source), (CONTROLLER, learned, controller):
-        if mine != theirs and not {mine, theirs} & UNNAMED:
-            raise ValueError(f"the monitor was fitted for the {what} {mine}, got {theirs}: give a monitor for {theirs}")
-    return check_number("the monitor's threshold", monitor.threshold)
-
-
-def check_answer(monitor: Monitor) -> None:
-    """Raise TypeError where a user's monitor answers a row with anything but a state and a surprise."""
-    if isinstance(monitor, CalibratedMonitor):
-        return
-    try:
-        tried = deepcopy(monitor)  # one that counts its rows must not count this one
-        answer: Any = tried.observe(tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))
-    except Exception as error:  # an alarm at the first row, unless it is mended by then
-        LOG.warning("the monitor failed at a row of zeros: %r", error)
-        return
-    if not (isinstance(answer, tuple) and len(answer) == 2 and hasattr(answer[1], "attribution")):
-        parts = [type(part).__name__ for part in answer] if isinstance(answer, tuple) else [type(answer).__name__]
-        raise TypeError(f"observe(state, stream) must return (state, Surprise), got ({', '.join(parts)})")
-
-
-def diagnosis_of(monitor: Monitor) -> Diagnosis | None:
-    """Return what names causes, and not only that something is wrong; None where nothing does."""
-    return monitor.diagnosis_ if isinstance(monitor, ExplainsItself) else None
-
-
-class Observation(NamedTuple):
-    """What a monitor made of n rows."""
-
-    surprise: Surprise  # infinite, and attributed to nothing, where there is a failure
-    expected: NDArray[np.float32] | None  # (n, A) what is likely to be commanded next; None where nobody asks
-    failures: Mapping[int, str]  # what failed, by robot
+Floats32 = NDArray[np.float32]
 
 
 class Observer:
@@ -120,63 +23,99 @@ class Observer:
     Args:
         monitor: fitted and calibrated.
         count: n.
-        rows: they know which surprise counts.
         recalls: the monitor is asked what it expects to be commanded.
+
+    Attributes:
+        latency: how long the monitor took for the last rows [s].
+        expected: (n, A) what is likely to be commanded next; None where nobody asks.
     """
 
-    def __init__(self, monitor: Monitor, count: int, rows: Rows, recalls: bool) -> None:
-        self._monitor, self._count, self._size, self._rows = monitor, count, monitor.spec.size, rows
-        self._ours = monitor if isinstance(monitor, NeuralASM) else None
+    def __init__(self, monitor: Monitor, count: int, recalls: bool) -> None:
+        self._monitor = monitor
+        self._count = count
+        self._size = monitor.spec.size
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
-        self._recalls = monitor if isinstance(monitor, ExpectsActions) and recalls else None
-        self.latency = 0.0  # of the monitor at the last rows [s]
+        self._expects = monitor if isinstance(monitor, ExpectsActions) and recalls else None
+        self._neural = monitor if isinstance(monitor, NeuralASM) else None
+        self._steps: list[_CompiledStep] = []  # the last two, which take turns
+        self.latency = 0.0
+        self.expected: Floats32 | None = None
         self.begin(np.ones(count, bool))
-        if self._ours is not None:  # what a row needs is loaded now, and not within the first step
-            self._ours.observe(self._initial, np.zeros((count, self._size), np.float32))
+        if self._neural is not None:  # what a row needs is loaded now, and not within the first step
+            self._neural.observe(self._initial, np.zeros((count, self._size), np.float32))
 
     def begin(self, which: Mask) -> None:
-        """New episodes in the streams of ``which`` (n,)."""
+        """Begin new episodes in the streams of ``which`` (n,)."""
         if which.all():
-            self._state = self._before = self._initial = self._monitor.initial_state(batch=self._count)
+            self._initial = self._monitor.initial_state(batch=self._count)
+            self._state = self._initial
+            self._before = self._initial
         elif which.any():
             self._state = choose(which, self._initial, self._state)
 
-    def observe(self, rows: NDArray[np.float32], failures: Mapping[int, str], active: Mask) -> Observation:
-        """Return what counts of the surprise at the next rows.
+    # ------------------------------------------------------------------ a row in compiled code
+
+    def compiled_step(self) -> Bound | None:
+        """Return what ``observe_rows`` needs for the next rows; None where Python takes part in them."""
+        if self._neural is None or self._expects is not None:
+            return None
+        kernel = self._neural.compiled_row()
+        if kernel is None:
+            return None
+        for step in self._steps:
+            if step.kernel is kernel and step.state is self._state and step.new is self._spare():
+                return step.bound
+        new = self._spare()
+        if new is None:
+            new = uninitialised(self._state)
+        step = _CompiledStep(kernel, self._state, new)
+        self._steps = [*self._steps[-1:], step]
+        return step.bound
+
+    def stepped(self, bound: Bound, seconds: float) -> None:
+        """Take up the state that compiled code has written, in so many seconds."""
+        step = next(step for step in self._steps if step.bound is bound)
+        self._before = self._state
+        self._state = step.new
+        self.latency = seconds
+
+    def _spare(self) -> Any:
+        """Return a state that may be written to; None where there is none."""
+        return None if self._before is self._initial or self._before is self._state else self._before
+
+    # ------------------------------------------------------------------ a row of any monitor
+
+    def observe(self, rows: Floats32, judged: Any, attribution: Any) -> dict[int, str]:
+        """Write what the monitor makes of rows (n, D), perhaps not finite.
 
         Args:
-            rows: (n, D) as they are believed, perhaps not finite.
-            failures: that are known already, by robot.
-            active: (n,) whose rows count.
-        """
-        free, self._before = self._before, self._state
-        start, expected = time.perf_counter(), None
-        try:
-            if self._ours is None:
-                state, surprise = self._monitor.observe(self._before, rows)
-                surprise = self._copied(surprise)  # its arrays may be buffers that it uses again
-            else:
-                reused = None if free is self._initial or free is self._before else free
-                state, surprise = self._ours.observe(self._before, rows, reused)
-            self.latency = time.perf_counter() - start
-            if self._recalls is not None:
-                expected = self._expected(self._recalls, state)
-            self._state = state
-        except Exception as error:  # nothing has judged these rows
-            surprise = Surprise(np.full(self._count, np.inf), np.zeros((self._count, self._size)))
-            failures = {i: joined(failures.get(i, ""), f"monitor: {error!r}") for i in range(self._count)}
-        for i, value in enumerate(surprise.value.tolist()):
-            if not value > -math.inf:  # NaN too
-                failures = {**failures, i: joined(failures.get(i, ""), f"monitor: its surprise is {value}")}
-        everyone = all(active.tolist())
-        if everyone and not (failures or self._rows.repairs):
-            return Observation(surprise, expected, failures)
-        surprise = self._rows.counted(_infinite(surprise, failures), failures)
-        surprise = surprise if everyone else surprise.silenced(~active)
-        return Observation(surprise, expected, failures)
+            judged: (n,) records of ``JUDGED``, written.
+            attribution: (n, D), written.
 
-    def amend(self, rows: NDArray[np.float32]) -> None:
+        Returns:
+            What failed, by robot.
+        """
+        start = time.perf_counter()
+        spare = self._spare()
+        self._before = self._state
+        try:
+            if self._neural is None:
+                state, surprise = self._monitor.observe(self._before, rows)
+            else:
+                state, surprise = self._neural.observe(self._before, rows, spare)
+            self._write(surprise, judged, attribution)
+            if self._expects is not None:
+                self.expected = self._expected_actions(self._expects, state)
+        except Exception as error:  # nothing has judged these rows
+            judged["surprise"] = np.inf
+            attribution[:] = 0.0
+            return dict.fromkeys(range(self._count), f"monitor: {error!r}")
+        self._state = state
+        self.latency = time.perf_counter() - start
+        return unjudged(judged)
+
+    def amend(self, rows: Floats32) -> None:
         """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
         with suppress(Exception):  # the state stays as it is: the next row is judged from there
             self._state, _ = self._monitor.observe(self._before, rows)
@@ -192,22 +131,43 @@ class Observer:
             return f"monitor: {error!r}"
         return ""
 
-    def _copied(self, surprise: Surprise) -> Surprise:
-        """Return what another monitor than ours says in arrays of its own."""
-        value, attribution = np.array(surprise.value, np.float64), np.array(surprise.attribution, np.float64)
-        shapes = (self._count,), (self._count, self._size)
-        if (value.shape, attribution.shape) != shapes:
-            raise ValueError(
-                f"a surprise must have values of shape {shapes[0]} and attributions of shape {shapes[1]}, "
-                f"got {value.shape} and {attribution.shape}"
-            )
-        return surprise._replace(value=value, attribution=attribution)
-
-    def _expected(self, monitor: ExpectsActions, state: Any) -> NDArray[np.float32]:
+    def _expected_actions(self, monitor: ExpectsActions, state: Any) -> Floats32:
         expected = np.asarray(monitor.expected_action(state), np.float32)
         if expected.shape != (self._count, self._monitor.spec.motor.size):
             raise ValueError(f"expected_action has the shape {expected.shape}")
         return expected
+
+    def _write(self, surprise: Surprise, judged: Any, attribution: Any) -> None:
+        """Write a surprise, whose arrays may be buffers that the monitor uses again."""
+        value = np.asarray(surprise.value, np.float64)
+        shares = np.asarray(surprise.attribution, np.float64)
+        wanted = (self._count,), (self._count, self._size)
+        if (value.shape, shares.shape) != wanted:
+            raise ValueError(
+                f"a surprise must have values of shape {wanted[0]} and attributions of shape {wanted[1]}, "
+                f"got {value.shape} and {shares.shape}"
+            )
+        judged["surprise"] = value
+        judged["raw_surprise"] = value if surprise.raw is None else surprise.raw
+        judged["excuse"] = 0 if surprise.excuse is None else surprise.excuse
+        attribution[:] = shares
+
+
+class _CompiledStep:
+    """A row from one state to another."""
+
+    def __init__(self, kernel: RowKernel, state: Any, new: Any) -> None:
+        self.kernel = kernel
+        self.state = state
+        self.new = new
+        self.bound = kernel.bound(state, new)
+
+
+def unjudged(judged: Any) -> dict[int, str]:
+    """Return what failed by robot, where a surprise is no number that a threshold can be compared with."""
+    values = judged["surprise"]
+    wrong = np.flatnonzero(~(values > -np.inf))  # NaN too
+    return {robot: f"monitor: its surprise is {values[robot]}" for robot in wrong.tolist()}
 
 
 def joined(*failures: str) -> str:
@@ -227,13 +187,3 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
     if not isinstance(old, np.ndarray) or len(old) != len(mask):
         raise TypeError(f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}")
     return np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-
-def _infinite(surprise: Surprise, failures: Mapping[int, str]) -> Surprise:
-    """Return it infinite, and attributed to nothing, where there are failures."""
-    if not failures:
-        return surprise
-    value, attribution = surprise.value.copy(), surprise.attribution.copy()
-    for robot in failures:
-        value[robot], attribution[robot] = np.inf, 0.0
-    return surprise._replace(value=value, attribution=attribution)

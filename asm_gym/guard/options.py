@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from asm_gym.data.action_meaning import ActionMeans
@@ -22,13 +22,12 @@ OnAlarmName = Literal["monitor", "hold", "retract", "comply", "recall", "graded"
 OnAlarm = OnAlarmName | Policy | Callable[[Any], Policy]
 """What ``on_alarm`` takes: a name, a policy, or what makes a policy for an environment."""
 
-TRY_AFTER_S, GIVE_UP_AFTER_S, GO_ON_S = 0.5, 3.0, 5.0
-"""Under ``"graded"``: when control is handed back on trial, when the episode ends, and for how long in an episode the
-policy may go on in alarm [s]."""
-
-STRIKES, IMPULSE = 3, 20.0
-"""Under ``"graded"``: the episode ends where the policy passes a contact limit for the time ``STRIKES``, or presses
-with more than ``IMPULSE`` beyond healthy motion [N s]."""
+# Under "graded":
+TRY_AFTER_S = 0.5  # control is handed back on trial after so long [s]
+GIVE_UP_AFTER_S = 3.0  # the episode ends after so long in an override [s]
+GO_ON_S = 5.0  # for so long in an episode the policy may go on in alarm [s]
+STRIKES = 3  # the episode ends where the policy passes a contact limit for this time
+IMPULSE = 20.0  # or presses with more than this, beyond healthy motion [N s]
 
 
 @dataclass(frozen=True)
@@ -76,10 +75,9 @@ class GuardOptions:
         limits = self.contact_limits
         if not (limits is None or isinstance(limits, ContactLimits) or limits == "memory"):
             raise ValueError(f'contact_limits must be ContactLimits, "memory" or None, got {short_repr(limits)}')
-        if self.adaptive_threshold is not None and not isinstance(self.adaptive_threshold, AdaptiveThreshold):
-            raise TypeError(
-                f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(self.adaptive_threshold)}"
-            )
+        adaptive = self.adaptive_threshold
+        if adaptive is not None and not isinstance(adaptive, AdaptiveThreshold):
+            raise TypeError(f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(adaptive)}")
 
     def reaction(self, names_causes: bool) -> OnAlarm:
         """Return ``on_alarm``, or what None means for a monitor that names causes or does not.
@@ -87,8 +85,9 @@ class GuardOptions:
         Raises:
             ValueError: there are responses, and nobody asks for them.
         """
-        usual: OnAlarmName = "graded" if names_causes else "hold"
-        chosen: OnAlarm = usual if self.on_alarm is None else self.on_alarm
+        chosen = self.on_alarm
+        if chosen is None:
+            chosen = "graded" if names_causes else "hold"
         if self.responses is not None and not (isinstance(chosen, str) and chosen == GRADED):
             raise ValueError(f"responses need on_alarm='graded', got on_alarm={short_repr(chosen)}")
         return chosen
@@ -97,16 +96,17 @@ class GuardOptions:
         """Return when control is handed back, for a control period of ``dt`` [s]; ``graded`` sets more limits."""
 
         def rows(steps: int | None, seconds: float) -> float:
-            if steps is None and not graded:
-                return math.inf
-            return rows_per_step * (max(1, round(seconds / dt)) if steps is None else steps)
+            if steps is not None:
+                return rows_per_step * steps
+            if graded:
+                return rows_per_step * max(1, round(seconds / dt))
+            return math.inf
 
-        return ReleaseRule(
-            rows_per_step * self.release_after,
-            rows(self.max_override, GIVE_UP_AFTER_S),
-            rows(self.try_after, TRY_AFTER_S),
-            rows_per_step * ReleaseRule.free_after,
-            STRIKES if graded else math.inf,
-            IMPULSE if graded else math.inf,
-            rows(None, GO_ON_S),
+        rule = ReleaseRule(
+            release_after=rows_per_step * self.release_after,
+            max_override=rows(self.max_override, GIVE_UP_AFTER_S),
+            try_after=rows(self.try_after, TRY_AFTER_S),
+            free_after=rows_per_step * ReleaseRule.free_after,
+            go_on=rows(None, GO_ON_S),
         )
+        return replace(rule, strikes=STRIKES, impulse=IMPULSE) if graded else rule

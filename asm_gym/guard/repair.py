@@ -8,13 +8,14 @@ second.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.guard.hand import HandAgainstJoints
-from asm_gym.memory.completion import Completion, Filling
+from asm_gym.guard.hand_check import HandCheck
+from asm_gym.memory.completion import Completion
 
 WELL_AFTER_S = 1.0  # a sense is well again once it has said what was expected for so long [s]
 WELL_WITHIN = 4.0  # standard deviations of the completion's own error that this may be off
@@ -26,78 +27,104 @@ FARTHEST = 6.0  # no completed number goes further than so many of its spreads f
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Row = NDArray[np.floating[Any]]
+
+
+@dataclass
+class MissingSensor:
+    """A sensor that is completed."""
+
+    silent: bool  # it says nothing: it is believed as soon as it says what is expected
+    age: int = 0  # rows for which it has been missing
+    well: int = 0  # rows, one after the other, in which it has said what was expected
 
 
 class Repair:
     """Keeps the rows of one robot well, from the first row on in which a sense is not believed.
 
     Args:
+        completion: completes senses from others.
         robot: which of those that ``hands`` know.
         before: (D,) the row before; None where there is none.
         read: (D,) which columns the policy reads, of whose completion something depends.
         hands: tell of missing angles better than the memory, and which senses are not to be believed again yet.
+
+    Attributes:
+        missing: (D,) which columns are completed.
+        settling: rows until the monitor has seen nothing but repaired rows of a sense that was found at fault.
     """
 
     def __init__(
         self,
         completion: Completion,
         robot: int,
-        before: NDArray[np.floating[Any]] | None,
+        before: Row | None,
         read: Mask,
-        hands: Sequence[HandAgainstJoints] = (),
+        hands: Sequence[HandCheck] = (),
     ) -> None:
-        self._completion, self._robot, self._hands, self._read = completion, robot, hands, read
-        spec = self._spec = completion.spec
-        self._patience, self._longest = round(TRUST_S / spec.dt), round(LONGEST_S / spec.dt)
+        spec = completion.spec
+        self._completion = completion
+        self._robot = robot
+        self._hands = hands
+        self._read = read
+        self._spec = spec
+        self._patience = round(TRUST_S / spec.dt)
+        self._longest = round(LONGEST_S / spec.dt)
         self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
         self._settle = 2 * completion.senses.lag + 1  # rows in which changes are taken from what was not yet repaired
-        self.missing = np.zeros(spec.size, bool)  # (D,) which columns are completed
+        self.missing = np.zeros(spec.size, bool)
         self.settling = 0
-        """Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault."""
         self._returned = np.zeros(spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
-        self._lost: set[str] = set()  # of the missing, which said nothing, and are believed when they do
-        self._age: dict[str, int] = {}  # rows for which each has been missing
-        self._well: dict[str, int] = {}  # rows in which each missing sensor has said what was expected
+        self._sensors: dict[str, MissingSensor] = {}
         self._unchecked = 0  # rows in which something was completed that no other sense tells of
-        self._before: Floats | None = None if before is None else np.array(before, np.float64)  # (D,) repaired
+        self._before: Floats | None = None  # (D,) the row before, repaired
+        if before is not None:
+            self._before = np.array(before, np.float64)
         self._good = self._before  # (D,) the last row before something was missing
-        self._raw = self._earlier = np.zeros(spec.size) if self._before is None else self._before
+        self._raw = np.zeros(spec.size) if self._before is None else self._before  # (D,) the newest, as it was sensed
+        self._raw_before = self._raw
 
     @property
     def names(self) -> tuple[str, ...]:
         """The sensors that are completed."""
-        return tuple(self._well)
+        return tuple(self._sensors)
 
     @property
     def trusted(self) -> bool:
         """False once a sense that no other tells of is missing for long, any for very long, or too many at a time."""
         sensory = self._spec.sensory
-        few = self.missing[sensory].mean() <= MOST_MISSING if len(sensory) else True
-        return bool(few and self._unchecked <= self._patience and max(self._age.values(), default=0) <= self._longest)
+        if len(sensory) and self.missing[sensory].mean() > MOST_MISSING:
+            return False
+        oldest = max((sensor.age for sensor in self._sensors.values()), default=0)
+        return self._unchecked <= self._patience and oldest <= self._longest
 
     @property
     def over(self) -> bool:
         """There is nothing left to repair."""
-        return not (self._well or self._returned.any() or self.settling) and self.trusted
+        busy = self._sensors or self._returned.any() or self.settling
+        return self.trusted and not busy
 
     @property
     def unjudged(self) -> Mask:
         """(D,) the numbers that surprise nobody: they are missing, or their changes are those from completed ones."""
         return self.missing | (self._returned > 0)
 
-    def next(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+    def next(self, row: Row) -> NDArray[np.float32]:
         """Return the next row (D,) as it should be."""
-        self._earlier, self._raw = self._raw, np.array(row, np.float64)
+        self._raw_before = self._raw
+        self._raw = np.array(row, np.float64)
         self.settling = max(0, self.settling - 1)
         self._returned = np.maximum(self._returned - 1, 0)
-        self._age = {name: self._age.get(name, 0) + 1 for name in self._well}
-        lost = ~np.isfinite(self._raw) & ~self.missing
-        lost[self._spec.motor] = False
-        if lost.any() and not lost[self._spec.sensory].all():
-            self._lost |= self._doubt(lost)
+        for sensor in self._sensors.values():
+            sensor.age += 1
+
+        silent = ~np.isfinite(self._raw) & ~self.missing
+        silent[self._spec.motor] = False
+        if silent.any() and not silent[self._spec.sensory].all():
+            self._complete(silent, silent=True)
         repaired = self._repaired()
-        if self._well:
-            self._judge(repaired)
+        if self._sensors:
+            self._believe_again(repaired)
         if not self.missing.any():
             self._good = self._raw
         self._before = repaired
@@ -109,64 +136,81 @@ class Repair:
         wanted[columns] = True
         if wanted[self._spec.sensory].all() or not (wanted & ~self.missing).any():
             return None
-        self._lost -= self._doubt(wanted)
+        self._complete(wanted, silent=False)
         self.settling = self._settle
-        self._before = repaired = self._repaired()
-        return repaired.astype(np.float32)
+        self._before = self._repaired()
+        return self._before.astype(np.float32)
 
-    def _doubt(self, columns: Mask) -> set[str]:
-        """Believe the sensors of ``columns`` (D,) no more; return which those are."""
-        names = [name for name, own in self._completion.sensors if columns[own].any()]
-        self._well |= dict.fromkeys(names, 0)  # in an order that no hash decides, for reports are to the last bit
-        self._choose()
-        return set(names)
+    def _complete(self, columns: Mask, silent: bool) -> None:
+        """Believe the sensors of ``columns`` (D,) no more."""
+        # In an order that no hash decides, for reports are equal to the last bit.
+        for name, own in self._completion.sensors:
+            if columns[own].any():
+                known = self._sensors.get(name, MissingSensor(silent))
+                self._sensors[name] = MissingSensor(silent, age=known.age)
+        self._choose_filling()
 
-    def _choose(self) -> None:
-        """Take up which sensors are missing."""
+    def _choose_filling(self) -> None:
+        """Take up which columns are missing, and how they are completed."""
         self.missing = np.zeros(self._spec.size, bool)
         for name, own in self._completion.sensors:
-            self.missing[own] |= name in self._well
-        self._filling: Filling = self._completion.filling(self.missing)
+            self.missing[own] |= name in self._sensors
+        self._filling = self._completion.filling(self.missing)
         spread = self._completion.senses.spread[self._filling.columns]
         self._untold = self._filling.error > UNTOLD * spread  # (M,)
         self._guessed = self._untold & self._read[self._filling.columns]  # (M,)
 
     def _repaired(self) -> Floats:
-        if not self._well:
+        """Return the newest row (D,) with what is missing completed."""
+        if not self._sensors:
             return self._raw
-        repaired, columns = self._raw.copy(), self._filling.columns
+        senses = self._completion.senses
+        columns = self._filling.columns
         before = self._raw if self._before is None else self._before
-        value = self._completion.complete(self._filling, self._completion.lift(np.stack([before, self._raw])))[-1]
+        lifted = self._completion.lift(np.stack([before, self._raw]))
+        value = self._completion.complete(self._filling, lifted)[-1]
         if self._guessed.any():
-            last = self._completion.senses.mean if self._good is None else self._good
+            last = senses.mean if self._good is None else self._good
             value = np.where(self._guessed, last[columns], value)
-        mean, spread = self._completion.senses.mean[columns], self._completion.senses.spread[columns]
-        repaired[columns] = np.clip(value, mean - FARTHEST * spread, mean + FARTHEST * spread)
-        error = self._completion.error * self._completion.senses.spread
+        mean = senses.mean[columns]
+        farthest = FARTHEST * senses.spread[columns]
+        repaired = self._raw.copy()
+        repaired[columns] = np.clip(value, mean - farthest, mean + farthest)
+        error = self._completion.error * senses.spread
         for hand in self._hands:
-            repaired = hand.refined(self._robot, repaired, self.missing, error)
+            repaired = hand.refine(self._robot, repaired, self.missing, error)
         return repaired
 
-    def _judge(self, repaired: Floats) -> None:
+    def _believe_again(self, repaired: Floats) -> None:
         """Count for how long each missing sensor has been well, and believe those that have been for long enough."""
-        columns, raw, before = self._filling.columns, self._raw[self._filling.columns], self.names
         self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
+        fine, there = self._as_expected(repaired)
+        well: list[str] = []
+        for name, own in self._completion.sensors:
+            sensor = self._sensors.get(name)
+            if sensor is None:
+                continue
+            sensor.well = sensor.well + 1 if fine[own].all() else 0
+            speaks = sensor.silent and there[own].all()
+            if sensor.well >= self._well_after or speaks:
+                well.append(name)
+                self._returned[own] = self._settle
+                repaired[own] = self._raw[own]
+        for name in well:
+            del self._sensors[name]
+        if well:
+            self._choose_filling()
+
+    def _as_expected(self, repaired: Floats) -> tuple[Mask, Mask]:
+        """Return (D,) which missing numbers say what others tell of them, and which at least say something likely."""
+        columns = self._filling.columns
+        raw = self._raw[columns]
         close = np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error  # False for what is not finite
         for hand in self._hands:
             close &= ~hand.accused(self._robot)[columns]
-        repeats = (raw == self._earlier[columns]) & (self._spec.noise[columns] > 0)
-        fine, there = np.zeros((2, self._spec.size), bool)
+        repeats = (raw == self._raw_before[columns]) & (self._spec.noise[columns] > 0)
+        fine = np.zeros(self._spec.size, bool)
         fine[columns] = close & ~repeats & ~self._untold
+        there = np.zeros(self._spec.size, bool)
         there[columns] = np.isfinite(raw) & (close | self._untold)
-        for name, own in self._completion.sensors:
-            if name not in self._well:
-                continue
-            self._well[name] = self._well[name] + 1 if fine[own].all() else 0
-            if self._well[name] >= self._well_after or (name in self._lost and there[own].all()):
-                del self._well[name]
-                self._age.pop(name, None)
-                self._lost.discard(name)
-                self._returned[own] = self._settle
-                repaired[own] = self._raw[own]
-        if self.names != before:
-            self._choose()
+        return fine, there

@@ -1,145 +1,198 @@
-"""What ``info["asm"]`` says of a control step, from the rows that were sensed in it."""
+"""What became of rows, and what ``info["asm"]`` says of a control step."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.events import EVENTS
-from asm_gym.guard.arbiter import ENDED, STATES, Decision
+from asm_gym.detection.benign_events import EVENTS, KNOCK
+from asm_gym.guard.alarm_terms import ALARM_TERMS, CONTACT
+from asm_gym.guard.arbiter import Decision
+from asm_gym.guard.contact_state import severity_info
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
-from asm_gym.guard.robots import NOTHING
-from asm_gym.guard.severity import KNOCKED, Severity
-from asm_gym.monitors import Surprise
+from asm_gym.guard.robot_facts import NOTHING
+from asm_gym.guard.robot_table import ENDED, STATES, Mask
 from asm_gym.spec import StreamSpec
 
-CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING = "contact", "failure", "surprise", "contradiction", "missing"
-REASONS = CONTACT, FAILURE, SURPRISE, CONTRADICTION, MISSING
-"""Reasons of an alarm: a contact limit was passed, something failed, surprise is over its threshold, a hand is not
-where its joints say, a number is not finite."""
-
-Mask = NDArray[np.bool_]
+KNOCKED = EVENTS.index(KNOCK)
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Outcome:
     """What became of the row of one robot about which there was something to decide."""
 
-    alarm: bool  # for whatever reason
-    reason: str  # one of ``REASONS``; empty where there is no alarm
-    event: int  # a place in ``EVENTS``; 0 where there is no alarm
-    response: Response  # what is done about it
-    decision: Decision  # what it has led to
+    terms: tuple[str, ...] = ()  # alarm terms that hold, in the order of priority; empty for no alarm
+    event: int = 0  # an index in ``EVENTS``; 0 where there is no alarm
+    response: Response = NO_RESPONSE  # what is done about it
+    decision: Decision = field(default_factory=Decision)  # what it has led to
+
+    @property
+    def reason(self) -> str:
+        """The alarm term that gives the reason; empty where there is no alarm."""
+        return self.terms[0] if self.terms else ""
+
+    @property
+    def ends(self) -> bool:
+        """Whether it ends the episode, where alarms do: a knock that passes no contact limit does not."""
+        return bool(self.terms) and (self.event != KNOCKED or self.reason == CONTACT)
 
 
-class RowReport(NamedTuple):
-    """What became of a row of each of n robots; mappings hold those robots alone of which there is something to say."""
+@dataclass(frozen=True, slots=True)
+class RowReport:
+    """What became of a row of each of n robots; mappings hold those robots alone of which there is something to say.
 
-    surprise: Surprise  # as it counts, repaired senses left out
-    threshold: NDArray[np.float64]  # (n,)
-    alarm: Mask  # (n,)
-    intervened: Mask  # (n,)
-    event: NDArray[np.int8]  # (n,) places in ``EVENTS``
-    state: NDArray[np.int8]  # (n,) who acts next, places in ``STATES``
-    severity: Severity
+    Args:
+        robots: (n,) their records of ``ROBOT`` after the row, a copy.
+        attribution: (n, D) what each number adds to the surprise, repaired senses left out.
+        outcomes: what was decided.
+        failures: what failed.
+        repairs: the sensors that are not believed.
+        lost: the numbers that were not finite.
+    """
+
+    robots: NDArray[Any]
+    attribution: NDArray[np.float64]
     outcomes: Mapping[int, Outcome] = NOTHING
-    failure: Mapping[int, str] = NOTHING
-    repairs: Mapping[int, tuple[str, ...]] = NOTHING  # the sensors that are not believed
-    lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
+    failures: Mapping[int, str] = NOTHING
+    repairs: Mapping[int, tuple[str, ...]] = NOTHING
+    lost: Mapping[int, tuple[str, ...]] = NOTHING
 
     @property
     def gave_up(self) -> Mask:
         """(n,) the episode is to end."""
-        return np.asarray(self.state == ENDED)
+        return np.asarray(self.robots["state"] == ENDED)
 
     @property
     def ends(self) -> Mask:
-        """(n,) an alarm that ends the episode, where alarms do: a knock that passes no contact limit does not."""
-        found = np.zeros(len(self.alarm), bool)
-        for i, outcome in self.outcomes.items():
-            found[i] = outcome.alarm and (outcome.event != KNOCKED or outcome.reason == CONTACT)
-        return found
-
-    def of(self, which: Mask) -> RowReport:
-        """Return the same with nothing to say of all robots but those of ``which`` (n,)."""
-        parts: dict[str, Any] = {}
-        for name in ("alarm", "intervened", "event", "state"):
-            values = getattr(self, name)
-            parts[name] = np.where(which, values, np.zeros_like(values))
-        for name in ("outcomes", "failure", "repairs", "lost"):
-            parts[name] = {i: value for i, value in getattr(self, name).items() if which[i]}
-        return self._replace(surprise=self.surprise.silenced(~which), severity=self.severity.where(which), **parts)
-
-    @classmethod
-    def nothing(cls, count: int, size: int, threshold: NDArray[np.float64]) -> RowReport:
-        """Return the report of a row in which there was nothing to decide, before the first step of an episode."""
-        no, codes = np.zeros(count, bool), np.zeros(count, np.int8)
-        surprise = Surprise(np.zeros(count), np.zeros((count, size)))
-        return cls(surprise, threshold.copy(), no, no, codes, codes, Severity.unknown(count))
+        """(n,) an alarm that ends the episode, where alarms do."""
+        ending = np.zeros(len(self.robots), bool)
+        for robot, outcome in self.outcomes.items():
+            ending[robot] = outcome.ends
+        return ending
 
 
-NO_OUTCOME = Outcome(False, "", 0, NO_RESPONSE, Decision())
+NO_OUTCOME = Outcome()
 
 
-def report(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None) -> dict[str, Any]:
-    """Return what to say of the rows of a step of one robot; the wrapper adds ``alarms``, steps in alarm so far.
+class AsmInfo(TypedDict, total=False):
+    """The fields of ``info["asm"]`` of one robot; in a vector each is an array whose first axis is n."""
+
+    surprise: float  # the largest of the rows of this step; infinite where something failed
+    threshold: float
+    alarm: bool  # for any reason
+    alarms: int  # steps in alarm so far in this episode
+    reason: str  # the alarm term of the least priority; empty without an alarm
+    terms: tuple[str, ...]  # all alarm terms that hold
+    event: str  # "fault", "knock", "stop" (no alarm), or empty
+    state: str  # who acts next
+    intervened: bool  # another than the policy acted, in some row
+    gave_up: bool  # the episode ends
+    transition: str  # what has led to the state, or how the policy goes on in alarm; empty for no change
+    failure: str  # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
+    cause: dict[str, Any]  # family, part, probability of the family, probabilities of all
+    response: str  # what is done about it under "graded"
+    case: str  # the row of the table of responses that says so
+    severity: dict[str, Any]  # see ``severity_info``; None for what is not known, so that a report equals itself
+    executed_action: Any  # (A,) after the limit of the hand's speed; None before the first step
+    slowed: float  # largest share that the speed limit took from a number of the action
+    attribution: dict[str, float]  # what each number adds to the largest surprise
+    surprises: NDArray[np.float64]  # (k,) of all rows in this step
+    completed: tuple[str, ...]  # the sensors that are not believed now
+    lost: tuple[str, ...]  # the numbers that were not finite
+    preview: dict[str, Any] | None  # of the present chunk of actions
+    ceiling: float  # highest threshold, only where it follows the policy
+    level: float  # share of episodes so far with a false alarm, likewise
+
+
+def asm_info(
+    rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, **step: Any
+) -> AsmInfo:
+    """Return what ``info["asm"]`` says of a robot, from the rows of a step.
 
     Args:
+        rows: of the step, in order.
+        robot: which.
+        spec: of its stream.
         executed: (A,) the action that was done last; None before the first step.
+        step: what the wrapper knows of the step: ``alarms``, ``slowed``, ``preview``, ``ceiling``, ``level``.
     """
-    surprises = np.array([row.surprise.value[robot] for row in rows])
-    largest, last = int(surprises.argmax()), rows[-1]
+    records = [row.robots[robot] for row in rows]
+    last = rows[-1]
+    surprises = np.array([record["surprise"] for record in records])
+    most_surprising = rows[int(surprises.argmax())]
     outcomes = [row.outcomes.get(robot, NO_OUTCOME) for row in rows]
-    caused = next((o.response for o in reversed(outcomes) if o.response.why), NO_RESPONSE)
-    reasons = [o.reason for o in outcomes if o.reason]
-    shares = rows[largest].surprise.attribution[robot].tolist()
-    return {
-        "surprise": float(surprises[largest]),  # the largest of this step; infinite where something failed
-        "threshold": float(last.threshold[robot]),
-        "alarm": any(bool(row.alarm[robot]) for row in rows),
-        "reason": min(reasons, key=REASONS.index, default=""),  # of the alarm, the first of ``REASONS``
-        "event": EVENTS[max(int(row.event[robot]) for row in rows)],  # "fault", "knock", "stop" (no alarm), or empty
-        "state": str(STATES[last.state[robot]]),  # who acts next
-        "intervened": any(bool(row.intervened[robot]) for row in rows),  # another than the policy acted, in some row
-        "gave_up": any(bool(row.gave_up[robot]) for row in rows),  # the episode ends
-        # What has led to the state, a name in ``TRANSITIONS``, or how the policy goes on in alarm; empty for no change
-        "transition": next((t for o in reversed(outcomes) if (t := o.decision.transition)), ""),
-        # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
-        "failure": joined(*(row.failure.get(robot, "") for row in rows)),
-        "cause": deepcopy(caused.cause),  # of an alarm: family, part, probability of the family, probabilities of all
-        "response": caused.name,  # what is done about it under "graded"
-        "case": caused.case,  # the row of the table of responses that says so
-        # How bad it is, see ``Severity``; None for what is not known, so that a report equals itself.
-        "severity": {k: v if v == v else None for k, v in last.severity.named(robot).items()},
-        "executed_action": deepcopy(executed),  # after the limit of the hand's speed
-        "attribution": dict(zip(spec.labels, shares, strict=True)),  # what each number adds to the largest surprise
-        "surprises": surprises,  # (k,) of all rows in this step
-        "completed": last.repairs.get(robot, ()),  # the sensors that are not believed now
-        "lost": last.lost.get(robot, ()),  # the numbers that were not finite
+    explained = [outcome.response for outcome in outcomes if outcome.response.why]
+    response = explained[-1] if explained else NO_RESPONSE
+    transitions = [outcome.decision.transition for outcome in outcomes if outcome.decision.transition]
+    terms = in_order_of_priority(name for outcome in outcomes for name in outcome.terms)
+    severity = severity_info(last.robots[robot])
+    info: AsmInfo = {
+        "surprise": float(surprises.max()),
+        "threshold": float(records[-1]["threshold"]),
+        "alarm": any(bool(record["alarm"]) for record in records),
+        "reason": terms[0] if terms else "",
+        "terms": terms,
+        "event": EVENTS[max(int(record["event"]) for record in records)],
+        "state": STATES[records[-1]["state"]],
+        "intervened": any(bool(record["overridden"]) for record in records),
+        "gave_up": any(bool(row.gave_up[robot]) for row in rows),
+        "transition": transitions[-1] if transitions else "",
+        "failure": joined(*(row.failures.get(robot, "") for row in rows)),
+        "cause": deepcopy(response.cause),
+        "response": response.name,
+        "case": response.case,
+        "severity": {name: value if value == value else None for name, value in severity.items()},
+        "executed_action": deepcopy(executed),
+        "attribution": dict(zip(spec.labels, most_surprising.attribution[robot].tolist(), strict=True)),
+        "surprises": surprises,
+        "completed": last.repairs.get(robot, ()),
+        "lost": last.lost.get(robot, ()),
     }
+    info.update(step)  # type: ignore[typeddict-item]
+    return info
 
 
-def side_by_side(row: RowReport, spec: StreamSpec) -> dict[str, Any]:
-    """Return what ``report`` says of one row of each robot, in arrays whose first axis is n."""
-    each = [report([row], i, spec) for i in range(len(row.alarm))]
-    found: dict[str, Any] = {}
-    for key, first in each[0].items():
-        values = [said[key] for said in each]
-        if key == "severity":
-            known = [row.severity.named(i) for i in range(len(each))]
-            found[key] = {name: np.array([value[name] for value in known]) for name in first}
-        elif key == "attribution":
-            found[key] = {name: np.array([value[name] for value in values]) for name in first}
-        elif isinstance(first, dict | tuple):
-            found[key] = np.empty(len(values), object)
-            found[key][:] = values
-        else:
-            found[key] = np.array(values)
-    return found | {"executed_action": None, "surprises": row.surprise.value[:, None]}
+def in_order_of_priority(names: Any) -> tuple[str, ...]:
+    """Return names of alarm terms, each once, the one that gives the reason first."""
+
+    def priority(name: str) -> float:
+        term = ALARM_TERMS.get(name)
+        return np.inf if term is None else term.priority
+
+    return tuple(sorted(dict.fromkeys(names), key=priority))
+
+
+def side_by_side(row: RowReport, spec: StreamSpec, **step: Any) -> dict[str, Any]:
+    """Return what ``asm_info`` says of one row of each robot, in arrays whose first axis is n.
+
+    Args:
+        row: of n robots.
+        spec: of their streams.
+        step: further fields, arrays whose first axis is n.
+    """
+    each = [asm_info([row], robot, spec) for robot in range(len(row.robots))]
+    numbers = [severity_info(record) for record in row.robots]
+    info: dict[str, Any] = {name: _stacked([said[name] for said in each]) for name in each[0]}  # type: ignore[literal-required]
+    info["severity"] = {name: np.array([severity[name] for severity in numbers]) for name in numbers[0]}
+    info["attribution"] = {label: row.attribution[:, column] for column, label in enumerate(spec.labels)}
+    info["surprises"] = row.robots["surprise"][:, None]
+    info["executed_action"] = None
+    return info | step
+
+
+def _stacked(values: list[Any]) -> NDArray[Any]:
+    """Return an array (n,), of objects where the values are not all numbers or text."""
+    if not isinstance(values[0], dict | tuple):
+        return np.array(values)
+    stacked = np.empty(len(values), object)
+    stacked[:] = values
+    return stacked
 
 
 class LazyInfo(dict[str, Any]):
@@ -156,7 +209,8 @@ class LazyInfo(dict[str, Any]):
 
     def fill(self) -> None:
         """Make the content now; what was written before stays."""
-        make, self._make = self._make, None
+        make = self._make
+        self._make = None
         if make is not None:
             dict.update(self, {**make(), **dict.copy(self)})
 
@@ -172,8 +226,7 @@ def _filled_first(name: str) -> Callable[..., Any]:
     return method
 
 
-for _name in (
-    *("__iter__", "__reversed__", "__len__", "__contains__", "__eq__", "__ne__", "__repr__", "__delitem__", "__or__"),
-    *("__ror__", "__ior__", "keys", "values", "items", "get", "pop", "popitem", "setdefault", "copy", "clear"),
-):
+_OPERATORS = "iter reversed len contains eq ne repr delitem or ror ior"
+_METHODS = "keys values items get pop popitem setdefault copy clear"
+for _name in (*(f"__{operator}__" for operator in _OPERATORS.split()), *_METHODS.split()):
     setattr(LazyInfo, _name, _filled_first(_name))

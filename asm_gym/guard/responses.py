@@ -53,11 +53,19 @@ class Response(NamedTuple):
     @property
     def why(self) -> str:
         """The cause in words, in brackets; empty where there is none."""
-        family, part, probability = self.cause["family"], self.cause["part"], self.cause["probability"]
-        return f" ({' '.join(filter(None, (self.case or family, part)))}, {probability:.2f})" if family else ""
+        family = self.cause["family"]
+        if not family:
+            return ""
+        words = " ".join(filter(None, (self.case or family, self.cause["part"])))
+        return f" ({words}, {self.cause['probability']:.2f})"
 
 
 NO_RESPONSE = Response("", as_info(None))  # where nothing is to be done
+
+
+def unexplained(name: str, part: str) -> Response:
+    """Return a response that an alarm term asks for by itself, whatever the cause."""
+    return Response(name, as_info(None) | {"family": "unknown", "part": part}, case="unknown")
 
 
 def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:

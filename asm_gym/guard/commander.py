@@ -1,0 +1,220 @@
+"""What n robots do in a step: what their policies want, or what a reflex does in their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.compilation import compiled
+from asm_gym.guard.arbiter import Arbiter
+from asm_gym.guard.observer import joined
+from asm_gym.guard.reflexes import FeltMotion, Motion
+from asm_gym.guard.robot_facts import NOTHING, RobotFacts
+from asm_gym.guard.robot_table import REFLEX, RobotTable
+from asm_gym.policies.base import Policy
+from asm_gym.policies.hold import Hold, HoldingActions
+from asm_gym.validation import as_float32, short_repr
+
+ABSURD = 1.0  # an unbounded action further out of the range of healthy commands than this share of it is not executed
+
+Floats32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Observe = Callable[[int], Any]  # returns the observation of a robot
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What is to be done in a step."""
+
+    actions: Floats32  # (n, A) finite, in the action space
+    brakes: Mask  # (n,) the robot stays, whatever the action is
+    overridden: Mask  # (n,) something else than the policy's action is done
+    failures: Mapping[int, str] = NOTHING  # what failed when it was chosen, by robot
+
+
+class Commander:
+    """Chooses what the robots do.
+
+    Args:
+        facts: what is known of the robots.
+        table: their records.
+        motion: of reflexes that act after an alarm; None where policies do, or nothing.
+        policies: the user's own, for each robot, in the place of reflexes.
+        arbiter: lets the reflex of a robot take over whose policy's action cannot be executed.
+        warn: says what failed, and what happens instead.
+        commands: (3, A) the least, the most and the greatest change of healthy commands; None where unknown.
+
+    Attributes:
+        holding: the actions for which the robots stay.
+    """
+
+    def __init__(
+        self,
+        facts: RobotFacts,
+        table: RobotTable,
+        motion: FeltMotion | None,
+        policies: Sequence[Policy],
+        arbiter: Arbiter,
+        warn: Callable[[int, str, str], None],
+        commands: NDArray[np.floating[Any]] | None = None,
+    ) -> None:
+        self._facts = facts
+        self._records = table.records
+        self._motion = motion
+        self._policies = policies
+        self._arbiter = arbiter
+        self._warn = warn
+        self._reacts = motion is not None or bool(policies)
+        self.holding = HoldingActions(facts.count, facts.meaning, facts.rest) if motion is None else motion.holding
+        self._bounds = np.stack([facts.low, facts.high])  # (2, A)
+        self._likely = _likely_range(facts, commands)  # (2, A)
+        self._executed = np.zeros((facts.count, facts.rest.size), np.float32)  # last
+        self._nobody = np.zeros(facts.count, bool)  # never written to
+        self._policy_states: dict[int, Any] = {}  # of policies that act in an override
+        self.begin(~self._nobody)
+
+    def begin(self, which: Mask) -> None:
+        """Begin new episodes of the robots of ``which`` (n,)."""
+        self._executed[which] = self._facts.rest
+        self.holding.begin(which)
+        if self._motion is not None:
+            self._motion.begin(which)
+        self._policy_states = {robot: state for robot, state in self._policy_states.items() if not which[robot]}
+
+    def start_override(self, robot: int, executed: Floats32) -> None:
+        """Begin the override of a robot that has ``executed`` (A,)."""
+        self.holding.start(robot, executed)
+        self._policy_states.pop(robot, None)
+
+    def expect(self, expected: Floats32) -> None:
+        """Take up what the memory expects to be commanded next (n, A)."""
+        if self._motion is not None:
+            self._motion.expected[:] = expected
+
+    def choose(self, proposed: Floats32, idle: Mask, reflexes: Sequence[str], observe: Observe) -> Command:
+        """Return what is to be done.
+
+        Args:
+            proposed: (n, A) by the policies.
+            idle: (n,) nothing is done, for an episode begins.
+            reflexes: name of the reflex that each robot does in an override.
+            observe: returns the observation of a robot.
+        """
+        executed = np.empty_like(proposed)
+        if clip_actions(self._records, proposed, self._bounds, self._likely, idle, executed):
+            return self._choose_each(proposed, executed, idle, reflexes, observe)
+        self._executed = executed.copy()  # who asked may write to the other
+        return Command(executed, brakes=self._nobody, overridden=self._nobody)
+
+    def _choose_each(
+        self, proposed: Floats32, executed: Floats32, idle: Mask, reflexes: Sequence[str], observe: Observe
+    ) -> Command:
+        """Return what is to be done where a robot is overridden or idle; ``executed`` is written to."""
+        records = self._records
+        records["refused"] &= ~idle
+        records["out_of_range"] &= ~idle
+        brakes = np.zeros(len(proposed), bool)
+        overridden = ((records["state"] == REFLEX) | records["refused"]) & ~idle
+        executed[idle] = np.clip(np.nan_to_num(self._facts.rest), self._facts.low, self._facts.high)
+        failures: dict[int, str] = {}
+        for robot in np.flatnonzero(overridden).tolist():
+            refusal = ""
+            if records["refused"][robot]:
+                refusal = self._refuse(robot, proposed[robot])
+            motion, failure = self._react(robot, reflexes[robot], observe)
+            executed[robot] = motion.action
+            brakes[robot] = motion.brakes
+            if reason := joined(refusal, failure):
+                failures[robot] = reason
+        self._executed = executed.copy()
+        return Command(executed, brakes, overridden, failures)
+
+    def _refuse(self, robot: int, proposed: Floats32) -> str:
+        """Let the reflex take over from a policy whose action cannot be executed; return what failed, if anything."""
+        failure = ""
+        if not np.isfinite(proposed).all():
+            failure = f"policy: the action must be finite, got {short_repr(proposed.tolist())}"
+            self._warn(robot, failure, "another is done instead")
+        if self._reacts and self._records["state"][robot] != REFLEX:
+            self._arbiter.take_over(robot)
+        self.start_override(robot, self._executed[robot])
+        return failure
+
+    def _react(self, robot: int, reflex: str, observe: Observe) -> tuple[Motion, str]:
+        """Return what a robot does in an override, within its bounds, and what failed: then, or by default, it stays."""
+        facts = self._facts
+        stay = Motion(self.holding.stay(robot), brakes=facts.brakes, keeps_grip=facts.rest_is_known)
+        motion = stay
+        failure = ""
+        try:
+            if self._reacts:
+                motion = self._asked(robot, reflex, observe)
+            action = np.array(as_float32(motion.action)).reshape(-1)
+            if action.shape != facts.rest.shape or not np.isfinite(action).all():
+                raise ValueError(f"the action must be {facts.rest.size} finite numbers, got {action}")
+        except Exception as error:
+            # Whatever a user's policy does, an alarm must not end in no action.
+            failure = f"reflex: {error!r}"
+            self._warn(robot, failure, "the robot holds instead")
+            motion = stay
+            action = stay.action.copy()
+        if motion.keeps_grip:
+            grip = self.holding.executed[robot, facts.grip]
+            action[facts.grip] = np.where(np.isfinite(grip), grip, action[facts.grip])
+        return motion._replace(action=np.clip(action, facts.low, facts.high)), failure
+
+    def _asked(self, robot: int, reflex: str, observe: Observe) -> Motion:
+        """Return what the reflex of a name, or the user's own policy, does."""
+        if self._motion is not None:
+            return self._motion.move(robot, reflex)
+        policy = self._policies[robot]
+        fresh = robot not in self._policy_states
+        state = self._policy_states.get(robot)
+        if fresh and isinstance(policy, Hold):  # any other policy starts as in a new episode
+            state = policy.begin(self.holding.executed[robot].copy())
+        action, self._policy_states[robot] = policy.predict(
+            observe(robot), state=state, episode_start=np.array([fresh]), deterministic=True
+        )
+        return Motion(action, keeps_grip=False)
+
+
+def _likely_range(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None) -> Floats32:
+    """Return (2, A) the range beyond which an action is absurd: that of healthy commands, where there are no bounds."""
+    likely = np.stack([facts.low, facts.high])
+    if commands is None or commands.shape[1] != facts.rest.size:
+        return likely
+    least, most = commands[0], commands[1]
+    margin = ABSURD * (most - least)
+    unbounded = ~(np.isfinite(facts.low) & np.isfinite(facts.high))
+    wide = np.stack([least - margin, most + margin])
+    return np.where(unbounded, wide, likely).astype(np.float32)
+
+
+@partial(compiled, calls=(".",))
+def clip_actions(robots: Any, proposed: Any, bounds: Any, likely: Any, idle: Any, executed: Any) -> bool:
+    """Write the proposed actions (n, A) within their ``bounds`` (2, A), and mark those that cannot be executed.
+
+    An action is refused where a number is not finite, or out of a ``likely`` range (2, A) that is within the bounds.
+
+    Returns:
+        Whether any robot is overridden, refused or ``idle`` (n,).
+    """
+    more = False
+    for n in range(len(robots)):
+        robot = robots[n]
+        finite = True
+        absurd = False
+        for i in range(proposed.shape[1]):
+            action = proposed[n, i]
+            executed[n, i] = min(max(action, bounds[0, i]), bounds[1, i])
+            finite = finite and np.isfinite(action)
+            absurd = absurd or executed[n, i] < likely[0, i] or executed[n, i] > likely[1, i]
+        robot.out_of_range = finite and absurd and robot.state != REFLEX
+        robot.refused = (not finite or absurd) and robot.state != REFLEX
+        more = more or not finite or robot.refused or robot.state == REFLEX or idle[n]
+    return more

@@ -1,0 +1,231 @@
+"""Names the cause of an alarm, and says what is to be done about it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.guard.contact_estimator import ContactEstimator
+from asm_gym.guard.contact_state import FREE_FORCE
+from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
+from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
+from asm_gym.guard.row_evidence import RowEvidence
+from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
+from asm_gym.spec import StreamSpec
+
+CALM_S = 1.0  # after so long without an alarm, what comes next has a cause of its own [s]
+SURE = 0.5  # a family that is less probable is unknown
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.float32]
+
+
+@dataclass
+class Incident:
+    """What has been found out about one robot since it was calm."""
+
+    rows_since: dict[str, int] = field(default_factory=dict)  # rows since a family was first the cause
+    touched: bool = False  # the last alarm was answered as a contact, or looked like one
+    calm_rows: int = 0  # rows without an alarm
+    belief: Floats = field(default_factory=lambda: np.zeros(len(FAMILIES)))  # mean probability of each family
+    diagnoses: int = 0
+    newest: dict[str, Cause] = field(default_factory=dict)  # the newest diagnosis of each family
+
+    def count_row(self, alarm: bool) -> None:
+        """Count a row more since each cause was first found."""
+        self.calm_rows = 0 if alarm else self.calm_rows + 1
+        self.rows_since = {family: rows + 1 for family, rows in self.rows_since.items()}
+
+    def believe(self, cause: Cause) -> Cause:
+        """Return the cause by all diagnoses, the newest of which counts a tenth at least."""
+        self.diagnoses += 1
+        probabilities = np.array([cause.probabilities[name] for name in FAMILIES])
+        self.belief = averaged(self.belief, probabilities, self.diagnoses)
+        self.newest[cause.family] = cause
+        family = FAMILIES[int(self.belief.argmax())]
+        return self.newest.get(family, cause)._replace(
+            family=family,
+            probability=float(self.belief.max()),
+            probabilities=dict(zip(FAMILIES, self.belief.tolist(), strict=True)),
+        )
+
+
+class Prescription(NamedTuple):
+    """What is to be done about an alarm."""
+
+    response: Response
+    columns: NDArray[np.intp] = NO_COLUMNS  # (k,) of the stream to complete, where the response is ``"complete"``
+
+
+class Diagnostician:
+    """Finds the causes of alarms of n robots, and the responses to them.
+
+    Args:
+        spec: of their streams.
+        diagnosis: of the monitor; without one every cause is unknown.
+        table: what is done about which cause, as ``responses_from`` gives it.
+        asked: the table is followed; else causes are only named.
+
+    Attributes:
+        incidents: of the robots that have not been calm for long enough.
+        rows: how many rows it looks back.
+    """
+
+    def __init__(self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool) -> None:
+        self._dt = spec.dt
+        self._diagnosis = diagnosis
+        self._table = table
+        self._asked = asked
+        self._blocked_rows = 1 + round(LASTING["actuator"] / spec.dt)  # by which a joint is found blocked
+        self._contact = None
+        if diagnosis is not None and columns_ending(spec.channels, "external_torque").size:
+            self._contact = ContactEstimator(diagnosis.completion)
+        self.incidents: dict[int, Incident] = {}
+        self.rows = WINDOW + self._blocked_rows
+
+    def begin(self, robot: int) -> None:
+        """Begin a new episode of a robot."""
+        self.incidents.pop(robot, None)
+
+    def watch(self, evidence: RowEvidence, policy_acts: bool) -> Response:
+        """Return what is known of a robot's last row, which is no alarm."""
+        incident = self.incidents.get(evidence.index)
+        if incident is None:
+            return NO_RESPONSE
+        touched = self._touched(incident, evidence.rows)
+        incident.count_row(alarm=False)
+        if incident.calm_rows > CALM_S / self._dt and (incident.rows_since or policy_acts):
+            self.begin(evidence.index)
+            return NO_RESPONSE
+        return NO_RESPONSE._replace(touched=touched)
+
+    def prescribe(self, evidence: RowEvidence) -> Prescription:
+        """Return what is to be done about an alarm."""
+        if evidence.only_lost:
+            return Prescription(_complete_missing(evidence))
+        incident = self.incidents.setdefault(evidence.index, Incident())
+        if evidence.robot.knocked and not evidence.certain:
+            return Prescription(self._brake(incident, evidence))
+
+        touched = self._touched(incident, evidence.rows)
+        incident.count_row(alarm=True)
+        presses = bool(evidence.robot.presses)
+        cause = self._find_cause(incident, evidence)
+        family = "unknown"
+        if cause is not None and cause.probability >= SURE:
+            family = cause.family
+        incident.touched = presses or (cause is not None and cause.family == "contact")
+        incident.rows_since.setdefault(PRESSING if presses else family, 0)
+
+        case, name = self._look_up(incident, family, cause, evidence)
+        description = as_info(cause)
+        if cause is None or family != cause.family:
+            description |= {"family": family, "part": ""}
+        columns = NO_COLUMNS
+        if cause is not None and name == "complete":
+            columns = cause.columns
+        if not self._asked:
+            return Prescription(Response("", description, touched), columns)
+        return Prescription(Response(name, description, touched, case), columns)
+
+    def instead_of_completing(self, response: Response) -> Response:
+        """Return what is done where the sensors at fault cannot be completed."""
+        return response._replace(name=self._table["unknown"])
+
+    def _brake(self, incident: Incident, evidence: RowEvidence) -> Response:
+        """Return the response to a knock that presses no more: the arm is braked until the contact has gone."""
+        incident.touched = True
+        incident.calm_rows = 0
+        name = "hold" if self._asked else ""
+        return Response(name, _certain("contact"), self._touched(incident, evidence.rows), "contact")
+
+    def _look_up(
+        self, incident: Incident, family: str, cause: Cause | None, evidence: RowEvidence
+    ) -> tuple[str, str]:
+        """Return the row of the table that holds, and the response."""
+        case = PRESSING if evidence.robot.presses else family
+        if case in (PRESSING, "contact") and self._lasts(incident, case):
+            case = f"lasting {case}"
+        name = self._table[case]
+        if name == "go on" and self._blocked(family, cause, evidence.rows):
+            # Whatever the policy goes on with, it does not move the arm, and presses.
+            case = "lasting actuator" if family == "actuator" else "lasting contact"
+            name = self._table[case]
+        if name in GOING_ON and not _may_go_on(name, cause, evidence):
+            name = "hold"
+            if case != "unknown" and self._table["unknown"] not in GOING_ON:
+                name = self._table["unknown"]
+        return case, name
+
+    def _find_cause(self, incident: Incident, evidence: RowEvidence) -> Cause | None:
+        """Return the cause; a contradiction names a sensor beyond doubt, though perhaps not which."""
+        failed = bool(evidence.robot.failed)
+        if evidence.contradiction is not None and not failed:
+            probabilities = {name: float(name == "sensor") for name in FAMILIES}
+            return Cause(
+                family="sensor",
+                part=evidence.contradiction.part,
+                probability=1.0,
+                probabilities=probabilities,
+                columns=evidence.contradiction.columns,
+            )
+        rows = evidence.rows[-1 - WINDOW :]
+        if failed or self._diagnosis is None or not np.isfinite(rows).all():
+            return None
+        try:
+            cause = self._diagnosis(rows, evidence.attribution, evidence.accounted_for)
+        except Exception as error:
+            # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
+            warnings.warn(f"diagnosis: {error!r}; the cause counts as unknown", stacklevel=2)
+            return None
+        return incident.believe(cause)
+
+    def _touched(self, incident: Incident, rows: Rows) -> bool | None:
+        """Return whether what touched the body still does; None where nobody knows."""
+        if not self._asked or not incident.touched or self._contact is None or len(rows) < 2:
+            return None
+        if not self._contact.presses(rows[-2:]):
+            return False
+        lasts = self._lasts(incident, "contact") or self._lasts(incident, PRESSING)
+        return None if lasts else True
+
+    def _blocked(self, family: str, cause: Cause | None, rows: Rows) -> bool:
+        """Return whether the joint at fault, or else the arm, is pressed and still, for as long as what lasts."""
+        if self._contact is None or len(rows) < self._blocked_rows:
+            return False
+        joint = ""
+        if family == "actuator" and cause is not None:
+            joint = cause.part
+        return self._contact.blocked(rows[-self._blocked_rows :], joint)
+
+    def _lasts(self, incident: Incident, case: str) -> bool:
+        """Return whether a case has been the cause for so long that it lasts."""
+        return incident.rows_since.get(case, 0) >= LASTING["contact"] / self._dt
+
+
+def _certain(family: str, part: str = "") -> dict[str, Any]:
+    """Return what ``info`` says of a cause beyond doubt."""
+    return as_info(None) | {"family": family, "part": part, "probability": 1.0}
+
+
+def _complete_missing(evidence: RowEvidence) -> Response:
+    """Return the response to missing numbers, which are completed where that is possible."""
+    if evidence.completed is None:
+        return NO_RESPONSE
+    return Response("complete", _certain("sensor", ", ".join(evidence.completed)), case="sensor")
+
+
+def _may_go_on(name: str, cause: Cause | None, evidence: RowEvidence) -> bool:
+    """Return whether the policy may go on in alarm."""
+    if evidence.fast:
+        return False
+    if name == "complete":  # what is left judges on, and what is completed is bounded by itself
+        return True
+    sure = cause is not None and cause.probability >= SURE
+    gentle = not evidence.robot.contact_force > FREE_FORCE
+    return sure and evidence.may_go_on and evidence.feels and gentle

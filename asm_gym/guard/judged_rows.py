@@ -1,0 +1,111 @@
+"""A healthy row in one compiled call, from what was sensed to what is decided.
+
+    rows (n, D), loads (n, 2 + F)
+       └► validate_rows ► observe_rows ► measure_contacts ► apply_alarm_rule ► record_motion
+                └► a row is lost, or contradicts itself: STOPPED, and Python goes on by the same functions
+
+``apply_alarm_rule`` counts the rows about which there is nothing to decide, and marks the others.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from asm_gym.compilation import compiled, inner
+from asm_gym.detection.alarm_rule import benign_event, over_threshold
+from asm_gym.detection.benign_events import EVENTS, KNOCK
+from asm_gym.guard.arbiter import MOSTLY_AFTER
+from asm_gym.guard.contact_state import measure_contacts
+from asm_gym.guard.reflexes import record_motion
+from asm_gym.guard.robot_table import POLICY, REFLEX
+from asm_gym.guard.row_validation import validate_rows
+from asm_gym.monitors.row_kernel import observe_rows
+
+KNOCKED = EVENTS.index(KNOCK)
+STOPPED = -1  # in the place of how many robots there are to decide about: the rows are to be repaired first
+
+
+@partial(compiled, calls=("memory", "detection", "monitors", "."))
+def judge_rows(guard: Any, memory: Any, rows: Any, load: Any, executed: Any, attribution: Any) -> int:
+    """Judge rows by a memory whose row is compiled, and count those about which there is nothing to decide.
+
+    Args:
+        guard: a ``Bound`` of ``GuardArrays``.
+        memory: a ``Bound`` of ``RowKernel``.
+        rows: (n, D) float32, written to where senses are stale.
+        load: (n, 2 + F), see ``no_load``.
+        executed: (n, A) in the step of the rows.
+        attribution: (n, D), written.
+
+    Returns:
+        How many robots there are to decide about, or ``STOPPED``.
+    """
+    robots, recent, hand_geometry, hand_state, columns, motion, judged, dt, most_impulse = guard.parts
+    if validate_rows(robots, rows, recent, hand_geometry, hand_state):
+        return STOPPED
+    observe_rows(memory, rows.astype(np.float64), judged, attribution)
+    measure_contacts(robots, rows, load, columns, dt, most_impulse)
+    to_decide = apply_alarm_rule(robots, judged, attribution)
+    record_motion(robots, rows, executed, motion)
+    return to_decide
+
+
+@compiled
+def apply_alarm_rule(robots: Any, judged: Any, attribution: Any) -> int:
+    """Compare surprise with its threshold, count the quiet rows, and mark the others.
+
+    Args:
+        robots: (n,) records of ``ROBOT``.
+        judged: (n,) records of ``JUDGED``.
+        attribution: (n, D).
+
+    Returns:
+        How many robots are marked by ``must_decide``.
+    """
+    to_decide = 0
+    for n in range(len(robots)):
+        robot = robots[n]
+        take_up_surprise(robot, judged[n], attribution[n])
+        robot.held = robot.state == REFLEX
+        robot.overridden = robot.held or robot.refused
+        robot.over = over_threshold(robot.surprise, robot.threshold)
+        robot.event = benign_event(robot.raw_surprise, robot.surprise, robot.excuse, robot.threshold)
+        robot.knocked = robot.event == KNOCKED
+        robot.alarm = False
+        eventful = robot.presses or robot.over or robot.knocked or robot.state != POLICY
+        reported = robot.policy_rows == MOSTLY_AFTER - 1
+        robot.must_decide = robot.active and (robot.must_decide or eventful or reported)
+        if robot.must_decide:
+            to_decide += 1
+        elif robot.active:
+            count_quiet_row(robot)
+    return to_decide
+
+
+@inner
+def take_up_surprise(robot: Any, judged: Any, attribution: Any) -> None:
+    """Take up what counts of the surprise at a row: it is infinite where something failed, and 0 where none counts."""
+    robot.surprise = judged.surprise
+    robot.raw_surprise = judged.raw_surprise
+    robot.excuse = judged.excuse
+    if robot.failed or not judged.surprise > -np.inf:  # NaN too
+        robot.failed = True
+        robot.surprise = np.inf
+        attribution[:] = 0.0
+    if not robot.active:
+        robot.surprise = 0.0
+        robot.raw_surprise = 0.0
+        attribution[:] = 0.0
+
+
+@inner
+def count_quiet_row(robot: Any) -> None:
+    """Count a row of the policy about which there is nothing to decide."""
+    robot.calm_rows += 1
+    robot.free_rows = 0
+    robot.rows_since_return += 1
+    robot.policy_rows += 1
+    robot.largest_surprise = max(robot.largest_surprise, robot.surprise)
