@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from asm_gym.guard.hand import Contradiction
 from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
-from asm_gym.guard.robots import NO_COLUMNS, named
+from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
 from asm_gym.guard.severity import FAST, FREE_FORCE
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
@@ -93,8 +93,8 @@ class ContactEstimator:
         # Where a contact shows: in external torques, their peaks too, and in forces and torques at the wrist.
         shows = ["external_torque" in c.name or c.group == "wrench" for c in spec.channels for _ in range(c.size)]
         self._filling = completion.filling(np.array(shows, bool))
-        self._own = np.isin(self._filling.columns, named(spec.channels, "external_torque"))
-        self._joints = named(spec.channels, "joint_position")
+        self._own = np.isin(self._filling.columns, columns_ending(spec.channels, "external_torque"))
+        self._joints = columns_ending(spec.channels, "joint_position")
 
     def beyond(self, rows: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Return (T - 1, J) external torques of rows (T, D) but the first, beyond what is expected [deviations]."""
@@ -134,7 +134,7 @@ class Diagnostician:
     def __init__(self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool) -> None:
         self._spec, self._diagnosis, self._table, self._asked = spec, diagnosis, table, asked
         self._contact = None
-        if diagnosis is not None and named(spec.channels, "external_torque").size:
+        if diagnosis is not None and columns_ending(spec.channels, "external_torque").size:
             self._contact = ContactEstimator(diagnosis.completion)
         self.incidents: dict[int, _Incident] = {}  # of the robots that have not been calm for long enough
         self.rows = WINDOW + 1 + round(LASTING["actuator"] / spec.dt)  # how many rows it looks back

@@ -24,10 +24,10 @@ from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import STALE, Fitted, Observation, Observer, diagnosis_of, joined
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.preview import Preview, preview_chunk
-from asm_gym.guard.reflexes import GRADED, REFLEXES, Reflexes
+from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion
 from asm_gym.guard.report import CONTACT, CONTRADICTION, FAILURE, MISSING, SURPRISE, Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from
-from asm_gym.guard.robots import NOTHING, Robots
+from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.guard.rows import Believed, Rows
 from asm_gym.guard.severity import SeverityEstimator, nothing_felt
 from asm_gym.monitors import ExpectsActions, Monitor
@@ -55,7 +55,7 @@ class Engine:
 
     def __init__(
         self,
-        robots: Robots,
+        robots: RobotFacts,
         monitor: Monitor,
         options: GuardOptions,
         policies: Sequence[Policy] = (),
@@ -71,7 +71,7 @@ class Engine:
         self.fitted = Fitted.of(monitor, spec)
         self.options, self.ends_on_alarm = options, name == "terminate"
         self._count, self._spec, self._name, self._graded, self._robots = n, spec, name, graded, robots
-        reflexes = Reflexes(robots, spec, name) if acts and not policies else None
+        reflexes = FeltMotion.of(robots, spec, name) if acts and not policies else None
         rule = options.rule(graded, robots.dt, rows_per_step) if acts else None
         self._arbiter = Arbiter(n, rule, self.fitted.threshold, options.adaptive_threshold)
         self._motions = Motions(robots, reflexes, policies, self._arbiter.take_over, self._warn)

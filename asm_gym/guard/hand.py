@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.kinematics import HAND, Chain, hand_at
-from asm_gym.guard.robots import NO_COLUMNS
+from asm_gym.guard.robot_facts import NO_COLUMNS
 from asm_gym.memory.completion import sensors_of
 from asm_gym.spec import StreamSpec
 

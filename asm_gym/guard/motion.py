@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.guard.observer import joined
-from asm_gym.guard.reflexes import Motion, Places, Reflexes
-from asm_gym.guard.robots import NOTHING, Robots
+from asm_gym.guard.reflexes import FeltMotion, Motion
+from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.policies.base import Policy
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.hold import Hold, HoldingActions
 from asm_gym.validation import as_float32, short_repr
 
 USUAL_GAIN = 0.1  # weight of the newest step in the external torque that is taken to be usual
@@ -44,15 +44,18 @@ class Motions:
 
     def __init__(
         self,
-        robots: Robots,
-        reflexes: Reflexes | None,
+        robots: RobotFacts,
+        reflexes: FeltMotion | None,
         policies: Sequence[Policy],
         take_over: Callable[[int], None],
         warn: Callable[[int, str, str], None],
     ) -> None:
         self._robots, self._reflexes, self._policies = robots, reflexes, policies
         self._take_over, self._warn, self._reacts = take_over, warn, reflexes is not None or bool(policies)
-        self.places = Places(robots.count, robots.meaning, robots.rest) if reflexes is None else reflexes.places
+        if reflexes is None:
+            self.places = HoldingActions(robots.count, robots.meaning, robots.rest)
+        else:
+            self.places = reflexes.holding
         self._last = np.zeros((robots.count, robots.rest.size), np.float32)  # executed last
         self.nobody: Mask = np.zeros(robots.count, bool)  # (n,) never written to
         self._memory: dict[int, Any] = {}  # the states of policies that are in an override
@@ -106,17 +109,17 @@ class Motions:
         self.places.sense(rows)
         r = self._reflexes
         if r is not None and r.feels:
-            _feel(rows, r.torques, executed, intervened, active, r.torque, r.usual, r.path, r.steps)
+            _feel(rows, r.torque_columns, executed, intervened, active, r.torque, r.usual_torque, r.path, r.path_steps)
 
     def expect(self, expected: Floats32) -> None:
         """Take up what the memory expects to be commanded next (n, A)."""
         if self._reflexes is not None:
-            self._reflexes.expected = expected
+            self._reflexes.expected[:] = expected
 
     def _reaction(self, robot: int, name: str, seen: Callable[[int], Any]) -> tuple[Floats32, bool, str]:
         """Return what is done, whether the robot brakes, and what failed; where nothing reacts the robot stays."""
         robots, failed = self._robots, ""
-        stay = Motion(self.places.stay(robot), robots.brakes, keeps_grip=robots.rests)
+        stay = Motion(self.places.stay(robot), robots.brakes, keeps_grip=robots.rest_is_known)
         try:
             motion = self._asked(robot, name, seen) if self._reacts else stay
             action = np.array(as_float32(motion.action)).reshape(-1)

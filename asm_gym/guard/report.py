@@ -13,7 +13,7 @@ from asm_gym.detection.events import EVENTS
 from asm_gym.guard.arbiter import ENDED, STATES, Decision
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
-from asm_gym.guard.robots import NOTHING
+from asm_gym.guard.robot_facts import NOTHING
 from asm_gym.guard.severity import KNOCKED, Severity
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled
 from asm_gym.guard.hand import NEEDS, Contradiction, HandAgainstJoints, compare, no_hand
 from asm_gym.guard.repair import Repair
-from asm_gym.guard.robots import NOTHING, Robots
+from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
@@ -50,21 +50,21 @@ class Rows:
 
     def __init__(
         self,
-        robots: Robots,
+        robots: RobotFacts,
         spec: StreamSpec,
         completion: Completion | None,
         kept: int,
     ) -> None:
         self._spec, self._kept = spec, kept
         self._stale = StaleSenses(robots.count, spec)
-        self._completion = None if robots.read is None else completion
-        if completion is not None and robots.read is None:
+        self._completion = None if robots.observed is None else completion
+        if completion is not None and robots.observed is None:
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
             reason = robots.refused.get("complete", "it is not known where they stand in the observation")
             warnings.warn(
                 f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}", stacklevel=5
             )
-        self.read = None if self._completion is None else robots.read
+        self.read = None if self._completion is None else robots.observed
         """(D,) which columns the policy reads; None where senses cannot be completed."""
         arms = (c for c in robots.chains if all(c[0].prefix + name in spec.slices for name in NEEDS))
         self._hands = tuple(HandAgainstJoints(chains, spec) for chains in arms)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.guard.arbiter import CALM, FREE, MOSTLY_AFTER, POLICY, ROWS, SINCE, STRIKES, Arbiter
-from asm_gym.guard.robots import named
+from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.monitors import Surprise
 from asm_gym.spec import Channel, StreamSpec
 
@@ -53,7 +53,7 @@ class Severity(NamedTuple):
 
     felt: Floats
     """(n, 2 + F) in the physics substeps of this control step: the largest share of a contact limit, when in the step a
-    limit was passed [s], and the mean of what was felt, in the order of ``Robots.felt_channels`` [N], [N m]."""
+    limit was passed [s], and the mean of what was felt, in the order of ``RobotFacts.felt_channels`` [N], [N m]."""
     numbers: Floats
     """(n, 3) contact force on the arm, estimated from wrist and joints, the mean of the step [N]; what that force has
     added up to beyond ``FREE_FORCE`` in this episode [N s]; speed of the fastest hand [m/s]."""
@@ -87,7 +87,7 @@ class Severity(NamedTuple):
 
 def _forces(channels: Sequence[Channel]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the columns that tell of a contact force: (W, 3) forces at wrists, and (J,) external torques."""
-    return named(channels, "wrist_force", 3).reshape(-1, 3), named(channels, "external_torque")
+    return columns_ending(channels, "wrist_force", 3).reshape(-1, 3), columns_ending(channels, "external_torque")
 
 
 @inner
@@ -186,7 +186,7 @@ class SeverityEstimator:
     """
 
     def __init__(self, count: int, spec: StreamSpec, felt: Sequence[Channel], arbiter: Arbiter) -> None:
-        hands = named(spec.channels, "hand_velocity", 3).reshape(-1, 3)
+        hands = columns_ending(spec.channels, "hand_velocity", 3).reshape(-1, 3)
         columns = *_forces(felt), *_forces(spec.channels), hands
         self._pressed, self._no_excuse = np.zeros((2, count)), np.zeros(count, np.int8)
         self._weights = np.zeros((2, count, max(len(columns[0]), len(columns[2])), 4))  # by what is felt, and by rows

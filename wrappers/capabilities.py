@@ -1,0 +1,227 @@
+"""What a guard asks of an environment that it does not know: one function for each capability.
+
+Each attribute belongs to the environment, or to a wrapper inside the guard. The members of a vector environment are of
+one kind; a capability is theirs if all have it.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.action_meaning import ActionMeaning, ActionMeans
+from asm_gym.detection.kinematics import Chain
+from asm_gym.guard.robot_facts import RobotFacts, TurningAction
+from asm_gym.policies.hold import Staying, gripper_columns, nearest_to_zero, staying, why_changed
+from asm_gym.spec import Channel, StreamSpec, control_period
+from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes
+from asm_gym.wrappers.observation_map import ObservationMap, ObservationPart, parts_of
+
+DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
+
+
+def robots_of(
+    env: AnyEnv,
+    spec: StreamSpec,
+    recorded: ActionMeaning | None = None,
+    action_means: ActionMeans | None = None,
+) -> tuple[RobotFacts, ObservationMap | None]:
+    """Return what an environment tells of its robots, and where their streams stand in observations.
+
+    Args:
+        env: an environment, or a vector environment.
+        spec: of the streams.
+        recorded: what recorded episodes show of the meaning of their actions.
+        action_means: what the user says of it.
+
+    Raises:
+        TypeError: members of a vector environment cannot be asked for attributes.
+        ValueError: ``action_means`` does not fit the actions.
+    """
+    attributes = EnvAttributes(env)
+    space = attributes.action_space
+    if not isinstance(space, gym.spaces.Box):
+        none = np.zeros(0, np.float32)
+        dt = control_period_of(attributes)
+        return RobotFacts(count=1, low=none, high=none, rest=none, dt=dt), None
+
+    resting = resting_of(attributes, space, recorded, action_means)
+    refused = refused_reflexes(attributes)
+    if resting.refused:
+        refused["hold"] = resting.refused
+    observation_map = None
+    try:
+        observation_map = observation_map_of(attributes, spec)
+    except ValueError as error:
+        refused["complete"] = str(error)
+
+    size = resting.action.size
+    robots = RobotFacts(
+        count=attributes.count,
+        low=np.float32(space.low).ravel(),
+        high=np.float32(space.high).ravel(),
+        rest=resting.action.ravel(),
+        rest_is_known=not resting.refused,
+        meaning=resting.meaning,
+        brakes=brakes(attributes),
+        grip=gripper_columns(attributes.first("gripper_actions", ()), size),
+        dt=control_period_of(attributes),
+        task=task_name(attributes),
+        chains=hand_chains(attributes),
+        felt_channels=felt_channels(attributes),
+        limits_contact=limits_contact(attributes),
+        observed=None if observation_map is None else observation_map.observed,
+        turning_action=turning_action(attributes),
+        efference=efference_columns(attributes, spec, size),
+        refused=refused,
+    )
+    return robots, observation_map
+
+
+def control_period_of(attributes: EnvAttributes) -> float:
+    """Return the control period [s]: ``dt`` of the members of a vector; see ``asm_gym.spec.control_period``."""
+    dt = 0.0
+    if attributes.is_vector:
+        dt = attributes.first("dt") or 0.0
+    return float(dt or control_period(attributes.env))
+
+
+def controller_of(attributes: EnvAttributes) -> str:
+    """Return the name of the arms' controller, such as ``OSC_POSE``: ``controller``; empty without it."""
+    return str(attributes.first("controller", ""))
+
+
+def takes_deltas(attributes: EnvAttributes) -> bool:
+    """Return whether actions are changes of pose or of joint angles, by the name of the controller."""
+    return controller_of(attributes) in DELTAS
+
+
+def has_stream(attributes: EnvAttributes) -> bool:
+    """Return whether there is a stream: ``stream_spec``; without it, observation and action are the stream."""
+    return attributes.has("stream_spec")
+
+
+def task_name(attributes: EnvAttributes) -> str:
+    """Return the name of the task: ``task.name``; empty without it."""
+    return getattr(attributes.first("task"), "name", "")
+
+
+def brakes(attributes: EnvAttributes) -> bool:
+    """Return whether a robot can be braked beneath its controller in all steps that wrappers make of one.
+
+    The attributes are those of ``asm_gym.policies.hold.HoldsItself``; without them an action has to make a robot stay.
+    """
+    return attributes.has("holding") and attributes.has("keeps_holding")
+
+
+def resting_of(
+    attributes: EnvAttributes,
+    space: gym.spaces.Box,
+    recorded: ActionMeaning | None,
+    action_means: ActionMeans | None,
+) -> Staying:
+    """Return which actions make the robots stay.
+
+    Where the user does not say what actions mean, ``action_means`` of the environment does, or else the recorded
+    episodes. Robots with the attribute ``holding`` stay whatever the action is.
+
+    Raises:
+        ValueError: ``action_means`` does not fit the actions.
+    """
+    zero = nearest_to_zero(space)
+    if recorded is not None and len(recorded.means) != zero.size:
+        recorded = None
+    if action_means is None:
+        action_means = attributes.first("action_means")
+    told = None
+    if action_means is not None:
+        told = ActionMeaning.told(action_means, zero.size, recorded)
+
+    if attributes.has("holding"):
+        return Staying(zero)
+    try:
+        return staying(attributes.env, space, told, recorded)
+    except ValueError as error:
+        return Staying(zero, refused=str(error))
+
+
+def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
+    """Return the kinematics of each arm in each environment: ``hand_chains``; none without it."""
+    return tuple(zip(*attributes.ask("hand_chains"), strict=True))
+
+
+def felt_channels(attributes: EnvAttributes) -> tuple[Channel, ...]:
+    """Return what the arms feel in physics substeps: ``felt_channels``; nothing without it."""
+    return attributes.first("felt_channels", ())
+
+
+def limits_contact(attributes: EnvAttributes) -> bool:
+    """Return whether arms compare what they feel with the attribute ``contact_limits`` in every physics substep."""
+    return bool(felt_channels(attributes)) and attributes.has("contact_limits")
+
+
+def efference_columns(attributes: EnvAttributes, spec: StreamSpec, size: int) -> NDArray[np.intp] | None:
+    """Return (A,) the columns of the stream with the executed action, which contact limits may slow down.
+
+    They are those of the stream's actions, if no wrapper inside changes actions, or their ``size``; else None.
+    """
+    if not (limits_contact(attributes) and has_stream(attributes)):
+        return None
+    if why_changed(attributes.env, "a reflex") or len(spec.motor) != size:
+        return None
+    return spec.motor
+
+
+def turning_action(attributes: EnvAttributes) -> TurningAction | None:
+    """Return what turns the joints of a robot: the method ``action_for``; None unless actions are changes."""
+    if not takes_deltas(attributes):
+        return None
+    return lambda robot, turns: attributes.call("action_for", turns)[robot]
+
+
+def refused_reflexes(attributes: EnvAttributes) -> dict[str, str]:
+    """Return why robots cannot do a reflex besides hold, by its name.
+
+    Retract and comply need actions that are changes; a wrapper inside must not change what a reflex does.
+    """
+    changed = why_changed(attributes.env, "a reflex")
+    refused = {}
+    for name in ("retract", "comply"):
+        if not takes_deltas(attributes):
+            refused[name] = (
+                f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, "
+                f"got {controller_of(attributes) or None}: "
+                "use hold with a safe_action of your own, or name any policy"
+            )
+        elif changed:
+            refused[name] = changed
+    if changed and has_stream(attributes):
+        refused["recall"] = changed
+    return refused
+
+
+def observation_map_of(attributes: EnvAttributes, spec: StreamSpec) -> ObservationMap:
+    """Return where the stream stands in observations.
+
+    The attribute ``observation_layout`` has the sizes of the observation's channels in order, by name, and
+    ``laid_out_space`` the space of that layout. Without a stream of its own, observation and action are the stream.
+
+    Raises:
+        ValueError: the environment does not say it, or a wrapper inside has changed the observation.
+    """
+    space = attributes.observation_space
+    if not has_stream(attributes) and isinstance(space, gym.spaces.Box):
+        whole = ObservationPart("", space, spec.sensory, np.arange(len(spec.sensory)))
+        return ObservationMap([whole], spec.size)
+
+    layout = attributes.first("observation_layout")
+    if not has_stream(attributes) or layout is None:
+        raise ValueError("the environment does not say where its stream stands in its observation")
+    default = None
+    if not attributes.is_vector:
+        default = attributes.env.unwrapped.observation_space
+    laid_out_space = attributes.first("laid_out_space", default)
+    if laid_out_space is not None and space != laid_out_space:
+        raise ValueError(f"a wrapper inside has changed the observation, which was {laid_out_space}")
+    return ObservationMap(parts_of(layout, spec, space), spec.size)
