@@ -148,7 +148,7 @@ class HoldingActions:
         if unknown.any() and self._newest.size:
             before = self._previous[robot]
             sensed = self._meaning.staying(self._newest[robot], before, self.executed[robot])
-            action[unknown] = sensed[unknown]
+            np.copyto(action, sensed, where=unknown)
         return np.where(np.isfinite(action), action, self._rest)
 
 
@@ -256,18 +256,18 @@ def _innermost(env: gym.Env[Any, Any], action: NDArray[np.float32]) -> NDArray[n
 
 def why_changed(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any], reflex: str) -> str:
     """Return why a reflex cannot know which action reaches a robot: a wrapper changes it; empty where none does."""
-    guard = "NeuralASMSafety"
-    if isinstance(env, VectorEnv):
-        guard = "VectorNeuralASMSafety"
     for layer in layers(env):
         changes = isinstance(layer, gym.ActionWrapper | VectorActionWrapper)
         if changes and not isinstance(layer, ClipAction):
-            return _changes_actions(layer, reflex, guard)
+            return _changes_actions(layer, reflex)
     return ""
 
 
-def _changes_actions(wrapper: Any, reflex: str, guard: str = "NeuralASMSafety") -> str:
+def _changes_actions(wrapper: Any, reflex: str) -> str:
     """Return that a wrapper must not stand inside of the guard."""
+    guard = "NeuralASMSafety"
+    if isinstance(wrapper, VectorActionWrapper):
+        guard = "VectorNeuralASMSafety"
     return (
         f"{type(wrapper).__name__} changes actions, so that {reflex} cannot know what reaches the robot: "
         f"put it outside of {guard}, or use Hold(env, safe_action=...)"

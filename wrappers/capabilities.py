@@ -51,8 +51,10 @@ def robots_of(
     if resting.refused:
         refused["hold"] = resting.refused
     observation_map = None
+    observed = None
     try:
         observation_map = observation_map_of(attributes, spec)
+        observed = observation_map.observed
     except ValueError as error:
         refused["complete"] = str(error)
 
@@ -62,7 +64,6 @@ def robots_of(
         low=np.float32(space.low).ravel(),
         high=np.float32(space.high).ravel(),
         rest=resting.action.ravel(),
-        rest_is_known=not resting.refused,
         meaning=resting.meaning,
         brakes=brakes(attributes),
         grip=gripper_columns(attributes.first("gripper_actions", ()), size),
@@ -71,7 +72,7 @@ def robots_of(
         chains=hand_chains(attributes),
         felt_channels=felt_channels(attributes),
         limits_contact=limits_contact(attributes),
-        observed=None if observation_map is None else observation_map.observed,
+        observed=observed,
         turning_action=turning_action(attributes),
         efference=efference_columns(attributes, spec, size),
         refused=refused,
@@ -81,20 +82,14 @@ def robots_of(
 
 def control_period_of(attributes: EnvAttributes) -> float:
     """Return the control period [s]: ``dt`` of the members of a vector; see ``asm_gym.spec.control_period``."""
-    dt = 0.0
-    if attributes.is_vector:
-        dt = attributes.first("dt") or 0.0
-    return float(dt or control_period(attributes.env))
+    if attributes.is_vector and (dt := attributes.first("dt")):
+        return float(dt)
+    return control_period(attributes.env)
 
 
 def controller_of(attributes: EnvAttributes) -> str:
     """Return the name of the arms' controller, such as ``OSC_POSE``: ``controller``; empty without it."""
     return str(attributes.first("controller", ""))
-
-
-def takes_deltas(attributes: EnvAttributes) -> bool:
-    """Return whether actions are changes of pose or of joint angles, by the name of the controller."""
-    return controller_of(attributes) in DELTAS
 
 
 def has_stream(attributes: EnvAttributes) -> bool:
@@ -173,10 +168,8 @@ def efference_columns(attributes: EnvAttributes, spec: StreamSpec, size: int) ->
     return spec.motor
 
 
-def turning_action(attributes: EnvAttributes) -> TurningAction | None:
-    """Return what turns the joints of a robot: the method ``action_for``; None unless actions are changes."""
-    if not takes_deltas(attributes):
-        return None
+def turning_action(attributes: EnvAttributes) -> TurningAction:
+    """Return the action that turns the joints of a robot: the method ``action_for``, of deltas."""
     return lambda robot, turns: attributes.call("action_for", turns)[robot]
 
 
@@ -185,19 +178,21 @@ def refused_reflexes(attributes: EnvAttributes) -> dict[str, str]:
 
     Retract and comply need actions that are changes; a wrapper inside must not change what a reflex does.
     """
-    changed = why_changed(attributes.env, "a reflex")
     refused = {}
-    for name in ("retract", "comply"):
-        if not takes_deltas(attributes):
+    changed = why_changed(attributes.env, "a reflex")
+    if changed:
+        refused = {"retract": changed, "comply": changed}
+        if has_stream(attributes):
+            refused["recall"] = changed
+
+    controller = controller_of(attributes)
+    if controller not in DELTAS:
+        for name in ("retract", "comply"):
             refused[name] = (
                 f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, "
-                f"got {controller_of(attributes) or None}: "
+                f"got {controller or None}: "
                 "use hold with a safe_action of your own, or name any policy"
             )
-        elif changed:
-            refused[name] = changed
-    if changed and has_stream(attributes):
-        refused["recall"] = changed
     return refused
 
 

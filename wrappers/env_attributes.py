@@ -52,8 +52,7 @@ class EnvAttributes:
         """Return what a method of each environment returns."""
         if self.is_vector:
             return tuple(self.env.unwrapped.call(method, argument))
-        owner = self.env if hasattr(self.env, method) else self.env.unwrapped
-        return (getattr(owner, method)(argument),)
+        return (self.env.get_wrapper_attr(method)(argument),)
 
 
 def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
@@ -65,6 +64,7 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     inner: Any = envs.unwrapped
     if not (hasattr(inner, "call") and hasattr(inner, "set_attr")):
         raise TypeError(
-            f"the environments in {inner} cannot be inspected: make it with SyncVectorEnv or AsyncVectorEnv"
+            f"the environments in {inner} cannot be inspected: "
+            "make it with SyncVectorEnv or AsyncVectorEnv"
         )
     return inner

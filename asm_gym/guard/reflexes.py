@@ -82,14 +82,15 @@ class FeltMotion:
 
         count = robots.count
         size = robots.rest.size
+        torque = np.zeros((count, len(torque_columns)))
         return cls(
             robots=robots,
             possible=frozenset(possible),
             tolerated=tolerated,
             holding=HoldingActions(count, robots.meaning, robots.rest),
             torque_columns=torque_columns,
-            torque=np.zeros((count, len(torque_columns))),
-            usual_torque=np.zeros((count, len(torque_columns))),
+            torque=torque,
+            usual_torque=torque.copy(),
             path=np.zeros((count, PATH, size), np.float32),
             path_steps=np.zeros(count, np.int64),
             expected=np.zeros((count, size), np.float32),

@@ -49,7 +49,6 @@ class RobotFacts:
     low: NDArray[np.float32]  # (A,) least action
     high: NDArray[np.float32]  # (A,) greatest action
     rest: NDArray[np.float32]  # (A,) for which a robot stays, or what comes nearest to it
-    rest_is_known: bool = True  # ``rest``, or ``meaning``, is known to make a robot stay
     meaning: ActionMeaning | None = None  # None where ``rest`` makes a robot stay everywhere
     brakes: bool = False  # a robot can stay by itself, whatever the action is
     grip: NDArray[np.intp] = field(default_factory=lambda: NO_COLUMNS)  # (G,) of the action
@@ -62,6 +61,11 @@ class RobotFacts:
     turning_action: TurningAction | None = None  # None where no action turns the joints
     efference: NDArray[np.intp] | None = None  # (A,) columns of the executed action, if slowed
     refused: Mapping[str, str] = field(default_factory=dict)  # why, by the name of a reflex
+
+    @property
+    def rest_is_known(self) -> bool:
+        """Whether ``rest``, or ``meaning``, is known to make a robot stay."""
+        return "hold" not in self.refused
 
     @cached_property
     def felt_size(self) -> int:
