@@ -33,7 +33,7 @@ class HoldsItself(Protocol):
     """An environment that can stay where it is, whatever its controller and the wrappers around it."""
 
     holding: bool  # set, arms and grippers stay in the next control step; the step unsets it
-    keeps_holding: bool  # set, no step unsets ``holding``, for wrappers that make several steps of one
+    keeps_holding: bool  # set, no step unsets ``holding``: a wrapper may make several of one
 
 
 class Hold:
@@ -51,7 +51,11 @@ class Hold:
         ValueError: ``safe_action`` does not fit the action space, or no action is known that holds the robot.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], safe_action: NDArray[np.float32] | None = None) -> None:
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        safe_action: NDArray[np.float32] | None = None,
+    ) -> None:
         space = env.action_space
         if not isinstance(space, spaces.Box):
             raise TypeError(f"a reflex needs a Box action space, got {space}")
@@ -108,30 +112,34 @@ class HoldingActions:
         rest: (A,) the action where nothing else is known.
     """
 
-    def __init__(self, count: int, meaning: ActionMeaning | None, rest: NDArray[np.float32]) -> None:
+    def __init__(
+        self,
+        count: int,
+        meaning: ActionMeaning | None,
+        rest: NDArray[np.float32],
+    ) -> None:
         self._meaning = meaning
         self._rest = rest
         self.executed = np.tile(rest, (count, 1))  # (n, A) the last action before the override
-        self._actions = np.full((count, rest.size), np.nan, np.float32)  # (n, A) NaN: not yet known
-        # (n, D) for each number of a row its newest finite value, now and a row earlier
-        self._newest: NDArray[np.float32] = np.zeros((count, 0), np.float32)
-        self._previous = self._newest
+        self._actions = np.full_like(self.executed, np.nan)  # (n, A) NaN: not yet known
+        # (2, n, D) the newest finite value of each number of a row, now and a row earlier
+        self._rows: NDArray[np.float32] = np.zeros((2, count, 0), np.float32)
 
     def begin(self, which: NDArray[np.bool_]) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
         self.executed[which] = self._rest
         self._actions[which] = np.nan
-        self._newest[which] = np.nan
-        self._previous[which] = np.nan
+        self._rows[:, which] = np.nan
 
     def sense(self, rows: NDArray[np.float32]) -> None:
         """Take in the newest rows (n, D)."""
         if self._meaning is None:
             return
-        if not self._newest.size:
-            self._newest = np.full_like(rows, np.nan)
-        self._previous = self._newest
-        self._newest = np.where(np.isfinite(rows), rows, self._previous)
+        previous = self._rows[0]
+        if not previous.size:
+            previous = np.full_like(rows, np.nan)
+        newest = np.where(np.isfinite(rows), rows, previous)
+        self._rows = np.stack([newest, previous])
 
     def start(self, robot: int, executed: NDArray[np.float32]) -> None:
         """Begin the override of a robot that has ``executed`` (A,)."""
@@ -140,16 +148,12 @@ class HoldingActions:
 
     def stay(self, robot: int) -> NDArray[np.float32]:
         """Return the action (A,) for which a robot stays; a number that is not known yet is that of ``rest``."""
-        if self._meaning is None:
-            return self._rest.copy()
-
         action = self._actions[robot]
-        unknown = ~np.isfinite(action)
-        if unknown.any() and self._newest.size:
-            before = self._previous[robot]
-            sensed = self._meaning.staying(self._newest[robot], before, self.executed[robot])
-            np.copyto(action, sensed, where=unknown)
-        return np.where(np.isfinite(action), action, self._rest)
+        if self._meaning is not None and self._rows.size:
+            newest, previous = self._rows[:, robot]
+            sensed = self._meaning.staying(newest, previous, self.executed[robot])
+            np.copyto(action, sensed, where=np.isnan(action))
+        return np.where(np.isnan(action), self._rest, action)
 
 
 class Staying(NamedTuple):
@@ -218,8 +222,9 @@ def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
         means = (means,)
     if not means or not set(means) <= {DELTA, VELOCITY}:
         raise ValueError(
-            f'{env.unwrapped} has no action_means="delta" or "velocity", so a zero action may not make it stay: '
-            'use Hold(env, safe_action=...), or on_alarm="hold" with NeuralASMSafety\'s action_means'
+            f'{env.unwrapped} has no action_means="delta" or "velocity", '
+            "so a zero action may not make it stay: use Hold(env, safe_action=...), "
+            'or on_alarm="hold" with NeuralASMSafety\'s action_means'
         )
     return resting_action(env)
 
@@ -269,7 +274,8 @@ def _changes_actions(wrapper: Any, reflex: str) -> str:
     if isinstance(wrapper, VectorActionWrapper):
         guard = "VectorNeuralASMSafety"
     return (
-        f"{type(wrapper).__name__} changes actions, so that {reflex} cannot know what reaches the robot: "
+        f"{type(wrapper).__name__} changes actions, "
+        f"so that {reflex} cannot know what reaches the robot: "
         f"put it outside of {guard}, or use Hold(env, safe_action=...)"
     )
 

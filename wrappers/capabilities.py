@@ -18,7 +18,8 @@ from asm_gym.spec import Channel, StreamSpec, control_period
 from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes
 from asm_gym.wrappers.observation_map import ObservationMap, ObservationPart, parts_of
 
-DELTAS = ("OSC_POSE", "JOINT_POSITION")  # controllers whose actions are changes, of pose or of joint angles
+# Controllers whose actions are changes, of pose or of joint angles.
+DELTAS = ("OSC_POSE", "JOINT_POSITION")
 
 
 def robots_of(
@@ -156,7 +157,11 @@ def limits_contact(attributes: EnvAttributes) -> bool:
     return bool(felt_channels(attributes)) and attributes.has("contact_limits")
 
 
-def efference_columns(attributes: EnvAttributes, spec: StreamSpec, size: int) -> NDArray[np.intp] | None:
+def efference_columns(
+    attributes: EnvAttributes,
+    spec: StreamSpec,
+    size: int,
+) -> NDArray[np.intp] | None:
     """Return (A,) the columns of the stream with the executed action, which contact limits may slow down.
 
     They are those of the stream's actions, if no wrapper inside changes actions, or their ``size``; else None.

@@ -27,7 +27,8 @@ from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.capabilities import controller_of, robots_of
 from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes, askable
 
-COUNTS = "episode_returns"  # attribute of wrappers that count episodes, Gymnasium's and Stable-Baselines3's
+# Attribute of wrappers that count episodes, Gymnasium's and Stable-Baselines3's.
+COUNTS = "episode_returns"
 
 
 class Guarding:
@@ -53,7 +54,12 @@ class Guarding:
         recorded = getattr(monitor, "about", {}).get(ACTIONS)
         if recorded is not None:
             recorded = ActionMeaning.from_json(recorded)
-        robots, self._observation_map = robots_of(self.env, monitor.spec, recorded, options.action_means)
+        robots, self._observation_map = robots_of(
+            self.env,
+            monitor.spec,
+            recorded,
+            options.action_means,
+        )
 
         policies: list[Policy] = []
         reaction = options.reaction(diagnosis_of(monitor) is not None)
@@ -119,17 +125,18 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
     """
     policy = on_alarm
     needs = "have a predict(), or make a policy"
-    can_make = callable(on_alarm) and (isinstance(on_alarm, type) or not hasattr(on_alarm, "predict"))
+    makes_policy = isinstance(on_alarm, type) or not hasattr(on_alarm, "predict")
     if isinstance(env, VectorEnv):
         needs = "one policy with a predict() that all environments share"
-        can_make = False
+        makes_policy = False
     try:
-        if can_make:
+        if makes_policy and callable(on_alarm):
             policy = on_alarm(env)
         if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
             raise TypeError("it has no predict()")
     except TypeError as error:
-        raise ValueError(f"on_alarm must be a name, or {needs}, got {short_repr(policy)}: {error}") from error
+        message = f"on_alarm must be a name, or {needs}, got {short_repr(policy)}: {error}"
+        raise ValueError(message) from error
     if isinstance(policy, Hold) and not policy.explicit:
         _check_bound(policy, env)
     return policy
@@ -169,7 +176,9 @@ def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
                 "with Stable-Baselines3, "
                 "make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))"
             )
-    if isinstance(env, VectorEnv) and ends and any(EnvAttributes(env).call("has_wrapper_attr", COUNTS)):
+    if not (isinstance(env, VectorEnv) and ends):
+        return
+    if any(EnvAttributes(env).call("has_wrapper_attr", COUNTS)):
         raise ValueError(
             "wrappers of the members that count episodes would miss those that the guard ends: use "
             f"gymnasium.wrappers.vector.RecordEpisodeStatistics({guard}(envs, monitor))"
@@ -187,7 +196,11 @@ def sensed_row(read: Callable[[], Any], size: int) -> tuple[NDArray[np.float32],
     return row, ""
 
 
-def felt_by(robots: RobotFacts, infos: dict[str, Any], present: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+def felt_by(
+    robots: RobotFacts,
+    infos: dict[str, Any],
+    present: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
     """Return what the arms felt in a step.
 
     Args:

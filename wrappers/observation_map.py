@@ -47,7 +47,12 @@ class ObservationMap:
         for part in parts:
             self.observed[part.columns] = True
 
-    def repaired(self, observation: Any, row: NDArray[np.float32], missing: NDArray[np.bool_]) -> Any:
+    def repaired(
+        self,
+        observation: Any,
+        row: NDArray[np.float32],
+        missing: NDArray[np.bool_],
+    ) -> Any:
         """Return the observation with the numbers of ``row`` (D,) where they are ``missing`` (D,)."""
         for part in self._parts:
             if not missing[part.columns].any():
@@ -60,7 +65,11 @@ class ObservationMap:
         return observation
 
 
-def parts_of(layout: dict[str, int], spec: StreamSpec, space: gym.spaces.Space[Any]) -> list[ObservationPart]:
+def parts_of(
+    layout: dict[str, int],
+    spec: StreamSpec,
+    space: gym.spaces.Space[Any],
+) -> list[ObservationPart]:
     """Return where the channels of a stream stand in an observation.
 
     Args:

@@ -18,9 +18,10 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
-from asm_gym.spec import StreamSpec, control_period
+from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
+from asm_gym.wrappers.capabilities import control_period_of
 from asm_gym.wrappers.env_attributes import EnvAttributes, askable
 from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, felt_by, sensed_row
 
@@ -106,7 +107,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                     f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
                 )
             spaces = env.single_observation_space, env.single_action_space
-            dt = float(EnvAttributes(env).first("dt") or control_period(env))
+            dt = control_period_of(EnvAttributes(env))
             return StreamSpec.from_spaces(*spaces, dt), False
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:

@@ -25,7 +25,11 @@ NOTHING: Mapping[int, Any] = MappingProxyType({})  # where there is nothing to s
 TurningAction = Callable[[int, NDArray[np.floating[Any]]], NDArray[np.float32]]
 
 
-def columns_ending(channels: Sequence[Channel], ending: str, size: int | None = None) -> NDArray[np.intp]:
+def columns_ending(
+    channels: Sequence[Channel],
+    ending: str,
+    size: int | None = None,
+) -> NDArray[np.intp]:
     """Return the columns of channels whose names have an ending, of all arms.
 
     Args:
@@ -72,8 +76,20 @@ class RobotFacts:
         """F, how many numbers the arms feel in physics substeps."""
         return sum(channel.size for channel in self.felt_channels)
 
-    def executed_in(self, rows: NDArray[np.float32], commanded: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the actions (n, A) that were executed in place of what was ``commanded``, by the rows (n, D) after."""
+    def executed_in(
+        self,
+        rows: NDArray[np.float32],
+        commanded: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Return the actions that were executed.
+
+        Args:
+            rows: (n, D) of the stream, after the actions.
+            commanded: (n, A) the actions where the rows do not tell them.
+
+        Returns:
+            (n, A) actions.
+        """
         if self.efference is None:
             return commanded
         executed = rows[:, self.efference]
