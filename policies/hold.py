@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from asm_gym.data.action_meaning import DELTA, MEANINGS, TARGET, VELOCITY, ActionMeaning
 from asm_gym.stream_source import layers
 
+SAFE_ACTION = "use Hold(env, safe_action=...)"
 KNOWN_TO_STAY = MEANINGS[:3]  # meanings under which some action makes a robot stay
 
 
@@ -167,7 +168,7 @@ class Staying(NamedTuple):
 def staying(
     env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any],
     space: spaces.Box,
-    told: ActionMeaning | None,
+    declared: ActionMeaning | None,
     recorded: ActionMeaning | None,
 ) -> Staying:
     """Return which actions make robots stay that do not hold by themselves.
@@ -175,37 +176,37 @@ def staying(
     Args:
         env: the environment, or a vector environment.
         space: the action space of one robot.
-        told: what the user or the environment says of the actions.
+        declared: what the user or the environment says of the actions.
         recorded: what recorded episodes show of them.
 
     Raises:
         ValueError: the meaning of an action is unknown, or it is a torque, or a wrapper changes it.
     """
     zero = nearest_to_zero(space)
-    meaning = told or recorded or ActionMeaning.unknown(space.shape)
+    meaning = declared or recorded or ActionMeaning.unknown(space.shape)
     meaning.check_stays(env.unwrapped)
-    if told is None:
+    if declared is None:
         return Staying(zero, meaning)
 
     if recorded is not None:
-        _warn_of_contradictions(told, recorded)
-    has_target = TARGET in told.means
+        _warn_of_contradictions(declared, recorded)
+    has_target = TARGET in declared.means
     if not has_target and not isinstance(env, VectorEnv):
         return Staying(resting_action(env))
 
     changed = why_changed(env, "a reflex")
-    moves_at_rest = np.any(zero.ravel()[np.array(told.means) != TARGET])
+    moves_at_rest = np.any(zero.ravel()[np.array(declared.means) != TARGET])
     if changed or moves_at_rest:
         raise ValueError(changed or _no_rest(space))
     if has_target:
-        return Staying(zero, told)
+        return Staying(zero, declared)
     return Staying(zero)
 
 
-def _warn_of_contradictions(told: ActionMeaning, recorded: ActionMeaning) -> None:
+def _warn_of_contradictions(declared: ActionMeaning, recorded: ActionMeaning) -> None:
     """Warn of numbers that are told to be a target and are recorded to be none, or the other way round."""
     contradictions = []
-    for number, (own, measured) in enumerate(zip(told.means, recorded.means, strict=True)):
+    for number, (own, measured) in enumerate(zip(declared.means, recorded.means, strict=True)):
         if own != measured and TARGET in (own, measured) and measured in KNOWN_TO_STAY:
             contradictions.append(f"number {number} moves as a {measured}")
     if contradictions:
@@ -223,7 +224,7 @@ def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     if not means or not set(means) <= {DELTA, VELOCITY}:
         raise ValueError(
             f'{env.unwrapped} has no action_means="delta" or "velocity", '
-            "so a zero action may not make it stay: use Hold(env, safe_action=...), "
+            f"so a zero action may not make it stay: {SAFE_ACTION}, "
             'or on_alarm="hold" with NeuralASMSafety\'s action_means'
         )
     return resting_action(env)
@@ -276,13 +277,13 @@ def _changes_actions(wrapper: Any, reflex: str) -> str:
     return (
         f"{type(wrapper).__name__} changes actions, "
         f"so that {reflex} cannot know what reaches the robot: "
-        f"put it outside of {guard}, or use Hold(env, safe_action=...)"
+        f"put it outside of {guard}, or {SAFE_ACTION}"
     )
 
 
 def _no_rest(space: spaces.Box) -> str:
     """Return that no action of a space is known to rest."""
-    return f"hold takes a zero action for rest, which is not in {space}: use Hold(env, safe_action=...)"
+    return f"hold takes a zero action for rest, which is not in {space}: {SAFE_ACTION}"
 
 
 def gripper_columns(columns: Sequence[int], size: int) -> NDArray[np.intp]:

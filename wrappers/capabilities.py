@@ -130,14 +130,14 @@ def resting_of(
         recorded = None
     if action_means is None:
         action_means = attributes.first("action_means")
-    told = None
+    declared = None
     if action_means is not None:
-        told = ActionMeaning.told(action_means, zero.size, recorded)
+        declared = ActionMeaning.told(action_means, zero.size, recorded)
 
     if attributes.has("holding"):
         return Staying(zero)
     try:
-        return staying(attributes.env, space, told, recorded)
+        return staying(attributes.env, space, declared, recorded)
     except ValueError as error:
         return Staying(zero, refused=str(error))
 
@@ -221,7 +221,7 @@ def observation_map_of(attributes: EnvAttributes, spec: StreamSpec) -> Observati
     default = None
     if not attributes.is_vector:
         default = attributes.env.unwrapped.observation_space
-    laid_out_space = attributes.first("laid_out_space", default)
-    if laid_out_space is not None and space != laid_out_space:
-        raise ValueError(f"a wrapper inside has changed the observation, which was {laid_out_space}")
+    own_space = attributes.first("laid_out_space", default)
+    if own_space is not None and space != own_space:
+        raise ValueError(f"a wrapper inside has changed the observation, which was {own_space}")
     return ObservationMap(parts_of(layout, spec, space), spec.size)

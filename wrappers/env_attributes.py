@@ -63,7 +63,6 @@ def askable(envs: VectorEnv[Any, Any, Any]) -> Any:
     """
     inner: Any = envs.unwrapped
     if not (hasattr(inner, "call") and hasattr(inner, "set_attr")):
-        raise TypeError(
-            f"the environments in {inner} cannot be inspected: make it with SyncVectorEnv or AsyncVectorEnv"
-        )
+        advice = "make it with SyncVectorEnv or AsyncVectorEnv"
+        raise TypeError(f"the environments in {inner} cannot be inspected: {advice}")
     return inner

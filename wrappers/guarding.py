@@ -87,7 +87,8 @@ class Guarding:
     def _watch_with_next(self) -> None:
         """Take over the monitor that was assigned, or was fitted or calibrated since."""
         if Fitted.of(self._next, self._spec).differs(self._engine.fitted):
-            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            reason = "the monitor was changed, fitted or calibrated since"
+            LOG.info("%s: it is taken over as it is now", reason)
             self._watch_with(self._next)
 
     @property

@@ -61,7 +61,7 @@ class ActionMeaning:
         return cls(**{name: tuple(values) for name, values in saved.items()})
 
     @classmethod
-    def told(cls, means: ActionMeans, size: int, found: ActionMeaning | None = None) -> ActionMeaning:
+    def told(cls, means: ActionMeans, size: int, recorded: ActionMeaning | None = None) -> ActionMeaning:
         """Return what a user says, for all numbers or for each, with the senses of targets that were found.
 
         Raises:
@@ -72,7 +72,7 @@ class ActionMeaning:
             raise ValueError(f"action_means must be one name, or {size} of them, got {short_repr(means)}")
         for name in each:
             check_choice("action_means", name, MEANINGS)
-        known = found or cls.unknown((size,))
+        known = recorded or cls.unknown((size,))
         return replace(known, means=each)
 
     @classmethod

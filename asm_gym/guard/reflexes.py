@@ -28,13 +28,11 @@ COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
 TOLERATED = 4.0  # external torque that no joint gives way to under "graded" [N m]
 TOLERATED_ALONE = 2.0  # and under "comply" [N m]
 
-NO_TORQUE = "comply needs the channel external_torque: make the environment with stream group torque"
-
 
 class Motion(NamedTuple):
     """What a reflex does next."""
 
-    action: NDArray[np.float32]  # (A,)
+    action: NDArray[np.float32]  # (A,) not to be written to
     brakes: bool = False  # the robot stays, whatever the action is
     keeps_grip: bool = True  # the grippers are commanded as before the override
 
@@ -69,7 +67,8 @@ class FeltMotion:
         torque_columns = columns_ending(spec.channels, "external_torque")
         refused = dict(robots.refused)
         if not torque_columns.size:
-            refused.setdefault("comply", NO_TORQUE)
+            needs = "comply needs the channel external_torque"
+            refused.setdefault("comply", f"{needs}: make the environment with stream group torque")
         for name in (on_alarm, "hold"):
             if name in refused:
                 raise ValueError(refused[name])
@@ -127,7 +126,7 @@ def retract(motion: FeltMotion, robot: int) -> Motion:
 
     path = motion.path[robot]
     undone = -path[-1]
-    path[1:] = path[:-1].copy()
+    path[1:] = path[:-1]
     motion.path_steps[robot] -= 1
     return Motion(undone)
 
@@ -138,8 +137,7 @@ def comply(motion: FeltMotion, robot: int) -> Motion:
     assert robots.turning_action is not None
     torque = motion.torque[robot] - motion.usual_torque[robot]
     beyond = np.sign(torque) * np.maximum(np.abs(torque) - motion.tolerated, 0.0)
-    action = robots.turning_action(robot, COMPLIANCE * robots.dt * beyond)
-    return Motion(np.array(action, np.float32))
+    return Motion(robots.turning_action(robot, COMPLIANCE * robots.dt * beyond))
 
 
 def recall(motion: FeltMotion, robot: int) -> Motion:
@@ -147,7 +145,7 @@ def recall(motion: FeltMotion, robot: int) -> Motion:
     expected = motion.expected[robot]
     if not np.isfinite(expected).all():
         return hold(motion, robot)
-    return Motion(expected.copy(), keeps_grip=False)
+    return Motion(expected, keeps_grip=False)
 
 
 REFLEXES: dict[str, Callable[[FeltMotion, int], Motion]] = {
