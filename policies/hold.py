@@ -31,7 +31,7 @@ KNOWN_TO_STAY = MEANINGS[:3]  # meanings under which some action makes a robot s
 
 @runtime_checkable
 class HoldsItself(Protocol):
-    """An environment that can stay where it is, whatever its controller and the wrappers around it."""
+    """An environment that can stay where it is, under any controller and wrapper."""
 
     holding: bool  # set, arms and grippers stay in the next control step; the step unsets it
     keeps_holding: bool  # set, no step unsets ``holding``: a wrapper may make several of one
@@ -40,16 +40,19 @@ class HoldsItself(Protocol):
 class Hold:
     """Keep the robot in place and keep its grip.
 
-    This package's environments hold by themselves, under any controller and wrapper. In any other environment a zero
-    action holds if its attribute ``action_means`` is ``"delta"`` or ``"velocity"``.
+    This package's environments hold by themselves, under any controller and wrapper. In any other
+    environment a zero action holds if its attribute ``action_means`` is ``"delta"`` or
+    ``"velocity"``.
 
     Args:
         env: an environment with a Box action space.
-        safe_action: (A,) the action to take instead, if a zero action does not hold; it passes through all wrappers.
+        safe_action: (A,) the action to take instead, if a zero action does not hold; it passes
+            through all wrappers.
 
     Raises:
         TypeError: the action space is no Box.
-        ValueError: ``safe_action`` does not fit the action space, or no action is known that holds the robot.
+        ValueError: ``safe_action`` does not fit the action space, or no action is known that
+            holds the robot.
     """
 
     def __init__(
@@ -148,7 +151,7 @@ class HoldingActions:
         self._actions[robot] = np.nan
 
     def stay(self, robot: int) -> NDArray[np.float32]:
-        """Return the action (A,) for which a robot stays; a number that is not known yet is that of ``rest``."""
+        """Return the action (A,) for which a robot stays; that of ``rest`` where unknown."""
         action = self._actions[robot]
         if self._meaning is not None and self._rows.size:
             newest, previous = self._rows[:, robot]
@@ -204,7 +207,7 @@ def staying(
 
 
 def _warn_of_contradictions(declared: ActionMeaning, recorded: ActionMeaning) -> None:
-    """Warn of numbers that are told to be a target and are recorded to be none, or the other way round."""
+    """Warn of numbers that are declared a target and move as none, or the other way round."""
     contradictions = []
     for number, (own, measured) in enumerate(zip(declared.means, recorded.means, strict=True)):
         if own != measured and TARGET in (own, measured) and measured in KNOWN_TO_STAY:
@@ -215,7 +218,11 @@ def _warn_of_contradictions(declared: ActionMeaning, recorded: ActionMeaning) ->
 
 
 def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
-    """Return the resting action. Raises ValueError where the environment does not say that zero makes it stay."""
+    """Return the resting action of an environment with the attribute ``action_means``.
+
+    Raises:
+        ValueError: the attribute does not say that a zero action makes the robot stay.
+    """
     means: Any = ()
     if env.has_wrapper_attr("action_means"):
         means = env.get_wrapper_attr("action_means") or ()
@@ -251,7 +258,11 @@ def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
 
 
 def _innermost(env: gym.Env[Any, Any], action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what an action becomes on its way to the innermost environment. Raises ValueError where that varies."""
+    """Return what an action (A,) becomes on its way to the innermost environment.
+
+    Raises:
+        ValueError: a wrapper changes it by more than a function of the action.
+    """
     for wrapper in layers(env):
         if isinstance(wrapper, TransformAction):  # a function of the action alone
             action = np.asarray(wrapper.action(action))
@@ -261,7 +272,15 @@ def _innermost(env: gym.Env[Any, Any], action: NDArray[np.float32]) -> NDArray[n
 
 
 def why_changed(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any], reflex: str) -> str:
-    """Return why a reflex cannot know which action reaches a robot: a wrapper changes it; empty where none does."""
+    """Return which wrapper keeps a reflex from knowing the action that reaches the robot.
+
+    Args:
+        env: the environment, or a vector environment.
+        reflex: what the message calls the reflex.
+
+    Returns:
+        A message; empty where no wrapper changes actions.
+    """
     for layer in layers(env):
         changes = isinstance(layer, gym.ActionWrapper | VectorActionWrapper)
         if changes and not isinstance(layer, ClipAction):
@@ -287,7 +306,10 @@ def _no_rest(space: spaces.Box) -> str:
 
 
 def gripper_columns(columns: Sequence[int], size: int) -> NDArray[np.intp]:
-    """Return (G,) which numbers of an action command grippers; none where an action of ``size`` lacks one of them."""
+    """Return (G,) the numbers of an action that command grippers.
+
+    They are none where one of the ``columns`` lies beyond the ``size`` of the action.
+    """
     if max(columns, default=-1) >= size:  # a wrapper inside takes other actions
         columns = ()
     return np.asarray(columns, np.intp)

@@ -1,7 +1,7 @@
 """What a guard asks of an environment that it does not know: one function for each capability.
 
-Each attribute belongs to the environment, or to a wrapper inside the guard. The members of a vector environment are of
-one kind; a capability is theirs if all have it.
+Each attribute belongs to the environment, or to a wrapper inside the guard. The members of a
+vector environment are of one kind; they have a capability if all of them have its attribute.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def robots_of(
     recorded: ActionMeaning | None = None,
     action_means: ActionMeans | None = None,
 ) -> tuple[RobotFacts, ObservationMap | None]:
-    """Return what an environment tells of its robots, and where their streams stand in observations.
+    """Return the facts of an environment's robots, and where their streams are observed.
 
     Args:
         env: an environment, or a vector environment.
@@ -67,7 +67,7 @@ def robots_of(
         rest=resting.action.ravel(),
         meaning=resting.meaning,
         brakes=brakes(attributes),
-        grip=gripper_columns(attributes.first("gripper_actions", ()), size),
+        grip=gripper_columns_of(attributes, size),
         dt=control_period_of(attributes),
         task=task_name(attributes),
         chains=hand_chains(attributes),
@@ -82,19 +82,26 @@ def robots_of(
 
 
 def control_period_of(attributes: EnvAttributes) -> float:
-    """Return the control period [s]: ``dt`` of the members of a vector; see ``asm_gym.spec.control_period``."""
+    """Return the control period [s].
+
+    It is ``dt`` of the members of a vector environment; else ``asm_gym.spec.control_period``
+    tells where it comes from.
+    """
     if attributes.is_vector and (dt := attributes.first("dt")):
         return float(dt)
     return control_period(attributes.env)
 
 
 def controller_of(attributes: EnvAttributes) -> str:
-    """Return the name of the arms' controller, such as ``OSC_POSE``: ``controller``; empty without it."""
+    """Return the name of the arms' controller: ``controller``; empty without it."""
     return str(attributes.first("controller", ""))
 
 
 def has_stream(attributes: EnvAttributes) -> bool:
-    """Return whether there is a stream: ``stream_spec``; without it, observation and action are the stream."""
+    """Return whether there is a stream: ``stream_spec``.
+
+    Without it, observation and action are the stream.
+    """
     return attributes.has("stream_spec")
 
 
@@ -104,9 +111,10 @@ def task_name(attributes: EnvAttributes) -> str:
 
 
 def brakes(attributes: EnvAttributes) -> bool:
-    """Return whether a robot can be braked beneath its controller in all steps that wrappers make of one.
+    """Return whether robots can be braked beneath their controllers: ``HoldsItself``.
 
-    The attributes are those of ``asm_gym.policies.hold.HoldsItself``; without them an action has to make a robot stay.
+    They stay in all steps that a wrapper makes of one. Without ``holding`` and
+    ``keeps_holding``, an action has to make them stay.
     """
     return attributes.has("holding") and attributes.has("keeps_holding")
 
@@ -119,8 +127,13 @@ def resting_of(
 ) -> Staying:
     """Return which actions make the robots stay.
 
-    Where the user does not say what actions mean, ``action_means`` of the environment does, or else the recorded
-    episodes. Robots with the attribute ``holding`` stay whatever the action is.
+    Robots with the attribute ``holding`` stay whatever the action is.
+
+    Args:
+        attributes: of the environment.
+        space: the action space of one robot.
+        recorded: what recorded episodes show of the meaning of actions, if nobody declares it.
+        action_means: what the user declares; by default ``action_means`` of the environment.
 
     Raises:
         ValueError: ``action_means`` does not fit the actions.
@@ -128,18 +141,45 @@ def resting_of(
     zero = nearest_to_zero(space)
     if recorded is not None and len(recorded.means) != zero.size:
         recorded = None
-    if action_means is None:
-        action_means = attributes.first("action_means")
-    declared = None
-    if action_means is not None:
-        declared = ActionMeaning.told(action_means, zero.size, recorded)
-
+    declared = declared_meaning(attributes, zero.size, recorded, action_means)
     if attributes.has("holding"):
         return Staying(zero)
     try:
         return staying(attributes.env, space, declared, recorded)
     except ValueError as error:
         return Staying(zero, refused=str(error))
+
+
+def declared_meaning(
+    attributes: EnvAttributes,
+    size: int,
+    recorded: ActionMeaning | None,
+    action_means: ActionMeans | None,
+) -> ActionMeaning | None:
+    """Return what actions mean, as declared: ``action_means``; None without it.
+
+    Args:
+        attributes: of the environment.
+        size: A, how many numbers an action has.
+        recorded: what recorded episodes show, which tells the senses of targets.
+        action_means: what the user declares, instead of the attribute.
+
+    Raises:
+        ValueError: an unknown meaning, or another number of them.
+    """
+    if action_means is None:
+        action_means = attributes.first("action_means")
+    if action_means is None:
+        return None
+    return ActionMeaning.told(action_means, size, recorded)
+
+
+def gripper_columns_of(attributes: EnvAttributes, size: int) -> NDArray[np.intp]:
+    """Return (G,) the numbers of an action of this size that command grippers: ``gripper_actions``.
+
+    There are none without it.
+    """
+    return gripper_columns(attributes.first("gripper_actions", ()), size)
 
 
 def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
@@ -153,7 +193,10 @@ def felt_channels(attributes: EnvAttributes) -> tuple[Channel, ...]:
 
 
 def limits_contact(attributes: EnvAttributes) -> bool:
-    """Return whether arms compare what they feel with the attribute ``contact_limits`` in every physics substep."""
+    """Return whether each physics substep compares what is felt with ``contact_limits``.
+
+    Without that attribute, or ``felt_channels``, nothing reacts within a control step.
+    """
     return bool(felt_channels(attributes)) and attributes.has("contact_limits")
 
 
@@ -162,9 +205,11 @@ def efference_columns(
     spec: StreamSpec,
     size: int,
 ) -> NDArray[np.intp] | None:
-    """Return (A,) the columns of the stream with the executed action, which contact limits may slow down.
+    """Return the columns of the stream with the executed action, if contact limits may slow it.
 
-    They are those of the stream's actions, if no wrapper inside changes actions, or their ``size``; else None.
+    Returns:
+        (A,) columns of the stream's action; None where a wrapper inside changes actions, or
+        actions have another ``size``.
     """
     if not (limits_contact(attributes) and has_stream(attributes)):
         return None
@@ -181,7 +226,8 @@ def turning_action(attributes: EnvAttributes) -> TurningAction:
 def refused_reflexes(attributes: EnvAttributes) -> dict[str, str]:
     """Return why robots cannot do a reflex besides hold, by its name.
 
-    Retract and comply need actions that are changes; a wrapper inside must not change what a reflex does.
+    Retract and comply need actions that are changes, by the controller's name. No wrapper inside
+    may change actions.
     """
     refused = {}
     changed = why_changed(attributes.env, "a reflex")
@@ -204,11 +250,11 @@ def refused_reflexes(attributes: EnvAttributes) -> dict[str, str]:
 def observation_map_of(attributes: EnvAttributes, spec: StreamSpec) -> ObservationMap:
     """Return where the stream stands in observations.
 
-    The attribute ``observation_layout`` has the sizes of the observation's channels in order, by name, and
-    ``laid_out_space`` the space of that layout. Without a stream of its own, observation and action are the stream.
+    The attribute ``observation_layout`` has the sizes of the observation's channels in order, by
+    name, and ``laid_out_space`` the space of that layout.
 
     Raises:
-        ValueError: the environment does not say it, or a wrapper inside has changed the observation.
+        ValueError: there is no layout, or a wrapper inside has changed the observation.
     """
     space = attributes.observation_space
     if not has_stream(attributes) and isinstance(space, gym.spaces.Box):

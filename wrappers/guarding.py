@@ -74,7 +74,7 @@ class Guarding:
         check_monitor(monitor, self._spec, controller_of(EnvAttributes(self.env)))
 
     def _limit_contact(self, anew: bool = False) -> None:
-        """Set the contact limits of the environments where they have changed, or ``anew`` for new episodes."""
+        """Set the environments' contact limits if they changed, or ``anew`` for new episodes."""
         limits = self._engine.limits
         if self._robots.limits_contact and (anew or limits is not self._limits):
             named_limits = [(self._name, own) for own in limits]
@@ -98,7 +98,10 @@ class Guarding:
 
     @property
     def monitor(self) -> Monitor:
-        """The monitor in use; one that is assigned, or was fitted or calibrated since, takes over at the next reset."""
+        """The monitor in use.
+
+        One that is assigned, or was fitted or calibrated since, takes over at the next reset.
+        """
         return self._engine.fitted.monitor
 
     @monitor.setter
@@ -108,7 +111,11 @@ class Guarding:
 
 
 def body_memory(env: AnyEnv, watched: StreamSpec) -> NeuralASM:
-    """Return the shipped memory of the robot in ``env``, or in all its members. Raises ValueError where none fits."""
+    """Return the shipped memory of the robot in ``env``, or in all its members.
+
+    Raises:
+        ValueError: no memory fits its stream and controller.
+    """
     memory = NeuralASM.pretrained(pretrained_for(watched, controller_of(EnvAttributes(env))))
     LOG.info("watching %s with %r", env.unwrapped, memory)
     return memory
@@ -122,7 +129,7 @@ def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
         env: the environment, or a vector environment.
 
     Raises:
-        ValueError: it is no policy, or a reflex that was made for another environment, whose arm it would move.
+        ValueError: it is no policy, or a reflex that would move the arm of another environment.
     """
     policy = on_alarm
     needs = "have a predict(), or make a policy"
@@ -225,7 +232,7 @@ def felt_by(
 
 
 def as_action(space: gym.spaces.Space[Any] | None, action: Any) -> Any:
-    """Return an action, or several, in the type of their space: whole numbers where a Box holds these."""
+    """Return actions in the type of their space: whole numbers where a Box holds these."""
     if isinstance(space, gym.spaces.Box) and space.dtype.kind in "iu":
         return np.rint(action).astype(space.dtype)
     return action

@@ -23,7 +23,7 @@ class ObservationPart:
     entries: NDArray[np.intp]  # (N,) of the flat array
 
     def replaced(self, array: Any, row: NDArray[np.float32], missing: NDArray[np.bool_]) -> Any:
-        """Return a copy of the array with the numbers of ``row`` (D,) where they are ``missing`` (D,)."""
+        """Return a copy of the array with the numbers of a row (D,) where ``missing`` (D,)."""
         wrong = missing[self.columns]
         changed = np.array(array)
         changed.reshape(-1)[self.entries[wrong]] = row[self.columns[wrong]]
@@ -43,7 +43,7 @@ class ObservationMap:
     def __init__(self, parts: Sequence[ObservationPart], size: int) -> None:
         self._parts = parts
         self.observed = np.zeros(size, bool)
-        """(D,) columns in the observation; a policy that receives nothing else cannot read others."""
+        """(D,) the columns in the observation, which are all that a policy can read."""
         for part in parts:
             self.observed[part.columns] = True
 
@@ -53,7 +53,7 @@ class ObservationMap:
         row: NDArray[np.float32],
         missing: NDArray[np.bool_],
     ) -> Any:
-        """Return the observation with the numbers of ``row`` (D,) where they are ``missing`` (D,)."""
+        """Return the observation with the numbers of a row (D,) where ``missing`` (D,)."""
         for part in self._parts:
             if not missing[part.columns].any():
                 continue
@@ -75,7 +75,8 @@ def parts_of(
     Args:
         layout: the sizes of the observation's channels in order, by name.
         spec: of the stream.
-        space: a Box of all channels, a dict with such a Box as ``state``, or a dict with an array for each channel.
+        space: a Box of all channels, a dict with such a Box as ``state``, or a dict with an
+            array for each channel.
     """
     arrays: Any = {"": space}
     if isinstance(space, gym.spaces.Dict):

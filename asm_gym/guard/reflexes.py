@@ -1,12 +1,12 @@
-"""What a robot does after an alarm: it stays, goes back, gives way, or goes on as the memory expects.
+"""What a robot does after an alarm: stay, go back, give way, or go on as expected.
 
     hold      the action for which the robot stays, or a brake beneath its controller
     retract   -u_t, -u_{t-1}, …   of the actions u that the policy executed last
-    comply    dq = c dt sign(τ) max(|τ| - τ_tolerated, 0),   τ the external torque beyond the usual
+    comply    dq = c dt sign(τ) max(|τ| - τ_tolerated, 0),   τ beyond the usual torque
     recall    the action that the memory expects
 
-A reflex is a function of ``FeltMotion`` and of the robot's index. To add one, write the function and name it in
-``REFLEXES``.
+A reflex is a function of ``FeltMotion`` and of the robot's index. To add one, write the function
+and name it in ``REFLEXES``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FeltMotion:
-    """What n robots feel, what they did, and what they are expected to do; the arrays are written to."""
+    """What n robots feel, did, and are expected to do; its arrays are written to."""
 
     robots: RobotFacts
     possible: frozenset[str]  # names of reflexes that the guard may ask for and the robots can do
@@ -120,7 +120,10 @@ def hold(motion: FeltMotion, robot: int) -> Motion:
 
 
 def retract(motion: FeltMotion, robot: int) -> Motion:
-    """Undo the last actions, the newest first, then stay: under a delta controller its negative undoes an action."""
+    """Undo the last actions, the newest first, then stay.
+
+    Under a controller of changes, the negative of an action undoes it.
+    """
     if not motion.path_steps[robot]:
         return hold(motion, robot)
 
@@ -141,7 +144,7 @@ def comply(motion: FeltMotion, robot: int) -> Motion:
 
 
 def recall(motion: FeltMotion, robot: int) -> Motion:
-    """Go on along what the memory expects to be commanded, grip included; stay where it expects nothing yet."""
+    """Do what the memory expects, grip included; stay where it expects nothing yet."""
     expected = motion.expected[robot]
     if not np.isfinite(expected).all():
         return hold(motion, robot)

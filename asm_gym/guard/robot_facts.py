@@ -96,7 +96,12 @@ class RobotFacts:
         return np.where(np.isfinite(executed), executed, commanded)
 
     def slowed(self, commanded: NDArray[np.float32], executed: NDArray[np.float32]) -> float:
-        """Return the greatest share of a number of the action (A,) that was taken from it; NaN where unknown."""
+        """Return the greatest share that was taken from a number of an action; NaN where unknown.
+
+        Args:
+            commanded: (A,) the action that was commanded.
+            executed: (A,) the action that was executed.
+        """
         if self.limits_contact and self.efference is None:  # a wrapper inside changes actions
             return np.nan
         moved = np.abs(commanded) > SMALLEST
