@@ -48,9 +48,7 @@ def robots_of(
         return RobotFacts(count=1, low=none, high=none, rest=none, dt=dt), None
 
     resting = resting_of(attributes, space, recorded, action_means)
-    refused = refused_reflexes(attributes)
-    if resting.refused:
-        refused["hold"] = resting.refused
+    refused = refused_reflexes(attributes, resting)
     observation_map = None
     observed = None
     try:
@@ -223,11 +221,11 @@ def turning_action(attributes: EnvAttributes) -> TurningAction:
     return lambda robot, turns: attributes.call("action_for", turns)[robot]
 
 
-def refused_reflexes(attributes: EnvAttributes) -> dict[str, str]:
-    """Return why robots cannot do a reflex besides hold, by its name.
+def refused_reflexes(attributes: EnvAttributes, resting: Staying) -> dict[str, str]:
+    """Return why robots cannot do a reflex, by its name.
 
-    Retract and comply need actions that are changes, by the controller's name. No wrapper inside
-    may change actions.
+    Hold needs a brake, or an action that makes the robots stay. Retract and comply need actions
+    that are changes, by the controller's name. No wrapper inside may change actions.
     """
     refused = {}
     changed = why_changed(attributes.env, "a reflex")
@@ -244,6 +242,8 @@ def refused_reflexes(attributes: EnvAttributes) -> dict[str, str]:
                 f"got {controller or None}: "
                 "use hold with a safe_action of your own, or name any policy"
             )
+    if resting.refused:
+        refused["hold"] = resting.refused
     return refused
 
 
