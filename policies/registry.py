@@ -9,8 +9,8 @@ from typing import Any, cast
 import gymnasium as gym
 
 from asm_gym.policies.base import Policy
+from asm_gym.policies.hold import Hold
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.policies.reflexes import Hold
 from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert

@@ -38,7 +38,7 @@ from asm_gym.tasks import env_id
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_number
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
-from asm_gym.wrappers.robots import body_memory
+from asm_gym.wrappers.guarding import body_memory
 
 NAMES = "monitor", "safety", "env"
 SECOND = 20  # control steps of a second

@@ -6,15 +6,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from asm_gym.guard.reflexes import Reflexes
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.reflexes import FeltMotion
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.rows import Rows
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.monitors.diagnosis import CLASSES, Diagnosis
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.wrappers.robots import robots_of
+from asm_gym.wrappers.capabilities import robots_of
 from tests.fakes import CueMonitor
 
 SPEC = StreamSpec(
@@ -133,7 +133,7 @@ class Repaired:
     """The rows of one arm, as a guard believes them."""
 
     def __init__(self):
-        robots = Robots.unknown(SPEC, np.ones(SPEC.size, bool))
+        robots = RobotFacts.unknown(SPEC, np.ones(SPEC.size, bool))
         self.rows = Rows(robots, SPEC, MEMORY, kept=10)
 
     def read(self, row):
@@ -156,4 +156,4 @@ class Repaired:
 def reflexes_of(env, name):
     """The reflexes of one robot."""
     spec = env.get_wrapper_attr("stream_spec")
-    return Reflexes(robots_of(env, spec)[0], spec, name)
+    return FeltMotion.of(robots_of(env, spec)[0], spec, name)

@@ -8,7 +8,7 @@ import pytest
 
 from asm_gym.data.action_meaning import ACTIONS, ActionMeaning, found_meaning
 from asm_gym.monitors import Surprise
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.hold import Hold
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 
 JOINTS, STEPS = 3, 150

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from asm_gym.guard.arbiter import STATES, Arbiter, Judged, Situation, State, following
 from asm_gym.guard.options import ReleaseRule
-from asm_gym.guard.reflexes import COMPLIANCE, Reflexes
+from asm_gym.guard.reflexes import COMPLIANCE, FeltMotion
 from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 ACTING = (State.POLICY, State.TRIAL)
@@ -121,27 +121,29 @@ def test_an_episode_that_begins_leaves_the_other_robots_as_they_are():
 SPEC = StreamSpec((Channel("external_torque", 2), Channel("action", 2, group=MOTOR)), 0.05)
 
 
-def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> Reflexes:
+def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> FeltMotion:
     low, rest, high = (np.full(2, value, np.float32) for value in (-1, 0, 1))
-    robots = Robots(1, low, high, rest, dt=0.05, turn=lambda _, turns: np.float32(turns), refused=refused or {})
-    made = Reflexes(robots, spec, on_alarm)
+    robots = RobotFacts(
+        1, low, high, rest, dt=0.05, turning_action=lambda _, turns: np.float32(turns), refused=refused or {}
+    )
+    made = FeltMotion.of(robots, spec, on_alarm)
     made.begin(np.ones(1, bool))
     return made
 
 
 def test_retract_undoes_the_last_actions_newest_first_and_then_stays():
     felt = reflexes("retract")
-    felt.path[0, -2:, 0], felt.steps[0] = (0.2, 0.3), 2
+    felt.path[0, -2:, 0], felt.path_steps[0] = (0.2, 0.3), 2
     moves = [felt.move(0, "retract").action[0] for _ in range(3)]
     np.testing.assert_allclose(moves, [-0.3, -0.2, 0.0], rtol=1e-6)
 
 
 def test_comply_gives_way_beyond_what_is_usual_and_tolerated():
     felt = reflexes("comply")
-    felt.torque[0], felt.usual[0] = [5.0, -9.0], [0.0, -5.0]
+    felt.torque[0], felt.usual_torque[0] = [5.0, -9.0], [0.0, -5.0]
     beyond = np.array([3.0, -2.0])
     np.testing.assert_allclose(felt.move(0, "comply").action, COMPLIANCE * 0.05 * beyond, rtol=1e-6)
-    felt.torque[0] = felt.usual[0]
+    felt.torque[0] = felt.usual_torque[0]
     assert not felt.move(0, "comply").action.any()
 
 

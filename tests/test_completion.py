@@ -8,7 +8,7 @@ from gymnasium import spaces
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.robots import robots_of
+from asm_gym.wrappers.capabilities import robots_of
 from tests.arms import MEMORY, SENSES, SPEC, STREAMS, Arm, Judge, Repaired, arm, offset
 
 

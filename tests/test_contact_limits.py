@@ -14,7 +14,7 @@ from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies import make_policy
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
-from asm_gym.wrappers.robots import robots_of
+from asm_gym.wrappers.capabilities import robots_of
 
 FOLDED = 0.0, -0.2, 2.5, -2.95, 1.34, 2.3, -2.73  # the fingers are in the pedestal, 9 mm deep [rad]
 

@@ -11,7 +11,7 @@ from gymnasium.vector import SyncVectorEnv
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.options import ON_ALARM
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.hold import Hold
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.arms import ACT as ARM_ACT
 from tests.arms import Acting, Judge, infos

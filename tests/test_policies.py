@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asm_gym.policies import make_policy, rollout
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.hold import Hold
 from asm_gym.policies.scripted.base import Style
 from tests.fakes import FakeEnv
 

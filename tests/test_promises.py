@@ -7,7 +7,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import asm_gym  # noqa: F401
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.hold import Hold
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import SPEC, CueMonitor, FadingMonitor, FakeEnv
 

@@ -9,7 +9,7 @@ from asm_gym import collect
 from asm_gym.envs.vector import ThreadedVectorEnv
 from asm_gym.guard.observer import choose
 from asm_gym.monitors import NeuralASM
-from asm_gym.policies.reflexes import Hold
+from asm_gym.policies.hold import Hold
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import SPEC, FadingMonitor, FakeEnv

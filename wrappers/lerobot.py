@@ -33,7 +33,7 @@ from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.preview import Preview
 from asm_gym.guard.report import FAILURE, RowReport
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
@@ -184,7 +184,7 @@ class LeRobotGuard:
         dt, size = self._spec.dt, len(self._names)
         low, high, unknown = (np.full(size, value, np.float32) for value in (-np.inf, np.inf, np.nan))
         grip = np.flatnonzero([bool(_GRIPPER.fullmatch(name.lower())) for name in self._names])
-        robots = Robots(1, low, high, rest=unknown, grip=grip, dt=dt, meaning=self._meaning())
+        robots = RobotFacts(1, low, high, rest=unknown, grip=grip, dt=dt, meaning=self._meaning())
         release_rows = sys.maxsize if self.on_alarm == "stop" else max(1, int(np.ceil(self.release_s / dt)))
         reaction: OnAlarmName = "hold" if self.on_alarm != "monitor" else "monitor"
         return Engine(robots, self.monitor, GuardOptions(reaction, release_rows, contact_limits=None))

@@ -18,10 +18,10 @@ from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.preview import Preview, checked_chunk
 from asm_gym.guard.report import LazyInfo, RowReport, report
 from asm_gym.monitors import Monitor
-from asm_gym.policies.reflexes import HoldsItself, changed_by, outside
+from asm_gym.policies.hold import HoldsItself, why_changed
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.robots import Guarding, as_action, body_memory, felt_by, sensed_row
+from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, felt_by, sensed_row
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -125,8 +125,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._source = StreamSource(env)
         self._spec = self._source.spec
         self._rows_per_step = self._source.rows_per_step
-        if self._rows_per_step > 1 and (wrapper := changed_by(env)) is not None:
-            raise ValueError(outside(wrapper, "a reflex within a step"))
+        changed = why_changed(env, "a reflex within a step")
+        if self._rows_per_step > 1 and changed:
+            raise ValueError(changed)
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
         self._inner: Any = env.unwrapped
         self._holds = isinstance(self._inner, HoldsItself)
@@ -197,7 +198,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._limit_contact()
         if repaired := self._engine.repaired:
             row, missing = repaired[0]
-            observation = observation if self._places is None else self._places.repaired(observation, row, missing)
+            if self._observation_map is not None:
+                observation = self._observation_map.repaired(observation, row, missing)
             if "stream" in info:
                 info["stream"] = row.copy()
         self._observation = observation

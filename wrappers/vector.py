@@ -18,10 +18,12 @@ from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
-from asm_gym.spec import StreamSpec, control_period
+from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
-from asm_gym.wrappers.robots import Guarding, Members, as_action, askable, body_memory, felt_by, sensed_row
+from asm_gym.wrappers.capabilities import control_period_of
+from asm_gym.wrappers.env_attributes import EnvAttributes, askable
+from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, felt_by, sensed_row
 
 Mask = NDArray[np.bool_]
 
@@ -105,12 +107,12 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                     f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
                 )
             spaces = env.single_observation_space, env.single_action_space
-            dt = float(Members(env).first("dt") or control_period(env))
+            dt = control_period_of(EnvAttributes(env))
             return StreamSpec.from_spaces(*spaces, dt), False
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:
             first.require(other, "the first environment")
-        if round(Members(env).first("dt", first.dt) / first.dt) > 1:
+        if round(EnvAttributes(env).first("dt", first.dt) / first.dt) > 1:
             raise ValueError("a vector is watched at its control rate: make the environments without stream_freq")
         return first, True
 
@@ -211,10 +213,10 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
         """Return the observations, and set the streams, with what is completed in the environments of ``where``."""
         for i, (row, missing) in self._engine.repaired.items():
-            if not where[i] or self._places is None:
+            if not where[i] or self._observation_map is None:
                 continue
             seen = list(iterate(self.observation_space, observations))[i]
-            observations = _with(observations, i, self._places.repaired(seen, row, missing))
+            observations = _with(observations, i, self._observation_map.repaired(seen, row, missing))
             if "stream" in infos:
                 infos["stream"] = _with(infos["stream"], i, row)
         return observations

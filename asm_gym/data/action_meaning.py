@@ -12,7 +12,7 @@ For each number u of the action, and each sense x with its change d_t = x_t - x_
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -61,7 +61,7 @@ class ActionMeaning:
         return cls(**{name: tuple(values) for name, values in saved.items()})
 
     @classmethod
-    def told(cls, means: ActionMeans, size: int, found: ActionMeaning | None = None) -> ActionMeaning:
+    def told(cls, means: ActionMeans, size: int, recorded: ActionMeaning | None = None) -> ActionMeaning:
         """Return what a user says, for all numbers or for each, with the senses of targets that were found.
 
         Raises:
@@ -72,11 +72,8 @@ class ActionMeaning:
             raise ValueError(f"action_means must be one name, or {size} of them, got {short_repr(means)}")
         for name in each:
             check_choice("action_means", name, MEANINGS)
-        known = [(-1, 0.0, 0.0)] * size
-        if found is not None:
-            parts = zip(each, found.means, found.senses, found.slopes, found.offsets, strict=True)
-            known = [(k, a, b) if own == was == TARGET else (-1, 0.0, 0.0) for own, was, k, a, b in parts]
-        return cls(each, *(tuple(values) for values in zip(*known, strict=True)))
+        known = recorded or cls.unknown((size,))
+        return replace(known, means=each)
 
     @classmethod
     def unknown(cls, shape: tuple[int, ...]) -> Self:

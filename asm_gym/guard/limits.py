@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits, Pace
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import Monitor
 
 CAREFUL = 1.0 / 3.0  # share of the speed limit that a hand has after it has pressed too hard
@@ -29,7 +29,7 @@ class EpisodeLimits:
         ValueError: limits of another arm.
     """
 
-    def __init__(self, robots: Robots, limits: ContactLimits | None, acts: bool) -> None:
+    def __init__(self, robots: RobotFacts, limits: ContactLimits | None, acts: bool) -> None:
         if limits is not None and robots.limits_contact:
             limits.most(robots.felt_channels)
         if limits is not None and not acts:

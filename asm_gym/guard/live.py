@@ -25,7 +25,7 @@ from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.report import RowReport
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32
 
@@ -129,7 +129,7 @@ class _Watch:
     ) -> None:
         self.say, self.seconds, self.spec, self.beat = say, seconds, monitor.spec, beat
         spec: StreamSpec = monitor.spec
-        self.engine = Engine(Robots.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
+        self.engine = Engine(RobotFacts.unknown(spec), monitor, GuardOptions("monitor", contact_limits=None))
         self.reader = reader
         self.no_action = np.zeros((1, spec.motor.size), np.float32)
         self.latencies: deque[float] = deque(maxlen=LATENCIES)

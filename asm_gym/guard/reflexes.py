@@ -1,147 +1,160 @@
-"""What a robot does after an alarm: it stays, goes back, gives way, or goes on as the memory expects.
+"""What a robot does after an alarm: stay, go back, give way, or go on as expected.
 
-A reflex is a function of ``Reflexes``, which knows what was felt and done, and of which robot it is. To add one, write
-the function and name it in ``REFLEXES``.
+    hold      the action for which the robot stays, or a brake beneath its controller
+    retract   -u_t, -u_{t-1}, …   of the actions u that the policy executed last
+    comply    dq = c dt sign(τ) max(|τ| - τ_tolerated, 0),   τ beyond the usual torque
+    recall    the action that the memory expects
+
+A reflex is a function of ``FeltMotion`` and of the robot's index. To add one, write the function
+and name it in ``REFLEXES``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import ActionMeaning
-from asm_gym.guard.robots import Robots, named
+from asm_gym.guard.robot_facts import RobotFacts, columns_ending
+from asm_gym.policies.hold import HoldingActions
 from asm_gym.spec import StreamSpec
 
-Mask = NDArray[np.bool_]
-
-GRADED = "graded"  # not a reflex, but the one that severity and cause ask for
+GRADED = "graded"  # no reflex: severity and cause choose one
 PATH = 10  # how many actions a retreat undoes
 COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
-TOLERATED, TOLERATED_ALONE = 4.0, 2.0  # external torque that none gives way to [N m]: under "graded"; "comply" alone
-
-NO_TORQUE = "comply needs the channel external_torque: make the environment with stream group torque"
+TOLERATED = 4.0  # external torque that no joint gives way to under "graded" [N m]
+TOLERATED_ALONE = 2.0  # and under "comply" [N m]
 
 
 class Motion(NamedTuple):
     """What a reflex does next."""
 
-    action: NDArray[np.float32]  # (A,)
+    action: NDArray[np.float32]  # (A,) not to be written to
     brakes: bool = False  # the robot stays, whatever the action is
-    keeps_grip: bool = True  # the grippers are told what they were told before the override
+    keeps_grip: bool = True  # the grippers are commanded as before the override
 
 
-class Places:
-    """The actions (n, A) for which n robots stay: each where it was when its override began.
+@dataclass(frozen=True, eq=False)
+class FeltMotion:
+    """What n robots feel, did, and are expected to do; its arrays are written to."""
 
-    Args:
-        meaning: of their actions; None where ``rest`` is known to make them stay.
-        rest: (A,) what is left to do where nothing else is known.
-    """
+    robots: RobotFacts
+    possible: frozenset[str]  # names of reflexes that the guard may ask for and the robots can do
+    tolerated: float  # external torque that no joint gives way to [N m]
+    holding: HoldingActions
+    torque_columns: NDArray[np.intp]  # (J,) of the external torques in the stream
+    torque: NDArray[np.float64]  # (n, J) external torque now [N m]
+    usual_torque: NDArray[np.float64]  # (n, J) external torque while the policy acts [N m]
+    path: NDArray[np.float32]  # (n, PATH, A) the policy's last actions, the newest last
+    path_steps: NDArray[np.int64]  # (n,) how many of them there are
+    expected: NDArray[np.float32]  # (n, A) the action that the memory expects next; NaN: unknown
 
-    def __init__(self, count: int, meaning: ActionMeaning | None, rest: NDArray[np.float32]) -> None:
-        self._meaning, self._rest = meaning, rest
-        self.executed = np.tile(rest, (count, 1))  # (n, A) last before the override
-        self._actions = np.full((count, rest.size), np.nan, np.float32)
-        self._rows: NDArray[np.float32] = np.zeros((count, 0), np.float32)  # (n, D) newest that were finite
-        self._before = self._rows  # (n, D) those before them
+    @classmethod
+    def of(cls, robots: RobotFacts, spec: StreamSpec, on_alarm: str) -> Self:
+        """Return a record of robots that have felt nothing yet.
+
+        Args:
+            robots: what is known of them.
+            spec: of their stream.
+            on_alarm: the name of a reflex, or ``"graded"``.
+
+        Raises:
+            ValueError: the robots cannot do what ``on_alarm`` names.
+        """
+        torque_columns = columns_ending(spec.channels, "external_torque")
+        refused = dict(robots.refused)
+        if not torque_columns.size:
+            needs = "comply needs the channel external_torque"
+            refused.setdefault("comply", f"{needs}: make the environment with stream group torque")
+        for name in (on_alarm, "hold"):
+            if name in refused:
+                raise ValueError(refused[name])
+
+        possible = {on_alarm}
+        tolerated = TOLERATED_ALONE
+        if on_alarm == GRADED:
+            possible = {"hold", "retract", "comply"}.difference(refused)
+            tolerated = TOLERATED
+
+        count = robots.count
+        size = robots.rest.size
+        torque = np.zeros((count, len(torque_columns)))
+        return cls(
+            robots=robots,
+            possible=frozenset(possible),
+            tolerated=tolerated,
+            holding=HoldingActions(count, robots.meaning, robots.rest),
+            torque_columns=torque_columns,
+            torque=torque,
+            usual_torque=torque.copy(),
+            path=np.zeros((count, PATH, size), np.float32),
+            path_steps=np.zeros(count, np.int64),
+            expected=np.zeros((count, size), np.float32),
+        )
+
+    @property
+    def feels(self) -> bool:
+        """Whether a possible reflex depends on what was felt and done."""
+        return not self.possible <= {"hold", "recall"}
 
     def begin(self, which: NDArray[np.bool_]) -> None:
-        """New episodes of the robots of ``which`` (n,)."""
-        self.executed[which], self._actions[which] = self._rest, np.nan
-        self._rows[which] = self._before[which] = np.nan
-
-    def sense(self, rows: NDArray[np.float32]) -> None:
-        """Take in the newest rows (n, D)."""
-        if self._meaning is not None:
-            self._before = self._rows if self._rows.size else np.full_like(rows, np.nan)
-            self._rows = np.where(np.isfinite(rows), rows, self._before)
-
-    def start(self, robot: int, executed: NDArray[np.float32]) -> None:
-        """An override begins, after the robot has ``executed`` (A,)."""
-        self.executed[robot], self._actions[robot] = executed, np.nan
-
-    def stay(self, robot: int) -> NDArray[np.float32]:
-        """Return the action (A,) for which a robot stays; a number that is not known yet is that of ``rest``."""
-        if self._meaning is None:
-            return self._rest.copy()
-        action = self._actions[robot]
-        if not np.isfinite(action).all() and self._rows.size:
-            found = self._meaning.staying(self._rows[robot], self._before[robot], self.executed[robot])
-            action[:] = np.where(np.isfinite(action), action, found)
-        return np.where(np.isfinite(action), action, self._rest)
-
-
-class Reflexes:
-    """What the reflexes of n robots have felt.
-
-    Raises:
-        ValueError: the robots cannot do what ``on_alarm`` names: a reflex, or ``"graded"``.
-    """
-
-    def __init__(self, robots: Robots, spec: StreamSpec, on_alarm: str) -> None:
-        n, actions = robots.count, robots.rest.size
-        wanted = ("hold", "retract", "comply") if on_alarm == GRADED else (on_alarm,)
-        self.torques = named(spec.channels, "external_torque")  # (J,) columns of external torques
-        lacks = dict(robots.refused)
-        if not self.torques.size:
-            lacks.setdefault("comply", NO_TORQUE)
-        for name in (on_alarm, "hold"):
-            if name in lacks:
-                raise ValueError(lacks[name])
-        self.possible = frozenset(name for name in wanted if name not in lacks)
-        self.feels = bool(self.possible - {"hold", "recall"})  # one of them depends on what was felt and done
-        self.robots = robots
-        self.tolerated = TOLERATED if on_alarm == GRADED else TOLERATED_ALONE
-        # (n, J) external torque now, and what is usual while the policy acts [N m]
-        self.torque, self.usual = np.zeros((n, len(self.torques))), np.zeros((n, len(self.torques)))
-        # (n, PATH, A) what the policy did last, the newest last, and (n,) how much of it there is
-        self.path, self.steps = np.zeros((n, PATH, actions), np.float32), np.zeros(n, np.int64)
-        self.expected = np.zeros((n, actions), np.float32)  # (n, A) what is likely to be commanded next; NaN: unknown
-        self.places = Places(n, robots.meaning, robots.rest)
-
-    def begin(self, which: Mask) -> None:
-        """New episodes of the robots of ``which`` (n,)."""
-        self.torque[which] = self.usual[which] = 0.0
-        self.steps[which] = 0
+        """Begin new episodes of the robots of ``which`` (n,)."""
+        self.torque[which] = 0.0
+        self.usual_torque[which] = 0.0
+        self.path_steps[which] = 0
         self.expected[which] = np.nan
 
     def move(self, robot: int, name: str) -> Motion:
-        """Return what a robot does; it stays where it cannot do what is asked for."""
-        return REFLEXES[name if name in self.possible else "hold"](self, robot)
+        """Return what a robot does; it stays where it cannot do the reflex of that name."""
+        if name not in self.possible:
+            name = "hold"
+        return REFLEXES[name](self, robot)
 
 
-def hold(felt: Reflexes, robot: int) -> Motion:
+def hold(motion: FeltMotion, robot: int) -> Motion:
     """Stay, by a brake beneath the controller where there is one."""
-    return Motion(felt.places.stay(robot), felt.robots.brakes)
+    return Motion(action=motion.holding.stay(robot), brakes=motion.robots.brakes)
 
 
-def retract(felt: Reflexes, robot: int) -> Motion:
-    """Undo the last actions, the newest first, then stay: under a delta controller its negative undoes an action."""
-    if not felt.steps[robot]:
-        return hold(felt, robot)
-    undone = -felt.path[robot, -1]
-    felt.path[robot, 1:] = felt.path[robot, :-1].copy()
-    felt.steps[robot] -= 1
+def retract(motion: FeltMotion, robot: int) -> Motion:
+    """Undo the last actions, the newest first, then stay.
+
+    Under a controller of changes, the negative of an action undoes it.
+    """
+    if not motion.path_steps[robot]:
+        return hold(motion, robot)
+
+    path = motion.path[robot]
+    undone = -path[-1]
+    path[1:] = path[:-1]
+    motion.path_steps[robot] -= 1
     return Motion(undone)
 
 
-def comply(felt: Reflexes, robot: int) -> Motion:
+def comply(motion: FeltMotion, robot: int) -> Motion:
     """Give way along the external torque beyond the usual, as a damper would."""
-    assert felt.robots.turn is not None
-    more = felt.torque[robot] - felt.usual[robot]
-    beyond = np.sign(more) * np.maximum(np.abs(more) - felt.tolerated, 0.0)
-    return Motion(np.array(felt.robots.turn(robot, COMPLIANCE * felt.robots.dt * beyond), np.float32))
+    robots = motion.robots
+    assert robots.turning_action is not None
+    torque = motion.torque[robot] - motion.usual_torque[robot]
+    beyond = np.sign(torque) * np.maximum(np.abs(torque) - motion.tolerated, 0.0)
+    return Motion(robots.turning_action(robot, COMPLIANCE * robots.dt * beyond))
 
 
-def recall(felt: Reflexes, robot: int) -> Motion:
-    """Go on along what the memory expects to be commanded, grip included; stay where it expects nothing yet."""
-    expected = felt.expected[robot]
-    return Motion(expected.copy(), keeps_grip=False) if np.isfinite(expected).all() else hold(felt, robot)
+def recall(motion: FeltMotion, robot: int) -> Motion:
+    """Do what the memory expects, grip included; stay where it expects nothing yet."""
+    expected = motion.expected[robot]
+    if not np.isfinite(expected).all():
+        return hold(motion, robot)
+    return Motion(expected, keeps_grip=False)
 
 
-REFLEXES: dict[str, Callable[[Reflexes, int], Motion]] = {f.__name__: f for f in (hold, retract, comply, recall)}
+REFLEXES: dict[str, Callable[[FeltMotion, int], Motion]] = {
+    "hold": hold,
+    "retract": retract,
+    "comply": comply,
+    "recall": recall,
+}
 """Reflexes by name."""

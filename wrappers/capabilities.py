@@ -1,0 +1,273 @@
+"""What a guard asks of an environment that it does not know: one function for each capability.
+
+Each attribute belongs to the environment, or to a wrapper inside the guard. The members of a
+vector environment are of one kind; they have a capability if all of them have its attribute.
+"""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.action_meaning import ActionMeaning, ActionMeans
+from asm_gym.detection.kinematics import Chain
+from asm_gym.guard.robot_facts import RobotFacts, TurningAction
+from asm_gym.policies.hold import Staying, gripper_columns, nearest_to_zero, staying, why_changed
+from asm_gym.spec import Channel, StreamSpec, control_period
+from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes
+from asm_gym.wrappers.observation_map import ObservationMap, ObservationPart, parts_of
+
+# Controllers whose actions are changes, of pose or of joint angles.
+DELTAS = ("OSC_POSE", "JOINT_POSITION")
+
+
+def robots_of(
+    env: AnyEnv,
+    spec: StreamSpec,
+    recorded: ActionMeaning | None = None,
+    action_means: ActionMeans | None = None,
+) -> tuple[RobotFacts, ObservationMap | None]:
+    """Return the facts of an environment's robots, and where their streams are observed.
+
+    Args:
+        env: an environment, or a vector environment.
+        spec: of the streams.
+        recorded: what recorded episodes show of the meaning of their actions.
+        action_means: what the user says of it.
+
+    Raises:
+        TypeError: members of a vector environment cannot be asked for attributes.
+        ValueError: ``action_means`` does not fit the actions.
+    """
+    attributes = EnvAttributes(env)
+    space = attributes.action_space
+    if not isinstance(space, gym.spaces.Box):
+        none = np.zeros(0, np.float32)
+        dt = control_period_of(attributes)
+        return RobotFacts(count=1, low=none, high=none, rest=none, dt=dt), None
+
+    resting = resting_of(attributes, space, recorded, action_means)
+    refused = refused_reflexes(attributes, resting)
+    observation_map = None
+    observed = None
+    try:
+        observation_map = observation_map_of(attributes, spec)
+        observed = observation_map.observed
+    except ValueError as error:
+        refused["complete"] = str(error)
+
+    size = resting.action.size
+    robots = RobotFacts(
+        count=attributes.count,
+        low=np.float32(space.low).ravel(),
+        high=np.float32(space.high).ravel(),
+        rest=resting.action.ravel(),
+        meaning=resting.meaning,
+        brakes=brakes(attributes),
+        grip=gripper_columns_of(attributes, size),
+        dt=control_period_of(attributes),
+        task=task_name(attributes),
+        chains=hand_chains(attributes),
+        felt_channels=felt_channels(attributes),
+        limits_contact=limits_contact(attributes),
+        observed=observed,
+        turning_action=turning_action(attributes),
+        efference=efference_columns(attributes, spec, size),
+        refused=refused,
+    )
+    return robots, observation_map
+
+
+def control_period_of(attributes: EnvAttributes) -> float:
+    """Return the control period [s].
+
+    It is ``dt`` of the members of a vector environment; else ``asm_gym.spec.control_period``
+    tells where it comes from.
+    """
+    if attributes.is_vector and (dt := attributes.first("dt")):
+        return float(dt)
+    return control_period(attributes.env)
+
+
+def controller_of(attributes: EnvAttributes) -> str:
+    """Return the name of the arms' controller: ``controller``; empty without it."""
+    return str(attributes.first("controller", ""))
+
+
+def has_stream(attributes: EnvAttributes) -> bool:
+    """Return whether there is a stream: ``stream_spec``.
+
+    Without it, observation and action are the stream.
+    """
+    return attributes.has("stream_spec")
+
+
+def task_name(attributes: EnvAttributes) -> str:
+    """Return the name of the task: ``task.name``; empty without it."""
+    return getattr(attributes.first("task"), "name", "")
+
+
+def brakes(attributes: EnvAttributes) -> bool:
+    """Return whether robots can be braked beneath their controllers: ``HoldsItself``.
+
+    They stay in all steps that a wrapper makes of one. Without ``holding`` and
+    ``keeps_holding``, an action has to make them stay.
+    """
+    return attributes.has("holding") and attributes.has("keeps_holding")
+
+
+def resting_of(
+    attributes: EnvAttributes,
+    space: gym.spaces.Box,
+    recorded: ActionMeaning | None,
+    action_means: ActionMeans | None,
+) -> Staying:
+    """Return which actions make the robots stay.
+
+    Robots with the attribute ``holding`` stay whatever the action is.
+
+    Args:
+        attributes: of the environment.
+        space: the action space of one robot.
+        recorded: what recorded episodes show of the meaning of actions, if nobody declares it.
+        action_means: what the user declares; by default ``action_means`` of the environment.
+
+    Raises:
+        ValueError: ``action_means`` does not fit the actions.
+    """
+    zero = nearest_to_zero(space)
+    if recorded is not None and len(recorded.means) != zero.size:
+        recorded = None
+    declared = declared_meaning(attributes, zero.size, recorded, action_means)
+    if attributes.has("holding"):
+        return Staying(zero)
+    try:
+        return staying(attributes.env, space, declared, recorded)
+    except ValueError as error:
+        return Staying(zero, refused=str(error))
+
+
+def declared_meaning(
+    attributes: EnvAttributes,
+    size: int,
+    recorded: ActionMeaning | None,
+    action_means: ActionMeans | None,
+) -> ActionMeaning | None:
+    """Return what actions mean, as declared: ``action_means``; None without it.
+
+    Args:
+        attributes: of the environment.
+        size: A, how many numbers an action has.
+        recorded: what recorded episodes show, which tells the senses of targets.
+        action_means: what the user declares, instead of the attribute.
+
+    Raises:
+        ValueError: an unknown meaning, or another number of them.
+    """
+    if action_means is None:
+        action_means = attributes.first("action_means")
+    if action_means is None:
+        return None
+    return ActionMeaning.told(action_means, size, recorded)
+
+
+def gripper_columns_of(attributes: EnvAttributes, size: int) -> NDArray[np.intp]:
+    """Return (G,) the numbers of an action of this size that command grippers: ``gripper_actions``.
+
+    There are none without it.
+    """
+    return gripper_columns(attributes.first("gripper_actions", ()), size)
+
+
+def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
+    """Return the kinematics of each arm in each environment: ``hand_chains``; none without it."""
+    return tuple(zip(*attributes.ask("hand_chains"), strict=True))
+
+
+def felt_channels(attributes: EnvAttributes) -> tuple[Channel, ...]:
+    """Return what the arms feel in physics substeps: ``felt_channels``; nothing without it."""
+    return attributes.first("felt_channels", ())
+
+
+def limits_contact(attributes: EnvAttributes) -> bool:
+    """Return whether each physics substep compares what is felt with ``contact_limits``.
+
+    Without that attribute, or ``felt_channels``, nothing reacts within a control step.
+    """
+    return bool(felt_channels(attributes)) and attributes.has("contact_limits")
+
+
+def efference_columns(
+    attributes: EnvAttributes,
+    spec: StreamSpec,
+    size: int,
+) -> NDArray[np.intp] | None:
+    """Return the columns of the stream with the executed action, if contact limits may slow it.
+
+    Returns:
+        (A,) columns of the stream's action; None where a wrapper inside changes actions, or
+        actions have another ``size``.
+    """
+    if not (limits_contact(attributes) and has_stream(attributes)):
+        return None
+    if why_changed(attributes.env, "a reflex") or len(spec.motor) != size:
+        return None
+    return spec.motor
+
+
+def turning_action(attributes: EnvAttributes) -> TurningAction:
+    """Return the action that turns the joints of a robot: the method ``action_for``, of deltas."""
+    return lambda robot, turns: attributes.call("action_for", turns)[robot]
+
+
+def refused_reflexes(attributes: EnvAttributes, resting: Staying) -> dict[str, str]:
+    """Return why robots cannot do a reflex, by its name.
+
+    Hold needs a brake, or an action that makes the robots stay. Retract and comply need actions
+    that are changes, by the controller's name. No wrapper inside may change actions.
+    """
+    refused = {}
+    changed = why_changed(attributes.env, "a reflex")
+    if changed:
+        refused = {"retract": changed, "comply": changed}
+        if has_stream(attributes):
+            refused["recall"] = changed
+
+    controller = controller_of(attributes)
+    if controller not in DELTAS:
+        for name in ("retract", "comply"):
+            refused[name] = (
+                f"{name} needs an environment whose controller is {' or '.join(DELTAS)}, "
+                f"got {controller or None}: "
+                "use hold with a safe_action of your own, or name any policy"
+            )
+    if resting.refused:
+        refused["hold"] = resting.refused
+    return refused
+
+
+def observation_map_of(attributes: EnvAttributes, spec: StreamSpec) -> ObservationMap:
+    """Return where the stream stands in observations.
+
+    The attribute ``observation_layout`` has the sizes of the observation's channels in order, by
+    name, and ``laid_out_space`` the space of that layout.
+
+    Raises:
+        ValueError: there is no layout, or a wrapper inside has changed the observation.
+    """
+    space = attributes.observation_space
+    if not has_stream(attributes) and isinstance(space, gym.spaces.Box):
+        whole = ObservationPart("", space, spec.sensory, np.arange(len(spec.sensory)))
+        return ObservationMap([whole], spec.size)
+
+    layout = attributes.first("observation_layout")
+    if not has_stream(attributes) or layout is None:
+        raise ValueError("the environment does not say where its stream stands in its observation")
+    default = None
+    if not attributes.is_vector:
+        default = attributes.env.unwrapped.observation_space
+    own_space = attributes.first("laid_out_space", default)
+    if own_space is not None and space != own_space:
+        raise ValueError(f"a wrapper inside has changed the observation, which was {own_space}")
+    return ObservationMap(parts_of(layout, spec, space), spec.size)

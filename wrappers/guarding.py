@@ -1,0 +1,238 @@
+"""What a guard of one environment has in common with a guard of many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+from uuid import uuid4
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.observer import LOG, Fitted, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.robot_facts import RobotFacts
+from asm_gym.guard.severity import nothing_felt
+from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
+from asm_gym.policies.base import Policy
+from asm_gym.policies.hold import Hold
+from asm_gym.spec import StreamSpec
+from asm_gym.stream_source import layers
+from asm_gym.validation import as_float32, short_repr
+from asm_gym.wrappers.capabilities import controller_of, robots_of
+from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes, askable
+
+# Attribute of wrappers that count episodes, Gymnasium's and Stable-Baselines3's.
+COUNTS = "episode_returns"
+
+
+class Guarding:
+    """Watch an environment, or many, with a monitor that may be replaced between episodes."""
+
+    env: Any
+    _options: GuardOptions
+    _spec: StreamSpec  # of the streams that are watched
+    _rows_per_step = 1
+
+    @cached_property
+    def _name(self) -> str:
+        """Its name among all guards around one environment."""
+        return uuid4().hex
+
+    def _watch_with(self, monitor: Monitor) -> None:
+        """Use a monitor, and make all that depends on it."""
+        options = self._options
+        refuse_counts(self.env, type(self).__name__, options.on_alarm)
+        check_answer(monitor)
+        self._check(monitor)
+
+        recorded = getattr(monitor, "about", {}).get(ACTIONS)
+        if recorded is not None:
+            recorded = ActionMeaning.from_json(recorded)
+        robots, self._observation_map = robots_of(
+            self.env,
+            monitor.spec,
+            recorded,
+            options.action_means,
+        )
+
+        policies: list[Policy] = []
+        reaction = options.reaction(diagnosis_of(monitor) is not None)
+        if not isinstance(reaction, str):
+            policies = [policy_for(reaction, self.env)] * robots.count
+        self._robots = robots
+        self._engine = Engine(robots, monitor, options, policies, self._rows_per_step)
+        self._next = monitor
+
+    def _check(self, monitor: Monitor) -> None:
+        """Raise where a monitor does not fit the streams or the controller."""
+        check_monitor(monitor, self._spec, controller_of(EnvAttributes(self.env)))
+
+    def _limit_contact(self, anew: bool = False) -> None:
+        """Set the environments' contact limits if they changed, or ``anew`` for new episodes."""
+        limits = self._engine.limits
+        if self._robots.limits_contact and (anew or limits is not self._limits):
+            named_limits = [(self._name, own) for own in limits]
+            if isinstance(self.env, VectorEnv):
+                askable(self.env).set_attr("limits_of_guard", named_limits)
+            else:
+                self.env.unwrapped.limits_of_guard = named_limits[0]
+        self._limits: tuple[Any, ...] = limits
+
+    def _watch_with_next(self) -> None:
+        """Take over the monitor that was assigned, or was fitted or calibrated since."""
+        if Fitted.of(self._next, self._spec).differs(self._engine.fitted):
+            reason = "the monitor was changed, fitted or calibrated since"
+            LOG.info("%s: it is taken over as it is now", reason)
+            self._watch_with(self._next)
+
+    @property
+    def latency(self) -> float:
+        """How long the monitor took for the last rows [s]."""
+        return self._engine.latency
+
+    @property
+    def monitor(self) -> Monitor:
+        """The monitor in use.
+
+        One that is assigned, or was fitted or calibrated since, takes over at the next reset.
+        """
+        return self._engine.fitted.monitor
+
+    @monitor.setter
+    def monitor(self, monitor: Monitor) -> None:
+        self._check(monitor)
+        self._next = monitor
+
+
+def body_memory(env: AnyEnv, watched: StreamSpec) -> NeuralASM:
+    """Return the shipped memory of the robot in ``env``, or in all its members.
+
+    Raises:
+        ValueError: no memory fits its stream and controller.
+    """
+    memory = NeuralASM.pretrained(pretrained_for(watched, controller_of(EnvAttributes(env))))
+    LOG.info("watching %s with %r", env.unwrapped, memory)
+    return memory
+
+
+def policy_for(on_alarm: Any, env: AnyEnv) -> Policy:
+    """Return the user's own policy that acts during an alarm.
+
+    Args:
+        on_alarm: a policy; for a single environment also a class or a function that makes one.
+        env: the environment, or a vector environment.
+
+    Raises:
+        ValueError: it is no policy, or a reflex that would move the arm of another environment.
+    """
+    policy = on_alarm
+    needs = "have a predict(), or make a policy"
+    makes_policy = isinstance(on_alarm, type) or not hasattr(on_alarm, "predict")
+    if isinstance(env, VectorEnv):
+        needs = "one policy with a predict() that all environments share"
+        makes_policy = False
+    try:
+        if makes_policy and callable(on_alarm):
+            policy = on_alarm(env)
+        if isinstance(policy, type) or not callable(getattr(policy, "predict", None)):
+            raise TypeError("it has no predict()")
+    except TypeError as error:
+        message = f"on_alarm must be a name, or {needs}, got {short_repr(policy)}: {error}"
+        raise ValueError(message) from error
+    if isinstance(policy, Hold) and not policy.explicit:
+        _check_bound(policy, env)
+    return policy
+
+
+def _check_bound(policy: Hold, env: AnyEnv) -> None:
+    """Raise ValueError unless a reflex that is bound to an environment is bound to this one."""
+    name = type(policy).__name__
+    if isinstance(env, VectorEnv):
+        raise ValueError(f"one {name} cannot act in several environments: give its name instead")
+    if policy.env.unwrapped is not env.unwrapped:
+        raise ValueError(
+            f"this {name} was made for another environment, and would move that: "
+            f"give the class, on_alarm={name}, or a function of the environment that makes it"
+        )
+
+
+def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
+    """Raise ValueError for a wrapper inside the guard that counts episodes.
+
+    It would miss the episodes that the guard ends, or numbers that the guard reports.
+
+    Args:
+        env: the environment that is guarded.
+        guard: the name of the guard's class.
+        on_alarm: what the guard does at an alarm; under ``"monitor"`` it ends no episode.
+    """
+    ends = not (isinstance(on_alarm, str) and on_alarm == "monitor")
+    for layer in layers(env):
+        reported = vars(layer).get("info_keywords", ())  # of Stable-Baselines3's Monitor
+        reports_guard = any(key.startswith(("asm", "cost")) for key in reported)
+        if COUNTS in vars(layer) and (ends or reports_guard):
+            name = type(layer).__name__
+            raise ValueError(
+                f"{name} inside the guard would miss the episodes that the guard ends, "
+                f"and what it reports: put it outside, as in {name}({guard}(env, monitor)); "
+                "with Stable-Baselines3, "
+                "make_vec_env(lambda: NeuralASMSafety(gym.make(ID), monitor))"
+            )
+    if not (isinstance(env, VectorEnv) and ends):
+        return
+    if any(EnvAttributes(env).call("has_wrapper_attr", COUNTS)):
+        raise ValueError(
+            "wrappers of the members that count episodes would miss those that the guard ends: use "
+            f"gymnasium.wrappers.vector.RecordEpisodeStatistics({guard}(envs, monitor))"
+        )
+
+
+def sensed_row(read: Callable[[], Any], size: int) -> tuple[NDArray[np.float32], str]:
+    """Return the row (D,) that is read, or NaN and what failed."""
+    try:
+        row = as_float32(read())
+        if row.shape != (size,):
+            raise ValueError(f"a row has the shape {(size,)}, got {row.shape}")
+    except Exception as error:
+        return np.full(size, np.nan, np.float32), f"stream: {error!r}"
+    return row, ""
+
+
+def felt_by(
+    robots: RobotFacts,
+    infos: dict[str, Any],
+    present: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Return what the arms felt in a step.
+
+    Args:
+        robots: whose arms they are.
+        infos: ``info`` of the step.
+        present: (n,) the robots that ``infos`` tell of; all by default.
+
+    Returns:
+        (n, 2 + F) as ``felt`` in ``asm_gym.guard.severity.Severity``.
+    """
+    felt = nothing_felt(robots.count, robots.felt_size)
+    if "contact_load" not in infos:
+        return felt
+    felt[:, 0] = infos["contact_load"]
+    felt[:, 1] = infos.get("contact_left_s", np.nan)
+    if "contact_felt" in infos:
+        felt[:, 2:] = infos["contact_felt"]
+    if present is not None:
+        felt[~present] = np.nan
+    return felt
+
+
+def as_action(space: gym.spaces.Space[Any] | None, action: Any) -> Any:
+    """Return actions in the type of their space: whole numbers where a Box holds these."""
+    if isinstance(space, gym.spaces.Box) and space.dtype.kind in "iu":
+        return np.rint(action).astype(space.dtype)
+    return action
