@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 from uuid import uuid4
 
 import gymnasium as gym
@@ -12,12 +12,14 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
-from asm_gym.guard.engine import Engine
-from asm_gym.guard.observer import LOG, Fitted, check_answer, check_monitor, diagnosis_of
-from asm_gym.guard.options import GuardOptions
+from asm_gym.data.action_meaning import ACTIONS, ActionMeaning, ActionMeans
+from asm_gym.detection import AdaptiveThreshold
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.guard.contact_state import no_load
+from asm_gym.guard.fitted_monitor import LOG, FittedMonitor, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.guard import Guard
+from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.robot_facts import RobotFacts
-from asm_gym.guard.severity import nothing_felt
 from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold
@@ -35,9 +37,44 @@ class Guarding:
     """Watch an environment, or many, with a monitor that may be replaced between episodes."""
 
     env: Any
-    _options: GuardOptions
+    guard: Guard
+    """The guard: its table of robots, and how often each alarm term held."""
+
     _spec: StreamSpec  # of the streams that are watched
     _rows_per_step = 1
+
+    def __init__(
+        self,
+        env: Any,
+        monitor: Monitor | None = None,
+        on_alarm: OnAlarm | None = None,
+        *,
+        release_after: int = 10,
+        max_override: int | None = None,
+        try_after: int | None = None,
+        truncate: bool = False,
+        adaptive_threshold: AdaptiveThreshold | None = None,
+        responses: Mapping[str, str] | None = None,
+        contact_limits: ContactLimits | Literal["memory"] | None = "memory",
+        action_means: ActionMeans | None = None,
+    ) -> None:
+        self._options = GuardOptions(
+            on_alarm=on_alarm,
+            release_after=release_after,
+            max_override=max_override,
+            try_after=try_after,
+            truncate=truncate,
+            adaptive_threshold=adaptive_threshold,
+            responses=responses,
+            contact_limits=contact_limits,
+            action_means=action_means,
+        )
+        self._limits: tuple[Any, ...] = ()
+        self._wrap(env, monitor)
+
+    def _wrap(self, env: Any, monitor: Monitor | None) -> None:
+        """Wrap an environment; None is the shipped memory of its robot."""
+        raise NotImplementedError
 
     @cached_property
     def _name(self) -> str:
@@ -54,20 +91,14 @@ class Guarding:
         recorded = getattr(monitor, "about", {}).get(ACTIONS)
         if recorded is not None:
             recorded = ActionMeaning.from_json(recorded)
-        robots, self._observation_map = robots_of(
-            self.env,
-            monitor.spec,
-            recorded,
-            options.action_means,
-        )
+        self._facts, self._observation_map = robots_of(self.env, monitor.spec, recorded, options.action_means)
 
         policies: list[Policy] = []
         reaction = options.reaction(diagnosis_of(monitor) is not None)
         if not isinstance(reaction, str):
-            policies = [policy_for(reaction, self.env)] * robots.count
-        self._robots = robots
-        self._engine = Engine(robots, monitor, options, policies, self._rows_per_step)
-        self._next = monitor
+            policies = [policy_for(reaction, self.env)] * self._facts.count
+        self.guard = Guard(self._facts, monitor, options, policies, self._rows_per_step)
+        self._next_monitor = monitor
 
     def _check(self, monitor: Monitor) -> None:
         """Raise where a monitor does not fit the streams or the controller."""
@@ -75,26 +106,25 @@ class Guarding:
 
     def _limit_contact(self, anew: bool = False) -> None:
         """Set the environments' contact limits if they changed, or ``anew`` for new episodes."""
-        limits = self._engine.limits
-        if self._robots.limits_contact and (anew or limits is not self._limits):
+        limits = self.guard.limits
+        if self._facts.limits_contact and (anew or limits is not self._limits):
             named_limits = [(self._name, own) for own in limits]
             if isinstance(self.env, VectorEnv):
                 askable(self.env).set_attr("limits_of_guard", named_limits)
             else:
                 self.env.unwrapped.limits_of_guard = named_limits[0]
-        self._limits: tuple[Any, ...] = limits
+        self._limits = limits
 
     def _watch_with_next(self) -> None:
         """Take over the monitor that was assigned, or was fitted or calibrated since."""
-        if Fitted.of(self._next, self._spec).differs(self._engine.fitted):
-            reason = "the monitor was changed, fitted or calibrated since"
-            LOG.info("%s: it is taken over as it is now", reason)
-            self._watch_with(self._next)
+        if FittedMonitor.of(self._next_monitor, self._spec).differs(self.guard.fitted):
+            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            self._watch_with(self._next_monitor)
 
     @property
     def latency(self) -> float:
         """How long the monitor took for the last rows [s]."""
-        return self._engine.latency
+        return self.guard.latency
 
     @property
     def monitor(self) -> Monitor:
@@ -102,12 +132,12 @@ class Guarding:
 
         One that is assigned, or was fitted or calibrated since, takes over at the next reset.
         """
-        return self._engine.fitted.monitor
+        return self.guard.fitted.monitor
 
     @monitor.setter
     def monitor(self, monitor: Monitor) -> None:
         self._check(monitor)
-        self._next = monitor
+        self._next_monitor = monitor
 
 
 def body_memory(env: AnyEnv, watched: StreamSpec) -> NeuralASM:
@@ -204,31 +234,28 @@ def sensed_row(read: Callable[[], Any], size: int) -> tuple[NDArray[np.float32],
     return row, ""
 
 
-def felt_by(
-    robots: RobotFacts,
-    infos: dict[str, Any],
+def load_felt(
+    facts: RobotFacts,
+    infos: Mapping[str, Any],
     present: NDArray[np.bool_] | None = None,
-) -> NDArray[np.float64]:
-    """Return what the arms felt in a step.
+) -> NDArray[np.float64] | None:
+    """Return what the arms felt in a step (n, 2 + F), see ``asm_gym.guard.contact_state.no_load``; None for nothing.
 
     Args:
-        robots: whose arms they are.
+        facts: what is known of the robots.
         infos: ``info`` of the step.
         present: (n,) the robots that ``infos`` tell of; all by default.
-
-    Returns:
-        (n, 2 + F) as ``felt`` in ``asm_gym.guard.severity.Severity``.
     """
-    felt = nothing_felt(robots.count, robots.felt_size)
     if "contact_load" not in infos:
-        return felt
-    felt[:, 0] = infos["contact_load"]
-    felt[:, 1] = infos.get("contact_left_s", np.nan)
+        return None
+    load = no_load(facts.count, facts.felt_size)
+    load[:, 0] = infos["contact_load"]
+    load[:, 1] = infos.get("contact_left_s", np.nan)
     if "contact_felt" in infos:
-        felt[:, 2:] = infos["contact_felt"]
+        load[:, 2:] = infos["contact_felt"]
     if present is not None:
-        felt[~present] = np.nan
-    return felt
+        load[~present] = np.nan
+    return load
 
 
 def as_action(space: gym.spaces.Space[Any] | None, action: Any) -> Any:

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, SupportsFloat
+from collections.abc import Sequence
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import ActionMeans
-from asm_gym.detection import AdaptiveThreshold
-from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.guard.arbiter import ENDED
-from asm_gym.guard.options import GuardOptions, OnAlarm
+from asm_gym.guard.adapter import SensedRows
+from asm_gym.guard.commander import Command
 from asm_gym.guard.preview import Preview, checked_chunk
-from asm_gym.guard.report import LazyInfo, RowReport, report
+from asm_gym.guard.report import AsmInfo, LazyInfo, RowReport, asm_info
+from asm_gym.guard.robot_facts import NOTHING
 from asm_gym.monitors import Monitor
-from asm_gym.policies.hold import HoldsItself, why_changed
+from asm_gym.policies.hold import HoldsItself, changed_by, outside
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, felt_by, sensed_row
+from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, load_felt, sensed_row
+
+Floats32 = NDArray[np.float32]
+StepResult = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -35,7 +36,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     alarm whatever the surprise. Under ``"graded"``, severity and cause choose the response, and an estimate replaces a
     faulty sensor in observation and stream.
 
-    ``info["asm"]`` describes the step; ``asm_gym.guard.report.report`` lists its fields. Flat NumPy scalars are beside
+    ``info["asm"]`` describes the step; ``asm_gym.guard.report.AsmInfo`` lists its fields. Flat NumPy scalars are beside
     it: ``asm_surprise``, ``asm_alarm``, ``asm_intervened``, ``cost`` (1.0 in every step in alarm), ``cost_sum`` (of the
     episode), and ``overridden`` (the policy's action was not executed: a recurrent policy keeps its previous state).
 
@@ -89,74 +90,55 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         ('policy', True)
     """
 
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        monitor: Monitor | None = None,
-        on_alarm: OnAlarm | None = None,
-        *,
-        release_after: int = 10,
-        max_override: int | None = None,
-        try_after: int | None = None,
-        truncate: bool = False,
-        adaptive_threshold: AdaptiveThreshold | None = None,
-        responses: Mapping[str, str] | None = None,
-        contact_limits: ContactLimits | Literal["memory"] | None = "memory",
-        action_means: ActionMeans | None = None,
-    ) -> None:
-        self._options = GuardOptions(
-            on_alarm=on_alarm,
-            release_after=release_after,
-            max_override=max_override,
-            try_after=try_after,
-            truncate=truncate,
-            adaptive_threshold=adaptive_threshold,
-            responses=responses,
-            contact_limits=contact_limits,
-            action_means=action_means,
-        )
+    def _wrap(self, env: gym.Env[Any, Any], monitor: Monitor | None) -> None:
         recorded = {"monitor": monitor, **vars(self._options)}
         RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
+        on_alarm = self._options.on_alarm
         if self._box is None and not (isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
             raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
+
         self._source = StreamSource(env)
         self._spec = self._source.spec
         self._rows_per_step = self._source.rows_per_step
-        changed = why_changed(env, "a reflex within a step")
-        if self._rows_per_step > 1 and changed:
-            raise ValueError(changed)
+        wrapper = changed_by(env)
+        if self._rows_per_step > 1 and wrapper is not None:
+            raise ValueError(outside(wrapper, "a reflex within a step"))
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
         self._inner: Any = env.unwrapped
-        self._holds = isinstance(self._inner, HoldsItself)
+        self._holds_itself = isinstance(self._inner, HoldsItself)
         self._ended = True
 
     @property
     def threshold(self) -> float:
         """Surprise above which a row is an alarm in this episode."""
-        return float(self._engine.threshold[0])
+        return float(self.guard.threshold[0])
 
     def confirm_alarm(self) -> None:
         """Confirm that the alarms of this episode were real, for ``adaptive_threshold``."""
-        self._engine.confirmed[:] = True
+        self.guard.confirm(np.ones(1, bool))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
         info = dict(info)
         self._watch_with_next()
-        nothing = self._engine.begin()
+        nothing = self.guard.begin()
         self._limit_contact(anew=True)
-        self._observation, self._alarms, self._solved = observation, 0, False
-        self._row: NDArray[np.float32] | None = None  # (D,) sensed last in this episode
-        self._begun, self._preview, self._announced = info, Preview(None), 0
-        if self._robots.meaning is not None:
-            self._engine.sense(np.array(self._source.first(observation, info))[None])
+        self._observation = observation
+        self._first_info = info
+        self._row: Floats32 | None = None  # (D,) sensed last in this episode
+        self._alarms = 0
+        self._solved = False
+        self._preview = Preview(None)
+        self._previewed = 0  # actions left of the chunk that was previewed
+        if self._facts.meaning is not None:
+            self.guard.sense(np.array(self._source.first(observation, info))[None])
         self._ended = False
         self._executed = np.zeros(0, np.float32)
-        self._report(info, [nothing], None)
+        self.report_step([nothing], info)
         return observation, info
 
     def preview(self, actions: Any) -> Preview:
@@ -168,115 +150,173 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if self._ended or self._box is None:
             raise gym.error.ResetNeeded("preview() needs a running episode and a Box action space")
         chunk = checked_chunk(actions, self._box.shape)
-        row = self._source.first(self._observation, self._begun) if self._row is None else self._row
-        last = self._executed.ravel() if self._executed.size else self._robots.rest
-        found = self._engine.preview(0, chunk.reshape(len(chunk), -1), row, last)
-        self._preview, self._announced = found._replace(kept=chunk[: len(found.kept)]), len(chunk)
+        row = self._row
+        if row is None:
+            row = self._source.first(self._observation, self._first_info)
+        last = self._executed.ravel() if self._executed.size else self._facts.rest
+        preview = self.guard.preview(0, chunk.reshape(len(chunk), -1), row, last)
+        self._preview = preview._replace(kept=chunk[: len(preview.kept)])
+        self._previewed = len(chunk)
         return self._preview
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> StepResult:
         if self._ended:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is running")
-        if self._box is not None:
-            action = np.array(as_float32(action, "an action"))  # a policy may use its buffer again
-            if action.shape != self._box.shape:
-                raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
+        self._executed = self._checked(action)
         self._ended = True  # where anything raises, nobody knows what was done
-        self._executed = action
-        self._rows: list[RowReport] = []
+        self._reports: list[RowReport] = []
         overridden, (observation, reward, terminated, truncated, info) = self._run()
         info = dict(info)  # an environment may use its own again
         if "success" in info:
             self._solved |= bool(info["success"])
             info.setdefault("is_success", self._solved)
-        row, failure = sensed_row(lambda: self._source.row(observation, self._executed, info), self._spec.size)
-        done = self._executed
-        if self._box is not None:
-            done = self._robots.executed_in(row[None], done.reshape(1, -1))[0].reshape(done.shape)
-        self._row = row
-        self._judge(row, failure, info)
-        self._limit_contact()
-        if repaired := self._engine.repaired:
-            row, missing = repaired[0]
-            if self._observation_map is not None:
-                observation = self._observation_map.repaired(observation, row, missing)
-            if "stream" in info:
-                info["stream"] = row.copy()
-        self._observation = observation
-        info["overridden"] = overridden or bool(info.get("overridden"))
-        self._report(info, self._rows, done)
-        gave_up = self._rows[-1].state[0] == ENDED
-        if gave_up or (self._engine.ends_on_alarm and any(row.ends[0] for row in self._rows)):
-            terminated, truncated = terminated or not self._options.truncate, truncated or self._options.truncate
-        self._ended = bool(terminated or truncated)
-        return observation, reward, terminated, truncated, info
 
-    def _command(self, action: NDArray[np.float32]) -> bool:
-        """Choose the next action: the policy's ``action`` (A,), or another."""
-        command = self._engine.act(action.reshape(1, -1), lambda _: self._observation)
-        self._executed = command.actions[0].reshape(action.shape)
+        sensed = self.sense_rows((observation, info))
+        self._row = sensed.rows[0]
+        self._reports.append(self.guard.judge(sensed, self._executed_row()))
+        self._limit_contact()
+        self._observation = self._repaired(observation, info)
+        info["overridden"] = overridden or bool(info.get("overridden"))
+        self.report_step(self._reports, info)
+
+        if self._gave_up():
+            terminated = terminated or not self._options.truncate
+            truncated = truncated or self._options.truncate
+        self._ended = bool(terminated or truncated)
+        return self._observation, reward, terminated, truncated, info
+
+    # ------------------------------------------------------------------ the adapter's three methods
+
+    def sense_rows(self, given: tuple[Any, dict[str, Any]]) -> SensedRows:
+        """Return the row that was sensed at the end of a step, by its observation and ``info``."""
+        observation, info = given
+        row, failure = sensed_row(lambda: self._source.row(observation, self._executed, info), self._spec.size)
+        return SensedRows(
+            rows=row[None],
+            load=load_felt(self._facts, info),
+            failures={0: failure} if failure else NOTHING,
+            infos=info,
+        )
+
+    def send_command(self, command: Command) -> bool:
+        """Take up what is to be done; return whether it is something else than the policy's action."""
+        self._executed = command.actions[0].reshape(self._executed.shape)
         if command.brakes[0]:
             self._inner.holding = True
         return bool(command.overridden[0])
 
-    def _run(self) -> tuple[bool, tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]]:
+    def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
+        """Write the report of a step to its ``info``."""
+        robots = [report.robots[0] for report in reports]
+        alarm = any([bool(robot["alarm"]) for robot in robots]) or bool(target.get("asm_alarm"))  # of a guard inside
+        intervened = any([bool(robot["overridden"]) for robot in robots]) or bool(target.get("asm_intervened"))
+        self._alarms += alarm
+        target["asm"] = LazyInfo(self._describe(reports))
+        target["asm_surprise"] = np.float64(max([robot["surprise"] for robot in robots]))
+        target["asm_alarm"] = np.bool_(alarm)
+        target["asm_intervened"] = np.bool_(intervened)
+        target["cost"] = np.float64(alarm)
+        target["cost_sum"] = np.float64(self._alarms)
+
+    # ------------------------------------------------------------------ parts of a step
+
+    def _checked(self, action: Any) -> Any:
+        """Return a copy of an action, as a policy may use its buffer again. Raises ValueError for another shape."""
+        if self._box is None:
+            return action
+        action = np.array(as_float32(action, "an action"))
+        if action.shape != self._box.shape:
+            raise ValueError(f"an action has the shape {self._box.shape}, got {action.shape}")
+        return action
+
+    def _executed_row(self) -> Floats32:
+        """Return (1, A) the action that is executed; (1, 0) where actions are no numbers."""
+        return np.zeros((1, 0), np.float32) if self._box is None else self._executed.reshape(1, -1)
+
+    def _command(self) -> bool:
+        """Choose what is done in place of the action so far; return whether that is something else."""
+        if self._box is None:
+            return False
+        return self.send_command(self.guard.act(self._executed_row(), lambda _: self._observation))
+
+    def _run(self) -> tuple[bool, StepResult]:
         """Command and step the environment; return whether the policy was overridden, and the result of the step.
 
         Rows within the step are judged meanwhile, and a hold lasts through all its parts; one that a guard outside has
         asked for goes on.
         """
-        hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else None
-        if hooks is not None:
-            hooks.append(self._judge)
+        hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else []
+        hooks.append(self._judge_within_step)
         inner = self._inner
-        kept = self._holds and inner.keeps_holding
-        held = kept and inner.holding
+        keeps_holding = self._holds_itself and inner.keeps_holding
+        held = keeps_holding and inner.holding
         try:
-            if self._holds:
+            if self._holds_itself:
                 inner.keeps_holding = True
-            overridden = self._box is not None and self._command(self._executed)
+            overridden = self._command()
             return overridden, stepped(self.env, as_action(self._box, self._executed))
         finally:
-            if self._holds:
-                inner.keeps_holding, inner.holding = kept, held
-            if hooks is not None:
-                hooks.remove(self._judge)
+            if self._holds_itself:
+                inner.keeps_holding = keeps_holding
+                inner.holding = held
+            hooks.remove(self._judge_within_step)
 
-    def _judge(self, row: NDArray[np.float32], failure: str = "", info: dict[str, Any] | None = None) -> None:
-        """Judge one row, with the ``info`` of the step that it completes; in mid-step a reflex acts at once."""
-        executed = np.zeros((1, 0), np.float32) if self._box is None else self._executed.reshape(1, -1)
-        felt = None if info is None else felt_by(self._robots, info)
-        acts = bool(self._engine.overriding[0])
-        failures = {0: failure} if failure else None
-        judged = self._engine.judge(np.array(row)[None], executed, felt, failures, ends_step=info is not None)
-        self._rows.append(judged)
-        if info is None and self._engine.overriding[0] and not (acts or judged.intervened[0]):
-            self._command(self._executed)
+    def _judge_within_step(self, row: Floats32) -> None:
+        """Judge a row that the environment senses in the middle of a step; a reflex acts at once."""
+        report = self.guard.judge(SensedRows(row[None]), self._executed_row(), ends_step=False)
+        self._reports.append(report)
+        takes_over = self.guard.overriding[0] and not report.robots["overridden"][0]
+        if takes_over:
+            self._command()
             self._limit_contact()
             self.env.get_wrapper_attr("command")(self._executed)
 
-    def _report(self, info: dict[str, Any], rows: Sequence[RowReport], executed: Any) -> None:
-        """Write the report of a step to ``info``."""
-        surprise = max([float(row.surprise.value[0]) for row in rows])
-        alarm = True in [bool(row.alarm[0]) for row in rows] or bool(info.get("asm_alarm"))  # of a guard inside
-        intervened = True in [bool(row.intervened[0]) for row in rows] or bool(info.get("asm_intervened"))
-        self._alarms += alarm
-        robots, asked, ahead = self._robots, self._executed, None
-        if self._announced > 0:
-            at = None if self._preview.at is None else self._preview.at - 1
-            self._announced = 0 if at == -1 else self._announced - 1
-            self._preview = self._preview._replace(at=at)
-            ahead = {"at": at, "reason": self._preview.reason, "known": self._preview.known}
-            ahead = ahead if self._announced else None
-        more: dict[str, float] = {"alarms": self._alarms}
-        if (running := self._engine.running) is not None:
-            more = more | {"ceiling": running.ceiling, "level": running.level}
+    def _repaired(self, observation: Any, info: dict[str, Any]) -> Any:
+        """Return the observation, and set the stream, with what is completed."""
+        repaired = self.guard.repaired
+        if not repaired:
+            return observation
+        row, missing = repaired[0]
+        if "stream" in info:
+            info["stream"] = row.copy()
+        if self._observation_map is None:
+            return observation
+        return self._observation_map.repaired(observation, row, missing)
 
-        def told() -> dict[str, Any]:
-            slowed = 0.0 if executed is None or self._box is None else robots.slowed(asked, executed)
-            return report(rows, 0, self._spec, executed) | more | {"slowed": slowed, "preview": ahead}
+    def _gave_up(self) -> bool:
+        """Return whether the guard ends the episode."""
+        if self._reports[-1].gave_up[0]:
+            return True
+        return self.guard.ends_on_alarm and any(report.ends[0] for report in self._reports)
 
-        info["asm"] = LazyInfo(told)
-        info["asm_surprise"], info["asm_alarm"], info["cost"] = np.float64(surprise), np.bool_(alarm), np.float64(alarm)
-        info["asm_intervened"] = np.bool_(intervened)
-        info["cost_sum"] = np.float64(self._alarms)
+    def _describe(self, reports: Sequence[RowReport]) -> Any:
+        """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
+        facts = self._facts
+        spec = self._spec
+        commanded = None if self._row is None else self._executed  # nothing was done before the first step
+        rows = self.guard.table.rows
+        step: dict[str, Any] = {"alarms": self._alarms, "preview": self._count_down()}
+        if self.guard.running is not None:
+            step["ceiling"] = self.guard.running.ceiling
+            step["level"] = self.guard.running.level
+
+        def describe() -> AsmInfo:
+            executed = commanded
+            slowed = 0.0
+            if commanded is not None and self._box is not None:
+                executed = facts.executed_in(rows, commanded.reshape(1, -1))[0].reshape(commanded.shape)
+                slowed = facts.slowed(commanded.ravel(), executed.ravel())
+            return asm_info(reports, 0, spec, executed, slowed=slowed, **step)
+
+        return describe
+
+    def _count_down(self) -> dict[str, Any] | None:
+        """Return what ``info`` says of the chunk that was previewed, an action of which is done; None without one."""
+        if not self._previewed:
+            return None
+        at = None if self._preview.at is None else self._preview.at - 1
+        self._preview = self._preview._replace(at=at)
+        self._previewed = 0 if at == -1 else self._previewed - 1
+        if not self._previewed:
+            return None
+        return {"at": at, "reason": self._preview.reason, "known": self._preview.known}

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,20 +12,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import ActionMeans
-from asm_gym.detection import AdaptiveThreshold
-from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.guard.options import GuardOptions, OnAlarm
+from asm_gym.guard.adapter import SensedRows
+from asm_gym.guard.commander import Command
 from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
+from asm_gym.guard.robot_table import Mask
 from asm_gym.monitors import Monitor
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
-from asm_gym.wrappers.capabilities import control_period_of
 from asm_gym.wrappers.env_attributes import EnvAttributes, askable
-from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, felt_by, sensed_row
+from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, load_felt, sensed_row
 
-Mask = NDArray[np.bool_]
+Floats32 = NDArray[np.float32]
 
 
 class VectorNeuralASMSafety(Guarding, VectorWrapper):
@@ -58,27 +56,11 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         ((2,), ['', ''])
     """
 
-    def __init__(
-        self,
-        env: VectorEnv[Any, Any, Any],
-        monitor: Monitor | None = None,
-        on_alarm: OnAlarm | None = None,
-        *,
-        release_after: int = 10,
-        max_override: int | None = None,
-        try_after: int | None = None,
-        truncate: bool = False,
-        adaptive_threshold: AdaptiveThreshold | None = None,
-        responses: Mapping[str, str] | None = None,
-        contact_limits: ContactLimits | Literal["memory"] | None = "memory",
-        action_means: ActionMeans | None = None,
-    ) -> None:
-        super().__init__(env)
+    def _wrap(self, env: VectorEnv[Any, Any, Any], monitor: Monitor | None) -> None:
+        VectorWrapper.__init__(self, env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
             raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
         refuse_running_statistics(env, "VectorNeuralASMSafety")
-        options = on_alarm, release_after, max_override, try_after, truncate
-        self._options = GuardOptions(*options, responses, contact_limits, adaptive_threshold, action_means=action_means)
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:
             raise ValueError(
@@ -87,176 +69,209 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             )
         self._resets_itself = mode == AutoresetMode.NEXT_STEP
         self._members = askable(env)
-        self._spec, self._own_stream = self._stream()
+        self._has_stream = all(self._members.call("has_wrapper_attr", "stream_spec"))
+        self._spec = self._stream_spec() if self._has_stream else self._spec_of_spaces()
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
-        self._holding = False
-        if self._robots.brakes:
+        self._holding = False  # members were told to hold in the last step
+        if self._facts.brakes:
             # Who is held is held in all steps that wrappers in between make of one.
             self._members.set_attr("keeps_holding", [True] * env.num_envs)
         self._alarms = np.zeros(env.num_envs, np.int64)
-        self._ended: Mask | None = None
+        self._ended: Mask | None = None  # (n,) None before the first reset, and where a step failed
         self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
 
-    def _stream(self) -> tuple[StreamSpec, bool]:
-        """Return the spec of the members' streams, and whether they have streams of their own."""
-        env = self.env
-        if not all(self._members.call("has_wrapper_attr", "stream_spec")):
-            if not isinstance(env.single_observation_space, gym.spaces.Box):
-                raise TypeError(
-                    f"environments without a stream must have Box observations to be watched in a vector, got "
-                    f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
-                )
-            spaces = env.single_observation_space, env.single_action_space
-            dt = control_period_of(EnvAttributes(env))
-            return StreamSpec.from_spaces(*spaces, dt), False
+    def _stream_spec(self) -> StreamSpec:
+        """Return the spec of the members' own streams."""
         first, *others = self._members.call("get_wrapper_attr", "stream_spec")
         for other in others:
             first.require(other, "the first environment")
-        if round(EnvAttributes(env).first("dt", first.dt) / first.dt) > 1:
+        if round(EnvAttributes(self.env).first("dt", first.dt) / first.dt) > 1:
             raise ValueError("a vector is watched at its control rate: make the environments without stream_freq")
-        return first, True
+        return first
+
+    def _spec_of_spaces(self) -> StreamSpec:
+        """Return the spec of streams that observations and actions form."""
+        env = self.env
+        if not isinstance(env.single_observation_space, gym.spaces.Box):
+            raise TypeError(
+                f"environments without a stream must have Box observations to be watched in a vector, got "
+                f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
+            )
+        dt = float(EnvAttributes(env).first("dt") or control_period(env))
+        return StreamSpec.from_spaces(env.single_observation_space, env.single_action_space, dt)
 
     @property
     def threshold(self) -> NDArray[np.float64]:
         """(n,) surprise above which a row is an alarm in the running episodes."""
-        return self._engine.threshold.copy()
+        return self.guard.threshold
 
     def confirm_alarm(self, which: Mask | None = None) -> None:
         """Confirm the alarms of the environments ``which`` (n,), by default of all; see ``NeuralASMSafety``."""
-        self._engine.confirmed[:] |= np.ones(self.num_envs, bool) if which is None else which
+        self.guard.confirm(np.ones(self.num_envs, bool) if which is None else which)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        n = self.num_envs
-        begun = np.array((options or {}).get("reset_mask", np.ones(n, bool)))
-        ended, self._ended = self._ended, None  # until it has worked
+        begun = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        ended = self._ended
+        self._ended = None  # until it has worked
         # A copy: vector environments take the mask out of the options they are given.
         self._observations, infos = self.env.reset(seed=seed, options=dict(options) if options else options)
-        infos = dict(infos)
         if ended is None and not begun.all():
             raise gym.error.ResetNeeded("the first reset() must reset all environments")
-        self._ended = np.zeros(n, bool) if ended is None else ended
+        self._ended = np.zeros(self.num_envs, bool) if ended is None else ended
         if begun.all():
             self._watch_with_next()
-        nothing = self._begin(begun)
-        self._report(infos, nothing, np.full(self.env.action_space.shape or (), np.nan, np.float32), begun)
+        infos = dict(infos)
+        self._present = begun
+        self._commanded = np.full(self._flat_shape, np.nan, np.float32)
+        self._executed = self._commanded
+        self.report_step([self._begin(begun)], infos)
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
         if self._ended is None or (not self._resets_itself and self._ended.any()):
             raise gym.error.ResetNeeded("call reset() before step(): an environment's episode is not running")
-        chosen = as_float32(actions, "actions").copy()
-        if chosen.shape != self.env.action_space.shape:
-            raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {chosen.shape}")
-        begun, self._ended = self._ended.copy(), None  # where anything raises, nobody knows what was done
-        executed, overridden = self._command(chosen, begun)
-        told = as_action(self.env.single_action_space, executed.copy())
-        observations, rewards, terminated, truncated, infos = self.env.step(told)
+        proposed = as_float32(actions, "actions").copy()
+        if proposed.shape != self.env.action_space.shape:
+            raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {proposed.shape}")
+        begun = self._ended.copy()  # their members begin an episode in this step, and take no action
+        running = ~begun
+        self._ended = None  # where anything raises, nobody knows what was done
+
+        self._limit_contact()
+        command = self.guard.act(proposed.reshape(self._flat_shape), self._observed_by, idle=begun)
+        observations, rewards, terminated, truncated, infos = self.send_command(command)
         infos = dict(infos)
-        infos["overridden"], infos["_overridden"] = overridden | infos.get("overridden", False), np.ones_like(begun)
+        infos["overridden"] = command.overridden | infos.get("overridden", False)
+        infos["_overridden"] = np.ones_like(begun)
         if self._forced.any():
-            forced = self._forced
-            observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
-            infos = _replaced(infos, fresh, forced)
-            rewards, terminated, truncated = (np.where(forced, 0, x) for x in (rewards, terminated, truncated))
-        rows, failures = self._sensed(observations, executed, infos)
-        felt = felt_by(self._robots, infos, infos.get("_contact_load"))
-        report = self._engine.judge(rows, executed, felt, failures, active=~begun)
-        stopped = (report.gave_up | (report.ends & self._engine.ends_on_alarm)) & ~begun
+            observations, infos = self._reset_forced(infos)
+            rewards, terminated, truncated = (np.where(self._forced, 0, x) for x in (rewards, terminated, truncated))
+
+        sensed = self.sense_rows((observations, infos))
+        report = self.guard.judge(sensed, self._commanded, active=running)
+        stopped = (report.gave_up | (report.ends & self.guard.ends_on_alarm)) & running
         self._forced = stopped & ~np.asarray(terminated | truncated, bool)
         terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
         truncated = np.asarray(truncated, bool) | (stopped & self._options.truncate)
-        self._observations = self._repaired(observations, infos, ~begun)
-        executed[begun] = np.nan
+
+        self._observations = self._repaired(observations, infos, running)
+        self._commanded[begun] = np.nan
+        self._executed = self._facts.executed_in(sensed.rows, self._commanded)
         self._ended = np.zeros_like(begun)
         self._begin(begun)
-        flat = executed.reshape(len(executed), -1)
-        done = self._robots.executed_in(rows, flat)
-        slowed = np.array([self._robots.slowed(*pair) for pair in zip(flat, done, strict=True)])
-        self._report(infos, report, done.reshape(executed.shape), np.ones(self.num_envs, bool), slowed)
+        self._present = np.ones_like(begun)
+        self.report_step([report], infos)
         self._ended = terminated | truncated
         return self._observations, rewards, terminated, truncated, infos
 
-    def _command(self, chosen: NDArray[np.float32], begun: Mask) -> tuple[NDArray[np.float32], Mask]:
-        """Return (n, A) what is done, and (n,) where it is not what the policy wanted."""
+    # ------------------------------------------------------------------ the adapter's three methods
 
-        def seen(robot: int) -> Any:
-            return list(iterate(self.observation_space, self._observations))[robot]
+    def sense_rows(self, given: tuple[Any, dict[str, Any]]) -> SensedRows:
+        """Return what was sensed in a step, by the observations and infos of the members."""
+        observations, infos = given
+        load = load_felt(self._facts, infos, infos.get("_contact_load"))
+        stream: Any = infos.get("stream")
+        present = np.asarray(infos.get("_stream", np.ones(self.num_envs, bool)))
+        shape = (self.num_envs, self._spec.size)
+        if self._has_stream and present.all() and np.shape(stream) == shape:
+            return SensedRows(np.asarray(as_float32(stream)), load, infos=infos)
 
-        self._limit_contact()
-        command = self._engine.act(chosen.reshape(len(chosen), -1), seen, idle=begun)
+        def read(member: int) -> Floats32:
+            if not self._has_stream:
+                return np.concatenate([np.ravel(observations[member]), self._commanded[member]])
+            if stream is None or not present[member]:
+                raise KeyError('info has no "stream"')
+            return stream[member]
+
+        rows, failures = zip(*(sensed_row(partial(read, i), self._spec.size) for i in range(shape[0])), strict=True)
+        failed = {member: failure for member, failure in enumerate(failures) if failure}
+        return SensedRows(np.stack(rows), load, failed, infos)
+
+    def send_command(self, command: Command) -> tuple[Any, ...]:
+        """Step the members as the guard decided; return what that gives."""
         brakes = bool(command.brakes.any())
         if brakes or self._holding:
             self._members.set_attr("holding", command.brakes.tolist())
         self._holding = brakes
-        return command.actions.reshape(chosen.shape), command.overridden.copy()
+        self._commanded = command.actions
+        actions = command.actions.copy().reshape(self.env.action_space.shape or ())
+        return self.env.step(as_action(self.env.single_action_space, actions))
 
-    def _sensed(
-        self, observations: Any, executed: NDArray[np.float32], infos: dict[str, Any]
-    ) -> tuple[NDArray[np.float32], dict[int, str]]:
-        """Return (n, D) what was sensed in this step, and what failed at that by environment."""
-        n, size = self.num_envs, self._spec.size
-        stream: Any = infos.get("stream")
-        there = np.asarray(infos.get("_stream", np.ones(n, bool)))
-        if self._own_stream and there.all() and np.shape(stream) == (n, size):
-            return np.array(as_float32(stream)), {}
+    def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
+        """Write the report of a step to its infos, with Gymnasium's masks of the members that are present."""
+        report = reports[-1]
+        robots = report.robots
+        alarm = robots["alarm"] | np.asarray(target.get("asm_alarm", False), bool)  # of guards inside
+        self._alarms += alarm
+        fields: dict[str, Any] = {
+            "asm_surprise": robots["surprise"].copy(),
+            "asm_alarm": alarm,
+            "asm_intervened": robots["overridden"] | np.asarray(target.get("asm_intervened", False), bool),
+            "cost": alarm.astype(np.float64),
+            "cost_sum": self._alarms.astype(np.float64),
+            "asm": LazyInfo(self._describe(report)),
+        }
+        for name, value in fields.items():
+            target[name] = value
+            target[f"_{name}"] = self._present
 
-        def row(i: int) -> NDArray[np.float32]:
-            if not self._own_stream:
-                return np.concatenate([np.ravel(observations[i]), np.ravel(executed[i])])
-            if stream is None or not there[i]:
-                raise KeyError('info has no "stream"')
-            return stream[i]
+    # ------------------------------------------------------------------ parts of a step
 
-        rows, said = zip(*(sensed_row(partial(row, i), size) for i in range(n)), strict=True)
-        return np.stack(rows), {i: failure for i, failure in enumerate(said) if failure}
+    @property
+    def _flat_shape(self) -> tuple[int, int]:
+        """(n, A) of the actions."""
+        return self.num_envs, self._facts.rest.size
 
-    def _repaired(self, observations: Any, infos: dict[str, Any], where: Mask) -> Any:
-        """Return the observations, and set the streams, with what is completed in the environments of ``where``."""
-        for i, (row, missing) in self._engine.repaired.items():
-            if not where[i] or self._observation_map is None:
+    def _observed_by(self, member: int) -> Any:
+        """Return the last observation of a member."""
+        return list(iterate(self.observation_space, self._observations))[member]
+
+    def _reset_forced(self, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Reset the members whose episodes this wrapper has ended; return observations and infos of all."""
+        observations, fresh = self.env.reset(options={"reset_mask": self._forced.copy()})
+        return observations, _replaced(infos, fresh, self._forced)
+
+    def _repaired(self, observations: Any, infos: dict[str, Any], running: Mask) -> Any:
+        """Return the observations, and set the streams, with what is completed of the ``running`` members."""
+        for member, (row, missing) in self.guard.repaired.items():
+            if not running[member] or self._observation_map is None:
                 continue
-            seen = list(iterate(self.observation_space, observations))[i]
-            observations = _with(observations, i, self._observation_map.repaired(seen, row, missing))
+            observation = list(iterate(self.observation_space, observations))[member]
+            repaired = self._observation_map.repaired(observation, row, missing)
+            observations = _with(observations, member, repaired)
             if "stream" in infos:
-                infos["stream"] = _with(infos["stream"], i, row)
+                infos["stream"] = _with(infos["stream"], member, row)
         return observations
 
     def _begin(self, begun: Mask) -> RowReport:
-        """Begin new episodes, which have forgotten their contact limits."""
+        """Begin new episodes of members, which have forgotten their contact limits."""
         assert self._ended is not None
-        self._ended[begun] = self._forced[begun] = False
+        self._ended[begun] = False
+        self._forced[begun] = False
         self._alarms[begun] = 0
         if not begun.any():
-            return self._engine.nothing()
-        nothing = self._engine.begin(begun)
+            return self.guard.nothing()
+        nothing = self.guard.begin(begun)
         self._limit_contact(anew=True)
         return nothing
 
-    def _report(
-        self,
-        infos: dict[str, Any],
-        report: RowReport,
-        executed: NDArray[np.float32],
-        present: Mask,
-        slowed: NDArray[np.float64] | None = None,
-    ) -> None:
-        """Add ``asm`` and ``cost`` of the environments that are ``present``, with Gymnasium's masks."""
-        alarm = report.alarm | np.asarray(infos.get("asm_alarm", False), bool)  # of guards inside
-        self._alarms += alarm
-        found: dict[str, Any] = {
-            "asm_surprise": report.surprise.value,
-            "asm_alarm": alarm,
-            "asm_intervened": report.intervened | np.asarray(infos.get("asm_intervened", False), bool),
-            "cost": alarm.astype(np.float64),
-            "cost_sum": self._alarms.astype(np.float64),
-        }
-        slowed = np.zeros(self.num_envs) if slowed is None else slowed
-        asm: dict[str, Any] = {"executed_action": executed.copy(), "alarms": self._alarms.copy(), "slowed": slowed}
-        if self._engine.running is not None:
-            n, running = self.num_envs, self._engine.running
-            asm |= {"ceiling": np.full(n, running.ceiling), "level": np.full(n, running.level)}
-        found["asm"] = LazyInfo(lambda: side_by_side(report, self._spec) | asm)
-        infos.update(found | {f"_{key}": present for key in found})
+    def _describe(self, report: RowReport) -> Any:
+        """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
+        facts = self._facts
+        spec = self._spec
+        commanded = self._commanded.copy()
+        executed = self._executed.copy()
+        step: dict[str, Any] = {"alarms": self._alarms.copy()}
+        if self.guard.running is not None:
+            step["ceiling"] = np.full(self.num_envs, self.guard.running.ceiling)
+            step["level"] = np.full(self.num_envs, self.guard.running.level)
+
+        def describe() -> dict[str, Any]:
+            slowed = [facts.slowed(*pair) for pair in zip(commanded, executed, strict=True)]
+            actions = executed.reshape(self.env.action_space.shape or ())
+            return side_by_side(report, spec, executed_action=actions, slowed=np.array(slowed), **step)
+
+        return describe
 
 
 def _with(batch: Any, i: int, value: Any) -> Any:
