@@ -131,9 +131,7 @@ class LeRobotGuard(Adapter):
         info["asm"] = {"alarm": self.alarm, "intervened": self.intervened, **self.last_alarm}
         return {**transition, "action": sent, "info": info}
 
-    def preview(
-        self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]
-    ) -> Preview:
+    def preview(self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]) -> Preview:
         """Return which action of a chunk leaves the range of healthy commands and why.
 
         Execute ``actions[:at]``, then ask the policy again.

@@ -1,7 +1,7 @@
 """Name what is wrong with a servo that an alarm points to: it is too hot, or it has stalled.
 
-    overheated    temperature >= HOT_C
-    stalled       min |sent - sensed| > STALL_SHARE (max sensed - min sensed), while sent changes, for STALL_S
+overheated    temperature >= HOT_C
+stalled       min |sent - sensed| > STALL_SHARE (max sensed - min sensed), while sent changes, for STALL_S
 """
 
 from __future__ import annotations
