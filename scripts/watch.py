@@ -188,7 +188,7 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
 
 
 def printer(args: Args, console: Console) -> Callable[[LiveEvent], None]:
-    """Return what prints each event, publishes each alarm and runs the hook on it, as the options ask."""
+    """Return a function that prints each event, publishes each alarm and runs the hook on it."""
     publish_alarm = None
     if args.topic:
         publish_alarm = publisher(args.topic)
@@ -217,9 +217,13 @@ def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:
     if args.watchdog is None and args.policy is None:
         return nullcontext()
     if args.watchdog is None or args.hook is None:
-        raise ValueError("a watchdog needs --watchdog SECONDS and --hook COMMAND, which makes the robot hold")
+        raise ValueError(
+            "a watchdog needs --watchdog SECONDS and --hook COMMAND, which makes the robot hold",
+        )
     if args.watchdog <= dt:
-        raise ValueError(f"--watchdog must be longer than the {dt:g} s between two rows, got {args.watchdog:g}")
+        raise ValueError(
+            f"--watchdog must be longer than the {dt:g} s between two rows, got {args.watchdog:g}",
+        )
     processes = []
     if args.policy is not None:
         processes = [args.policy]

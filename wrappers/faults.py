@@ -18,16 +18,18 @@ from asm_gym.validation import short_repr, typed
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Inject timed faults into every episode.
 
-    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth.
-    Faults of nested wrappers add up.
+    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the
+    ground truth. Faults of nested wrappers add up.
 
     Args:
-        env: a robosuite environment of this package, wrapped or not; for sensor and action faults, any with Box spaces.
+        env: a robosuite environment of this package, wrapped or not; for sensor and action faults,
+            any with Box spaces.
         faults: the faults of an episode, with their onsets and durations in control steps.
 
     Raises:
         TypeError: the environment has other spaces, or ``faults`` is not a sequence of faults.
-        ValueError: a fault that this environment cannot have: an unknown body or joint, an onset past the horizon.
+        ValueError: a fault that this environment cannot have: an unknown body or joint, an onset
+            past the horizon.
 
     Example:
         >>> import gymnasium as gym
@@ -61,13 +63,19 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if not isinstance(fault, Fault):
             raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {short_repr(fault)}")
         if isinstance(self._inner, FaultyInterface) and not fault.anywhere:
-            raise ValueError(f"{fault.name} needs a robosuite environment of asm_gym, got {self.unwrapped}")
+            needs = f"{fault.name} needs a robosuite environment of asm_gym"
+            raise ValueError(f"{needs}, got {self.unwrapped}")
         fault.check(self._inner)
         horizon = self._inner.horizon
         if horizon is not None and fault.onset >= horizon:
             raise ValueError(f"{fault} starts at or after the horizon of {horizon} steps")
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
         self.undo_faults()  # before the reset: a hard one replaces the model, a soft one keeps it
         self._step = 0
         observation, info = self.env.reset(seed=seed, options=options)

@@ -1,10 +1,10 @@
 """Guard a policy that runs in LeRobot: a step of the pipeline between the policy and the robot.
 
-    row_t = [observation_t, action_t]          as LeRobot records them, by the names of motors; judged before sending
+    row_t = [observation_t, action_t]    as LeRobot records them, by motor; judged before sending
 
-After an alarm a hold replaces the policy's action until surprise has been low for ``release_s``. Fit the memory on
-data with pauses: otherwise a hold surprises it and never ends. Only finite numbers are sent; until every joint has been
-sensed or commanded once, an alarm sends nothing.
+After an alarm a hold replaces the policy's action until surprise has been low for ``release_s``.
+Fit the memory on data with pauses: otherwise a hold surprises it and never ends. Only finite
+numbers are sent; until every joint has been sensed or commanded once, an alarm sends nothing.
 
 Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 """
@@ -63,17 +63,20 @@ class LeRobotGuard(Adapter):
     """Guard a policy as a processor step of LeRobot's pipeline.
 
     Args:
-        monitor: a monitor calibrated on a LeRobot dataset of this robot (``asm-gym fit DATASET``), or its file.
-        on_alarm: ``"hold"`` until surprise is low, ``"stop"`` until ``reset``, or ``"monitor"`` only reports.
-        release_s: time of surprise below 80 % of the threshold after which the policy acts again [s].
-        action_means: as in ``NeuralASMSafety``, in the order of the memory's actions. By default ``.pos`` is a target
-            and ``.vel`` a velocity.
+        monitor: a monitor calibrated on a LeRobot dataset of this robot (``asm-gym fit DATASET``),
+            or its file.
+        on_alarm: ``"hold"`` until surprise is low, ``"stop"`` until ``reset``, or ``"monitor"``
+            only reports.
+        release_s: time of surprise below 80 % of the threshold after which the policy acts
+            again [s].
+        action_means: as in ``NeuralASMSafety``, in the order of the memory's actions. By default
+            ``.pos`` is a target and ``.vel`` a velocity.
         watchdog: receives a beat at every row; its death is an alarm.
 
     Attributes:
         alarm, intervened: whether the newest row raised an alarm, and whether a hold was sent.
-        last_alarm: surprise in thresholds, reason, channel, servo and fault of the servo ("overheated", "stalled" or
-            empty) of the newest alarm; empty before the first.
+        last_alarm: surprise in thresholds, reason, channel, servo and fault of the servo
+            ("overheated", "stalled" or empty) of the newest alarm; empty before the first.
 
     Example:
         >>> guard = LeRobotGuard("so101.asm")  # doctest: +SKIP
@@ -131,7 +134,11 @@ class LeRobotGuard(Adapter):
         info["asm"] = {"alarm": self.alarm, "intervened": self.intervened, **self.last_alarm}
         return {**transition, "action": sent, "info": info}
 
-    def preview(self, observation: Mapping[str, Any], actions: Sequence[Mapping[str, Any]]) -> Preview:
+    def preview(
+        self,
+        observation: Mapping[str, Any],
+        actions: Sequence[Mapping[str, Any]],
+    ) -> Preview:
         """Return which action of a chunk leaves the range of healthy commands and why.
 
         Execute ``actions[:at]``, then ask the policy again.
@@ -246,7 +253,8 @@ class LeRobotGuard(Adapter):
         """Return what the actions mean: what the user said, or what LeRobot's names say.
 
         Raises:
-            ValueError: they are to be held, and some are torques, or neither a position nor a velocity by their names.
+            ValueError: they are to be held, and some are torques, or neither a position nor a
+                velocity by their names.
         """
         means = tuple(map(_usual_meaning, self._names))
         if self._action_means is not None:
@@ -335,7 +343,7 @@ def _column_of(label: str) -> MotorColumn:
     match = _MOTOR.fullmatch(label)
     if match is None:
         raise ValueError(
-            "the memory must be fitted on a LeRobot dataset that names its motors, observation.state[MOTOR] and "
-            f"action[MOTOR], got the channel {label!r}"
+            "the memory must be fitted on a LeRobot dataset that names its motors, "
+            f"observation.state[MOTOR] and action[MOTOR], got the channel {label!r}"
         )
     return MotorColumn(group=match[1], motor=match[2])

@@ -1,4 +1,7 @@
-"""Record any environment's sensorimotor stream."""
+"""Record any environment's sensorimotor stream.
+
+T control steps ► Episode: stream (k T, D), actions (T, A), observations (T + 1, O), rewards (T,)
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,9 @@ from asm_gym.validation import as_float32
 class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Keep every finished episode in ``episodes``.
 
-    Without ``info["stream"]``, observation and action form the stream. A stream that is faster than control has several
-    rows for each action. Without ``info["success"]`` and ``info["is_success"]`` an episode counts as a success.
+    Without ``info["stream"]``, observation and action form the stream. A stream that is faster than
+    control has several rows for each action. Without ``info["success"]`` and ``info["is_success"]``
+    an episode counts as a success.
 
     Args:
         env: an environment with a stream, or with spaces that can be read as numbers.
@@ -57,9 +61,13 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._rows: list[NDArray[np.float32]] = []  # (k, D) each
         self._faults: list[bool] = []  # a fault was active, of each row
         self._success: bool | None = None  # None: nothing was reported yet
-        self._terminated = False
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
         self._finish()
         observation, info = self.env.reset(seed=seed, options=options)
         self._begin(seed, [deepcopy(observation)])
@@ -80,9 +88,8 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         success = info.get("success", info.get("is_success"))
         if success is not None:
             self._success = bool(self._success or success)
-        self._terminated = bool(terminated)
         if terminated or truncated:
-            self._finish()
+            self._finish(bool(terminated))
         return observation, reward, terminated, truncated, info
 
     def finish(self) -> Episode:
@@ -107,7 +114,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             action = flat(space, action)
         return np.array(as_float32(action), ndmin=1)
 
-    def _finish(self) -> None:
+    def _finish(self, terminated: bool = False) -> None:
         """Keep the running episode, if it has a step."""
         if not self._rows:
             return
@@ -125,7 +132,7 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observations=observations,
             rewards=np.asarray(self._rewards, np.float32),
             faults=np.array(self._faults),
-            info={"terminated": self._terminated, CONTROLLER: controller},
+            info={"terminated": terminated, CONTROLLER: controller},
         )
         self.episodes.append(episode)
         self._begin(None, [])

@@ -1,7 +1,9 @@
 """Name what is wrong with a servo that an alarm points to: it is too hot, or it has stalled.
 
-overheated    temperature >= HOT_C
-stalled       min |sent - sensed| > STALL_SHARE (max sensed - min sensed), while sent changes, for STALL_S
+    overheated    temperature >= HOT_C
+    stalled       min |sent - sensed| > STALL_SHARE (max sensed - min sensed), and sent changes
+
+A stall is looked for in the steps of the newest ``STALL_S``.
 """
 
 from __future__ import annotations
@@ -61,7 +63,8 @@ class ServoHistory:
 
         Args:
             motor: name of the number that an alarm points to.
-            observation: the newest one, perhaps with a temperature such as ``elbow_flex.temperature``.
+            observation: the newest one, perhaps with a temperature such as
+                ``elbow_flex.temperature``.
         """
         servo = servo_of(motor)
         for name in TEMPERATURES:

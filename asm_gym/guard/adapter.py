@@ -1,8 +1,10 @@
-"""Connect a guard with the robots that it guards: what a wrapper, a pipeline or a live watch must do.
+"""Connect a guard with its robots: what a wrapper, a pipeline or a live watch must do.
 
-sense_rows      robots ► rows (n, D)       read what the robots sensed
-send_command    command ► robots           do what the guard decided
-report_step     reports ► user             tell what became of the step
+    sense_rows      robots ► rows (n, D)       read what the robots sensed
+    send_command    command ► robots           do what the guard decided
+    report_step     reports ► user             tell what became of the step
+
+All else is the guard's: it judges the rows, and decides what is commanded.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a live watch says: alarms, notes and a summary, as text, as JSON, or to a command of the user."""
+"""Say alarms, notes and a summary of a live watch: as text, as JSON, or to the user's command."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Watch rows as they come, in constant memory, over lost rows, other rates and sources that die and come back.
+"""Watch rows as they come, in constant memory, whatever their source does.
 
     line ► problem? ► lost rows ► judge ► latency ► watchdog ► alarm or note
 
-Nothing that a line holds ends a watch: a line that cannot be read is an alarm.
+Nothing that a line holds ends a watch: a line that cannot be read is an alarm. Rows may be lost or
+come at another rate, and a source may die and come back.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ LONGEST_PROBLEM = 200  # characters of an unreadable line's problem in its alarm
 class WatchSettings:
     """How a live source is watched.
 
-    ``reopen(first_s)`` opens the source anew after its death; its first line may take ``first_s`` [s].
+    ``reopen(first_s)`` opens the source anew; its first line may take ``first_s`` [s].
     """
 
     bridge_s: float = 0.0  # longest time for which numbers may be missing without an alarm [s]
@@ -319,7 +320,7 @@ class LiveWatch(Adapter):
 
 
 def _opened(reopen: Callable[[float], Iterator[str]], first_s: float) -> Iterable[str] | None:
-    """Return the lines of a source; None where it is not there, or sends none within ``first_s``."""
+    """Return the lines of a source; None where it is not there, or sends none in ``first_s``."""
     try:
         lines = reopen(first_s)
         return chain([next(lines)], lines)

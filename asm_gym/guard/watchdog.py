@@ -1,10 +1,11 @@
-"""Make an arm hold when the process that guards it, or one that it depends on, dies or falls silent.
+"""Make an arm hold when its guard dies or falls silent, or a process that it depends on dies.
 
 The watchdog is a separate process, which only waits:
 
-    guard ── beat, a row ──► watchdog ── no beat for ``patience``, or a process has ended ──► hold(why)
+    guard ── a beat a row ──► watchdog ── no beat for ``patience``, or a death ──► hold(why)
 
-It ends with the guard, after ``close`` without a hold. If the watchdog itself dies, ``beat`` returns False.
+It ends with the guard, after ``close`` without a hold. If the watchdog itself dies, ``beat``
+returns False.
 """
 
 from __future__ import annotations
@@ -31,9 +32,10 @@ class Watchdog:
     """Watch the process that makes it, from a process of its own.
 
     Args:
-        hold: called with the reason, makes the arm hold. The watchdog's process imports it, so it must be a function
-            in a module, and open by itself what it needs.
-        patience: time without ``beat`` after which the guard counts as silent [s], from the first beat on.
+        hold: called with the reason, makes the arm hold. The watchdog's process imports it, so it
+            must be a function in a module, and open by itself what it needs.
+        patience: time without ``beat`` after which the guard counts as silent [s], from the first
+            beat on.
         processes: ids of other processes that must live, such as the policy's.
 
     Raises:
@@ -45,7 +47,12 @@ class Watchdog:
         >>> guard = LeRobotGuard("so101.asm", watchdog=watchdog)  # doctest: +SKIP
     """
 
-    def __init__(self, hold: Hold, patience: float = PATIENCE_S, processes: Sequence[int] = ()) -> None:
+    def __init__(
+        self,
+        hold: Hold,
+        patience: float = PATIENCE_S,
+        processes: Sequence[int] = (),
+    ) -> None:
         check_number("patience", patience, above=0.0)
         for process in processes:
             os.kill(process, 0)
@@ -60,7 +67,9 @@ class Watchdog:
         self.process.start()
         while not ready.wait(POLL_S):
             if not self.process.is_alive():
-                raise RuntimeError("the watchdog did not start: hold must be a function of an importable module")
+                raise RuntimeError(
+                    "the watchdog did not start: hold must be a function of an importable module",
+                )
 
     def beat(self) -> bool:
         """Report that a row was judged; return whether the watchdog lives."""
