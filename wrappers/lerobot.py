@@ -12,19 +12,18 @@ Source: LeRobot 0.4, ``lerobot/processor/pipeline.py`` (ProcessorStep).
 from __future__ import annotations
 
 import logging
-import re
 import sys
 import time
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.action_meaning import TARGET, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
+from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.data.rows import ClockWentBack, Pace
 from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.adapter import Adapter, SensedRows
@@ -33,11 +32,20 @@ from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.preview import Preview
 from asm_gym.guard.report import FAILURE, RowReport
-from asm_gym.guard.robots import Robots
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
-from asm_gym.wrappers.servo_faults import LoopStep, ServoHistory, number_of, servo_of
+from asm_gym.wrappers.lerobot_arm import (
+    COMMANDED,
+    LoopStep,
+    column_of,
+    meaning_of,
+    number_of,
+    robots_of,
+    row_of,
+    servo_of,
+)
+from asm_gym.wrappers.servo_faults import ServoHistory
 
 Floats32 = NDArray[np.float32]
 
@@ -45,18 +53,6 @@ _log = logging.getLogger("asm_gym.lerobot")
 
 # Stay where the arm stood until surprise is low; stay until ``reset``; only report.
 ON_ALARM = ("hold", "stop", "monitor")
-
-SENSED = "observation.state"
-COMMANDED = "action"
-_MOTOR = re.compile(r"(observation\.state|action)\[(.*\D.*)\]")
-_GRIPPER = re.compile("gripper|hand|jaw", re.IGNORECASE)
-
-
-class MotorColumn(NamedTuple):
-    """A column of the stream, as LeRobot names it."""
-
-    group: str  # ``SENSED`` or ``COMMANDED``
-    motor: str
 
 
 class LeRobotGuard(Adapter):
@@ -105,7 +101,7 @@ class LeRobotGuard(Adapter):
         self.monitor: Any = monitor
         self._spec = monitor.spec
         check_monitor(monitor, self._spec)
-        self._columns = [_column_of(label) for label in self._spec.labels]
+        self._columns = [column_of(label) for label in self._spec.labels]
         self._action_means = action_means
         self._watchdog = watchdog
         with suppress(ImportError):
@@ -150,7 +146,7 @@ class LeRobotGuard(Adapter):
             raise ValueError("a chunk needs at least one action, got none")
         engine = self._engine_for(actions[0])
         chunk = np.concatenate([self._numbers(action) for action in actions])  # (k, A)
-        row = self._rows(LoopStep(observation, self._sent))[0]
+        row = row_of(LoopStep(observation, self._sent), self._columns)[0]
         return engine.preview(0, chunk, row, self._numbers(self._sent)[0])
 
     def guarded(self, observation: Mapping[str, Any], action: Mapping[str, Any]) -> dict[str, Any]:
@@ -166,7 +162,7 @@ class LeRobotGuard(Adapter):
         self._check_rate()
         engine = self._engine_for(action)
         step = LoopStep(observation, action)
-        engine.sense(self._rows(step))
+        engine.sense(row_of(step, self._columns))
         if self.on_alarm != "monitor":
             step = LoopStep(observation, self._chosen(engine, action))
         sensed = self.sense_rows(step)
@@ -181,7 +177,7 @@ class LeRobotGuard(Adapter):
         self.intervened = overrides or bool(engine.overriding[0])
         if self.intervened and not overrides:  # the hold begins before anything is sent
             step = LoopStep(observation, self._chosen(engine, action))
-            engine.amend(self._rows(step))
+            engine.amend(row_of(step, self._columns))
         self._history.append(observation, self._sent)
         command = action
         if self.intervened:
@@ -195,7 +191,7 @@ class LeRobotGuard(Adapter):
         failures = {}
         if self._watchdog is not None and not self._watchdog.beat():
             failures[0] = "watchdog: it has died"
-        return SensedRows(self._rows(given), failures=failures)
+        return SensedRows(row_of(given, self._columns), failures=failures)
 
     def send_command(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Return and remember the finite numbers of a command, for LeRobot to send."""
@@ -227,46 +223,23 @@ class LeRobotGuard(Adapter):
         return self._engine
 
     def _new_engine(self) -> Engine:
-        """Return the engine of one arm whose actions are known by name."""
-        dt = self._spec.dt
-        unbounded = np.full(len(self._names), np.inf, np.float32)
-        is_gripper = [_GRIPPER.search(name) is not None for name in self._names]
-        robots = Robots(
-            count=1,
-            low=-unbounded,
-            high=unbounded,
-            rest=np.full(len(self._names), np.nan, np.float32),
-            grip=np.flatnonzero(is_gripper),
-            dt=dt,
-            meaning=self._meaning(),
-        )
-        release_rows = max(1, int(np.ceil(self.release_s / dt)))
-        reaction: OnAlarmName = "hold"
-        if self.on_alarm == "stop":
-            release_rows = sys.maxsize
-        elif self.on_alarm == "monitor":
-            reaction = "monitor"
-        options = GuardOptions(reaction, release_rows, contact_limits=None)
-        return Engine(robots, self.monitor, options)
-
-    def _meaning(self) -> ActionMeaning:
-        """Return what the actions mean: what the user said, or what LeRobot's names say.
+        """Return the engine of one arm whose actions are known by name.
 
         Raises:
-            ValueError: they are to be held, and some are torques, or neither a position nor a
-                velocity by their names.
+            ValueError: the actions are to be held, and some are torques, or neither a position nor
+                a velocity by their names.
         """
-        means = tuple(map(_usual_meaning, self._names))
-        if self._action_means is not None:
-            means = ActionMeaning.told(self._action_means, len(means)).means
-
-        column_of = {label: column for column, label in enumerate(self._spec.labels)}
-        senses = tuple(column_of.get(f"{SENSED}[{name}]", -1) for name in self._names)
-        same = (1.0,) * len(means)  # a target is in the unit of its sense
-        meaning = ActionMeaning(means, senses, slopes=same, offsets=(0.0,) * len(means))
+        dt = self._spec.dt
+        meaning = meaning_of(self._names, self._spec.labels, self._action_means)
+        reaction: OnAlarmName = "monitor"
         if self.on_alarm != "monitor":
             meaning.check_stays("this robot", self._names)
-        return meaning
+            reaction = "hold"
+        release_rows = max(1, int(np.ceil(self.release_s / dt)))
+        if self.on_alarm == "stop":
+            release_rows = sys.maxsize
+        options = GuardOptions(reaction, release_rows, contact_limits=None)
+        return Engine(robots_of(self._names, meaning, dt), self.monitor, options)
 
     def _check_rate(self) -> None:
         """Log that rows come at another rate than the memory reads."""
@@ -287,15 +260,9 @@ class LeRobotGuard(Adapter):
         """Return (1, A) the numbers of an action; NaN where one is missing."""
         return np.array([[number_of(action, name) for name in self._names]], np.float32)
 
-    def _rows(self, step: LoopStep) -> Floats32:
-        """Return (1, D) the row of the stream; NaN where a number is missing."""
-        sources = {SENSED: step.observation, COMMANDED: step.command}
-        row = [number_of(sources[column.group], column.motor) for column in self._columns]
-        return np.array([row], np.float32)
-
     def _description(self, report: RowReport, step: LoopStep) -> dict[str, Any]:
         """Return what there is to say of an alarm."""
-        row = self._rows(step)[0]
+        row = row_of(step, self._columns)[0]
         cause = reason(row)
         if report.failure:
             cause = FAILURE
@@ -327,23 +294,3 @@ class LeRobotGuard(Adapter):
     def transform_features(self, features: Any) -> Any:
         """Return the features unchanged."""
         return features
-
-
-def _usual_meaning(name: str) -> str:
-    """Return what a number of an action means by its LeRobot name."""
-    if name.endswith(".pos"):
-        return TARGET
-    if name.endswith(".vel"):
-        return VELOCITY
-    return UNKNOWN
-
-
-def _column_of(label: str) -> MotorColumn:
-    """Return what a column of the memory holds, by its label."""
-    match = _MOTOR.fullmatch(label)
-    if match is None:
-        raise ValueError(
-            "the memory must be fitted on a LeRobot dataset that names its motors, "
-            f"observation.state[MOTOR] and action[MOTOR], got the channel {label!r}"
-        )
-    return MotorColumn(group=match[1], motor=match[2])

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+
+from asm_gym.wrappers.lerobot_arm import LoopStep, number_of, servo_of
 
 OVERHEATED = "overheated"
 STALLED = "stalled"
@@ -21,26 +23,6 @@ STALL_S = 0.2  # for so long a stalled servo has not moved [s]
 STALL_SHARE = 3.0  # least distance to a stalled servo's target, in distances that it moved
 HOT_C = 60.0  # servos switch themselves off at 70 °C
 TEMPERATURES = ("temperature", "temp")  # names of temperatures beside a servo's position
-
-
-def number_of(values: Mapping[str, Any], name: str) -> float:
-    """Return a number by name; NaN where there is none."""
-    try:
-        return float(values.get(name, np.nan))
-    except (TypeError, ValueError):
-        return np.nan
-
-
-def servo_of(motor: str) -> str:
-    """Return the servo of a motor's number: ``elbow_flex`` of ``elbow_flex.pos``."""
-    return motor.rpartition(".")[0] or motor
-
-
-class LoopStep(NamedTuple):
-    """One step of a robot's loop."""
-
-    observation: Mapping[str, Any]  # numbers that were sensed, by name
-    command: Mapping[str, Any]  # numbers of the action that belongs to them, by name
 
 
 class ServoHistory:
