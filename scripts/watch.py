@@ -15,7 +15,7 @@ import io
 import math
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -35,7 +35,8 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
-from asm_gym.guard.live import ALARM, LiveEvent, follow, hold_by_hook, run_hook
+from asm_gym.guard.live_events import ALARM, LiveEvent, hold_by_hook, run_hook
+from asm_gym.guard.live_watch import WatchSettings, follow
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
@@ -153,36 +154,80 @@ def watch(args: Args, console: Console) -> int:
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
     if live is None:
         return review(args, monitor, console)
+    return watch_live(args, monitor, console, returns=live.returns)
+
+
+def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int:
+    """Watch a live source; one that ``returns`` after its death is opened anew."""
     opened = partial(lines_from, args.source, sys.stdin, args.silence)
-    publish_alarm = publisher(args.topic) if args.topic else None
+    reopen: Callable[[float], Iterator[str]] | None = None
+    if returns:
+        reopen = opened
+    say = printer(args, console)
+    lines = opened(max(args.wait, args.silence))
+    guarded = ""
+    beat = None
+    with _watchdog(args, monitor.spec.dt) as watchdog:
+        if watchdog is not None:
+            guarded = ", guarded by a watchdog"
+            beat = watchdog.beat
+        print(f"asm-gym: watching {args.source}{guarded}", file=sys.stderr)
+        settings = WatchSettings(
+            bridge_s=bridge_of(args.bridge, monitor.spec.dt),
+            reopen=reopen,
+            wait_s=args.wait,
+            until_alarm=args.until_alarm,
+            beat=beat,
+            clock=args.clock,
+            silence_s=args.silence,
+        )
+        alarms = follow(lines, monitor, say, settings)
+    if alarms:
+        return BAD_NEWS
+    return DONE
+
+
+def printer(args: Args, console: Console) -> Callable[[LiveEvent], None]:
+    """Return a function that prints each event, publishes each alarm and runs the hook on it."""
+    publish_alarm = None
+    if args.topic:
+        publish_alarm = publisher(args.topic)
 
     def say(event: LiveEvent) -> None:
-        text = event.to_json() if args.json else str(event)
+        text = str(event)
+        if args.json:
+            text = event.to_json()
         console.print(text, soft_wrap=True, highlight=False, markup=False)
-        if publish_alarm and event.kind == ALARM:
+        if event.kind != ALARM:
+            return
+        if publish_alarm is not None:
             publish_alarm(event.to_json())
-        if args.hook and event.kind == ALARM:
+        if args.hook:
             run_hook(args.hook, event)
 
-    bridge = bridge_of(args.bridge, monitor.spec.dt)
-    lines, again = opened(max(args.wait, args.silence)), opened if live.returns else None
-    with _watchdog(args, monitor.spec.dt) as watchdog:
-        beat = None if watchdog is None else watchdog.beat
-        print(f"asm-gym: watching {args.source}{', guarded by a watchdog' if beat else ''}", file=sys.stderr)
-        how = args.wait, args.until_alarm, beat, args.clock, args.silence
-        alarms = follow(lines, monitor, say, bridge, again, *how)
-    return BAD_NEWS if alarms else DONE
+    return say
 
 
 def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:
-    """Return the watchdog that is asked for. Raises ValueError where it could not do anything."""
+    """Return the watchdog that is asked for, in a watch of rows ``dt`` [s] apart.
+
+    Raises:
+        ValueError: it could not do anything.
+    """
     if args.watchdog is None and args.policy is None:
         return nullcontext()
     if args.watchdog is None or args.hook is None:
-        raise ValueError("a watchdog needs --watchdog SECONDS and --hook COMMAND, which makes the robot hold")
+        raise ValueError(
+            "a watchdog needs --watchdog SECONDS and --hook COMMAND, which makes the robot hold",
+        )
     if args.watchdog <= dt:
-        raise ValueError(f"--watchdog must be longer than the {dt:g} s between two rows, got {args.watchdog:g}")
-    return Watchdog(partial(hold_by_hook, args.hook), args.watchdog, [] if args.policy is None else [args.policy])
+        raise ValueError(
+            f"--watchdog must be longer than the {dt:g} s between two rows, got {args.watchdog:g}",
+        )
+    processes = []
+    if args.policy is not None:
+        processes = [args.policy]
+    return Watchdog(partial(hold_by_hook, args.hook), args.watchdog, processes)
 
 
 main = partial(run, "watch", Args, watch)

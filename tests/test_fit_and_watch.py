@@ -18,7 +18,7 @@ from asm_gym.data.logs import Log
 from asm_gym.data.selection import normal_episodes, pieces, split_at_random, split_in_time, with_shared_noise
 from asm_gym.data.text import read_text
 from asm_gym.evaluation.alarms import alarms_of, traces_of
-from asm_gym.guard.live import follow
+from asm_gym.guard.live_watch import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.version import __version__

@@ -24,7 +24,8 @@ from asm_gym.data.timing import bridge_of
 from asm_gym.detection.events import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.guard.live import LiveEvent, follow
+from asm_gym.guard.live_events import LiveEvent
+from asm_gym.guard.live_watch import WatchSettings, follow
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -52,10 +53,10 @@ def lines(rows, stamps=None, dies=False):
         raise SourceDied("nothing came for 2 s")
 
 
-def watched(source, monitor, *how):
+def watched(source, monitor, **settings):
     """The number of alarms, and what was said."""
     events = []
-    return follow(source, monitor, events.append, *how), "\n".join(map(str, events))
+    return follow(source, monitor, events.append, WatchSettings(**settings)), "\n".join(map(str, events))
 
 
 def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
@@ -69,13 +70,13 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
     assert count
     assert "0.260 s  2 rows lost: an alarm (late)" in said
     assert said.splitlines()[-1].startswith("30 rows, ")
-    assert watched(lines(rows[kept], DT * kept), monitor, 0.05)[0] == 0
+    assert watched(lines(rows[kept], DT * kept), monitor, bridge_s=0.05)[0] == 0
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3, 30])
 def test_up_to_two_lost_rows_are_bridged_and_more_are_one_alarm(lost, monitor):
     kept = np.delete(np.arange(80), np.arange(20, 20 + lost))
-    count, said = watched(lines(episode(500).stream[kept], DT * kept), monitor, bridge_of(None, DT))
+    count, said = watched(lines(episode(500).stream[kept], DT * kept), monitor, bridge_s=bridge_of(None, DT))
     assert count == (lost > 2)
     assert said.count("(late)") == (lost > 2)
 
@@ -103,7 +104,7 @@ def test_a_source_whose_lines_are_no_rows_at_all_is_an_error_unless_others_may_s
     rows = list(lines(episode(500).stream[:10]))
     with pytest.raises(ValueError, match="line 1 is no row of numbers, and no header"):
         watched(["garbage", *rows], monitor)
-    count, said = watched(["garbage", *rows], monitor, 0.0, lambda first: iter(()), 0.1)
+    count, said = watched(["garbage", *rows], monitor, reopen=lambda first: iter(()), wait_s=0.1)
     assert count == 1
     assert "10 rows" in said
     with pytest.raises(ValueError, match="no row came"):
@@ -113,7 +114,7 @@ def test_a_source_whose_lines_are_no_rows_at_all_is_an_error_unless_others_may_s
 def test_the_first_alarm_ends_a_watch_that_is_told_so(monitor):
     rows = list(lines(episode(500).stream))
     source = iter([*rows[:5], "no row", *rows])
-    assert watched(source, monitor, 0.0, None, 0.0, True)[0] == 1
+    assert watched(source, monitor, until_alarm=True)[0] == 1
     assert next(source) == rows[0]
 
 
@@ -137,7 +138,7 @@ def test_missing_numbers_are_bridged_or_an_alarm_that_says_why(monitor):
     assert count
     assert "q[1]  inf thresholds" in said
     assert "(missing data)" in said
-    assert watched(lines(with_gap(50, 1, 1)), monitor, 0.05)[0] == 0
+    assert watched(lines(with_gap(50, 1, 1)), monitor, bridge_s=0.05)[0] == 0
 
 
 def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, monkeypatch):
@@ -278,7 +279,7 @@ def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(
             raise ConnectionRefusedError
         return lines(rows, [5.0, 5.02, 1.0, 1.02] if len(opened) == 2 else None)
 
-    count, said = watched(lines(rows, dies=True), monitor, 0.0, again, 5.0)
+    count, said = watched(lines(rows, dies=True), monitor, reopen=again, wait_s=5.0)
     assert count
     assert said.count("the source is back") == 1
     assert "time must increase, got 1.02 s after 5.02 s: an alarm, and a new beginning" in said
@@ -290,5 +291,5 @@ def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(
     def never(first):
         raise OSError("no")
 
-    said = watched(lines(rows, dies=True), monitor, 0.0, never, 0.3)[1]
+    said = watched(lines(rows, dies=True), monitor, reopen=never, wait_s=0.3)[1]
     assert "the source did not come back within 0.3 s" in said

@@ -9,7 +9,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from asm_gym.guard.live import LiveEvent
+from asm_gym.guard.live_events import LiveEvent
 from tests.wheel import ROOT
 
 NOTE = LiveEvent("note", 0.5, "knock: no alarm").to_json()

@@ -18,16 +18,18 @@ from asm_gym.validation import short_repr, typed
 class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Inject timed faults into every episode.
 
-    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the ground truth.
-    Faults of nested wrappers add up.
+    ``info["fault"]`` is a tuple of the names of the faults that were active during the step: the
+    ground truth. Faults of nested wrappers add up.
 
     Args:
-        env: a robosuite environment of this package, wrapped or not; for sensor and action faults, any with Box spaces.
+        env: a robosuite environment of this package, wrapped or not; for sensor and action faults,
+            any with Box spaces.
         faults: the faults of an episode, with their onsets and durations in control steps.
 
     Raises:
         TypeError: the environment has other spaces, or ``faults`` is not a sequence of faults.
-        ValueError: a fault that this environment cannot have: an unknown body or joint, an onset past the horizon.
+        ValueError: a fault that this environment cannot have: an unknown body or joint, an onset
+            past the horizon.
 
     Example:
         >>> import gymnasium as gym
@@ -43,25 +45,37 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     @typed
     def __init__(self, env: gym.Env[Any, Any], faults: Sequence[Fault]) -> None:
         RecordConstructorArgs.__init__(self, faults=faults)
-        theirs = env.unwrapped
-        inner: Any = theirs if isinstance(theirs, RobosuiteEnv) else FaultyInterface(env)
-        gym.Wrapper.__init__(self, env if inner is theirs else inner)
+        self._inner: Any = env.unwrapped  # what faults act on
+        if not isinstance(self._inner, RobosuiteEnv):
+            env = FaultyInterface(env)
+            self._inner = env
+        gym.Wrapper.__init__(self, env)
         if not isinstance(faults, Sequence):
             raise TypeError(f"faults must be a sequence, got {short_repr(faults)}")
         for fault in faults:
-            if not isinstance(fault, Fault):
-                raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {short_repr(fault)}")
-            if inner is not theirs and not fault.anywhere:
-                raise ValueError(f"{fault.name} needs a robosuite environment of asm_gym, got {theirs}")
-            fault.check(inner)
-            if inner.horizon is not None and fault.onset >= inner.horizon:
-                raise ValueError(f"{fault} starts at or after the horizon of {inner.horizon} steps")
+            self._check(fault)
         self.faults = tuple(faults)
-        self._inner = inner
-        self._running: dict[int, Generator[None, None, None]] = {}
+        self._running: dict[int, Generator[None, None, None]] = {}  # by place in ``faults``
         self._step = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def _check(self, fault: Fault) -> None:
+        """Raise TypeError or ValueError for a fault that this environment cannot have."""
+        if not isinstance(fault, Fault):
+            raise TypeError(f"faults must be asm_gym.faults.Fault objects, got {short_repr(fault)}")
+        if isinstance(self._inner, FaultyInterface) and not fault.anywhere:
+            needs = f"{fault.name} needs a robosuite environment of asm_gym"
+            raise ValueError(f"{needs}, got {self.unwrapped}")
+        fault.check(self._inner)
+        horizon = self._inner.horizon
+        if horizon is not None and fault.onset >= horizon:
+            raise ValueError(f"{fault} starts at or after the horizon of {horizon} steps")
+
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
         self.undo_faults()  # before the reset: a hard one replaces the model, a soft one keeps it
         self._step = 0
         observation, info = self.env.reset(seed=seed, options=options)
@@ -69,13 +83,14 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        for k, fault in enumerate(self.faults):
+        for place, fault in enumerate(self.faults):
             if fault.active(self._step):
-                next(self._running.setdefault(k, fault.inject(self._inner)))
-            elif k in self._running:
-                self._running.pop(k).close()
+                next(self._running.setdefault(place, fault.inject(self._inner)))
+            elif place in self._running:
+                self._running.pop(place).close()
         observation, reward, terminated, truncated, info = stepped(self.env, action)
-        info["fault"] = (*info.get("fault", ()), *(self.faults[k].name for k in self._running))
+        active = [self.faults[place].name for place in self._running]
+        info["fault"] = (*info.get("fault", ()), *active)
         self._step += 1
         return observation, reward, terminated, truncated, info
 
@@ -86,6 +101,7 @@ class FaultInjection(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def undo_faults(self) -> None:
         """End and undo every active fault, as ``reset`` and ``close`` do."""
         while self._running:
-            self._running.popitem()[1].close()
+            _, injection = self._running.popitem()
+            injection.close()
         if self.env.has_wrapper_attr("undo_faults"):
             self.env.get_wrapper_attr("undo_faults")()

@@ -1,4 +1,7 @@
-"""Record any environment's sensorimotor stream."""
+"""Record any environment's sensorimotor stream.
+
+T control steps ► Episode: stream (k T, D), actions (T, A), observations (T + 1, O), rewards (T,)
+"""
 
 from __future__ import annotations
 
@@ -19,8 +22,9 @@ from asm_gym.validation import as_float32
 class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Keep every finished episode in ``episodes``.
 
-    Without ``info["stream"]``, observation and action form the stream. A stream that is faster than control has several
-    rows for each action. Without ``info["success"]`` and ``info["is_success"]`` an episode counts as a success.
+    Without ``info["stream"]``, observation and action form the stream. A stream that is faster than
+    control has several rows for each action. Without ``info["success"]`` and ``info["is_success"]``
+    an episode counts as a success.
 
     Args:
         env: an environment with a stream, or with spaces that can be read as numbers.
@@ -42,44 +46,58 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._source = StreamSource(env)
         self.episodes: list[Episode] = []
         """What was recorded; an episode that was cut short by ``reset`` is kept too."""
-        self._clear(None)
+        self._begin(None, [])
 
     @property
     def stream_spec(self) -> StreamSpec:
         return self._source.spec
 
-    def _clear(self, seed: int | None, *first: Any) -> None:
-        """Begin an episode of ``seed`` with its ``first`` observation, if there is one."""
-        self._seed, self._observations = seed, list(first)
-        self._steps: list[tuple[NDArray[np.float32], float, NDArray[np.float32], list[bool]]] = []
-        self._success: bool | None = None  # nothing was reported yet
-        self._terminated = False
+    def _begin(self, seed: int | None, observations: list[Any]) -> None:
+        """Begin an episode with the observation of ``reset``, if there is one."""
+        self._seed = seed
+        self._observations = observations
+        self._actions: list[NDArray[np.float32]] = []  # (A,) each
+        self._rewards: list[float] = []
+        self._rows: list[NDArray[np.float32]] = []  # (k, D) each
+        self._faults: list[bool] = []  # a fault was active, of each row
+        self._success: bool | None = None  # None: nothing was reported yet
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self,
+        *,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
         self._finish()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._clear(seed, deepcopy(observation))
+        self._begin(seed, [deepcopy(observation)])
         return observation, {**info, "stream": self._source.first(observation, info)}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = stepped(self.env, action)
         info = {**info, "stream": self._source.row(observation, action, info)}
+
         # Copies: an environment, a driver or a policy may use its arrays again.
         rows = np.array(self._source.rows(observation, action, info))
-        faults = [bool(info.get("fault"))] * len(rows)
+        self._rows.append(rows)
+        self._faults += [bool(info.get("fault"))] * len(rows)
         self._observations.append(deepcopy(observation))
-        space = self.env.action_space
-        numbers = flat(space, action) if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else action
-        self._steps.append((np.array(np.atleast_1d(as_float32(numbers))), float(reward), rows, faults))
+        self._actions.append(self._numbers(action))
+        self._rewards.append(float(reward))
+
         success = info.get("success", info.get("is_success"))
-        self._success = self._success if success is None else bool(self._success or success)
-        self._terminated = bool(terminated)
+        if success is not None:
+            self._success = bool(self._success or success)
         if terminated or truncated:
-            self._finish()
+            self._finish(bool(terminated))
         return observation, reward, terminated, truncated, info
 
     def finish(self) -> Episode:
-        """End the running episode; remove the last episode and return it. Raises ValueError if there is none."""
+        """End the running episode; remove the last episode and return it.
+
+        Raises:
+            ValueError: there is none.
+        """
         self._finish()
         if not self.episodes:
             raise ValueError("no step was recorded yet")
@@ -89,22 +107,32 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._finish()
         super().close()
 
-    def _finish(self) -> None:
-        if not self._steps:
+    def _numbers(self, action: Any) -> NDArray[np.float32]:
+        """Return a copy (A,) of an action."""
+        space = self.env.action_space
+        if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+            action = flat(space, action)
+        return np.array(as_float32(action), ndmin=1)
+
+    def _finish(self, terminated: bool = False) -> None:
+        """Keep the running episode, if it has a step."""
+        if not self._rows:
             return
-        space, own = self.env.observation_space, self._source.own
-        kept = [] if own and isinstance(space, gym.spaces.Dict) else [flat(space, o) for o in self._observations]
-        actions, rewards, rows, faults = zip(*self._steps, strict=True)
+        space = self.env.observation_space
+        observations = np.zeros((0, 0), np.float32)
+        if not (self._source.own and isinstance(space, gym.spaces.Dict)):
+            observations = np.stack([flat(space, each) for each in self._observations])
+        controller = getattr(self.env.unwrapped, CONTROLLER, "")
         episode = Episode(
-            stream=np.concatenate(rows),
+            stream=np.concatenate(self._rows),
             spec=self.stream_spec,
             success=self._success is not False,
             seed=self._seed,
-            actions=np.stack(actions),
-            observations=np.stack(kept) if kept else np.zeros((0, 0), np.float32),
-            rewards=np.asarray(rewards, np.float32),
-            faults=np.concatenate(faults),
-            info={"terminated": self._terminated, CONTROLLER: getattr(self.env.unwrapped, CONTROLLER, "")},
+            actions=np.stack(self._actions),
+            observations=observations,
+            rewards=np.asarray(self._rewards, np.float32),
+            faults=np.array(self._faults),
+            info={"terminated": terminated, CONTROLLER: controller},
         )
         self.episodes.append(episode)
-        self._clear(None)
+        self._begin(None, [])

@@ -1,0 +1,68 @@
+"""Say alarms, notes and a summary of a live watch: as text, as JSON, or to the user's command."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from threading import Thread
+
+# Kinds of events.
+ALARM = "alarm"
+NOTE = "note"
+SUMMARY = "summary"
+
+# Reasons of alarms, beside those of ``asm_gym.data.timing``.
+DIED = "source died"
+UNREADABLE = "unreadable"
+CLOCK = "clock"
+RATE = "rate"
+WATCHDOG = "watchdog"
+
+
+@dataclass(frozen=True, slots=True)
+class LiveEvent:
+    """An alarm, a note or the summary of a watch; as text it is a line for the user."""
+
+    kind: str  # ``ALARM``, ``NOTE`` or ``SUMMARY``
+    time: float  # of the rows up to now [s]
+    text: str  # what happened
+    reason: str = ""  # of an alarm
+    channel: str = ""  # that an alarm points to
+    thresholds: float | None = None  # surprise over its threshold; infinite for missing numbers
+    latency_ms: float | None = None  # from the arrival of the row to the alarm [ms]
+
+    def __str__(self) -> str:
+        if self.kind == SUMMARY:
+            return self.text
+        return f"{self.time:.3f} s  {self.text}"
+
+    def to_json(self) -> str:
+        """Return one line of JSON; a number that is not finite is text: ``"inf"``, ``"nan"``."""
+        fields = asdict(self)
+        for name, value in fields.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                fields[name] = str(value)
+        return json.dumps(fields)
+
+
+def run_hook(command: str, event: LiveEvent) -> None:
+    """Run a shell command with an event as JSON on its standard input; do not wait for it."""
+    process = subprocess.Popen(
+        command,
+        shell=True,
+        stdin=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdin is not None
+    with suppress(BrokenPipeError), process.stdin as file:  # the command need not read
+        file.write(event.to_json() + "\n")
+    Thread(target=process.wait, daemon=True).start()
+
+
+def hold_by_hook(command: str, why: str) -> None:
+    """Run a shell command as ``run_hook`` does, for a watchdog that reports ``why``."""
+    run_hook(command, LiveEvent(ALARM, 0.0, f"{why}: an alarm", WATCHDOG))

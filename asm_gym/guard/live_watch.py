@@ -1,0 +1,335 @@
+"""Watch rows as they come, in constant memory, whatever their source does.
+
+    line ► problem? ► lost rows ► judge ► latency ► watchdog ► alarm or note
+
+Nothing that a line holds ends a watch: a line that cannot be read is an alarm. Rows may be lost or
+come at another rate, and a source may die and come back.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.rows import Row, RowReader, SourceDied
+from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
+from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
+from asm_gym.guard.adapter import Adapter, SensedRows
+from asm_gym.guard.engine import Engine
+from asm_gym.guard.live_events import (
+    ALARM,
+    CLOCK,
+    DIED,
+    NOTE,
+    RATE,
+    SUMMARY,
+    UNREADABLE,
+    WATCHDOG,
+    LiveEvent,
+)
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.report import RowReport
+from asm_gym.guard.robots import Robots
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import as_float32
+
+MOST_LOST = 1000  # lost rows that a bridge is asked about one by one
+LATENCIES = 10_000  # newest rows whose latency is kept
+RETRY_S = 0.2  # time between two attempts to open a source again [s]
+LONGEST_PROBLEM = 200  # characters of an unreadable line's problem in its alarm
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchSettings:
+    """How a live source is watched.
+
+    ``reopen(first_s)`` opens the source anew; its first line may take ``first_s`` [s].
+    """
+
+    bridge_s: float = 0.0  # longest time for which numbers may be missing without an alarm [s]
+    reopen: Callable[[float], Iterator[str]] | None = None  # opens the source anew
+    wait_s: float = 0.0  # for how long a watch tries to open the source anew [s]
+    until_alarm: bool = False  # the first alarm ends the watch
+    beat: Callable[[], bool] | None = None  # tells a watchdog of a row; whether the watchdog lives
+    clock: str = ""  # column of times; by default the first that has a clock's name
+    silence_s: float = 2.0  # after which the numbers of one of several publishers are missing [s]
+
+
+USUAL = WatchSettings()
+
+
+def follow(
+    lines: Iterable[str],
+    monitor: Any,
+    say: Callable[[LiveEvent], None],
+    settings: WatchSettings = USUAL,
+) -> int:
+    """Watch a live source until it ends; say each alarm at once, those of one cause as one.
+
+    Args:
+        lines: rows as text, as ``asm_gym.data.live.lines_from`` yields them.
+        monitor: a calibrated monitor.
+        say: called with every event.
+        settings: how the source is watched.
+
+    Returns:
+        The number of alarms.
+
+    Raises:
+        ValueError: no row came, or the first line of a source that cannot be opened anew is no row.
+    """
+    watch = LiveWatch(monitor, say, settings)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*rows under this policy alarm")  # each alarm is said
+        try:
+            for row, arrival in watch.rows_of(lines):
+                watch.follow_row(row, arrival)
+                if watch.alarms and settings.until_alarm:
+                    break
+        except KeyboardInterrupt:
+            if watch.rows:
+                watch.summarise()
+            raise
+    watch.summarise()
+    return watch.alarms
+
+
+class LiveWatch(Adapter):
+    """Judge the rows of a live source, and say what is wrong with them.
+
+    Args:
+        monitor: a calibrated monitor.
+        say: called with every event.
+        settings: how the source is watched.
+
+    Attributes:
+        rows: how many rows came or were lost.
+        alarms: how many alarms there were.
+    """
+
+    def __init__(
+        self,
+        monitor: Any,
+        say: Callable[[LiveEvent], None],
+        settings: WatchSettings,
+    ) -> None:
+        spec: StreamSpec = monitor.spec
+        self.rows = 0
+        self.alarms = 0
+        self._say = say
+        self._settings = settings
+        self._spec = spec
+        self._reader = RowReader(spec, settings.clock, settings.silence_s)
+        options = GuardOptions("monitor", contact_limits=None)
+        self._engine = Engine(Robots.unknown(spec), monitor, options)
+        self._no_action = np.zeros((1, spec.motor.size), np.float32)
+        self._beat = settings.beat
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
+        self._unreadable_lines = 0
+        self._unreadable_at = -math.inf  # arrival of the newest unreadable line [s]
+        self._judge(np.zeros(spec.size), is_bridged=False)  # compiles
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget the rows before: they are not the past of those that follow."""
+        self._engine.begin()
+        self._bridge = Bridge(self._settings.bridge_s, self._spec.dt, self._spec.size)
+        self._lost_before = 0  # rows lost before the newest one
+        self._cause = ""  # why surprise is over its threshold; empty where it is not
+        self._event = NO_EVENT  # of the newest row
+        self._newest = dict[str, int]()  # the last row over the threshold, by cause
+
+    def rows_of(self, lines: Iterable[str] | None) -> Iterator[tuple[Row, float]]:
+        """Yield each row and its arrival [s], of a source and of the same opened anew."""
+        while lines is not None:
+            try:
+                yield from self._reader.rows(lines)
+                return
+            except SourceDied as error:
+                self._alarm(f"the source has died, {error}: an alarm", DIED)
+            lines = self._reopened()
+
+    def _reopened(self) -> Iterable[str] | None:
+        """Return the lines of the source once it is there again; None where it is not."""
+        settings = self._settings
+        if settings.reopen is None or settings.until_alarm or not self.rows:
+            return None
+
+        start = time.monotonic()
+        while (left_s := start + settings.wait_s - time.monotonic()) > 0:
+            lines = _opened(settings.reopen, left_s)
+            if lines is not None:
+                self._reader.begin()
+                self._begin()
+                self._note(f"the source is back after {time.monotonic() - start:.1f} s")
+                return lines
+            time.sleep(min(RETRY_S, left_s))
+        self._note(f"the source did not come back within {settings.wait_s:g} s")
+        return None
+
+    def follow_row(self, row: Row, arrival: float) -> None:
+        """Judge a row that can be read, and say what is wrong with it.
+
+        Args:
+            row: as it came.
+            arrival: when its line came, by ``time.perf_counter`` [s].
+
+        Raises:
+            ValueError: the first line of a source that cannot be opened anew is no row.
+        """
+        self._check_reading(row, arrival)
+        if not row.read:
+            return
+
+        self.rows += 1
+        if row.lost:
+            self._pass_lost_rows(row.lost)
+        self._lost_before = row.lost
+
+        report = self._judge(row.numbers, self._bridge.over(np.isnan(row.numbers)))
+        self._latencies.append(1e3 * (time.perf_counter() - arrival))
+        self._check_watchdog()
+        self.report_step([report], row)
+
+    def _check_reading(self, row: Row, arrival: float) -> None:
+        """Say what is wrong with the line, the clock or the rate."""
+        if row.problem and not self.rows and self._settings.reopen is None:
+            raise ValueError(row.problem)
+        if row.problem and not row.read:
+            self._count_unreadable(row.problem, arrival)
+        elif row.problem:
+            self._alarm(f"{row.problem}: an alarm, and a new beginning", CLOCK)
+            self._begin()
+        elif row.change and row.read:
+            self._note(row.change)
+        elif row.change:
+            self._alarm(f"{row.change}: they are not judged, an alarm", RATE)
+            self._begin()
+
+    def _count_unreadable(self, problem: str, arrival: float) -> None:
+        """Count a line that cannot be read; lines close together are one alarm."""
+        self._unreadable_lines += 1
+        if arrival - self._unreadable_at > TOGETHER_S:
+            self._alarm(f"{problem[:LONGEST_PROBLEM]}: an alarm", UNREADABLE)
+        self._unreadable_at = arrival
+
+    def _pass_lost_rows(self, lost: int) -> None:
+        """Go on over rows that did not come, as many as the bridge allows."""
+        missing = np.full(self._spec.size, np.nan)
+        bridged = [self._bridge.over(np.isnan(missing)) for _ in range(min(lost, MOST_LOST))]
+        is_alarm = not all(bridged)
+        if is_alarm:
+            del bridged[1:]
+        for _ in bridged:
+            self._judge(missing, is_bridged=True)
+
+        # A source that loses rows again and again is one alarm.
+        if is_alarm and not self._lost_before:
+            self._alarm(f"{_counted(lost, 'row')} lost: an alarm ({LATE})", LATE)
+        self.rows += lost
+
+    def _judge(self, numbers: NDArray[np.float64], is_bridged: bool) -> RowReport:
+        """Return the report of a row (D,); a bridged row raises no alarm."""
+        sensed = self.sense_rows(numbers)
+        is_active = np.array([not is_bridged])
+        return self._engine.judge(sensed.rows, self._no_action, active=is_active)
+
+    def _check_watchdog(self) -> None:
+        """Tell the watchdog that a row was judged; its death is one alarm."""
+        if self._beat is not None and not self._beat():
+            self._beat = None
+            self._alarm("the watchdog has died: an alarm", WATCHDOG)
+
+    def sense_rows(self, given: NDArray[np.float64]) -> SensedRows:
+        """Return the numbers (D,) of a line as the row of one robot."""
+        return SensedRows(as_float32(given)[None])
+
+    def send_command(self, command: Any) -> None:
+        """Send nothing: a watch commands no robot."""
+
+    def report_step(self, reports: Sequence[RowReport], target: Row) -> None:
+        """Say alarms and events of the row that the reports are of."""
+        for report in reports:
+            self._report_surprise(report, target.numbers)
+            self._report_event(EVENTS[report.event[0]])
+
+    def _report_surprise(self, report: RowReport, numbers: NDArray[np.float64]) -> None:
+        """Raise an alarm where surprise is over its threshold for a cause that is new."""
+        excess = float(report.surprise.value[0] / report.threshold[0])
+        if not excess > 1.0:
+            self._cause = ""
+            return
+
+        cause = self._cause or reason(numbers)
+        if (self.rows - self._newest.get(cause, -math.inf)) * self._spec.dt > TOGETHER_S:
+            self._alarm_surprise(cause, excess, blamed(numbers, report.surprise.attribution[0]))
+        self._cause = cause
+        self._newest[cause] = self.rows
+
+    def _alarm_surprise(self, cause: str, excess: float, column: int | None) -> None:
+        """Raise the alarm of a surprise of ``excess`` thresholds in a column of the row."""
+        latency_ms = self._latencies[-1]
+        text = f"{excess:.2f} thresholds  {latency_ms:.2f} ms after the row came"
+        if cause != SURPRISING:
+            text += f"  ({cause})"
+        channel = ""
+        if column is not None:
+            channel = self._spec.labels[column]
+            text = f"{channel}  {text}"
+        self._alarm(text, cause, channel=channel, thresholds=excess, latency_ms=latency_ms)
+
+    def _report_event(self, event: str) -> None:
+        """Note a knock or a stop when it begins."""
+        if event in (KNOCK, STOP) and event != self._event:
+            self._note(f"{event}: no alarm")
+        self._event = event
+
+    def _alarm(self, text: str, reason: str, **details: Any) -> None:
+        """Count and say an alarm."""
+        self.alarms += 1
+        self._note(text, kind=ALARM, reason=reason, **details)
+
+    def _note(self, text: str, kind: str = NOTE, **details: Any) -> None:
+        """Say an event of the newest row."""
+        self._say(LiveEvent(kind, self.rows * self._spec.dt, text, **details))
+
+    def summarise(self) -> None:
+        """Say how many rows and alarms there were, and how long a row took.
+
+        Raises:
+            ValueError: no row came.
+        """
+        if not (self.rows or self._unreadable_lines):
+            raise ValueError("no row came")
+        text = f"{self.rows} rows, {_counted(self.alarms, 'alarm')}"
+        if self._unreadable_lines:
+            text += f", {_counted(self._unreadable_lines, 'line')} that could not be read"
+        if self._latencies:
+            median, slow = np.percentile(self._latencies, [50, 99])
+            text += f"; a row took {median:.2f} ms, 99 % of the newest under {slow:.2f} ms"
+        self._note(text, SUMMARY)
+
+
+def _opened(reopen: Callable[[float], Iterator[str]], first_s: float) -> Iterable[str] | None:
+    """Return the lines of a source; None where it is not there, or sends none in ``first_s``."""
+    try:
+        lines = reopen(first_s)
+        return chain([next(lines)], lines)
+    except (OSError, SourceDied, StopIteration):
+        return None
+
+
+def _counted(count: int, noun: str) -> str:
+    """Return a number of things: ``1 row``, ``2 rows``."""
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count} {noun}s"
