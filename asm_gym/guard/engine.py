@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.events import EVENTS, FAULT, KNOCK
+from asm_gym.detection.alarm_rule import EVENTS, FAULT, KNOCK
 from asm_gym.guard.arbiter import POLICY, REFLEX, Arbiter, Judged
 from asm_gym.guard.diagnosis import Alarm, Diagnostician
 from asm_gym.guard.limits import EpisodeLimits, limits_of

@@ -21,7 +21,7 @@ import numpy as np
 
 from asm_gym.data.rows import Row, RowReader, SourceDied
 from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
-from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.engine import Engine
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.report import RowReport

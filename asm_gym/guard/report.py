@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.events import EVENTS
+from asm_gym.detection.alarm_rule import EVENTS
 from asm_gym.guard.arbiter import ENDED, STATES, Decision
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response

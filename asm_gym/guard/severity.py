@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.detection.events import EVENTS, KNOCK
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK
 from asm_gym.guard.arbiter import CALM, FREE, MOSTLY_AFTER, POLICY, ROWS, SINCE, STRIKES, Arbiter
 from asm_gym.guard.robots import named
 from asm_gym.monitors import Surprise

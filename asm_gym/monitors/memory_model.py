@@ -132,11 +132,9 @@ class MemoryModel(ScaledModel):
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
         assert self.compiled_ is not None
-        new = uninitialised(state)
-        states = [part for s in (state, new) for part in (s.traces, s.expected, *s.history, s.skill)]
-        arguments: list[Any] = [np.ascontiguousarray(rows, np.float64), *states, *self.compiled_, True]
-        error, _ = expect_rows(*arguments)
-        return new, ModelOutput(error, new.expected)
+        new: MemoryState = uninitialised(state)
+        errors, _ = expect_rows(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64), True)
+        return new, ModelOutput(errors, new.expected)
 
     def expected_action(self, state: MemoryState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), by the motor association or else by the temporal network."""
