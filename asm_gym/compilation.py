@@ -138,11 +138,5 @@ structref.define_proxy(Bound, _BoundType, ["parts"])  # type: ignore[no-untyped-
 
 @compiled
 def bind(*parts: Any) -> Bound:
-    """Return arrays, numbers and named tuples of them as one object; takes 0.3 ms."""
+    """Return arrays, numbers and named tuples of them as one object."""
     return Bound(parts)  # type: ignore[no-untyped-call]
-
-
-@compiled
-def rebind(bound: Bound, *parts: Any) -> None:
-    """Put other parts of the same types into an object that ``bind`` returned; takes 5 µs."""
-    bound.parts = parts

@@ -147,10 +147,20 @@ class Detector(NamedTuple):
         return strength(episode, self.gains), running
 
 
+NO_DETECTOR = Detector(
+    whitening=np.zeros((0, 0)),
+    ceiling=np.zeros((0, 0)),
+    tail=np.zeros((0, 0)),
+    context_quantile=np.zeros(1),
+    context_range=np.zeros(2),
+    gains=np.zeros(0),
+    bound=BOUND,
+)
+"""A detector of no errors."""
+
+
 @compiled
-def step_evidence(
-    detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any
-) -> None:
+def step_evidence(detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any) -> None:
     """Write the new evidence, and each error's share (B, X) of the value."""
     whitened = whiten(detector, output.errors)
     ratios = np.empty(detector.ceiling.shape)

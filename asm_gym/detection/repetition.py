@@ -47,6 +47,15 @@ class RepetitionWeights(NamedTuple):
     offset: Floats  # (X,) n_0
 
 
+NO_REPETITION = RepetitionWeights(
+    columns=np.zeros(0, np.intp),
+    steps=np.zeros((2, 2, 0)),
+    most=np.zeros(0),
+    offset=np.zeros(0),
+)
+"""What is known of no senses."""
+
+
 class Repetition(NamedTuple):
     """State of B streams; never changed in place."""
 

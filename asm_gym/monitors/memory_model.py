@@ -23,7 +23,7 @@ from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.layout import Layout
-from asm_gym.monitors.row_kernel import expect_rows, layout_of, uninitialised
+from asm_gym.monitors.row_kernel import expected_errors, layout_of, uninitialised
 from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
@@ -133,7 +133,7 @@ class MemoryModel(ScaledModel):
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
         assert self.compiled_ is not None
         new: MemoryState = uninitialised(state)
-        errors, _ = expect_rows(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64), True)
+        errors = expected_errors(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64))
         return new, ModelOutput(errors, new.expected)
 
     def expected_action(self, state: MemoryState) -> NDArray[np.float32]:

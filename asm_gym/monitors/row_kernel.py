@@ -1,15 +1,14 @@
 """One row of each stream in one compiled call: the errors of a memory, their evidence, and what excuses it.
 
-    read → carry on, associate → errors → whiten, accumulate → repetitions → attribute → excuse
+    read → carry on, associate → errors → whiten, accumulate → repetitions, events → attribute
 
-``expect_rows`` is the first half, up to the errors, which a memory's model uses by itself; ``judge_rows`` is the second.
-Functions that write a state take the state before and the state after, whose arrays they fill.
+Functions that write a state take the state before and the state after, whose arrays they fill. ``expected_errors``
+stops at the errors, for a memory under another detection and for one that learns.
 """
 
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
@@ -19,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.blas import ONE_THREAD
-from asm_gym.compilation import Bound, bind, compiled, inner, must_compile, rebind
+from asm_gym.compilation import Bound, bind, compiled, inner, must_compile
 from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.detection.base import ModelOutput
 from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState, find_events
-from asm_gym.detection.detector import step_evidence
-from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY
+from asm_gym.detection.detector import NO_DETECTOR, step_evidence
+from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, Evidence
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
-from asm_gym.detection.repetition import RepetitionWeights, step_repetition
+from asm_gym.detection.repetition import NO_REPETITION, Repetition, RepetitionWeights, step_repetition
 from asm_gym.memory.association import normalised_errors
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
@@ -37,11 +36,11 @@ from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.layout import Layout, matrix, vector
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 
-__all__ = ["JUDGED", "RowKernel", "expect_rows", "layout_of", "observe_rows", "uninitialised"]
+__all__ = ["JUDGED", "RowKernel", "expected_errors", "layout_of", "observe_rows", "uninitialised"]
 
 
 def layout_of(network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]) -> Layout:
-    """Return what ``expect_rows`` computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
+    """Return what a memory computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
     either = weight_shapes(1, 1, 1) | settling_shapes(1, 1, 1)
     singles = {name: np.zeros(shape) for name, shape in either.items()}  # what the other kind of network has
     singles |= network.weights._asdict()
@@ -74,11 +73,6 @@ class RowState(NamedTuple):
     detection: EvidenceState
     events: EventState
 
-    @classmethod
-    def of(cls, state: MonitorState) -> RowState:
-        """Return the part of a monitor's state; the arrays are not copied."""
-        return cls(memory=state.model, detection=state.detection, events=state.excuses)
-
 
 class RowKernel:
     """``observe`` of a memory under the detection of evidence, for the weights as they are.
@@ -90,18 +84,14 @@ class RowKernel:
     """
 
     def __init__(self, memory: Layout, detection: EvidenceDetection, events: BenignEvents | None) -> None:
-        self._arguments = (memory, detection, events)
-        detector = detection.fitted_detector
         if must_compile(observe_rows):
             print("asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr)
+        self._arguments = (memory, detection, events)
         self._excuses = events is not None
-        senses = NO_SENSES
-        if events is not None:
-            senses = events.senses
+        senses = NO_SENSES if events is None else events.senses
+        detector = detection.fitted_detector
         wants_context = bool(detector.context_quantile[:-1].any())
         self._learned = bind(memory, wants_context, detector, detection.fitted_repetition, senses)
-        self._bound: Bound | None = None
-        self._lock = threading.Lock()  # of what is bound at present
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle by the arguments: what is bound lies in memory that is not Python's."""
@@ -114,7 +104,7 @@ class RowKernel:
             state: before the rows.
             new: to be written, a state of as many streams, whose arrays are other ones.
         """
-        return bind(self._learned, RowState.of(state), RowState.of(new))
+        return bind_states(self._learned, *arrays_of(state), *arrays_of(new))
 
     def __call__(
         self, state: MonitorState, rows: NDArray[np.float64], out: MonitorState | None = None
@@ -127,22 +117,62 @@ class RowKernel:
             out = uninitialised(state._replace(values=()))
         judged = np.empty(len(rows), JUDGED)
         attribution = np.empty(rows.shape)
-        threads = ONE_THREAD if len(rows) > 1 else nullcontext()  # one row calls no BLAS
-        with threads, self._lock:
-            observe_rows(self._rebound(state, out), rows, judged, attribution)
+        with ONE_THREAD if len(rows) > 1 else nullcontext():  # one row calls no BLAS
+            observe_rows(self.bound(state, out), rows, judged, attribution)
 
+        divisor = judged["divisor"].copy()
         surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
         if self._excuses:
             surprise = surprise._replace(raw=judged["raw_surprise"].copy(), excuse=judged["excuse"].copy())
-        return out, surprise, judged["divisor"].copy()
+        return out, surprise, divisor
 
-    def _rebound(self, state: MonitorState, new: MonitorState) -> Bound:
-        """Return as ``bound`` does, in an object that the next call uses again."""
-        if self._bound is None:
-            self._bound = self.bound(state, new)
-        else:
-            rebind(self._bound, self._learned, RowState.of(state), RowState.of(new))
-        return self._bound
+
+def expected_errors(memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]) -> Any:
+    """Return the errors (B, X) of rows (B, D), and write the memory's state: the first half of a row by itself."""
+    learned = bind(memory, True, NO_DETECTOR, NO_REPETITION, NO_SENSES)
+    detection = EvidenceState(evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0))
+    events = EventState.start(len(rows), 0)
+    states = [MonitorState(memory, detection, events) for memory in (before, after)]
+    bound = bind_states(learned, *arrays_of(states[0]), *arrays_of(states[1]))
+    return observe_rows(bound, rows, np.empty(len(rows), JUDGED), np.empty(rows.shape))
+
+
+def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
+    """Return the arrays of a state in the order in which ``state_of`` takes them."""
+    memory = state.model
+    detection = state.detection
+    return [
+        memory.traces,
+        memory.expected,
+        memory.skill,
+        *memory.history,
+        *detection.evidence,
+        *detection.repetition,
+        *state.excuses,
+    ]
+
+
+@inner
+def state_of(arrays: Any) -> RowState:
+    """Return the state of so many arrays, see ``arrays_of``."""
+    traces, expected, skill = arrays[:3]
+    history = RowHistory(arrays[3], arrays[4], arrays[5])
+    evidence = Evidence(arrays[6], arrays[7], arrays[8])
+    repetition = Repetition(arrays[9], arrays[10], arrays[11])
+    return RowState(
+        memory=MemoryState(traces, expected, history, skill),
+        detection=EvidenceState(evidence, repetition),
+        events=EventState(arrays[12], arrays[13]),
+    )
+
+
+@partial(compiled, calls=("memory", "detection", "."))
+def bind_states(learned: Bound, *arrays: Any) -> Bound:
+    """Return what was learned, a state, and a state that is to be written; ``arrays`` are those of both.
+
+    Numba takes longer to look through nested named tuples that Python hands over than through arrays.
+    """
+    return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
 
 
 def uninitialised(state: Any) -> Any:
@@ -155,8 +185,10 @@ def uninitialised(state: Any) -> Any:
 
 
 @partial(compiled, calls=("memory", "detection", "."))
-def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> None:
-    """Observe the next rows, and write the new state.
+def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any:
+    """Observe the next rows, write the new state, and return the memory's errors (B, X).
+
+    A detector of no errors judges nothing: then ``judged`` and ``attribution`` stay as they are.
 
     Args:
         memory: see ``RowKernel.bound``.
@@ -166,49 +198,45 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Non
     """
     learned, before, after = memory.parts
     layout, wants_context, detector, repetition, senses = learned.parts
-    errors, finite = expect_rows(layout, before.memory, after.memory, rows, wants_context)
-
-    shares = np.empty(errors.shape)
-    output = ModelOutput(errors, after.memory.expected)
-    step_evidence(detector, before.detection.evidence, after.detection.evidence, output, shares)
-    step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
-    find_events(senses, before.events, after.events, rows, judged)
-    judge_rows(repetition, after.detection.repetition.unlikely, shares, finite, judged, attribution)
-
-
-@partial(compiled, calls=("memory", "."))
-def expect_rows(layout: Layout, before: MemoryState, after: MemoryState, rows: Any, wants_context: bool) -> Any:
-    """Write the new state; return the errors (B, X) of rows (B, D), and which of their numbers are finite (B, D).
-
-    Args:
-        layout: what was learned, see ``layout_of``.
-        before: the state.
-        after: the state that is written.
-        rows: (B, D).
-        wants_context: whether f(μ) is needed.
-    """
-    reading = read(layout, before.history, after.history, rows)
-    carry_on(layout, before, after, reading, wants_context)
+    reading = read(layout, before.memory.history, after.memory.history, rows)
+    carry_on(layout, before.memory, after.memory, reading, wants_context)
     errors, units = associate(layout, reading)
+    doubt_first_rows(before.memory.history, errors)
+    name_skills(layout, before.memory, after.memory, units)
 
-    steps = before.history.steps
-    lag = before.history.before.shape[1]
-    for n in range(len(rows)):
-        if steps[n] < 2 * lag:  # nothing came before the first rows, so that no change is known
-            sure = np.float32(0.0) if steps[n] < lag else UNSURE
-            for i in range(errors.shape[1]):
-                errors[n, i] *= sure
+    if detector.whitening.size:
+        shares = np.empty(errors.shape)
+        output = ModelOutput(errors, after.memory.expected)
+        step_evidence(detector, before.detection.evidence, after.detection.evidence, output, shares)
+        step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
+        find_events(senses, before.events, after.events, rows, judged)
+        unlikely = after.detection.repetition.unlikely
+        judge_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
+    return errors
+
+
+@inner
+def doubt_first_rows(history: RowHistory, errors: Any) -> None:
+    """Weigh the errors (B, X) of the first rows less: nothing came before them, so that no change is known."""
+    lag = history.before.shape[1]
+    for n in range(len(errors)):
+        weight = np.float32(0.0)
+        if history.steps[n] >= lag:
+            weight = UNSURE
+        for i in range(errors.shape[1]):
+            if history.steps[n] < 2 * lag:
+                errors[n, i] *= weight
+
+
+@partial(inner, inlined=True)
+def name_skills(layout: Layout, before: MemoryState, after: MemoryState, units: Any) -> None:
+    """Write the evidence for each skill, by the units (B, M) and the state."""
     if before.skill.shape[1]:
-        named = add_up(
-            before.skill,
-            units,
-            after.expected,
-            matrix(layout.singles, layout.at[0].W_K),
-            vector(layout.singles, layout.at[0].b_K),
-        )
-        for n in range(len(rows)):
-            copy_row(named, after.skill, n)
-    return errors, reading.finite
+        W_K = matrix(layout.singles, layout.at[0].W_K)
+        b_K = vector(layout.singles, layout.at[0].b_K)
+        skill = add_up(before.skill, units, after.expected, W_K, b_K)
+        for n in range(len(skill)):
+            copy_row(skill, after.skill, n)
 
 
 @inner
@@ -218,7 +246,7 @@ def copy_row(rows: Any, to: Any, n: int) -> None:
         to[n, i] = rows[n, i]
 
 
-@inner
+@partial(inner, inlined=True)
 def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
     """Write the new history; return the rows (B, D) beside those that they are compared with."""
     lag = before.before.shape[1]
@@ -250,7 +278,7 @@ def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> Sc
     )
 
 
-@inner
+@partial(inner, inlined=True)
 def carry_on(
     layout: Layout, before: MemoryState, after: MemoryState, reading: ScaledRows, wants_context: bool
 ) -> None:
@@ -262,16 +290,15 @@ def carry_on(
         due = due or steps[n] % lag == 0
         copy_row(before.traces, after.traces, n)
         copy_row(before.expected, after.expected, n)
-    if not due:
-        return
-    expected, carried = follow(layout, before.traces, reading, wants_context)  # of all streams
-    for n in range(len(steps)):
-        if steps[n] % lag == 0:
-            copy_row(carried, after.traces, n)
-            copy_row(expected, after.expected, n)
+    if due:
+        expected, carried = follow(layout, before.traces, reading, wants_context)  # of all streams
+        for n in range(len(steps)):
+            if steps[n] % lag == 0:
+                copy_row(carried, after.traces, n)
+                copy_row(expected, after.expected, n)
 
 
-@inner
+@partial(inner, inlined=True)
 def follow(layout: Layout, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
     """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
     at = layout.at[0]
@@ -308,7 +335,7 @@ def follow(layout: Layout, traces: Any, reading: ScaledRows, wants_context: bool
     )
 
 
-@inner
+@partial(inner, inlined=True)
 def associate(layout: Layout, reading: ScaledRows) -> Any:
     """Return the errors (B, X) of what other senses predict, and the units (B, M)."""
     at = layout.at[0]
