@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba import types
 from numba.core.config import reload_config
 from numba.core.registry import cpu_target
+from numba.experimental import structref
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -115,3 +117,26 @@ def _digest(folder: Path) -> str:
     for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+@structref.register
+class _BoundType(types.StructRef):
+    """The compiler's type of ``Bound``."""
+
+
+class Bound(structref.StructRefProxy):
+    """A tuple of arrays and records, ``parts``, that compiled functions take as one argument.
+
+    A compiled function that Python calls looks through all arrays of its arguments; of a ``Bound`` it takes a pointer.
+    """
+
+    parts: tuple[Any, ...]
+
+
+structref.define_proxy(Bound, _BoundType, ["parts"])  # type: ignore[no-untyped-call]
+
+
+@compiled
+def bind(*parts: Any) -> Bound:
+    """Return arrays, numbers and named tuples of them as one object."""
+    return Bound(parts)  # type: ignore[no-untyped-call]

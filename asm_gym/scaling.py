@@ -118,7 +118,7 @@ class StreamScaler:
         """Read rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
         x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
         sensory, motor = self.spec.sensory, self.spec.motor
-        return ScaledRows(*_read(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow))
+        return read_rows(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow)
 
 
 @inner
@@ -134,7 +134,7 @@ def _believed(number: float) -> float:
 
 
 @compiled
-def _read(
+def read_rows(
     rows: Floats,
     before: Floats,
     earlier: Floats,
@@ -144,8 +144,8 @@ def _read(
     sensory: Ints,
     motor: Ints,
     slow: Ints,
-) -> tuple[Any, ...]:
-    """Return the fields of a ``ScaledRows``, in order."""
+) -> ScaledRows:
+    """Read rows (B, D), see ``StreamScaler.read``."""
     B, D = rows.shape
     X, A, L = len(sensory), len(motor), len(slow)
     senses, seen = np.zeros((B, X + L), np.float32), np.zeros((B, X + L), np.float32)
@@ -178,7 +178,7 @@ def _read(
             commands[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]) if finite[n, i] else 0.0
             inputs[n, D + X + L + j] = commands[n, j] if abs(commands[n, j]) < FARTHEST else 0.0
         inputs[n, D + X + L + A] = 1.0
-    return senses, seen, commands, inputs, changes, whole, finite
+    return ScaledRows(senses, seen, commands, inputs, changes, whole, finite)
 
 
 def rows_apart(dt: float) -> int:

@@ -71,10 +71,10 @@ def cache() -> Check:
     """Check whether compiled code is kept for the next process."""
     try:
         from asm_gym.compilation import KEEP_NOWHERE, kept_in
-        from asm_gym.monitors.row_kernel import expect_rows
+        from asm_gym.monitors.row_kernel import observe_rows
     except ImportError as error:  # of what another check names
         return Check("cache", str(error), REINSTALL, needed=True)
-    folder = kept_in(expect_rows)
+    folder = kept_in(observe_rows)
     if folder is None or KEEP_NOWHERE in str(folder):
         return Check(
             "cache", "compiled code is lost with the process: neither the install nor HOME is writable", NAME_CACHE

@@ -17,7 +17,7 @@ from rich.console import Console
 from asm_gym.compilation import kept_in
 from asm_gym.data.episode import Episode
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.row_kernel import expect_rows
+from asm_gym.monitors.row_kernel import observe_rows
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import run
 from asm_gym.spec import Channel, StreamSpec
@@ -38,7 +38,7 @@ def warm_up(args: Args, console: Console) -> None:
             progress(done, 3)
         _step(NeuralASMSafety)
         progress(3, 3)
-    where = kept_in(expect_rows) or "memory only"
+    where = kept_in(observe_rows) or "memory only"
     console.print(f"Compiled after {sum(seconds.values()):.0f} s; kept in {where}", soft_wrap=True, markup=False)
 
 

@@ -26,7 +26,6 @@ from asm_gym.detection.evidence import (
     TAIL_INDEX,
     Evidence,
     accumulated,
-    no_evidence,
     pool,
     whitening,
     worst_case,
@@ -72,7 +71,7 @@ def test_whitened_errors_have_the_identity_as_covariance_by_a_symmetric_matrix()
 def test_the_evidence_of_a_whole_episode_is_that_of_its_rows(steps):
     rng, gains = np.random.default_rng(steps), np.array([0.5, 0.1, 1.0])
     whitened, contexts = rng.normal(size=(steps, 4)), rng.normal(size=(steps, 3))
-    evidence, vectors, running = no_evidence(1, 3, 4, context=3), [], []
+    evidence, vectors, running = Evidence.start(1, 3, 4, context=3), [], []
     for e, c in zip(whitened, contexts, strict=True):
         evidence = accumulate(evidence, e[None], c[None], gains)
         vectors.append(evidence.vector[0])

@@ -6,7 +6,7 @@ import pytest
 
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.detector import GAINS
-from asm_gym.detection.events import EVENTS, EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, Excuses
+from asm_gym.detection.alarm_rule import EVENTS, EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, Excuses
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import NeuralASMSafety

@@ -21,7 +21,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
 from asm_gym.data.rows import SourceDied
 from asm_gym.data.timing import bridge_of
-from asm_gym.detection.events import EVENTS, KNOCK
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.guard.live_events import LiveEvent

@@ -16,13 +16,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.detection.base import Array, Floats, ModelOutput
 from asm_gym.detection.evidence import (
     CONTEXT_GAIN,
@@ -32,7 +31,6 @@ from asm_gym.detection.evidence import (
     Evidence,
     accumulated,
     bounded,
-    no_evidence,
     pool,
     strength,
     whitening,
@@ -42,81 +40,22 @@ from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 100.0
-UNBOUNDED_LOG = np.array([-700.0, 700.0])  # a range of logarithms that bounds nothing
 FAINTEST = 1e-9  # smallest s whose logarithm is taken
 LEAST = math.log(TINY)
 NEGLIGIBLE = -50.0  # logarithm of a share that vanishes beside 1 in double precision
 USUAL = 0.95  # τ
 MOST_ROWS = 60_000  # largest number of rows, evenly spaced, that teach what is usual in a context
-UPDATES, PASSES, FEWEST = 1000, 12, 40  # largest number of batches and of passes, and smallest number of batches
-BATCH, RATE = 512, 1e-2
+UPDATES = 1000  # largest number of batches
+PASSES = 12  # largest number of passes
+FEWEST = 40  # smallest number of batches
+BATCH = 512
+RATE = 1e-2
 STEPS_PER_NUMBER = 8  # with fewer nominal rows for each number of a context, nothing is learned
 EXTREME = 0.005  # share of nominal rows below l, and above h
 
 
-@compiled
-def _step(
-    vector: Any,
-    running: Any,
-    steps: Any,
-    errors: Any,
-    context: Any,
-    whitening: Any,
-    ceiling: Any,
-    tail: Any,
-    context_quantile: Any,
-    context_range: Any,
-    gains: Any,
-    bound: float,
-    new: Any,
-    recent: Any,
-    counted: Any,
-    value: Any,
-    shares: Any,
-) -> None:
-    """Write the fields of the new ``Evidence``, the value (B,) and the shares of the errors (B, X)."""
-    B, X = errors.shape
-    G, C = len(gains), context.shape[1]
-    ratios, limited = np.empty((G, X)), np.empty((B, X))  # logarithms of ratios, and bounded errors
-    for n in range(B):
-        for i in range(X):
-            share = errors[n, i] / bound
-            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
-            shares[n, i] = 0.0
-    whitened = np.empty((B, X))
-    np.dot(limited, whitening, whitened)
-    for n in range(B):
-        counted[n] = steps[n] + 1
-        greatest = LEAST
-        for g in range(G):
-            a = gains[g]
-            variance = a / (2.0 - a) * (1.0 - (1.0 - a) ** (2 * (steps[n] + 1)))
-            for i in range(X):
-                w = vector[n, g, i] + a * (whitened[n, i] - vector[n, g, i])
-                new[n, g, i] = w
-                ratios[g, i] = tail[g, i] * np.log(w * w / (variance * ceiling[g, i]))
-                greatest = max(greatest, ratios[g, i])
-        total = 0.0
-        for g in range(G):
-            for i in range(X):
-                below = POWER * (ratios[g, i] - greatest)
-                if not below < NEGLIGIBLE:  # NaN goes on, and is an alarm
-                    part = np.exp(below)
-                    shares[n, i] += part
-                    total += part
-        drive = context_quantile[2 * C]
-        for c in range(C):
-            recent[n, c] = running[n, c] + CONTEXT_GAIN * (context[n, c] - running[n, c])
-            drive += context[n, c] * context_quantile[c] + recent[n, c] * context_quantile[C + c]
-        usual = min(max(drive, context_range[0]), context_range[1])
-        value[n] = np.exp(greatest) * total ** (1.0 / POWER) / np.exp(usual)
-        for i in range(X):
-            shares[n, i] *= value[n] / max(total, TINY)
-
-
-@dataclass(frozen=True, eq=False)
-class Detector:
-    """Turns errors into one number."""
+class Detector(NamedTuple):
+    """Turns errors into one number; C numbers of context, G gains, X errors."""
 
     whitening: Floats  # (X, X) M
     ceiling: Floats  # (G, X) q
@@ -127,95 +66,199 @@ class Detector:
     bound: float  # ν > 0
 
     @classmethod
-    def fit(
-        cls,
-        learned: Sequence[ModelOutput],
-        held_out: Sequence[ModelOutput],
-        gains: Sequence[float],
-        bound: float,
-        shrinkage: float,
-        rng: np.random.Generator,
-        habituates: bool = True,
-        tail_index: float = TAIL_INDEX,
-    ) -> Self:
-        """Fit nominal episodes that the model has learned, and others that it has not."""
-        matrix = whitening(bounded(np.concatenate([r.errors for r in learned]), bound), shrinkage)
-        a = np.asarray(gains, np.float64)
-        ones = np.ones((len(a), len(matrix)))
-        plain = cls(matrix, ones, ones, np.zeros(1), UNBOUNDED_LOG, a, bound)
-        everything = [*learned, *held_out]
-        ceiling, tail = worst_case(np.array([plain.strengths(r)[0].max(axis=0) for r in everything]), tail_index)
-        steps, numbers = sum(len(r.errors) for r in everything), 2 * everything[0].contexts.shape[1]
-        if not habituates or steps < STEPS_PER_NUMBER * numbers:
-            return cls(matrix, ceiling, tail, np.zeros(numbers + 1), np.zeros(2), a, bound)
-        stride = -(-steps // MOST_ROWS)
-        contexts, levels = [], []
-        for r in everything:
-            strengths, running = plain.strengths(r)
-            contexts.append(np.hstack([r.contexts, running])[::stride].astype(np.float32))
-            ratios = ((strengths / ceiling) ** tail).reshape(len(running), -1)
-            levels.append(np.log(np.maximum(pool(ratios)[0], FAINTEST))[::stride])
-        return cls(matrix, ceiling, tail, *usual_levels(contexts, levels, rng), a, bound)
+    def white(cls, learned: Sequence[ModelOutput], gains: Sequence[float], bound: float, shrinkage: float) -> Detector:
+        """Return the detector of white errors, by those of nominal episodes that the model has learned."""
+        matrix = whitening(bounded(np.concatenate([run.errors for run in learned]), bound), shrinkage)
+        ones = np.ones((len(gains), len(matrix)))
+        return cls(
+            whitening=matrix,
+            ceiling=ones,
+            tail=ones,
+            context_quantile=np.zeros(2 * learned[0].contexts.shape[1] + 1),
+            context_range=np.zeros(2),
+            gains=np.asarray(gains, np.float64),
+            bound=bound,
+        )
+
+    def with_worst_case(self, runs: Sequence[ModelOutput], tail_index: float) -> Detector:
+        """Return the detector with q and κ of nominal episodes, by ξ_0."""
+        maxima = [self.strengths(run)[0].max(axis=0) for run in runs]
+        ceiling, tail = worst_case(np.array(maxima), tail_index)
+        return self._replace(ceiling=ceiling, tail=tail)
+
+    def habituated(self, runs: Sequence[ModelOutput], rng: np.random.Generator) -> Detector:
+        """Return the detector that knows what is usual in each context of nominal episodes; the same for too few."""
+        rows = sum(len(run.errors) for run in runs)
+        if rows < STEPS_PER_NUMBER * (len(self.context_quantile) - 1):
+            return self
+        stride = -(-rows // MOST_ROWS)
+        contexts = []
+        levels = []
+        for run in runs:
+            strengths, running = self.strengths(run)
+            pooled, _ = pool(self.ratios(strengths))
+            contexts.append(np.hstack([run.contexts, running])[::stride].astype(np.float32))
+            levels.append(np.log(np.maximum(pooled, FAINTEST))[::stride])
+        quantile, limits = usual_levels(contexts, levels, rng)
+        return self._replace(context_quantile=quantile, context_range=limits)
 
     @property
     def reach(self) -> float:
         """Largest value in a context of 0: every error at ν for ever, so that |w_i| <= ν Σ_j |M_ji|."""
         most = self.bound * np.abs(self.whitening).sum(axis=0, keepdims=True)
         with np.errstate(over="ignore"):  # a context that hides everything reaches 0
-            return float(self._most(most)[0] / np.exp(self.context_quantile[-1]))
+            return float(self._lasting(most)[0] / np.exp(self.context_quantile[-1]))
 
     @property
     def reach_of_errors(self) -> Floats:
         """Largest value (X,) in the context of the least surprise, one error alone at ν for ever, the others at 0."""
         least = np.exp(min(self.context_quantile[-1], self.context_range[0]))
-        return self._most(self.bound * self.whitening) / least
+        return self._lasting(self.bound * self.whitening) / least
 
-    def _most(self, evidence: Floats) -> Floats:
+    def _lasting(self, whitened: Floats) -> Floats:
         """Return the pooled ratios (N,) of whitened errors (N, X) that last for ever: v_i = w_i² (2 - a) / a."""
         with np.errstate(over="ignore", divide="ignore"):
-            strengths = (evidence**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None]  # (N, G, X)
-            return pool(((strengths / self.ceiling) ** self.tail).reshape(len(evidence), -1))[0]
+            strengths = (whitened**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None]  # (N, G, X)
+            return pool(self.ratios(strengths))[0]
+
+    def ratios(self, strengths: Floats) -> Floats:
+        """Return r (N, G X) of v (N, G, X)."""
+        return ((strengths / self.ceiling) ** self.tail).reshape(len(strengths), -1)
 
     def start(self, batch: int) -> Evidence:
         """Return evidence before the first row."""
-        gains, size = self.ceiling.shape
-        return no_evidence(batch, gains, size, (len(self.context_quantile) - 1) // 2)
+        gains, errors = self.ceiling.shape
+        context = (len(self.context_quantile) - 1) // 2
+        return Evidence.start(batch, gains, errors, context)
 
-    def step(self, evidence: Evidence, errors: Array, context: Array) -> tuple[Evidence, Floats, Floats]:
-        """Return the new evidence, the value (B,), and each error's share of it (B, X); ``context`` is (B, C)."""
-        learned = self.whitening, self.ceiling, self.tail, self.context_quantile, self.context_range
-        row = np.asarray(errors, np.float64), np.asarray(context, np.float64)
-        new = Evidence._make(map(np.empty_like, evidence))
-        value, shares = np.empty(len(errors)), np.empty(errors.shape)
-        _step(*evidence, *row, *learned, self.gains, self.bound, *new, value, shares)
-        return new, value, shares
+    def step(self, evidence: Evidence, errors: Array, context: Array) -> tuple[Evidence, Floats]:
+        """Return the new evidence, and each error's share (B, X) of the value; ``context`` is (B, C)."""
+        after = self.start(len(errors))
+        shares = np.empty(errors.shape)
+        output = ModelOutput(errors=np.asarray(errors, np.float64), contexts=np.asarray(context, np.float64))
+        step_evidence(self, evidence, after, output, shares)
+        return after, shares
 
     def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:
         """Return v (T, G, X), and the running mean of the contexts (T, C), of a whole episode."""
         whitened = bounded(run.errors, self.bound) @ self.whitening
         vectors, running = accumulated(whitened, np.asarray(run.contexts, np.float64), self.gains)
-        whole = Evidence(vectors, running, np.arange(1, len(vectors) + 1))
-        return strength(whole, self.gains), whole.context
+        episode = Evidence(vector=vectors, context=running, steps=np.arange(1, len(vectors) + 1))
+        return strength(episode, self.gains), running
+
+
+NO_DETECTOR = Detector(
+    whitening=np.zeros((0, 0)),
+    ceiling=np.zeros((0, 0)),
+    tail=np.zeros((0, 0)),
+    context_quantile=np.zeros(1),
+    context_range=np.zeros(2),
+    gains=np.zeros(0),
+    bound=BOUND,
+)
+"""A detector of no errors."""
+
+
+@compiled
+def step_evidence(detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any) -> None:
+    """Write the new evidence, and each error's share (B, X) of the value."""
+    whitened = whiten(detector, output.errors)
+    ratios = np.empty(detector.ceiling.shape)
+    for n in range(len(shares)):
+        after.steps[n] = before.steps[n] + 1
+        add_evidence(detector, before.vector[n], after.vector[n], whitened[n])
+        greatest = write_ratios(detector, after.vector[n], after.steps[n], ratios)
+        total = write_shares(ratios, greatest, shares[n])
+
+        usual = usual_level(detector, before.context[n], after.context[n], output.contexts[n])
+        value = np.exp(greatest) * total ** (1.0 / POWER) / np.exp(usual)
+        for i in range(shares.shape[1]):
+            shares[n, i] *= value / max(total, TINY)
+
+
+@inner
+def whiten(detector: Detector, errors: Any) -> Any:
+    """Return ẽ M (B, X) of errors (B, X), with ẽ_i = e_i / √(1 + e_i²/ν²)."""
+    limited = np.empty(errors.shape)
+    for n in range(errors.shape[0]):
+        for i in range(errors.shape[1]):
+            share = errors[n, i] / detector.bound
+            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
+    whitened = np.empty(errors.shape)
+    np.dot(limited, detector.whitening, whitened)
+    return whitened
+
+
+@inner
+def add_evidence(detector: Detector, before: Any, after: Any, whitened: Any) -> None:
+    """Write w_t (G, X) = w_{t-1} + a (ẽ_t - w_{t-1})."""
+    for g in range(len(detector.gains)):
+        for i in range(len(whitened)):
+            after[g, i] = before[g, i] + detector.gains[g] * (whitened[i] - before[g, i])
+
+
+@inner
+def write_ratios(detector: Detector, vector: Any, steps: int, ratios: Any) -> float:
+    """Write log r (G, X) = κ log(v/q) after so many rows; return the largest."""
+    greatest = LEAST
+    for g in range(len(detector.gains)):
+        gain = detector.gains[g]
+        variance = gain / (2.0 - gain) * (1.0 - (1.0 - gain) ** (2 * steps))
+        for i in range(ratios.shape[1]):
+            w = vector[g, i]
+            ratios[g, i] = detector.tail[g, i] * np.log(w * w / (variance * detector.ceiling[g, i]))
+            greatest = max(greatest, ratios[g, i])
+    return greatest
+
+
+@inner
+def write_shares(ratios: Any, greatest: float, shares: Any) -> float:
+    """Write Σ_g (r/r_max)^p of each error (X,), from logarithms (G, X); return the sum of all."""
+    total = 0.0
+    for i in range(len(shares)):
+        shares[i] = 0.0
+    for g in range(ratios.shape[0]):
+        for i in range(ratios.shape[1]):
+            below = POWER * (ratios[g, i] - greatest)
+            if not below < NEGLIGIBLE:  # NaN goes on, and is an alarm
+                part = np.exp(below)
+                shares[i] += part
+                total += part
+    return total
+
+
+@inner
+def usual_level(detector: Detector, before: Any, after: Any, context: Any) -> float:
+    """Write the running mean (C,) of the context (C,); return log ŝ = min(max(w c + b, l), h)."""
+    size = len(context)
+    drive = detector.context_quantile[2 * size]
+    for c in range(size):
+        after[c] = before[c] + CONTEXT_GAIN * (context[c] - before[c])
+        now = context[c] * detector.context_quantile[c]
+        drive += now + after[c] * detector.context_quantile[size + c]
+    return min(max(drive, detector.context_range[0]), detector.context_range[1])
 
 
 def usual_levels(contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Return w and b (C + 1,), and l and h (2,), from contexts (T, C) and log s (T,) of nominal episodes."""
-    context, level = np.concatenate(contexts), np.concatenate(levels)
-    w, _ = np.split(habituate(context, level, rng), [-1])
-    drive = context @ w
+    context = np.concatenate(contexts)
+    level = np.concatenate(levels)
+    weights = habituate(context, level, rng)[:-1]
+    drive = context @ weights
     low, high = np.quantile(drive, (EXTREME, 1.0 - EXTREME))
-    b = np.quantile(level - np.clip(drive, low, high), USUAL)
-    return np.append(w, b).astype(np.float64), np.array([low + b, high + b])
+    bias = np.quantile(level - np.clip(drive, low, high), USUAL)
+    return np.append(weights, bias).astype(np.float64), np.array([low + bias, high + bias])
 
 
 def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray[np.float32]:
     """Return w, then b (C + 1,), from contexts (N, C) and log s (N,) of nominal rows."""
-    w, b = np.zeros(context.shape[1], np.float32), np.array([np.quantile(level, USUAL)], np.float32)
-    weights, bias = Synapse(w), Synapse(b)
+    weights = Synapse(np.zeros(context.shape[1], np.float32))
+    bias = Synapse(np.array([np.quantile(level, USUAL)], np.float32))
     updates = max(FEWEST, min(UPDATES, PASSES * len(level) // BATCH))
     for n, rows in zip(range(updates), shuffled(len(level), BATCH, rng), strict=False):
-        c, rate = context[rows], cosine_decay(RATE, n / updates)
-        pull = (USUAL - (level[rows] < c @ w + b)).astype(np.float32)
-        weights.learn(pull @ c / np.float32(len(rows)), rate)
+        rate = cosine_decay(RATE, n / updates)
+        below = level[rows] < context[rows] @ weights.W + bias.W
+        pull = (USUAL - below).astype(np.float32)
+        weights.learn(pull @ context[rows] / np.float32(len(rows)), rate)
         bias.learn(pull.mean(keepdims=True), rate)
-    return np.concatenate([w, b])
+    return np.concatenate([weights.W, bias.W])

@@ -32,7 +32,8 @@ TINY = float(np.finfo(np.float64).tiny)
 
 TAIL_INDEX = 0.3  # ξ_0: a ratio falls off as probability to this power
 NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays below q
-HOURS_TAIL_INDEX, HOURS_QUANTILE = 0.2, 0.98  # the same two where hours of healthy operation set q
+HOURS_TAIL_INDEX = 0.2  # ξ_0 where hours of healthy operation set q
+HOURS_QUANTILE = 0.98  # share of their episodes
 FEWEST_EPISODES = 100  # that such a quantile needs
 TAIL_PRIOR_COUNT = 10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
 SMALLEST = 1e-9  # lower bound of q
@@ -44,9 +45,11 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
     check_inputs(errors.shape[1])
     exact = np.asarray(errors, np.float64)
     covariance = gram(exact) / len(exact)  # (X, X)
-    scale = float(np.trace(covariance)) / len(covariance)
-    target = (scale if scale > 0 else 1.0) * np.eye(len(covariance))
-    values, vectors = np.linalg.eigh((1.0 - shrinkage) * covariance + shrinkage * target)
+    variance = float(np.trace(covariance)) / len(covariance)
+    if not variance > 0:
+        variance = 1.0
+    shrunk = (1.0 - shrinkage) * covariance + shrinkage * (variance * np.eye(len(covariance)))
+    values, vectors = np.linalg.eigh(shrunk)
     return (vectors / np.sqrt(values)) @ vectors.T
 
 
@@ -63,17 +66,22 @@ class Evidence(NamedTuple):
     context: Floats  # (B, C) running mean of the contexts
     steps: NDArray[np.int64]  # (B,) t, rows so far
 
-
-def no_evidence(batch: int, gains: int, size: int, context: int = 0) -> Evidence:
-    """Return w_0 for ``batch`` streams of ``size`` errors."""
-    return Evidence(np.zeros((batch, gains, size)), np.zeros((batch, context)), np.zeros(batch, np.int64))
+    @classmethod
+    def start(cls, batch: int, gains: int, errors: int, context: int = 0) -> Evidence:
+        """Return w_0 for ``batch`` streams."""
+        return cls(
+            vector=np.zeros((batch, gains, errors)),
+            context=np.zeros((batch, context)),
+            steps=np.zeros(batch, np.int64),
+        )
 
 
 @compiled
 def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats, Floats]:
     """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
     T, X = whitened.shape
-    vectors, running = np.zeros((T, len(gains), X)), np.zeros(contexts.shape)
+    vectors = np.zeros((T, len(gains), X))
+    running = np.zeros(contexts.shape)
     for t in range(T):
         before = max(t - 1, 0)  # in the first row all is still 0
         for g in range(len(gains)):
@@ -87,7 +95,8 @@ def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats,
 
 def strength(evidence: Evidence, gains: Array) -> Floats:
     """Return v (B, G, X), the squared evidence in each error."""
-    variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * evidence.steps[:, None]))  # (B, G) of each w_t,i
+    rows = evidence.steps[:, None]
+    variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * rows))  # (B, G) of each w_t,i
     return evidence.vector**2 / variance[:, :, None]
 
 
@@ -104,7 +113,8 @@ def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[Floats, F
     """Return q and κ (…) by ξ_0 from the maxima of N nominal episodes (N, …)."""
     ceiling = ceilings(maxima, NOMINAL_QUANTILE)
     beyond = np.log(np.maximum(maxima / ceiling, 1.0))
-    total, count = beyond.sum(axis=0), (beyond > 0).sum(axis=0)
+    total = beyond.sum(axis=0)
+    count = (beyond > 0).sum(axis=0)
     common = np.median(total / np.maximum(count, 1))  # Hill's estimate of ξ is total / count
     index = (total + TAIL_PRIOR_COUNT * common) / (count + TAIL_PRIOR_COUNT)
     return ceiling, tail_index / np.maximum(index, tail_index)
@@ -112,5 +122,5 @@ def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[Floats, F
 
 def ceilings(maxima: Array, quantile: float) -> Floats:
     """Return q (…): a quantile of the maxima of N nominal episodes (N, …)."""
-    found = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
-    return np.maximum(found, LEAST_SHARE * np.median(found))
+    ceiling = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
+    return np.maximum(ceiling, LEAST_SHARE * np.median(ceiling))

@@ -6,9 +6,10 @@ joined     (value^p + Σ_i r_i^p)^(1/p)         value: of ``detector``; r_i: of 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,14 @@ from numpy.typing import NDArray
 from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
 from asm_gym.detection.evidence import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, TINY, Evidence, ceilings, pool
-from asm_gym.detection.repetition import MOST_BEYOND, RARER, Repetition, count_repetitions, evidence_steps
+from asm_gym.detection.repetition import (
+    MOST_BEYOND,
+    RARER,
+    Repetition,
+    RepetitionWeights,
+    count_repetitions,
+    evidence_steps,
+)
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
 
@@ -41,7 +49,7 @@ class EvidenceDetection:
 
     Attributes:
         detector_: turns errors into surprise; None before ``fit``.
-        repeating: evidence steps (2, 2, X) of repetitions, their upper bound (X,) and offset (X,), after ``fit``.
+        repetition_: turns repeated readings into evidence; None before ``fit``.
     """
 
     name = "evidence"
@@ -57,7 +65,8 @@ class EvidenceDetection:
         habituates: bool = True,
         tail_index: float = TAIL_INDEX,
     ) -> None:
-        self.spec, self.gains = spec, tuple(check_number("each of gains", a, above=0.0, high=1.0) for a in gains)
+        self.spec = spec
+        self.gains = tuple(check_number("each of gains", a, above=0.0, high=1.0) for a in gains)
         if not self.gains:
             raise ValueError("gains must be numbers in (0, 1], got ()")
         self.bound = check_number("bound", bound, above=0.0)
@@ -66,49 +75,86 @@ class EvidenceDetection:
         self.tail_index = check_number("tail_index", tail_index, above=0.0, high=1.0)
         self.learned_: Arrays = {}
         self.detector_: Detector | None = None
+        self.repetition_: RepetitionWeights | None = None
 
     def fit(self, nominal: Nominal, rng: np.random.Generator) -> Self:
         """Fit the whitening to learned episodes, and ceilings and contexts to all."""
-        learned, fresh = nominal.outputs(nominal.learned), nominal.outputs(nominal.held_out)
-        how = self.gains, self.bound, self.shrinkage, rng, self.habituates, self.tail_index
-        detector = Detector.fit(learned, fresh, *how)
+        learned = nominal.outputs(nominal.learned)
+        everything = [*learned, *nominal.outputs(nominal.held_out)]
+        detector = Detector.white(learned, self.gains, self.bound, self.shrinkage)
+        detector = detector.with_worst_case(everything, self.tail_index)
+        if self.habituates:
+            detector = detector.habituated(everything, rng)
+
         senses = self.spec.sensory
-        counted = count_repetitions([e.stream[:, senses] for e in nominal.episodes], self.spec.noise[senses] > 0)
-        return self.restore({name: getattr(detector, name) for name in self.arrays[:-1]} | {"repetition": counted})
+        streams = [episode.stream[:, senses] for episode in nominal.episodes]
+        arrays = {name: getattr(detector, name) for name in self.arrays[:-1]}
+        arrays["repetition"] = count_repetitions(streams, self.spec.noise[senses] > 0)
+        return self.restore(arrays)
 
     def with_ceilings(self, maxima: Array, anew: bool) -> EvidenceDetection:
         """Return a copy with q from the largest v (N, G, X) in healthy episodes, and κ ``anew`` by a smaller ξ_0."""
-        tail = np.minimum(self.learned_["tail"] * (HOURS_TAIL_INDEX / self.tail_index if anew else 1.0), 1.0)
-        how = self.gains, self.bound, self.shrinkage, self.habituates, self.tail_index
-        learned = {**self.learned_, "ceiling": ceilings(maxima, HOURS_QUANTILE), "tail": tail}
-        return EvidenceDetection(self.spec, *how).restore(learned)
+        tail = self.learned_["tail"]
+        if anew:
+            tail = tail * (HOURS_TAIL_INDEX / self.tail_index)
+        learned = {
+            **self.learned_,
+            "ceiling": ceilings(maxima, HOURS_QUANTILE),
+            "tail": np.minimum(tail, 1.0),
+        }
+        return copy.copy(self).restore(learned)
 
     def restore(self, learned: Arrays) -> Self:
         """Take over what another has learned. Raises ValueError where it does not fit."""
-        found = {name: learned[name] for name in self.arrays[:-1]}
-        X = len(found["whitening"])
-        check_shapes(found, {"whitening": (X, X), "ceiling": (len(self.gains), X), "tail": (len(self.gains), X)})
+        detector = self._detector_of(learned)
+        repetition = self._repetition_of(learned["repetition"])
+        self.learned_ = learned
+        self.detector_ = detector
+        self.repetition_ = repetition
+        return self
+
+    def _detector_of(self, learned: Arrays) -> Detector:
+        """Return the detector of learned arrays. Raises ValueError where they do not fit."""
+        arrays = {name: np.array(learned[name], np.float64) for name in self.arrays[:-1]}
+        gains = len(self.gains)
+        errors = len(arrays["whitening"])
+        shapes = {"whitening": (errors, errors), "ceiling": (gains, errors), "tail": (gains, errors)}
+        check_shapes(arrays, shapes)
         for name, most in (("ceiling", math.inf), ("tail", 1.0)):
-            if not ((found[name] > 0.0) & (found[name] <= most)).all():
+            if not ((arrays[name] > 0.0) & (arrays[name] <= most)).all():
                 raise ValueError(f"the {name} of evidence must be in (0, {most:g}]")
-        detector = Detector(**found, gains=np.array(self.gains), bound=self.bound)
+
+        detector = Detector(**arrays, gains=np.array(self.gains), bound=self.bound)
         if not detector.reach > 1.0:  # what is seldom exceeded in nominal episodes
             raise ValueError(f"no error can add up to evidence: at most {detector.reach:g} of what is usual")
-        counted, shape = learned["repetition"], (3, len(self.spec.sensory))
+        return detector
+
+    def _repetition_of(self, counted: NDArray[Any]) -> RepetitionWeights:
+        """Return what ``count_repetitions`` counted. Raises ValueError where it does not fit."""
+        shape = (3, len(self.spec.sensory))
         if counted.shape != shape or not ((counted >= 0.0) & np.isfinite(counted)).all():
             raise ValueError(
                 f"the repetition of evidence should be {shape} numbers of at least 0, found {short_repr(counted)}"
             )
         offset = counted[2] + RARER
-        self.repeating = evidence_steps(counted[:2]), offset + MOST_BEYOND, offset
-        self.learned_, self.detector_ = learned, detector
-        return self
+        return RepetitionWeights(
+            columns=self.spec.sensory,
+            steps=evidence_steps(counted[:2]),
+            most=offset + MOST_BEYOND,
+            offset=offset,
+        )
 
     @property
     def fitted_detector(self) -> Detector:
         """The detector, after ``fit``."""
         assert self.detector_ is not None
         return self.detector_
+
+    @property
+    def fitted_repetition(self) -> RepetitionWeights:
+        """What turns repeated readings into evidence, after ``fit``."""
+        assert self.repetition_ is not None
+        return self.repetition_
 
     @property
     def reach(self) -> float:
@@ -121,32 +167,38 @@ class EvidenceDetection:
 
     def start(self, batch: int, errors: int) -> EvidenceState:
         """Return the state before the first row."""
-        return EvidenceState(self.fitted_detector.start(batch), Repetition.start(batch, len(self.spec.sensory)))
+        return EvidenceState(
+            evidence=self.fitted_detector.start(batch),
+            repetition=Repetition.start(batch, len(self.spec.sensory)),
+        )
 
     def attribute_step(
         self, state: EvidenceState, output: ModelOutput, rows: Floats, place: Place
     ) -> tuple[EvidenceState, Floats]:
         """Return the new state, and each number's share (B, D) of the surprise at the next rows (B, D)."""
-        evidence, _, parts = self.fitted_detector.step(state.evidence, *output)
-        senses, (steps, most, offset) = self.spec.sensory, self.repeating
-        repetition = state.repetition.followed_by(rows[:, senses], steps, most)
-        found = place(parts)
+        senses = self.spec.sensory
+        weights = self.fitted_repetition
+        evidence, parts = self.fitted_detector.step(state.evidence, output.errors, output.contexts)
+        repetition = state.repetition.followed_by(rows[:, senses], weights.steps, weights.most)
+        shares = place(parts)
         if repetition.unlikely.any():
-            ratios = np.zeros_like(found)
-            ratios[:, senses] = repetition.ratios(offset)
-            found = _joined(found, ratios)
-        return EvidenceState(evidence, repetition), found
+            ratios = np.zeros_like(shares)
+            ratios[:, senses] = repetition.ratios(weights.offset)
+            shares = _joined(shares, ratios)
+        return EvidenceState(evidence=evidence, repetition=repetition), shares
 
     def reset(self, state: EvidenceState) -> EvidenceState:
         """Return the state without its evidence; its number of rows and its context are kept."""
+        vector = np.zeros_like(state.evidence.vector)
+        unlikely = np.zeros_like(state.repetition.unlikely)
         return EvidenceState(
-            state.evidence._replace(vector=np.zeros_like(state.evidence.vector)),
-            state.repetition._replace(unlikely=np.zeros_like(state.repetition.unlikely)),
+            evidence=state.evidence._replace(vector=vector),
+            repetition=state.repetition._replace(unlikely=unlikely),
         )
 
 
-def _joined(found: Floats, ratios: Floats) -> Floats:
+def _joined(shares: Floats, ratios: Floats) -> Floats:
     """Return each number's share (B, D) of its surprise so far pooled with further ratios."""
-    value = found.sum(axis=1, keepdims=True)
+    value = shares.sum(axis=1, keepdims=True)
     _, parts = pool(np.hstack([value, ratios]))
-    return found * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]
+    return shares * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]

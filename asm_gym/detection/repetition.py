@@ -16,7 +16,7 @@ Source: Page 1954 (Biometrika 41, 100-115).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,26 @@ RESTS = 0.5  # a sense that repeats itself this often after a repetition is at r
 RESTLESS = 5.0  # a repetition is assumed no rarer than one in this many times the number of nominal episodes
 MOST_READ = 20_000  # largest number of rows from which noise and resolution are estimated
 
+Stream = NDArray[np.floating[Any]]
+
+
+class RepetitionWeights(NamedTuple):
+    """What was learned of X senses' repetitions."""
+
+    columns: NDArray[np.intp]  # (X,) of the senses in a row
+    steps: Floats  # (2, 2, X) see ``evidence_steps``
+    most: Floats  # (X,) upper bound of n
+    offset: Floats  # (X,) n_0
+
+
+NO_REPETITION = RepetitionWeights(
+    columns=np.zeros(0, np.intp),
+    steps=np.zeros((2, 2, 0)),
+    most=np.zeros(0),
+    offset=np.zeros(0),
+)
+"""What is known of no senses."""
+
 
 class Repetition(NamedTuple):
     """State of B streams; never changed in place."""
@@ -44,62 +64,83 @@ class Repetition(NamedTuple):
     unlikely: Floats  # (B, X) n
 
     @classmethod
-    def start(cls, *shape: int) -> Self:
-        """Return the state before the first row, for a ``shape`` (B, X)."""
-        return cls(np.full(shape, np.nan), np.zeros(shape, np.bool_), np.zeros(shape))
+    def start(cls, batch: int, senses: int) -> Repetition:
+        """Return the state before the first row."""
+        shape = (batch, senses)
+        return cls(row=np.full(shape, np.nan), again=np.zeros(shape, np.bool_), unlikely=np.zeros(shape))
 
     def followed_by(self, rows: Floats, steps: Floats, most: Floats) -> Repetition:
         """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
-        new = Repetition._make(map(np.empty_like, self))
-        arguments: list[Any] = [*self, rows, np.arange(rows.shape[1]), steps, most, *new]
-        repeated(*arguments)
-        return new
+        columns = np.arange(rows.shape[1])
+        weights = RepetitionWeights(columns=columns, steps=steps, most=most, offset=most)
+        after = Repetition.start(len(rows), rows.shape[1])
+        step_repetition(weights, self, after, rows)
+        return after
 
     def ratios(self, offset: Floats) -> Floats:
         """Return r (B, X), with n_0 ``offset`` (X,)."""
         return np.where(self.unlikely > 0, np.exp(TAIL_INDEX * (self.unlikely - offset)), 0.0)
 
 
-def stands_still(streams: Sequence[NDArray[np.floating[Any]]]) -> NDArray[np.bool_]:
-    """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
-    read = np.cumsum([len(stream) for stream in streams])
-    enough = streams[: int(np.searchsorted(read, MOST_READ)) + 1]
-    X = streams[0].shape[1]
-    found = np.zeros(X, np.bool_)
-    for i in range(X):
-        steps = [resolution(stream[:, i]) for stream in enough]
-        step = float(np.median([s for s in steps if s])) if any(steps) else 0.0
-        if step and sum(s > 0 for s in steps) >= len(steps) / 2:
-            found[i] = np.median([noise_of(stream[:, i]) for stream in enough]) < UNMOVED * step
-    return found
-
-
-def count_repetitions(streams: Sequence[NDArray[np.floating[Any]]], noisy: NDArray[np.bool_]) -> Floats:
+def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Floats:
     """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0 - 3.
 
-    ``streams`` are the senses (T, X) in nominal episodes, ``noisy`` (X,) those with declared noise.
+    Args:
+        streams: the senses (T, X) in nominal episodes.
+        noisy: (X,) those with declared noise.
     """
-    chances, happened = np.zeros((2, len(noisy))), np.zeros((2, len(noisy)))
+    chances = np.zeros((2, len(noisy)))  # after a change, and after a repetition
+    repeats = np.zeros((2, len(noisy)))
     for stream in streams:
         again = stream[1:] == stream[:-1]
-        before, now = again[:-1], again[1:]
-        chances += [(~before).sum(axis=0), before.sum(axis=0)]
-        happened += [(now & ~before).sum(axis=0), (now & before).sum(axis=0)]
-    first = (happened[0] + 0.5) / (chances[0] + 1.0)
+        for repeated, group in enumerate((~again[:-1], again[:-1])):
+            chances[repeated] += group.sum(axis=0)
+            repeats[repeated] += (again[1:] & group).sum(axis=0)
+
+    first = (repeats[0] + 0.5) / (chances[0] + 1.0)
     # Rest comes by the episode: where n of them never rested, the next may.
     first = np.maximum(first, 1.0 / (RESTLESS * len(streams)))
     # As rare after a repetition as after a change, unless seen to be otherwise.
-    p = np.array([first, (happened[1] + first) / (chances[1] + 1.0)])
-    watched = (noisy & ~stands_still(streams) & (p[1] < RESTS)) if noisy.any() else happened.sum(axis=0) == 0
-    counted = np.where(watched, -np.log(p), 0.0)
-    offset, steps = np.full(len(noisy), REPETITION_OFFSET), evidence_steps(counted)
+    p = np.array([first, (repeats[1] + first) / (chances[1] + 1.0)])
+
+    watched = repeats.sum(axis=0) == 0
+    if noisy.any():
+        watched = noisy & ~stands_still(streams) & (p[1] < RESTS)
+    surprise = np.where(watched, -np.log(p), 0.0)
+    return np.concatenate([surprise, largest_offset(streams, surprise)[None]])
+
+
+def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
+    """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
+    ends = np.cumsum([len(stream) for stream in streams])
+    enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
+    return np.array([_stands_still([stream[:, i] for stream in enough]) for i in range(streams[0].shape[1])])
+
+
+def _stands_still(readings: Sequence[Stream]) -> bool:
+    """Return whether one sense's noise, in episodes (T,), is too small to change its reading."""
+    steps = [resolution(episode) for episode in readings]
+    known = [step for step in steps if step]
+    if not known or len(known) < len(steps) / 2:
+        return False
+    noise = np.median([noise_of(episode) for episode in readings])
+    return bool(noise < UNMOVED * float(np.median(known)))
+
+
+def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
+    """Return n_0 - 3 (X,): the largest n in nominal episodes (T, X), at least 12; ``surprise`` is -log p (2, X)."""
+    senses = surprise.shape[1]
+    steps = evidence_steps(surprise)
+    unbounded = np.full(senses, np.inf)
+    offset = np.full(senses, REPETITION_OFFSET)
+
     ordered = sorted(streams, key=len, reverse=True)
-    state, unbounded = Repetition.start(len(ordered), len(noisy)), np.full(len(noisy), np.inf)
+    state = Repetition.start(len(ordered), senses)
     for t in range(len(ordered[0])):
         rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
         state = Repetition._make(part[: len(rows)] for part in state).followed_by(rows, steps, unbounded)
         offset = np.maximum(offset, state.unlikely.max(axis=0))
-    return np.concatenate([counted, offset[None]])
+    return offset
 
 
 def evidence_steps(surprise: Floats) -> Floats:
@@ -107,21 +148,18 @@ def evidence_steps(surprise: Floats) -> Floats:
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
         steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
-    found: Floats = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
-    return np.ascontiguousarray(found)
+    watched: Floats = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
+    return np.ascontiguousarray(watched)
 
 
 @compiled
-def repeated(
-    row: Any, again: Any, unlikely: Any, rows: Any, columns: Any, steps: Any, most: Any, new: Any, now: Any, sum_: Any
-) -> None:
-    """Write the fields of ``Repetition``, ``new``, ``now`` and ``sum_``, after the ``columns`` (X,) of rows (B, D).
-
-    ``steps`` are ``evidence_steps``, ``most`` (X,) is the upper bound of n.
-    """
+def step_repetition(weights: RepetitionWeights, before: Repetition, after: Repetition, rows: Any) -> None:
+    """Write the state after rows (B, D)."""
     for n in range(len(rows)):
-        for i in range(len(columns)):
-            new[n, i] = rows[n, columns[i]]
-            now[n, i] = new[n, i] == row[n, i]
-            step = steps[1 if again[n, i] else 0, 1 if now[n, i] else 0, i]
-            sum_[n, i] = min(max(unlikely[n, i] + step, 0.0), most[i])
+        for i in range(len(weights.columns)):
+            reading = rows[n, weights.columns[i]]
+            again = reading == before.row[n, i]
+            step = weights.steps[int(before.again[n, i]), int(again), i]
+            after.row[n, i] = reading
+            after.again[n, i] = again
+            after.unlikely[n, i] = min(max(before.unlikely[n, i] + step, 0.0), weights.most[i])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection.events import EVENTS, KNOCK, STOP
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK, STOP
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
 
@@ -27,7 +27,7 @@ class Surprise(NamedTuple):
         attribution: (B, D) share of each number of the row; adds up to ``value`` along the last axis.
         skill: (B,) name of the skill that seems to be running; None where no skill has a name.
         raw: (B,) ``value`` before knocks and stops excuse part of it; None where nothing is excused.
-        excuse: (B,) index in ``detection.events.EVENTS`` of the event that excuses it; None likewise.
+        excuse: (B,) index in ``detection.alarm_rule.EVENTS`` of the event that excuses it; None likewise.
     """
 
     value: NDArray[np.float64]

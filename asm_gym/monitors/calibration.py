@@ -15,7 +15,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import Blocks, EvidenceDetection, conformal_episodes
 from asm_gym.detection.base import Array
 from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, episode_threshold, hourly_threshold
-from asm_gym.detection.events import Excuses
+from asm_gym.detection.benign_events import BenignEvents
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.spec import StreamSpec
@@ -163,7 +163,7 @@ def _worst_of(
         some = episodes[first : first + AT_ONCE]
         for episode, output in zip(some, model_outputs(monitor.model, some), strict=True):
             strengths, _ = detector.strengths(output)
-            if isinstance(excuses, Excuses):
+            if isinstance(excuses, BenignEvents):
                 strengths /= excuses.divisors(episode.stream)[:, None, None] ** 2
             found.append(strengths.max(axis=0))
     return np.array(found)

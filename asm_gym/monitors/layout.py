@@ -12,14 +12,13 @@ Its type depends on names and kinds alone, not on sizes, so that code compiled f
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import inner
 
-KINDS = np.float32, np.float64, np.int64
 LINE = 64  # bytes
 
 
@@ -28,23 +27,42 @@ class Layout(NamedTuple):
 
     singles: NDArray[np.float32]
     doubles: NDArray[np.float64]
-    places: NDArray[np.int64]
+    integers: NDArray[np.int64]
     at: NDArray[Any]  # (1,) a record: of each array its beginning, rows and columns; the numbers
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]], numbers: Mapping[str, Any]) -> Self:
-        """Lay out arrays of float32, float64 and integers; a vector is a matrix of one row."""
-        flat: list[list[NDArray[Any]]] = [[np.zeros(0, kind)] for kind in KINDS]
-        ends, places = [0] * len(KINDS), {}
+    def of(cls, arrays: Mapping[str, NDArray[Any]], numbers: Mapping[str, Any]) -> Layout:
+        """Lay out arrays of float32, float64 and int64; a vector is a matrix of one row."""
+        singles = _Line(np.float32)
+        doubles = _Line(np.float64)
+        integers = _Line(np.int64)
+        line_of = {line.kind: line for line in (singles, doubles, integers)}
+
+        fields = []
+        values = []
         for name, array in arrays.items():
-            k = KINDS.index(array.dtype.type)
-            places[name] = ends[k], int(np.prod(array.shape[:-1])), array.shape[-1]
-            flat[k] += [np.ravel(array), np.zeros(-array.size % (LINE // array.itemsize), KINDS[k])]
-            ends[k] += flat[k][-2].size + flat[k][-1].size
-        kinds = [(name, np.int64, (3,)) for name in places]
-        fields: Any = [*kinds, *((name, np.asarray(number).dtype) for name, number in numbers.items())]
-        singles, doubles, integers = map(np.concatenate, flat)
-        return cls(singles, doubles, integers, np.array([(*places.values(), *numbers.values())], fields))
+            fields.append((name, np.int64, (3,)))
+            values.append(line_of[array.dtype].append(array))
+        for name, number in numbers.items():
+            fields.append((name, np.asarray(number).dtype))
+            values.append(number)
+        record = np.array([tuple(values)], np.dtype(fields))
+        return cls(singles=singles.array, doubles=doubles.array, integers=integers.array, at=record)
+
+
+class _Line:
+    """Arrays of one kind, end to end."""
+
+    def __init__(self, kind: type[np.generic]) -> None:
+        self.kind = np.dtype(kind)
+        self.array = np.zeros(0, kind)
+
+    def append(self, array: NDArray[Any]) -> tuple[int, int, int]:
+        """Add an array; return its beginning, rows and columns."""
+        begin = len(self.array)
+        padding = np.zeros(-array.size % (LINE // array.itemsize), self.kind)
+        self.array = np.concatenate([self.array, np.ravel(array), padding])
+        return begin, int(np.prod(array.shape[:-1])), array.shape[-1]
 
 
 @inner

@@ -23,7 +23,7 @@ from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.layout import Layout
-from asm_gym.monitors.row_kernel import expect_rows, layout_of, uninitialised
+from asm_gym.monitors.row_kernel import expected_errors, layout_of, uninitialised
 from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
@@ -132,11 +132,9 @@ class MemoryModel(ScaledModel):
 
     def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
         assert self.compiled_ is not None
-        new = uninitialised(state)
-        states = [part for s in (state, new) for part in (s.traces, s.expected, *s.history, s.skill)]
-        arguments: list[Any] = [np.ascontiguousarray(rows, np.float64), *states, *self.compiled_, True]
-        error, _ = expect_rows(*arguments)
-        return new, ModelOutput(error, new.expected)
+        new: MemoryState = uninitialised(state)
+        errors = expected_errors(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64))
+        return new, ModelOutput(errors, new.expected)
 
     def expected_action(self, state: MemoryState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), by the motor association or else by the temporal network."""

@@ -19,7 +19,7 @@ from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection
 from asm_gym.detection.base import Arrays
-from asm_gym.detection.events import Excuses
+from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.arm_inputs import Derived
@@ -53,7 +53,7 @@ class NeuralASM(CalibratedMonitor):
             a memory that watches any policy.
         dynamics: how the temporal network represents the past: ``"traces"`` of senses and actions, or ``"settling"``,
             the temporal predictive coding network of the papers, whose state is inferred on every row.
-        excuses: do not count knocks, joints at their stops and moving fingers as faults (``detection.events``): for a
+        excuses: do not count knocks, joints at their stops and moving fingers as faults (``detection.benign_events``): for a
             memory that watches any policy, including policies that hit things.
         values: judge values, such as torques, beside changes (``monitors.values``), if other senses predict them: for
             lasting pushes, in logs of real arms.
@@ -122,7 +122,7 @@ class NeuralASM(CalibratedMonitor):
         checked = {name: getattr(evidence, name) for name in ("gains", "bound", "shrinkage", "tail_index")}
         self.config, self.habituates = replace(config, **checked), evidence.habituates
         super().__init__(model, evidence, seed=seed)
-        self.excuses_ = Excuses(spec) if excuses else None
+        self.excuses_ = BenignEvents(spec) if excuses else None
         self.values_: Values | None = None
         self._diagnosis: Diagnosis | None = None
         self._kernel: RowKernel | None = None
@@ -172,7 +172,7 @@ class NeuralASM(CalibratedMonitor):
 
     def initial_state(self, batch: int = 1) -> MonitorState:
         state = super().initial_state(batch)
-        excuses = np.zeros((batch, 0), np.int64) if self.excuses_ is None else self.excuses_.start(batch)
+        excuses = EventState.start(batch, 0) if self.excuses_ is None else self.excuses_.start(batch)
         values = () if self.values_ is None else self.values_.monitor.initial_state(batch)
         return state._replace(excuses=excuses, values=values)
 

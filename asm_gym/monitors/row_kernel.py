@@ -1,8 +1,9 @@
-"""One row of each stream in two compiled calls: the errors of a memory, their evidence, and what excuses it.
+"""One row of each stream in one compiled call: the errors of a memory, their evidence, and what excuses it.
 
-    read → carry on, associate → errors → whiten, accumulate → repetitions → attribute → excuse
+    read → carry on, associate → errors → whiten, accumulate → repetitions, events → attribute
 
-``expect_rows`` is the first half, which a memory's model uses by itself; ``judge_rows`` is the second.
+Functions that write a state take the state before and the state after, whose arrays they fill. ``expected_errors``
+stops at the errors, for a memory under another detection and for one that learns.
 """
 
 from __future__ import annotations
@@ -11,47 +12,66 @@ import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.blas import ONE_THREAD
-from asm_gym.compilation import compiled, inner, must_compile
-from asm_gym.detection.detector import _step
-from asm_gym.detection.events import Excuses
-from asm_gym.detection.events import _step as _excuse
+from asm_gym.compilation import Bound, bind, compiled, inner, must_compile
+from asm_gym.detection.alarm_rule import JUDGED
+from asm_gym.detection.base import ModelOutput
+from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState, find_events
+from asm_gym.detection.detector import NO_DETECTOR, step_evidence
 from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, Evidence
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
-from asm_gym.detection.repetition import Repetition, repeated
+from asm_gym.detection.repetition import NO_REPETITION, Repetition, RepetitionWeights, step_repetition
 from asm_gym.memory.association import normalised_errors
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
-from asm_gym.memory.traces import Weights, carry, weight_shapes
+from asm_gym.memory.traces import carry, weight_shapes
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.monitors.layout import Layout, matrix, vector
-from asm_gym.scaling import StreamScaler, _read
+from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
+
+__all__ = ["JUDGED", "RowKernel", "expected_errors", "layout_of", "observe_rows", "uninitialised"]
 
 
 def layout_of(network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]) -> Layout:
-    """Return what ``expect_rows`` computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
-    spec, weights = scaler.spec, network.weights._asdict()
-    both = (weight_shapes(1, 1, 1), Weights), (settling_shapes(1, 1, 1), SettlingWeights)
-    unused = {name: np.zeros(shape, np.float32) for shapes, _ in both for name, shape in shapes.items()}
-    singles = unused | weights | network.association._asdict() | dict(names)
-    doubles = {"mean": scaler.mean, "spread": scaler.spread, "change": scaler.change}
-    places = {"sensory": spec.sensory, "motor": spec.motor, "slow": scaler.slow, "groups": scaler.groups}
-    places["spans"] = network.spans
-    arrays = {
-        name: np.asarray(array, kind)
-        for kind, own in ((np.float32, singles), (np.float64, doubles), (np.int64, places))
-        for name, array in own.items()
+    """Return what a memory computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
+    either = weight_shapes(1, 1, 1) | settling_shapes(1, 1, 1)
+    singles = {name: np.zeros(shape) for name, shape in either.items()}  # what the other kind of network has
+    singles |= network.weights._asdict()
+    singles |= network.association._asdict()
+    singles |= names
+    integers = {
+        "sensory": scaler.spec.sensory,
+        "motor": scaler.spec.motor,
+        "slow": scaler.slow,
+        "groups": scaler.groups,
+        "spans": network.spans,
     }
-    how = "prior_precision", "sensory_precision", "curvature", "iterations"
-    numbers = dict(zip(how, network.inference, strict=True))
-    return Layout.of(arrays, numbers | {"settles": isinstance(network.weights, SettlingWeights)})
+    arrays = {name: np.asarray(array, np.float32) for name, array in singles.items()}
+    arrays |= {name: np.asarray(array, np.float64) for name, array in scaler.arrays.items()}
+    arrays |= {name: np.asarray(array, np.int64) for name, array in integers.items()}
+    numbers = {
+        "prior_precision": network.prior_precision,
+        "sensory_precision": network.sensory_precision,
+        "curvature": network.curvature,
+        "iterations": network.iterations,
+        "settles": isinstance(network.weights, SettlingWeights),
+    }
+    return Layout.of(arrays, numbers)
+
+
+class RowState(NamedTuple):
+    """What a row changes of a ``MonitorState``."""
+
+    memory: MemoryState
+    detection: EvidenceState
+    events: EventState
 
 
 class RowKernel:
@@ -60,26 +80,31 @@ class RowKernel:
     Args:
         memory: what its model computes with.
         detection: fitted.
-        excuses: of knocks and stops; None where nothing is excused.
+        events: that excuse surprise; None where nothing is excused.
     """
 
-    def __init__(self, memory: Layout, detection: EvidenceDetection, excuses: Excuses | None) -> None:
-        d = detection.fitted_detector
-        if must_compile(expect_rows):
+    def __init__(self, memory: Layout, detection: EvidenceDetection, events: BenignEvents | None) -> None:
+        if must_compile(observe_rows):
             print("asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr)
-        arrays = {name: getattr(d, name) for name in detection.arrays[:-1]} | {"gains": d.gains}
-        arrays |= dict(
-            zip(("repetition_steps", "repetition_most", "repetition_offset"), detection.repeating, strict=True)
-        )
-        arrays["sensory"] = detection.spec.sensory
-        none: list[NDArray[Any]] = [np.zeros(0, np.intp)] * 4
-        columns, ends = (none, np.zeros((0, 2))) if excuses is None else excuses.arrays
-        arrays |= dict(zip(("wrist", "joints", "fingers", "lasting", "ends"), (*columns, ends), strict=True))
-        on_its_way = 0.0 if excuses is None else excuses.on_its_way
-        excused = {"excuses": excuses is not None, "on_its_way": on_its_way}
-        self._memory: tuple[Any, ...] = *memory, bool(d.context_quantile[:-1].any())
-        _, *self._judges = Layout.of(arrays, {"bound": d.bound} | excused)
-        self._excuses = excuses
+        self._arguments = (memory, detection, events)
+        self._excuses = events is not None
+        senses = NO_SENSES if events is None else events.senses
+        detector = detection.fitted_detector
+        wants_context = bool(detector.context_quantile[:-1].any())
+        self._learned = bind(memory, wants_context, detector, detection.fitted_repetition, senses)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle by the arguments: what is bound lies in memory that is not Python's."""
+        return RowKernel, self._arguments
+
+    def bound(self, state: MonitorState, new: MonitorState) -> Bound:
+        """Return all that ``observe_rows`` needs.
+
+        Args:
+            state: before the rows.
+            new: to be written, a state of as many streams, whose arrays are other ones.
+        """
+        return bind_states(self._learned, *arrays_of(state), *arrays_of(new))
 
     def __call__(
         self, state: MonitorState, rows: NDArray[np.float64], out: MonitorState | None = None
@@ -88,236 +113,322 @@ class RowKernel:
 
         The new state is written to ``out``, where that is given, a state of as many streams.
         """
-        B, empty = len(rows), np.empty
-        old = _arrays(state)
-        new = [empty(array.shape, array.dtype) for array in old] if out is None else _arrays(out)
-        value, attribution, raw, excuse, divisor = empty(B), empty(rows.shape), empty(B), empty(B, np.int8), empty(B)
-        found: tuple[Any, ...] = value, attribution, raw, excuse, divisor
-        with ONE_THREAD if B > 1 else nullcontext():  # one row calls no BLAS
-            error, finite = expect_rows(rows, *old[:6], *new[:6], *self._memory)
-            judge_rows(rows, error, finite, new[1], *old[6:], *new[6:], *found, *self._judges)
-        excused = (raw, excuse) if self._excuses is not None else (None, None)
-        surprise = Surprise(value, attribution, None, *excused)
-        if out is not None:
-            return out, surprise, divisor
-        memory = MemoryState(new[0], new[1], RowHistory(new[2], new[3], new[4]), new[5])
-        detection = EvidenceState(Evidence(new[6], new[7], new[8]), Repetition(new[9], new[10], new[11]))
-        return MonitorState(memory, detection, new[12]), surprise, divisor
+        if out is None:
+            out = uninitialised(state._replace(values=()))
+        judged = np.empty(len(rows), JUDGED)
+        attribution = np.empty(rows.shape)
+        with ONE_THREAD if len(rows) > 1 else nullcontext():  # one row calls no BLAS
+            observe_rows(self.bound(state, out), rows, judged, attribution)
+
+        divisor = judged["divisor"].copy()
+        surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
+        if self._excuses:
+            surprise = surprise._replace(raw=judged["raw_surprise"].copy(), excuse=judged["excuse"].copy())
+        return out, surprise, divisor
 
 
-def _arrays(state: MonitorState) -> list[Any]:
-    """Return the arrays of a state, in the order in which the compiled functions take them."""
-    (traces, expected, history, skill), (evidence, repetition) = state.model, state.detection
-    return [traces, expected, *history, skill, *evidence, *repetition, state.excuses]
+def expected_errors(memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]) -> Any:
+    """Return the errors (B, X) of rows (B, D), and write the memory's state: the first half of a row by itself."""
+    learned = bind(memory, True, NO_DETECTOR, NO_REPETITION, NO_SENSES)
+    detection = EvidenceState(evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0))
+    events = EventState.start(len(rows), 0)
+    states = [MonitorState(memory, detection, events) for memory in (before, after)]
+    bound = bind_states(learned, *arrays_of(states[0]), *arrays_of(states[1]))
+    return observe_rows(bound, rows, np.empty(len(rows), JUDGED), np.empty(rows.shape))
+
+
+def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
+    """Return the arrays of a state in the order in which ``state_of`` takes them."""
+    memory = state.model
+    detection = state.detection
+    return [
+        memory.traces,
+        memory.expected,
+        memory.skill,
+        *memory.history,
+        *detection.evidence,
+        *detection.repetition,
+        *state.excuses,
+    ]
+
+
+@inner
+def state_of(arrays: Any) -> RowState:
+    """Return the state of so many arrays, see ``arrays_of``."""
+    traces, expected, skill = arrays[:3]
+    history = RowHistory(arrays[3], arrays[4], arrays[5])
+    evidence = Evidence(arrays[6], arrays[7], arrays[8])
+    repetition = Repetition(arrays[9], arrays[10], arrays[11])
+    return RowState(
+        memory=MemoryState(traces, expected, history, skill),
+        detection=EvidenceState(evidence, repetition),
+        events=EventState(arrays[12], arrays[13]),
+    )
+
+
+@partial(compiled, calls=("memory", "detection", "."))
+def bind_states(learned: Bound, *arrays: Any) -> Bound:
+    """Return what was learned, a state, and a state that is to be written; ``arrays`` are those of both.
+
+    Numba takes longer to look through nested named tuples that Python hands over than through arrays.
+    """
+    return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
 
 
 def uninitialised(state: Any) -> Any:
     """Return a state of the same arrays, in whatever nesting, that are yet to be written."""
     if isinstance(state, np.ndarray):
         return np.empty(state.shape, state.dtype)
-    return type(state)(*map(uninitialised, state))
+    if not state:
+        return state
+    return type(state)._make(map(uninitialised, state))
+
+
+@partial(compiled, calls=("memory", "detection", "."))
+def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any:
+    """Observe the next rows, write the new state, and return the memory's errors (B, X).
+
+    A detector of no errors judges nothing: then ``judged`` and ``attribution`` stay as they are.
+
+    Args:
+        memory: see ``RowKernel.bound``.
+        rows: (B, D), perhaps not finite.
+        judged: (B,) of ``JUDGED``, written.
+        attribution: (B, D) share of each number in the surprise, written.
+    """
+    learned, before, after = memory.parts
+    layout, wants_context, detector, repetition, senses = learned.parts
+    reading = read(layout, before.memory.history, after.memory.history, rows)
+    carry_on(layout, before.memory, after.memory, reading, wants_context)
+    errors, units = associate(layout, reading)
+    doubt_first_rows(before.memory.history, errors)
+    name_skills(layout, before.memory, after.memory, units)
+
+    if detector.whitening.size:
+        shares = np.empty(errors.shape)
+        output = ModelOutput(errors, after.memory.expected)
+        step_evidence(detector, before.detection.evidence, after.detection.evidence, output, shares)
+        step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
+        find_events(senses, before.events, after.events, rows, judged)
+        unlikely = after.detection.repetition.unlikely
+        judge_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
+    return errors
 
 
 @inner
-def _copy(rows: Any, to: Any, n: int) -> None:
+def doubt_first_rows(history: RowHistory, errors: Any) -> None:
+    """Weigh the errors (B, X) of the first rows less: nothing came before them, so that no change is known."""
+    lag = history.before.shape[1]
+    for n in range(len(errors)):
+        weight = np.float32(0.0)
+        if history.steps[n] >= lag:
+            weight = UNSURE
+        for i in range(errors.shape[1]):
+            if history.steps[n] < 2 * lag:
+                errors[n, i] *= weight
+
+
+@partial(inner, inlined=True)
+def name_skills(layout: Layout, before: MemoryState, after: MemoryState, units: Any) -> None:
+    """Write the evidence for each skill, by the units (B, M) and the state."""
+    if before.skill.shape[1]:
+        W_K = matrix(layout.singles, layout.at[0].W_K)
+        b_K = vector(layout.singles, layout.at[0].b_K)
+        skill = add_up(before.skill, units, after.expected, W_K, b_K)
+        for n in range(len(skill)):
+            copy_row(skill, after.skill, n)
+
+
+@inner
+def copy_row(rows: Any, to: Any, n: int) -> None:
     """Copy row ``n``; numba takes seconds to compile an assignment of rows, with its message about shapes."""
     for i in range(rows.shape[1]):
         to[n, i] = rows[n, i]
 
 
-@inner
-def _compare(
-    rows: Any, before: Any, earlier: Any, steps: Any, new_before: Any, new_earlier: Any, new_steps: Any
-) -> Any:
-    """Write the new history; return the rows that ``rows`` (B, D) are compared with, and those before."""
-    lag = before.shape[1]
-    last, past = np.empty_like(rows), np.empty_like(rows)
+@partial(inner, inlined=True)
+def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
+    """Write the new history; return the rows (B, D) beside those that they are compared with."""
+    lag = before.before.shape[1]
+    last = np.empty_like(rows)
+    past = np.empty_like(rows)
     for n in range(len(rows)):
-        new_steps[n] = steps[n] + 1
+        after.steps[n] = before.steps[n] + 1
         for i in range(rows.shape[1]):
-            last[n, i] = before[n, 0, i] if steps[n] >= lag else rows[n, i]  # at first nothing moves
-            past[n, i] = earlier[n, 0, i] if steps[n] >= 2 * lag else last[n, i]
-            new_before[n, lag - 1, i], new_earlier[n, lag - 1, i] = rows[n, i], last[n, i]
+            last[n, i] = before.before[n, 0, i] if before.steps[n] >= lag else rows[n, i]  # at first nothing moves
+            past[n, i] = before.earlier[n, 0, i] if before.steps[n] >= 2 * lag else last[n, i]
+            after.before[n, lag - 1, i] = rows[n, i]
+            after.earlier[n, lag - 1, i] = last[n, i]
         for k in range(lag - 1):
             for i in range(rows.shape[1]):
-                new_before[n, k, i], new_earlier[n, k, i] = before[n, k + 1, i], earlier[n, k + 1, i]
-    return last, past
+                after.before[n, k, i] = before.before[n, k + 1, i]
+                after.earlier[n, k, i] = before.earlier[n, k + 1, i]
+
+    at = layout.at[0]
+    return read_rows(
+        rows=rows,
+        before=last,
+        earlier=past,
+        mean=vector(layout.doubles, at.mean),
+        spread=vector(layout.doubles, at.spread),
+        change=vector(layout.doubles, at.change),
+        sensory=vector(layout.integers, at.sensory),
+        motor=vector(layout.integers, at.motor),
+        slow=vector(layout.integers, at.slow),
+    )
 
 
-@partial(compiled, calls=("memory", "."))
-def expect_rows(
-    rows: Any,
-    traces: Any,
-    expected: Any,
-    before: Any,
-    earlier: Any,
-    steps: Any,
-    skill: Any,
-    new_traces: Any,
-    new_expected: Any,
-    new_before: Any,
-    new_earlier: Any,
-    new_steps: Any,
-    new_skill: Any,
-    singles: Any,
-    doubles: Any,
-    places: Any,
-    layout: Any,
-    context: bool,
-) -> Any:
-    """Write the new state; return the errors (B, X) of rows (B, D), and which of their numbers are finite (B, D).
-
-    Args:
-        rows: (B, D).
-        traces: and on to ``skill`` the fields of ``MemoryState``; after them, as ``new``, those that are written.
-        singles: and on to ``layout`` what was learned, see ``layout_of``.
-        context: whether f(μ) is wanted.
-    """
-    at, lag, due = layout[0], before.shape[1], False
-    last, past = _compare(rows, before, earlier, steps, new_before, new_earlier, new_steps)
-    scale = vector(doubles, at.mean), vector(doubles, at.spread), vector(doubles, at.change)
-    columns = vector(places, at.sensory), vector(places, at.motor), vector(places, at.slow)
-    senses, seen, commands, inputs, changes, whole, finite = _read(rows, last, past, *scale, *columns)
-
-    for n in range(len(rows)):
-        due = due or steps[n] % lag == 0
-        _copy(traces, new_traces, n)
-        _copy(expected, new_expected, n)
-    if due:  # f(μ_t) (B, H) and c_t (B, I), were it due for all streams
-        how = at.prior_precision, at.sensory_precision, at.curvature, at.iterations
-        W_F = matrix(singles, at.W_F)
-        if at.settles:
-            weights = matrix(singles, at.W_H), matrix(singles, at.W_U), W_F, vector(singles, at.b_F)
-            state, carried = settle(traces, commands, senses, seen, *weights, *how)
-        else:
-            others = matrix(singles, at.W_D), vector(singles, at.gains)
-            state, carried = carry(traces, commands, senses, seen, matrix(singles, at.W_C), W_F, *others, *how, context)
-        for n in range(len(rows)):
-            if steps[n] % lag == 0:
-                _copy(carried, new_traces, n)
-                _copy(state, new_expected, n)
-
-    hidden = matrix(singles, at.V), matrix(singles, at.U), matrix(singles, at.D)
-    spread = matrix(singles, at.W_S), vector(singles, at.b_S), matrix(singles, at.span_S)
-    beyond = vector(singles, at.remainder), matrix(places, at.spans)
-    far = matrix(singles, at.R), matrix(singles, at.Q), matrix(singles, at.doubt), vector(places, at.groups)
-    error, units = normalised_errors(inputs, changes, whole, *hidden, *spread, *beyond, *far, rows.shape[1])
-    for n in range(len(rows)):
-        # Nothing came before the first rows, so that no change is known.
-        sure = np.float32(0.0) if steps[n] < lag else UNSURE
-        for i in range(error.shape[1]):
-            if steps[n] < 2 * lag:
-                error[n, i] *= sure
-    if skill.shape[1]:
-        named = add_up(skill, units, new_expected, matrix(singles, at.W_K), vector(singles, at.b_K))
-        for n in range(len(rows)):
-            _copy(named, new_skill, n)
-    return error, finite
-
-
-@partial(compiled, calls=("detection", "."))
-def judge_rows(
-    rows: Any,
-    error: Any,
-    finite: Any,
-    expected: Any,
-    evidence: Any,
-    context: Any,
-    counted: Any,
-    last: Any,
-    again: Any,
-    unlikely: Any,
-    excused: Any,
-    new_evidence: Any,
-    new_context: Any,
-    new_counted: Any,
-    new_last: Any,
-    new_again: Any,
-    new_unlikely: Any,
-    new_excused: Any,
-    value: Any,
-    attribution: Any,
-    raw: Any,
-    excuse: Any,
-    divisor: Any,
-    learned: Any,
-    columns: Any,
-    layout: Any,
+@partial(inner, inlined=True)
+def carry_on(
+    layout: Layout, before: MemoryState, after: MemoryState, reading: ScaledRows, wants_context: bool
 ) -> None:
-    """Write the surprise of rows (B, D), and the state of detection after them.
+    """Write traces and expected state, where the temporal network takes up the row, else those of before."""
+    steps = before.history.steps
+    lag = before.history.before.shape[1]
+    due = False
+    for n in range(len(steps)):
+        due = due or steps[n] % lag == 0
+        copy_row(before.traces, after.traces, n)
+        copy_row(before.expected, after.expected, n)
+    if due:
+        expected, carried = follow(layout, before.traces, reading, wants_context)  # of all streams
+        for n in range(len(steps)):
+            if steps[n] % lag == 0:
+                copy_row(carried, after.traces, n)
+                copy_row(expected, after.expected, n)
 
-    The arrays come one by one: numba takes longer to look through named tuples of them than to compute with them.
 
-    Args:
-        error, finite, expected: (B, X), (B, D) and (B, H), as ``expect_rows`` found them.
-        evidence: and on to ``excused`` the fields of ``EvidenceState``, and what is excused; after them, as ``new``,
-            those that are written.
-        value, attribution, raw, excuse: of the surprise, see ``Surprise``.
-        divisor: (B,) of what is excused.
-        learned: and on to ``layout`` what is known of detection and excuses.
-    """
-    d = layout[0]
-    B, X = error.shape
-    errors, shares, now = np.empty((B, X)), np.empty((B, X)), np.empty(expected.shape)
-    for n in range(B):
-        for i in range(X):
-            errors[n, i] = error[n, i]
-        for i in range(now.shape[1]):
-            now[n, i] = expected[n, i]
-    white = matrix(learned, d.whitening), matrix(learned, d.ceiling), matrix(learned, d.tail)
-    usual = vector(learned, d.context_quantile), vector(learned, d.context_range), vector(learned, d.gains)
-    new = new_evidence, new_context, new_counted, value, shares
-    _step(evidence, context, counted, errors, now, *white, *usual, d.bound, *new)
-    sensory, offset = vector(columns, d.sensory), vector(learned, d.repetition_offset)
-    by = vector(learned, d.repetition_steps).reshape((2, 2, X)), vector(learned, d.repetition_most)
-    repeated(last, again, unlikely, rows, sensory, *by, new_last, new_again, new_unlikely)
-    _attribute(shares, new_unlikely, offset, sensory, finite, value, attribution)
-    for n in range(B):
-        raw[n], excuse[n], divisor[n] = value[n], 0, 1.0
-    if d.excuses:
-        stops = vector(columns, d.joints), matrix(learned, d.ends)
-        senses = vector(columns, d.wrist), *stops, vector(columns, d.fingers), vector(columns, d.lasting)
-        _excuse(excused, rows, *senses, d.on_its_way, new_excused, excuse, divisor)
-        for n in range(B):
-            if divisor[n] != 1.0:
-                value[n] /= divisor[n]
-                for i in range(attribution.shape[1]):
-                    attribution[n, i] /= divisor[n]
+@partial(inner, inlined=True)
+def follow(layout: Layout, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
+    """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
+    at = layout.at[0]
+    W_F = matrix(layout.singles, at.W_F)
+    if at.settles:
+        return settle(
+            z=traces,
+            u=reading.commands,
+            x=reading.senses,
+            seen=reading.seen,
+            W_H=matrix(layout.singles, at.W_H),
+            W_U=matrix(layout.singles, at.W_U),
+            W_F=W_F,
+            b_F=vector(layout.singles, at.b_F),
+            pi_z=at.prior_precision,
+            pi_x=at.sensory_precision,
+            curvature=at.curvature,
+            iterations=at.iterations,
+        )
+    return carry(
+        c=traces,
+        u=reading.commands,
+        x=reading.senses,
+        seen=reading.seen,
+        W_C=matrix(layout.singles, at.W_C),
+        W_F=W_F,
+        W_D=matrix(layout.singles, at.W_D),
+        gains=vector(layout.singles, at.gains),
+        pi_z=at.prior_precision,
+        pi_x=at.sensory_precision,
+        curvature=at.curvature,
+        iterations=at.iterations,
+        context=wants_context,
+    )
+
+
+@partial(inner, inlined=True)
+def associate(layout: Layout, reading: ScaledRows) -> Any:
+    """Return the errors (B, X) of what other senses predict, and the units (B, M)."""
+    at = layout.at[0]
+    singles = layout.singles
+    return normalised_errors(
+        inputs=reading.inputs,
+        changes=reading.changes,
+        whole=reading.whole,
+        V=matrix(singles, at.V),
+        U=matrix(singles, at.U),
+        D=matrix(singles, at.D),
+        W_S=matrix(singles, at.W_S),
+        b_S=vector(singles, at.b_S),
+        span_S=matrix(singles, at.span_S),
+        remainder=vector(singles, at.remainder),
+        spans=matrix(layout.integers, at.spans),
+        R=matrix(singles, at.R),
+        Q=matrix(singles, at.Q),
+        doubt=matrix(singles, at.doubt),
+        groups=vector(layout.integers, at.groups),
+        first=reading.finite.shape[1],
+    )
 
 
 @inner
-def _attribute(
-    shares: Any, unlikely: Any, offset: Any, sensory: Any, finite: Any, value: Any, attribution: Any
+def judge_rows(
+    repetition: RepetitionWeights, unlikely: Any, shares: Any, finite: Any, judged: Any, attribution: Any
 ) -> None:
-    """Write the surprise: shares of errors (B, X), pooled with repetitions; what is not finite is above all."""
-    D, X = attribution.shape[1], len(sensory)
-    ratios = np.zeros(X)
-    for n in range(len(value)):
-        found, whole = 0.0, True
-        for i in range(D):
-            attribution[n, i] = 0.0
-            whole = whole and finite[n, i]
-        for i in range(X):
-            attribution[n, sensory[i]] = shares[n, i]
-        for i in range(D):
-            found += attribution[n, i]
-        greatest = max(found, TINY)
-        for i in range(X):
-            stuck = unlikely[n, i] > 0
-            ratios[i] = np.exp(TAIL_INDEX * (unlikely[n, i] - offset[i])) if stuck else 0.0
-            greatest = max(greatest, ratios[i])
-        total = (found / greatest) ** POWER
-        own = total
-        for i in range(X):
-            ratios[i] = (ratios[i] / greatest) ** POWER
-            total += ratios[i]
-        pooled = greatest * total ** (1.0 / POWER) / max(total, TINY)
-        if total > own:
-            for i in range(X):
-                shared = attribution[n, sensory[i]] * (pooled * own / max(found, TINY))
-                attribution[n, sensory[i]] = shared + pooled * ratios[i]
-        value[n] = 0.0
-        for i in range(D):
-            if not whole:
-                attribution[n, i] = 0.0 if finite[n, i] else np.inf
-            value[n] += attribution[n, i]
+    """Write surprise and attribution: shares of errors pooled with repetitions, and divided by what excuses them.
+
+    Args:
+        repetition: what was learned of repetitions.
+        unlikely: (B, X) n of ``repetition``.
+        shares: (B, X) of the errors.
+        finite: (B, D) which numbers are; what is not is above all.
+        judged: (B,) of ``JUDGED``, with the divisors.
+        attribution: (B, D), written.
+    """
+    columns = repetition.columns
+    ratios = np.empty(len(columns))
+    for n in range(len(judged)):
+        share = attribution[n]
+        for i in range(len(share)):
+            share[i] = 0.0
+        for i in range(len(columns)):
+            share[columns[i]] = shares[n, i]
+        pool_repetitions(repetition, unlikely[n], ratios, share)
+        mark_missing(finite[n], share)
+
+        surprise = 0.0
+        for i in range(len(share)):
+            surprise += share[i]
+        judged[n].raw_surprise = surprise
+        judged[n].surprise = surprise
+        if judged[n].divisor != 1.0:
+            judged[n].surprise = surprise / judged[n].divisor
+            for i in range(len(share)):
+                share[i] /= judged[n].divisor
+
+
+@inner
+def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, ratios: Any, share: Any) -> None:
+    """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
+    value = 0.0
+    for i in range(len(share)):
+        value += share[i]
+    greatest = max(value, TINY)
+    for i in range(len(ratios)):
+        ratios[i] = 0.0
+        if unlikely[i] > 0:
+            ratios[i] = np.exp(TAIL_INDEX * (unlikely[i] - repetition.offset[i]))
+        greatest = max(greatest, ratios[i])
+
+    own = (value / greatest) ** POWER
+    total = own
+    for i in range(len(ratios)):
+        ratios[i] = (ratios[i] / greatest) ** POWER
+        total += ratios[i]
+    if not total > own:
+        return
+    pooled = greatest * total ** (1.0 / POWER) / max(total, TINY)
+    for i in range(len(ratios)):
+        column = repetition.columns[i]
+        share[column] = share[column] * (pooled * own / max(value, TINY)) + pooled * ratios[i]
+
+
+@inner
+def mark_missing(finite: Any, share: Any) -> None:
+    """Give all of the surprise, which is infinite, to the numbers that are not finite, if there are any."""
+    whole = True
+    for i in range(len(finite)):
+        whole = whole and finite[i]
+    if whole:
+        return
+    for i in range(len(finite)):
+        share[i] = 0.0 if finite[i] else np.inf

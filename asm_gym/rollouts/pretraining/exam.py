@@ -12,7 +12,7 @@ import numpy as np
 from asm_gym.data.crashes import CRASH, peak_force
 from asm_gym.data.episode import Episode
 from asm_gym.detection import AdaptiveThreshold
-from asm_gym.detection.events import KNOCK, STOP
+from asm_gym.detection.alarm_rule import KNOCK, STOP
 from asm_gym.evaluation.comparison import detectability_of, visible_kinds
 from asm_gym.evaluation.detection_tables import kept_rate, milliseconds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
