@@ -3,12 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from asm_gym.guard.limits import EpisodeLimits, limits_of
 
 from asm_gym import Episode, collect
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import MOMENTUM, ContactLimits, Pace, healthy_forces
 from asm_gym.envs.actions import BESIDE
-from asm_gym.guard.limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies import make_policy

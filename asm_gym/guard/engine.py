@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from asm_gym.detection.events import EVENTS, FAULT, KNOCK
 from asm_gym.guard.arbiter import POLICY, REFLEX, Arbiter, Judged
 from asm_gym.guard.diagnosis import Alarm, Diagnostician
-from asm_gym.guard.limits import EpisodeLimits, limits_of
+from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.motion import Command, Motions
 from asm_gym.guard.observer import STALE, Fitted, Observation, Observer, diagnosis_of, joined
 from asm_gym.guard.options import GuardOptions

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.envs.robots import PHYSICS_FREQ
+from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.contact_limits import ContactLimits, Pace
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.guard.robots import Robots
 from asm_gym.monitors import Monitor
 
@@ -61,4 +62,4 @@ def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor, task
     """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones in a task."""
     if contact_limits is None or isinstance(contact_limits, ContactLimits):
         return contact_limits
-    return ContactLimits(healthy=getattr(monitor, "healthy_", ()), pace=Pace.of(getattr(monitor, "pace_", {}), task))
+    return ContactLimits(healthy=getattr(monitor, "healthy_", ()), pace=HandSpeedMap.of(getattr(monitor, "pace_", {}), task))
