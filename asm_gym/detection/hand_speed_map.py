@@ -222,9 +222,7 @@ def healthy_share(limit: SpeedLimit, arm: int, place: Floats, twist: Floats) -> 
 
 
 @compiled
-def allowed_share(
-    limit: SpeedLimit, arm: int, place: Floats, twist: Floats, speed: float, momentum: float
-) -> float:
+def allowed_share(limit: SpeedLimit, arm: int, place: Floats, twist: Floats, speed: float, momentum: float) -> float:
     """Return s, the share that a hand may have of a motion; above 1 where it may go faster.
 
     Args:

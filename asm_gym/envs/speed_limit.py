@@ -41,9 +41,7 @@ _address = types.intp
 _site_jacobian: Any = types.ExternalFunction(
     "mj_jacSite", types.void(_address, _address, _address, _address, types.int32)
 )
-_solve_mass: Any = types.ExternalFunction(
-    "mj_solveM", types.void(_address, _address, _address, _address, types.int32)
-)
+_solve_mass: Any = types.ExternalFunction("mj_solveM", types.void(_address, _address, _address, _address, types.int32))
 
 
 class ActionScale(NamedTuple):
@@ -171,9 +169,7 @@ def momentum(views: Views, motions: Motions, row: int) -> float:
 
 
 @partial(inner, inlined=True)
-def share_of(
-    views: Views, arms: Arms, limit: SpeedLimit, motions: Motions, a: int, row: int, speed: float
-) -> float:
+def share_of(views: Views, arms: Arms, limit: SpeedLimit, motions: Motions, a: int, row: int, speed: float) -> float:
     """Return the share that arm ``a``'s hand may have of a motion whose fastest point has a speed [m/s]."""
     along = 0.0
     if limit.grid.shape[0] > 0:

@@ -100,9 +100,7 @@ class Hands:
         limits: slow the hands down; None for no limits.
     """
 
-    def __init__(
-        self, row: NDArray[np.floating[Any]], monitor: Any, dt: float, limits: ContactLimits | None
-    ) -> None:
+    def __init__(self, row: NDArray[np.floating[Any]], monitor: Any, dt: float, limits: ContactLimits | None) -> None:
         sensed = row.astype(np.float64)[hands_of(monitor.spec)]  # (H, 2, 3)
         self._places = sensed[:, 0]
         self._velocities = sensed[:, 1]

@@ -67,8 +67,11 @@ def run(config: Config) -> kit.Findings:
         if task not in known:
             found = collect(env_id(task), policy="scripted", episodes=config.learned, seed=500, workers=config.workers)
             spec, solved = found[0].spec, [episode for episode in found if episode.success]
-            learned = {"pace_": HandSpeedMap.by_task(solved, spec), "motion_": learned_motion([e.stream for e in solved], spec)}
-            known[task] = SimpleNamespace(spec=spec, **learned)
+            known[task] = SimpleNamespace(
+                spec=spec,
+                pace_=HandSpeedMap.by_task(solved, spec),
+                motion_=learned_motion([episode.stream for episode in solved], spec),
+            )
         trials = [replace(case.trial, seed=1000 + config.seed + n) for n in range(count)]
         jobs += [(case._replace(trial=trial), known[task]) for trial in trials]
     records = kit.each("episodes", episode, jobs, config)

@@ -40,10 +40,9 @@ def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, 
     if not isinstance(robot, Sequence):
         raise ValueError(f"robot must be a name or a sequence of names, got {short_repr(robot)}")
 
+    names = tuple(robot)
     if isinstance(robot, str):
         names = (robot,) * task.arms
-    else:
-        names = tuple(robot)
     for name in names:
         robot_named(name)
     if len(names) != task.arms:
