@@ -6,15 +6,17 @@ import pytest
 
 from asm_gym import Episode, collect
 from asm_gym.data.episode import EpisodeLabel
-from asm_gym.detection.contact_limits import MOMENTUM, ContactLimits, Pace, healthy_forces
-from asm_gym.envs.actions import BESIDE
-from asm_gym.guard.limits import EpisodeLimits, limits_of
+from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
+from asm_gym.detection.hand_speed_map import MOMENTUM, HandSpeedMap
+from asm_gym.envs.speed_limit import BESIDE
+from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies import make_policy
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
 from asm_gym.wrappers.capabilities import robots_of
+from tests.hand_motion import hand_momentum, hand_speed, present_twist
 
 FOLDED = 0.0, -0.2, 2.5, -2.95, 1.34, 2.3, -2.73  # the fingers are in the pedestal, 9 mm deep [rad]
 
@@ -161,7 +163,7 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
     env.reset(seed=0)
     arm = env.unwrapped
     arm.contact_limits = ContactLimits(1e3, 1e3, hand_speed=0.15)
-    arm.substep_hooks.append(lambda k: speeds.append(arm.simulation.hand_speeds(arm.simulation.hand_twist(0)[None])[0]))
+    arm.substep_hooks.append(lambda k: speeds.append(hand_speed(present_twist(arm.simulation, 0))))
     for step in range(12):
         if step % 4 == 0:
             action = rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32)
@@ -180,11 +182,11 @@ def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_heal
         found = []
         for _ in range(60):
             lift.step(np.float32(action))
-            twist = simulation.hand_twist(0)
-            found.append((simulation.hand_momenta(0, twist[None])[0], np.linalg.norm(twist[:3])))
+            twist = present_twist(simulation, 0)
+            found.append((hand_momentum(simulation, 0, twist), np.linalg.norm(twist[:3])))
         return np.max(found, axis=0)
 
-    elsewhere = Pace(np.array([[0, 20, 20, 20, *[0.1] * 12]]))
+    elsewhere = HandSpeedMap(np.array([[0, 20, 20, 20, *[0.1] * 12]]))
     forward, sideways = [1, 0, -0.3, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0, 0]
     assert most(forward, elsewhere)[0] < 1.2 * MOMENTUM < most(forward, None)[0] / 1.5
     assert most(sideways, elsewhere)[1] == pytest.approx(most(sideways, None)[1], rel=0.05)
@@ -199,7 +201,7 @@ def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():
     def feel(_):
         simulation = arm.simulation
         hand, base = simulation.views.site_xpos[simulation.arms.site[0]], np.array([-0.56, 0.0, 0.912])
-        speed = simulation.hand_speeds(simulation.hand_twist(0)[None])[0]
+        speed = hand_speed(present_twist(simulation, 0))
         found.append((np.hypot(*(hand - base)[:2]), speed, simulation.contact_forces[-1]))
 
     arm.substep_hooks.append(feel)
@@ -228,11 +230,11 @@ def hands(*twists, place=(0.1, 0.2, 0.91)):
 
 def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual_one(tmp_path):
     spec, stream = hands([0.4, 0.0, -0.1, 0, 0, 1.0], [0.0, 0.0, -0.3, 0, 0, 0])
-    limits, here = ContactLimits(pace=Pace(Pace.learned([stream], spec))), np.array([0.1, 0.2, 0.91])
+    limits, here = ContactLimits(pace=HandSpeedMap(HandSpeedMap.learned([stream], spec))), np.array([0.1, 0.2, 0.91])
 
     def most(*twist, place=here, momentum=0.0):
         speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
-        return float(limits.shares(0, place, np.array([twist], float), *np.array([[speed], [momentum]]))[0])
+        return limits.share(0, place, np.array(twist, float), speed, momentum)
 
     assert most(0.4, 0, 0, 0, 0, 1.0) >= 1.0  # as healthy hands did
     assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
@@ -240,11 +242,11 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
     assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
     assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(0.15 / 0.3)  # with whatever is behind it
     assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2  # not so where no healthy hand went down
-    assert ContactLimits().shares(0, here, np.array([[0.3, 0, 0, 0, 0, 0]]), *np.array([[0.3], [0]])) == [0.5]
-    assert Pace.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
+    assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == 0.5
+    assert HandSpeedMap.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
     for bad in (np.zeros((0, 16)), np.full((1, 16), np.nan), np.full((1, 16), 1e9), np.zeros((1, 15))):
         with pytest.raises(ValueError, match="pace must be rows"):
-            Pace(bad)
+            HandSpeedMap(bad)
 
 
 def test_a_task_with_enough_healthy_episodes_has_a_pace_of_its_own(tmp_path):
@@ -254,7 +256,8 @@ def test_a_task_with_enough_healthy_episodes_has_a_pace_of_its_own(tmp_path):
         return [Episode.from_stream(stream, spec, label=label) for _ in range(count)]
 
     every = [*episodes("Lift", 40, 0.2), *episodes("Stack", 40, 0.4), *episodes("Door", 3, 0.6)]
-    known, here = Pace.by_task(every, every[0].spec), np.array([0.1, 0.2, 0.91])
-    fastest = {t: float(Pace.of(known, t).seen(0, here)[0, 0]) for t in ("Lift", "Stack", "Door", "Wipe")}
+    known, here = HandSpeedMap.by_task(every, every[0].spec), np.array([0.1, 0.2, 0.91])
+    maps = {task: HandSpeedMap.of(known, task) for task in ("Lift", "Stack", "Door", "Wipe")}
+    fastest = {task: float(own.fastest_near(0, here)[0, 0]) for task, own in maps.items()}
     assert fastest == pytest.approx({"Lift": 0.2, "Stack": 0.4, "Door": 0.6, "Wipe": 0.6})
-    assert Pace.of({}, "Lift") is None
+    assert HandSpeedMap.of({}, "Lift") is None

@@ -6,8 +6,9 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import asm_gym  # noqa: F401
-from asm_gym.envs.backend import CONTROLLERS, IK_ROBOTS
+from asm_gym.envs.backend import CONTROLLERS
 from asm_gym.envs.control import YIELDS_AT
+from asm_gym.envs.robots import robot_named
 from asm_gym.faults import Push
 from asm_gym.tasks import ROBOTS
 from asm_gym.wrappers import FaultInjection, NeuralASMSafety, VectorNeuralASMSafety
@@ -62,7 +63,7 @@ def assert_stays(speed, farthest, last):
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("robot", [r if r == "Panda" else pytest.param(r, marks=pytest.mark.slow) for r in ROBOTS])
 def test_held_at_speed_the_joints_stop_where_they_are(robot, controller):
-    if controller == "IK_POSE" and robot not in IK_ROBOTS:
+    if controller == "IK_POSE" and not robot_named(robot).has_inverse_kinematics:
         with pytest.raises(ValueError, match=f"IK_POSE is for Panda, Sawyer, and not for {robot}"):
             made(robot, controller)
         return

@@ -7,7 +7,8 @@ import pytest
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection.commands import healthy_commands, learned_motion
-from asm_gym.detection.contact_limits import ContactLimits, Pace
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.guard.preview import preview_chunk
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -49,7 +50,7 @@ def memory(lift):
     lift.reset(seed=0)
     rows = [lift.step(action.astype(np.float32))[4]["stream"] for action in [*UP, *-UP]]
     memory = NeuralASM.pretrained("panda")
-    memory.pace_ = {"": Pace.learned([np.array(rows)], memory.spec)}
+    memory.pace_ = {"": HandSpeedMap.learned([np.array(rows)], memory.spec)}
     memory.motion_ = learned_motion([np.array(rows)], memory.spec)
     return memory
 
@@ -57,7 +58,7 @@ def memory(lift):
 def test_a_hand_that_would_go_faster_than_any_was_there_is_the_end_of_a_chunk():
     spec = StreamSpec((*HAND.channels[:2], Channel("hand_angular_velocity", 3), HAND.channels[2]), HAND.dt)
     rows = np.insert(path(0.2, (0.2, 0.0)), 6, np.zeros((3, 1)), axis=1)
-    known = SimpleNamespace(spec=spec, pace_={"": Pace.learned([rows], spec)}, motion_=np.zeros((5, 3)))
+    known = SimpleNamespace(spec=spec, pace_={"": HandSpeedMap.learned([rows], spec)}, motion_=np.zeros((5, 3)))
     known.motion_[3, 0] = 1.0  # the hand has the velocity that is commanded
     row, last = rows[10], rows[10, 9:]
 

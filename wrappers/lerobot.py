@@ -27,7 +27,7 @@ from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.data.rows import ClockWentBack, Pace
 from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.adapter import Adapter, SensedRows
-from asm_gym.guard.engine import Engine
+from asm_gym.guard.guard import Guard
 from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.preview import Preview
@@ -112,7 +112,7 @@ class LeRobotGuard(Adapter):
 
     def reset(self) -> None:
         """Begin a new episode, and end a stop."""
-        self._engine: Engine | None = None  # made once the names of the actions are known
+        self._guard: Guard | None = None  # made once the names of the actions are known
         self._sent: dict[str, float] = {}  # the newest finite number that was sent, by name
         self._pace = Pace(self._spec.dt)
         self._history = ServoHistory(self._spec.dt)
@@ -144,7 +144,7 @@ class LeRobotGuard(Adapter):
         """
         if not len(actions):
             raise ValueError("a chunk needs at least one action, got none")
-        engine = self._engine_for(actions[0])
+        engine = self._guard_for(actions[0])
         chunk = np.concatenate([self._numbers(action) for action in actions])  # (k, A)
         row = row_of(LoopStep(observation, self._sent), self._columns)[0]
         return engine.preview(0, chunk, row, self._numbers(self._sent)[0])
@@ -160,7 +160,7 @@ class LeRobotGuard(Adapter):
             Numbers by name; none in an alarm while no position is known.
         """
         self._check_rate()
-        engine = self._engine_for(action)
+        engine = self._guard_for(action)
         step = LoopStep(observation, action)
         engine.sense(row_of(step, self._columns))
         if self.on_alarm != "monitor":
@@ -214,15 +214,15 @@ class LeRobotGuard(Adapter):
         if not (was_alarm or report.intervened[0]):
             _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
 
-    def _engine_for(self, action: Mapping[str, Any]) -> Engine:
+    def _engine_for(self, action: Mapping[str, Any]) -> Guard:
         """Return the engine, which is made for the names of the first action."""
-        if self._engine is None:
+        if self._guard is None:
             commanded = [column.motor for column in self._columns if column.group == COMMANDED]
             self._names = tuple(dict.fromkeys([*commanded, *action]))
-            self._engine = self._new_engine()
-        return self._engine
+            self._guard = self._new_engine()
+        return self._guard
 
-    def _new_engine(self) -> Engine:
+    def _new_engine(self) -> Guard:
         """Return the engine of one arm whose actions are known by name.
 
         Raises:
@@ -239,7 +239,7 @@ class LeRobotGuard(Adapter):
         if self.on_alarm == "stop":
             release_rows = sys.maxsize
         options = GuardOptions(reaction, release_rows, contact_limits=None)
-        return Engine(robots_of(self._names, meaning, dt), self.monitor, options)
+        return Guard(robots_of(self._names, meaning, dt), self.monitor, options)
 
     def _check_rate(self) -> None:
         """Log that rows come at another rate than the memory reads."""
@@ -251,7 +251,7 @@ class LeRobotGuard(Adapter):
         if self._pace.change:
             _log.warning(self._pace.change)
 
-    def _chosen(self, engine: Engine, action: Mapping[str, Any]) -> dict[str, float]:
+    def _chosen(self, engine: Guard, action: Mapping[str, Any]) -> dict[str, float]:
         """Return the action that the guard chooses, the policy's or a hold; some may be NaN."""
         executed = engine.act(self._numbers(action), lambda _: None).actions[0]
         return dict(zip(self._names, executed.tolist(), strict=True))

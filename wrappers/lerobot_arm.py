@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import TARGET, UNKNOWN, VELOCITY, ActionMeaning, ActionMeans
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robot_facts import RobotFacts
 
 SENSED = "observation.state"
 COMMANDED = "action"
@@ -98,7 +98,7 @@ def meaning_of(
     )
 
 
-def robots_of(names: Sequence[str], meaning: ActionMeaning, dt: float) -> Robots:
+def robots_of(names: Sequence[str], meaning: ActionMeaning, dt: float) -> RobotFacts:
     """Return what is known of one arm.
 
     Args:
@@ -108,7 +108,7 @@ def robots_of(names: Sequence[str], meaning: ActionMeaning, dt: float) -> Robots
     """
     unbounded = np.full(len(names), np.inf, np.float32)
     is_gripper = [_GRIPPER.search(name) is not None for name in names]
-    return Robots(
+    return RobotFacts(
         count=1,
         low=-unbounded,
         high=unbounded,

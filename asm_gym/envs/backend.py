@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import somewhere
+from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.envs.compiled_substeps import touching
 from asm_gym.envs.mujoco_views import Floats
-from asm_gym.envs.robots import PHYSICS_FREQ
+from asm_gym.envs.robots import ROBOTS, robot_named
 from asm_gym.extras import require
 from asm_gym.spec import Channel
 from asm_gym.tasks import TaskSpec
@@ -24,8 +25,6 @@ from asm_gym.validation import check_choice, check_text
 
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
-
-IK_ROBOTS = ("Panda", "Sawyer")  # arms that robosuite's inverse kinematics knows
 
 # Tasks that choose one of several objects for each episode: attributes with the objects and with the choice.
 _CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("nuts", "nut_id")}
@@ -93,9 +92,8 @@ def make(task: TaskSpec, robots: tuple[str, ...], controller: str, control_freq:
     """Return robosuite's environment; raise ValueError for a controller that is unknown or does not fit the robot."""
     robosuite = import_robosuite()
     check_choice("controller", check_text("controller", controller), CONTROLLERS)
-    unknown = [robot for robot in robots if robot not in IK_ROBOTS]
-    if unknown and controller == "IK_POSE":
-        raise ValueError(f"IK_POSE is for {', '.join(IK_ROBOTS)}, and not for {unknown[0]}")
+    if controller == "IK_POSE":
+        _check_inverse_kinematics(robots)
     return robosuite.make(
         task.name,
         robots=list(robots),
@@ -107,6 +105,13 @@ def make(task: TaskSpec, robots: tuple[str, ...], controller: str, control_freq:
         reward_shaping=reward_shaping and task.name != "TwoArmTransport",  # which has no dense reward
         ignore_done=True,
     )
+
+
+def _check_inverse_kinematics(robots: tuple[str, ...]) -> None:
+    for name in robots:
+        if not robot_named(name).has_inverse_kinematics:
+            known = [robot.name for robot in ROBOTS.values() if robot.has_inverse_kinematics]
+            raise ValueError(f"IK_POSE is for {', '.join(known)}, and not for {name}")
 
 
 def _configuration(controller: str, robot: str) -> dict[str, Any]:

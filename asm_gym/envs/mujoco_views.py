@@ -15,6 +15,7 @@ Ints = NDArray[np.int64]
 JOINTS = 7  # the most joints an arm may have; shorter arms leave the rest unused
 FELT = JOINTS + 3  # numbers that limits apply to: external torque of the joints, then force at the wrist
 OSC_POSE, JOINT_POSITION = 0, 1
+UNKNOWN_CHANGE, JOINT_ANGLES, HAND_POSE = range(3)  # what the inputs of an arm change
 
 
 class Views(NamedTuple):
@@ -89,6 +90,8 @@ class Arms(NamedTuple):
     first: Ints  # (A,) where the arm's part of the action begins
     inputs: Ints  # (A,) how many numbers it has
     scaling: Floats  # (A, 5, JOINTS) of them; see ``commands``
+    changes: Ints  # (A,) what they change: UNKNOWN_CHANGE, JOINT_ANGLES or HAND_POSE
+    gain: Floats  # (A, JOINTS) Kp/Kd: the velocity that a change asked for again and again leads to [1/s]
 
 
 class Goals(NamedTuple):

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
+from asm_gym.envs.arms import PHYSICS_FREQ, chains_of
 from asm_gym.envs.rendering import OffscreenRenderer
-from asm_gym.envs.robots import PHYSICS_FREQ, chains_of, free_first_joints, robots_for
+from asm_gym.envs.robots import mend_robots, robots_for
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
@@ -118,6 +119,7 @@ class RobosuiteEnv(SteppedEnv):
         self.hand_chains = chains_of(self.simulation.parts, self.simulation.model, self.sensor_noise)
         """Kinematic chains of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
+        self._actions.begin_episode(self.simulation)
         self.action_space = self._actions.space
         self.gripper_actions = self._actions.grippers  # indices of the action that command grippers
         self._build_spaces()
@@ -128,7 +130,7 @@ class RobosuiteEnv(SteppedEnv):
 
     def _bind(self) -> None:
         """Take up the present model, which a hard reset replaces."""
-        free_first_joints(self.robosuite_env)
+        mend_robots(self.robosuite_env)
         self.simulation = Simulation(self.robosuite_env, self.substeps)
         self._objects = backend.ObjectSensors(self.robosuite_env, self.task)
         backend.speed_up_contacts(self.robosuite_env)
@@ -180,6 +182,7 @@ class RobosuiteEnv(SteppedEnv):
             self._bind()
         else:
             self.simulation.begin_episode()
+        self._actions.begin_episode(self.simulation)
         self._diverged = self._divergences()
         self._steps_taken, self.holding = 0, False
         self.contact_limits = None

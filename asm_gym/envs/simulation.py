@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from asm_gym.compilation import must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
+from asm_gym.envs.arms import bodies, controller_of, describe, describe_inputs, is_compilable
 from asm_gym.envs.commands import move_gripper, scaling_of
-from asm_gym.envs.control import HELD, REACHES
+from asm_gym.envs.control import HELD
 from asm_gym.envs.mujoco_views import (
     ACTS,
     ARMED,
@@ -30,11 +31,9 @@ from asm_gym.envs.mujoco_views import (
     Views,
     Work,
 )
-from asm_gym.envs.robots import SLOWED, NominalDynamics, bodies, describe, is_compilable
+from asm_gym.envs.nominal_dynamics import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
 from asm_gym.spec import Channel
-
-LIGHT = 1e-12  # no inverse mass is taken to be less [1/kg]
 
 
 class Simulation:
@@ -72,7 +71,7 @@ class Simulation:
         self._done = self._row_began = 0
         self._force_before, self._pressed = 0.0, False
         self._fresh = False
-        self.controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in self.parts]
+        self.controllers = [controller_of(part) for part in self.parts]
         """Robosuite's, of each arm."""
         # Asked once an episode: robosuite puts these together anew at every look.
         starts = np.cumsum([0, *(robot.action_dim for robot, _ in self.parts)]).tolist()
@@ -81,14 +80,11 @@ class Simulation:
         """Each arm's part of the action."""
         grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
         self._grips = [grip for grip in grips if grip is not None]
-        self.compiled = all(is_compilable(robot, arm) for robot, arm in self.parts)  # whether control runs compiled
+        self.compiled = all(is_compilable(part) for part in self.parts)  # whether control runs compiled
         self.arms = describe(self.parts, self.model)
         self.speed_limits[:] = np.inf
-        for a, (controller, part) in enumerate(zip(self.controllers, self.moves, strict=True)):
-            size = part.stop - part.start
-            if controller.name in SLOWED and size <= JOINTS:
-                self.arms.first[a], self.arms.inputs[a] = part.start, size
-                self.arms.scaling[a, :, :size] = scaling_of(controller, size)
+        for a, (controller, move) in enumerate(zip(self.controllers, self.moves, strict=True)):
+            describe_inputs(self.arms, a, self.model, controller, move)
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
         self._limits.state[:] = 0, 0, 0, -1, 0, 0
@@ -198,6 +194,11 @@ class Simulation:
         return self._samples[self._limited[0], : self._done - self._row_began, self._columns].T
 
     @property
+    def felt_mean(self) -> Floats:
+        """(N,) their means over the substeps that ``sense`` has summarised last."""
+        return self.proprioception.mean[self._limited[0], self._columns]
+
+    @property
     def contact_forces(self) -> NDArray[np.float64]:
         """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
         forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
@@ -247,43 +248,16 @@ class Simulation:
 
         return move
 
-    def hand_twist(self, a: int, moves: Floats | None = None, in_joints: bool = True) -> Floats:
-        """Return the twist (6,) of arm ``a``'s hand in the world, linear and angular; that of its joints by default.
-
-        Args:
-            moves: speeds of joints, or else of the hand in the frame of actions, linear alone or with angular ones.
-        """
-        if in_joints:
-            speeds = self.views.qvel[self.arms.dofs[a, : int(self.arms.joints[a])]] if moves is None else moves
-            return self.hand_jacobian(a) @ speeds
-        assert moves is not None
-        frame, twist = int(self.arms.base[a]), np.zeros(6)
-        twist[: len(moves)] = moves
-        return twist if frame < 0 else (twist.reshape(2, 3) @ self.views.site_xmat[frame].reshape(3, 3).T).ravel()
-
-    @staticmethod
-    def hand_speeds(twists: Floats) -> Floats:
-        """Return how fast the furthest point of a hand can go (n,) under each of n twists (n, 6) [m/s]."""
-        squares = twists * twists
-        return np.sqrt(squares[:, :3].sum(axis=1)) + REACHES * np.sqrt(squares[:, 3:].sum(axis=1))
-
-    def hand_momenta(self, a: int, twists: Floats) -> Floats:
-        """Return m |v| (n,) at arm ``a``'s hand in each of n twists (n, 6), by the reflected mass m along v [N s].
-
-        1/m = uᵀ J M⁻¹ Jᵀ u, u = v/|v| (Khatib 1995): it grows as the arm is stretched.
-        """
-        jacobian, solved = np.zeros((2, 3, self.model.nv))
-        mujoco.mj_jacSite(self.model, self.data, jacobian, None, int(self.arms.site[a]))
-        mujoco.mj_solveM(self.model, self.data, solved, jacobian)
-        v = twists[:, :3]
-        speeds, gives = np.linalg.norm(v, axis=1), ((v @ jacobian @ solved.T) * v).sum(axis=1)
-        return np.asarray(speeds**3 / np.maximum(gives, LIGHT))
-
-    def hand_jacobian(self, a: int) -> NDArray[np.float64]:
-        """Return the Jacobian (6, n) of arm ``a``'s hand: linear, then angular velocity."""
+    def hand_change(self, a: int, turns: Floats) -> Floats:
+        """Return the change (6,) of the pose of arm ``a``'s hand, in the frame of actions, by turns (n,) of joints."""
         jacobian = np.zeros((6, self.model.nv))
         mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], int(self.arms.site[a]))
-        return jacobian[:, self.arms.dofs[a, : int(self.arms.joints[a])]]
+        change = jacobian[:, self.arms.dofs[a, : len(turns)]] @ turns
+        base = int(self.arms.base[a])
+        if base < 0:
+            return change
+        frame = self.data.site_xmat[base].reshape(3, 3)
+        return np.concatenate([frame.T @ change[:3], frame.T @ change[3:]])
 
     @property
     def motors(self) -> NDArray[np.intp]:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.actions import Actions
+from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.envs.backend import ObjectSensors
 from asm_gym.envs.edits import SimulatorEdits
-from asm_gym.envs.robots import PHYSICS_FREQ
 from asm_gym.envs.sensors import Corruption, Reading, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import Channel
@@ -91,7 +91,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
                     row_hook(reading.stream)
         if limits is not None and limits.stays and self.simulation.passed_limit is not None:
             # What was done last is what the stream says was commanded.
-            self._action = self._actions.resting(self.simulation, self._action)
+            self._action = self._actions.resting(self._action)
 
     def command(self, action: NDArray[np.float32]) -> None:
         """From within a hook: command another action (A,) for the rest of the control step, efference copy included."""
@@ -99,7 +99,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def _command(self, action: NDArray[np.float32]) -> None:
         held, self.holding = self.holding, self.holding and self.keeps_holding
-        self._action = self._actions.resting(self.simulation, self._action) if held else self._slowed(action)
+        self._action = self._actions.resting(self._action) if held else self._slowed(action)
         self.simulation.command(self._delivered(self._action), held)
 
     def _slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -108,7 +108,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         if limits is None or not math.isfinite(limits.hand_speed):
             self.simulation.speed_limits[:] = np.inf
             return action
-        return self._actions.slowed(self.simulation, action, limits)
+        return self._actions.slowed(action, limits)
 
     def _delivered(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
         """Return the action that arrives, in robosuite's units."""
@@ -118,7 +118,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def action_for(self, turns: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """Return the action (A,) that turns joints by ``turns`` (J,) [rad]; raise ValueError where none is a change."""
-        return self._actions.turning(self.simulation, np.asarray(turns, np.float64))
+        return self._actions.turning(np.asarray(turns, np.float64))
 
     def measure(self) -> NDArray[np.float64]:
         """Return the readings (M,) of ``measured_spec`` over the time since the last row, with noise and faults."""
@@ -137,7 +137,7 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
             found["braked"] = sim.braked
             found["contact_load"] = np.inf if unstable else sim.load
             found["contact_left_s"] = np.inf if passed is None else (passed + 1) / PHYSICS_FREQ
-            found["contact_felt"] = sim.felt.mean(axis=0)
+            found["contact_felt"] = sim.felt_mean
         return found
 
     def _divergences(self) -> int:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from asm_gym.blas import ONE_THREAD
 from asm_gym.compilation import bind
-from asm_gym.detection.benign_events import EVENTS, FAULT
+from asm_gym.detection.alarm_rule import EVENTS, FAULT, JUDGED
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.alarm_terms import BY_CAUSE, CONTACT, SURPRISE, AlarmTerms
 from asm_gym.guard.arbiter import Arbiter
@@ -44,7 +44,6 @@ from asm_gym.guard.robot_table import POLICY, REFLEX, Mask, RobotTable, cleared
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator, ValidatedRows
 from asm_gym.monitors import ExpectsActions, Monitor, Surprise
-from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.policies.base import Policy
 
 FAULTY = EVENTS.index(FAULT)

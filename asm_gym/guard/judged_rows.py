@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.detection.alarm_rule import benign_event, over_threshold
-from asm_gym.detection.benign_events import EVENTS, KNOCK
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK, benign_event, over_threshold
 from asm_gym.guard.arbiter import MOSTLY_AFTER
 from asm_gym.guard.contact_state import measure_contacts
 from asm_gym.guard.reflexes import record_motion

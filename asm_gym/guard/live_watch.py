@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from asm_gym.data.rows import Row, RowReader, SourceDied
 from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
-from asm_gym.detection.events import EVENTS, KNOCK, NO_EVENT, STOP
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.adapter import Adapter, SensedRows
-from asm_gym.guard.engine import Engine
+from asm_gym.guard.guard import Guard
 from asm_gym.guard.live_events import (
     ALARM,
     CLOCK,
@@ -38,7 +38,7 @@ from asm_gym.guard.live_events import (
 )
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.report import RowReport
-from asm_gym.guard.robots import Robots
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32
 
@@ -130,7 +130,7 @@ class LiveWatch(Adapter):
         self._spec = spec
         self._reader = RowReader(spec, settings.clock, settings.silence_s)
         options = GuardOptions("monitor", contact_limits=None)
-        self._engine = Engine(Robots.unknown(spec), monitor, options)
+        self._guard = Guard(RobotFacts.unknown(spec), monitor, options)
         self._no_action = np.zeros((1, spec.motor.size), np.float32)
         self._beat = settings.beat
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
@@ -141,7 +141,7 @@ class LiveWatch(Adapter):
 
     def _begin(self) -> None:
         """Forget the rows before: they are not the past of those that follow."""
-        self._engine.begin()
+        self._guard.begin()
         self._bridge = Bridge(self._settings.bridge_s, self._spec.dt, self._spec.size)
         self._lost_before = 0  # rows lost before the newest one
         self._cause = ""  # why surprise is over its threshold; empty where it is not
@@ -241,7 +241,7 @@ class LiveWatch(Adapter):
         """Return the report of a row (D,); a bridged row raises no alarm."""
         sensed = self.sense_rows(numbers)
         is_active = np.array([not is_bridged])
-        return self._engine.judge(sensed.rows, self._no_action, active=is_active)
+        return self._guard.judge(sensed.rows, self._no_action, active=is_active)
 
     def _check_watchdog(self) -> None:
         """Tell the watchdog that a row was judged; its death is one alarm."""

@@ -9,19 +9,20 @@ a chunk surprise it more in healthy chunks than in hostile ones.
 
 from __future__ import annotations
 
-from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.commands import PACE, PLACE, hands_of, out_of_range
-from asm_gym.detection.contact_limits import ContactLimits, Pace
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.validation import as_float32
 
 NO_ACTION = "no action"  # a number of it is not finite
 SLACK = 0.05  # a hand may be faster than healthy ones by so much [m/s]
 
+Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
 
@@ -51,7 +52,7 @@ def preview_chunk(
     dt: float,
     limits: ContactLimits | None = None,
 ) -> Preview:
-    """Return what becomes of a chunk.
+    """Return the prediction for a chunk.
 
     Args:
         chunk: (k, A).
@@ -61,37 +62,74 @@ def preview_chunk(
         dt: control period [s].
         limits: slow hands down; None for no limits.
     """
-    motion, commands = getattr(monitor, "motion_", None), getattr(monitor, "commands_", None)
-    own = limits.pace if limits is not None else None
-    pace = None if motion is None else own or Pace.of(getattr(monitor, "pace_", {}))
-    place, velocity = row.astype(np.float64)[hands_of(monitor.spec)].swapaxes(0, 1)  # (H, 3)
-    known, rows = pace is not None or commands is not None, max(1, round(dt / monitor.spec.dt))
-    for j, action in enumerate(chunk):
-        reason = "" if np.isfinite(action).all() else NO_ACTION
-        if pace is not None and not reason:
-            for _ in range(rows):
-                velocity = (np.concatenate([velocity.ravel(), action]) @ motion).reshape(place.shape)
-                if limits is not None:
-                    velocity *= [[_share(limits, *hand)] for hand in zip(count(), place, velocity, strict=False)]
-                place = place + dt / rows * velocity
-            reason = next(filter(None, (_beyond(pace, *hand) for hand in zip(count(), place, velocity))), "")
-        elif commands is not None and not reason:
+    speed_map = _speed_map(monitor, limits)
+    commands = getattr(monitor, "commands_", None)
+    known = speed_map is not None or commands is not None
+    hands = Hands(row, monitor, dt, limits)
+    for index, action in enumerate(chunk):
+        reason = ""
+        if not np.isfinite(action).all():
+            reason = NO_ACTION
+        elif speed_map is not None:
+            hands.move(action)
+            reason = hands.beyond(speed_map)
+        elif commands is not None:
             reason = out_of_range(commands, last, action)
         if reason:
-            return Preview(j, reason, j * dt, known)
+            return Preview(at=index, reason=reason, seconds=index * dt, known=known)
         last = action
-    return Preview(None, known=known)
+    return Preview(at=None, known=known)
 
 
-def _share(limits: ContactLimits, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> float:
-    """Return the share of a velocity (3,) that limits leave to a hand at a place (3,)."""
-    twist, speed = np.append(velocity, np.zeros(3)), np.linalg.norm(velocity)
-    return min(1.0, float(limits.shares(hand, place, twist[None], np.array([speed]), np.zeros(1))[0]))
+def _speed_map(monitor: Any, limits: ContactLimits | None) -> HandSpeedMap | None:
+    """Return how fast healthy hands went; None where the monitor cannot predict how hands move."""
+    if getattr(monitor, "motion_", None) is None:
+        return None
+    if limits is not None and limits.pace is not None:
+        return limits.pace
+    return HandSpeedMap.of(getattr(monitor, "pace_", {}))
 
 
-def _beyond(pace: Pace, hand: int, place: NDArray[np.float64], velocity: NDArray[np.float64]) -> str:
-    """Return what no healthy hand did near a place (3,): be there, or have the velocity (3,); else empty."""
-    seen = pace.seen(hand, place)[:, :3]
-    if not seen.any():
-        return PLACE
-    return PACE if (np.abs(velocity) > np.where(velocity > 0.0, *seen) + SLACK).any() else ""
+class Hands:
+    """The hands of a robot, as the monitor predicts their motion.
+
+    Args:
+        row: (D,) the last row that was sensed.
+        monitor: knows how hands move by commands, ``motion_`` (3 H + A, 3 H).
+        dt: control period [s].
+        limits: slow the hands down; None for no limits.
+    """
+
+    def __init__(self, row: NDArray[np.floating[Any]], monitor: Any, dt: float, limits: ContactLimits | None) -> None:
+        sensed = row.astype(np.float64)[hands_of(monitor.spec)]  # (H, 2, 3)
+        self._places = sensed[:, 0]
+        self._velocities = sensed[:, 1]
+        self._motion = getattr(monitor, "motion_", None)
+        self._rows = max(1, round(dt / monitor.spec.dt))  # of the stream, in a control period
+        self._row_s = dt / self._rows
+        self._limits = limits
+
+    def move(self, action: Floats32) -> None:
+        """Predict where the hands are after an action (A,), and how fast."""
+        for _ in range(self._rows):
+            inputs = np.concatenate([self._velocities.ravel(), action])
+            self._velocities = (inputs @ self._motion).reshape(self._places.shape)
+            if self._limits is not None:
+                self._slow_down(self._limits)
+            self._places = self._places + self._row_s * self._velocities
+
+    def _slow_down(self, limits: ContactLimits) -> None:
+        for hand, velocity in enumerate(self._velocities):
+            twist = np.append(velocity, np.zeros(3))
+            speed = float(np.linalg.norm(velocity))
+            velocity *= min(1.0, limits.share(hand, self._places[hand], twist, speed))
+
+    def beyond(self, speed_map: HandSpeedMap) -> str:
+        """Return what no healthy hand did near the place of any: be there, or be so fast; else empty."""
+        for hand, velocity in enumerate(self._velocities):
+            along, against = speed_map.fastest_near(hand, self._places[hand])[:, :3]
+            if not along.any() and not against.any():
+                return PLACE
+            if (np.abs(velocity) > np.where(velocity > 0.0, along, against) + SLACK).any():
+                return PACE
+        return ""

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.compilation import compiled, inner
 from asm_gym.guard.robot_facts import RobotFacts, columns_ending
 from asm_gym.policies.hold import HoldingActions
 from asm_gym.spec import StreamSpec
@@ -27,6 +28,7 @@ PATH = 10  # how many actions a retreat undoes
 COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
 TOLERATED = 4.0  # external torque that no joint gives way to under "graded" [N m]
 TOLERATED_ALONE = 2.0  # and under "comply" [N m]
+USUAL_GAIN = 0.1  # weight of the newest step in the external torque that is taken to be usual
 
 
 class Motion(NamedTuple):
@@ -158,3 +160,67 @@ REFLEXES: dict[str, Callable[[FeltMotion, int], Motion]] = {
     "recall": recall,
 }
 """Reflexes by name."""
+
+
+class MotionArrays(NamedTuple):
+    """What compiled code keeps of ``FeltMotion``."""
+
+    torque_columns: NDArray[np.intp]  # (J,)
+    torque: NDArray[np.float64]  # (n, J)
+    usual_torque: NDArray[np.float64]  # (n, J)
+    path: NDArray[np.float32]  # (n, PATH, A)
+    path_steps: NDArray[np.int64]  # (n,)
+
+
+def motion_arrays(motion: FeltMotion | None, facts: RobotFacts) -> MotionArrays:
+    """Return the arrays of ``motion``; empty ones where no reflex depends on what was felt and done."""
+    if motion is not None and motion.feels:
+        return MotionArrays(
+            torque_columns=motion.torque_columns,
+            torque=motion.torque,
+            usual_torque=motion.usual_torque,
+            path=motion.path,
+            path_steps=motion.path_steps,
+        )
+    nothing = np.zeros((facts.count, 0))
+    return MotionArrays(
+        torque_columns=np.zeros(0, np.intp),
+        torque=nothing,
+        usual_torque=nothing,
+        path=np.zeros((facts.count, 0, 0), np.float32),
+        path_steps=np.zeros(facts.count, np.int64),
+    )
+
+
+@compiled
+def record_motion(robots: Any, rows: Any, executed: Any, motion: Any) -> None:
+    """Take rows (n, D) that end a step into external torques, and what policies executed (n, A) into their paths.
+
+    Args:
+        robots: (n,) records of ``ROBOT``.
+        motion: ``MotionArrays``, written to.
+    """
+    for n in range(len(robots)):
+        robot = robots[n]
+        if not (robot.active and robot.ends_step):
+            continue
+        for j in range(len(motion.torque_columns)):
+            if not robot.overridden:
+                # What is carried weighs on the joints as well; only what has come since is yielded to.
+                motion.usual_torque[n, j] += USUAL_GAIN * (motion.torque[n, j] - motion.usual_torque[n, j])
+            torque = float(rows[n, motion.torque_columns[j]])
+            motion.torque[n, j] = torque if np.isfinite(torque) else 0.0
+        if not robot.overridden:
+            extend_path(motion, n, executed[n])
+
+
+@inner
+def extend_path(motion: Any, n: int, executed: Any) -> None:
+    """Append an action (A,) to the path of a robot."""
+    path = motion.path[n]
+    newest = len(path) - 1
+    for i in range(path.shape[1]):
+        for k in range(newest):
+            path[k, i] = path[k + 1, i]
+        path[newest, i] = executed[i]
+    motion.path_steps[n] = min(motion.path_steps[n] + 1, len(path))

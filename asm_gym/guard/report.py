@@ -10,7 +10,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.benign_events import EVENTS, KNOCK
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK
 from asm_gym.guard.alarm_terms import ALARM_TERMS, CONTACT
 from asm_gym.guard.arbiter import Decision
 from asm_gym.guard.contact_state import severity_info

@@ -18,7 +18,8 @@ from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput,
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
-from asm_gym.detection.contact_limits import Pace, healthy_forces
+from asm_gym.detection.contact_limits import healthy_forces
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import LOG, AlarmRate, apart_for_ceilings, require_sight, with_ceilings
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
@@ -61,7 +62,7 @@ class CalibratedMonitor:
         promised_: ``"episode"`` or ``"hour"``, the unit of the promise.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty if the stream has no such channels.
-        pace_: (N, 16) speed of the hands in these episodes, by place and direction, of each task; see ``Pace``.
+        pace_: (N, 16) speed of the hands in these episodes, by place and direction, of each task; see ``HandSpeedMap``.
     """
 
     model: StreamModel
@@ -245,7 +246,7 @@ class CalibratedMonitor:
         self.threshold_, self.promised_ = threshold, asked.per
         self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
         streams = [episode.stream for episode in episodes]
-        self.healthy_, self.pace_ = healthy_forces(streams, self.spec), Pace.by_task(episodes, self.spec)
+        self.healthy_, self.pace_ = healthy_forces(streams, self.spec), HandSpeedMap.by_task(episodes, self.spec)
         self.motion_, self.commands_ = learned_motion(streams, self.spec), healthy_commands(streams, self.spec)
         return self
 

@@ -196,6 +196,12 @@ class NeuralASM(CalibratedMonitor):
             surprise = surprise._replace(skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)])
         return now, surprise
 
+    def compiled_row(self) -> RowKernel | None:
+        """Return the kernel that does all that ``observe`` does; None where Python takes part in a row."""
+        if self.values_ is not None or self.model.skills_:
+            return None
+        return self._row_kernel()
+
     def expected_action(self, state: MonitorState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), in the units of the action, after this state."""
         return self.model.expected_action(state.model)

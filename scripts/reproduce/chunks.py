@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from asm_gym.detection.commands import learned_motion
-from asm_gym.detection.contact_limits import Pace
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.evaluation.tables import Table
 from asm_gym.guard.preview import preview_chunk
 from asm_gym.policies import rollout
@@ -67,8 +67,11 @@ def run(config: Config) -> kit.Findings:
         if task not in known:
             found = collect(env_id(task), policy="scripted", episodes=config.learned, seed=500, workers=config.workers)
             spec, solved = found[0].spec, [episode for episode in found if episode.success]
-            learned = {"pace_": Pace.by_task(solved, spec), "motion_": learned_motion([e.stream for e in solved], spec)}
-            known[task] = SimpleNamespace(spec=spec, **learned)
+            known[task] = SimpleNamespace(
+                spec=spec,
+                pace_=HandSpeedMap.by_task(solved, spec),
+                motion_=learned_motion([episode.stream for episode in solved], spec),
+            )
         trials = [replace(case.trial, seed=1000 + config.seed + n) for n in range(count)]
         jobs += [(case._replace(trial=trial), known[task]) for trial in trials]
     records = kit.each("episodes", episode, jobs, config)

@@ -18,12 +18,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.envs.robots import PHYSICS_FREQ
+from asm_gym.envs.arms import PHYSICS_FREQ
 from asm_gym.evaluation.defaults import TRANSIENT
 from asm_gym.evaluation.figures import figure, look
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
 from asm_gym.evaluation.tables import Table
-from asm_gym.guard.severity import LEANS_S
+from asm_gym.guard.contact_state import LEANS_S
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE

@@ -11,7 +11,8 @@ import numpy as np
 from asm_gym.data.crashes import CRASH, peak_force, peak_torques
 from asm_gym.data.episode import Episode, spans
 from asm_gym.detection.conformal import HOUR
-from asm_gym.detection.contact_limits import Pace, healthy_forces
+from asm_gym.detection.contact_limits import healthy_forces
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.calibration import AlarmRate
@@ -144,5 +145,5 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     tasks = [episode.labelled.task for episode in whole] if all(map(asked.possible, by_task.values())) else []
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=tasks)
     memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
-    memory.pace_ = Pace.by_task(hours or lessons.calibration, memory.spec)
+    memory.pace_ = HandSpeedMap.by_task(hours or lessons.calibration, memory.spec)
     return memory

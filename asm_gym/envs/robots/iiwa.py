@@ -1,0 +1,7 @@
+"""KUKA's LBR iiwa, with the Robotiq 140 gripper."""
+
+from __future__ import annotations
+
+from asm_gym.envs.robots.robot_model import RobotModel
+
+IIWA = RobotModel(name="IIWA")
