@@ -61,19 +61,30 @@ class ActionMeaning:
         return cls(**{name: tuple(values) for name, values in saved.items()})
 
     @classmethod
-    def told(cls, means: ActionMeans, size: int, recorded: ActionMeaning | None = None) -> ActionMeaning:
-        """Return what a user says, for all numbers or for each, with the senses of targets that were found.
+    def told(
+        cls,
+        means: ActionMeans,
+        size: int,
+        recorded: ActionMeaning | None = None,
+    ) -> ActionMeaning:
+        """Return the meaning that a user or an environment declares.
+
+        Args:
+            means: one name for all numbers of an action, or one for each.
+            size: A, how many numbers an action has.
+            recorded: what recorded episodes show, which tells the senses of targets.
 
         Raises:
             ValueError: an unknown meaning, or another number of them.
         """
-        each = (means,) * size if isinstance(means, str) else tuple(means)
-        if len(each) != size:
+        if isinstance(means, str):
+            means = (means,) * size
+        if len(means) != size:
             raise ValueError(f"action_means must be one name, or {size} of them, got {short_repr(means)}")
-        for name in each:
+        for name in means:
             check_choice("action_means", name, MEANINGS)
         known = recorded or cls.unknown((size,))
-        return replace(known, means=each)
+        return replace(known, means=tuple(means))
 
     @classmethod
     def unknown(cls, shape: tuple[int, ...]) -> Self:
@@ -98,18 +109,37 @@ class ActionMeaning:
         before: NDArray[np.floating[Any]],
         executed: NDArray[np.floating[Any]],
     ) -> NDArray[np.float32]:
-        """Return the action (A,) for which a robot stays where it is sensed to be in ``row`` (D,).
+        """Return the action for which a robot stays where it is sensed to be.
 
-        An arm that pursues what was ``executed`` (A,) is between that and where it was in the row ``before``: a sense
-        that says otherwise has failed, and is believed up to there. A target whose sense is not known or not finite
-        stays at what was executed last, as does what is kept; all else stays at 0.
+        An arm that pursues the ``executed`` action is between that and where it was a row before.
+        A sense that says otherwise has failed, and counts up to there. A target whose sense is
+        unknown or not finite stays at the executed action, as does what is kept. All else stays
+        at 0.
+
+        Args:
+            row: (D,) the newest of the stream.
+            before: (D,) the row before it.
+            executed: (A,) the last action before the robot is to stay.
+
+        Returns:
+            (A,) the action.
         """
-        senses, stays = np.array(self.senses, np.intp), np.isin(self.means, (TARGET, KEPT))
-        slopes, offsets = np.array(self.slopes), np.array(self.offsets)
-        sensed, was = (np.where(senses >= 0, offsets + slopes * x[senses], np.nan) for x in (row, before))
-        between = np.clip(sensed, np.minimum(was, executed), np.maximum(was, executed))
-        sensed = np.where(np.isfinite(between), between, sensed)
-        return np.where(stays, np.where(np.isfinite(sensed), sensed, executed), 0.0).astype(np.float32)
+        target = self._sensed_target(row)
+        previous = self._sensed_target(before)
+        low = np.minimum(previous, executed)
+        high = np.maximum(previous, executed)
+        between = np.clip(target, low, high)
+
+        target = np.where(np.isfinite(between), between, target)
+        target = np.where(np.isfinite(target), target, executed)
+        stays = np.isin(self.means, (TARGET, KEPT))
+        return np.where(stays, target, 0.0).astype(np.float32)
+
+    def _sensed_target(self, row: NDArray[np.floating[Any]]) -> Floats:
+        """Return the targets (A,) that are reached at a row (D,); NaN where no sense is known."""
+        senses = np.array(self.senses, np.intp)
+        target = np.array(self.offsets) + np.array(self.slopes) * row[senses]
+        return np.where(senses >= 0, target, np.nan)
 
 
 def found_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
