@@ -27,11 +27,12 @@ from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.data.rows import ClockWentBack, Pace
 from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.adapter import Adapter, SensedRows
+from asm_gym.guard.alarm_terms import FAILURE
+from asm_gym.guard.fitted_monitor import check_monitor
 from asm_gym.guard.guard import Guard
-from asm_gym.guard.observer import check_monitor
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.preview import Preview
-from asm_gym.guard.report import FAILURE, RowReport
+from asm_gym.guard.report import RowReport
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
@@ -144,10 +145,10 @@ class LeRobotGuard(Adapter):
         """
         if not len(actions):
             raise ValueError("a chunk needs at least one action, got none")
-        engine = self._guard_for(actions[0])
+        guard = self._guard_for(actions[0])
         chunk = np.concatenate([self._numbers(action) for action in actions])  # (k, A)
         row = row_of(LoopStep(observation, self._sent), self._columns)[0]
-        return engine.preview(0, chunk, row, self._numbers(self._sent)[0])
+        return guard.preview(0, chunk, row, self._numbers(self._sent)[0])
 
     def guarded(self, observation: Mapping[str, Any], action: Mapping[str, Any]) -> dict[str, Any]:
         """Return the numbers to send in place of an action: finite ones only.
@@ -160,24 +161,20 @@ class LeRobotGuard(Adapter):
             Numbers by name; none in an alarm while no position is known.
         """
         self._check_rate()
-        engine = self._guard_for(action)
+        guard = self._guard_for(action)
         step = LoopStep(observation, action)
-        engine.sense(row_of(step, self._columns))
+        guard.sense(row_of(step, self._columns))
         if self.on_alarm != "monitor":
-            step = LoopStep(observation, self._chosen(engine, action))
+            step = LoopStep(observation, self._chosen(guard, action))
         sensed = self.sense_rows(step)
-        report = engine.judge(
-            sensed.rows,
-            executed=self._numbers(self._sent),
-            failures=sensed.failures,
-        )
+        report = guard.judge(sensed, executed=self._numbers(self._sent))
         self.report_step([report], step)
 
-        overrides = bool(report.intervened[0])
-        self.intervened = overrides or bool(engine.overriding[0])
+        overrides = bool(report.robots["overridden"][0])
+        self.intervened = overrides or bool(guard.overriding[0])
         if self.intervened and not overrides:  # the hold begins before anything is sent
-            step = LoopStep(observation, self._chosen(engine, action))
-            engine.amend(row_of(step, self._columns))
+            step = LoopStep(observation, self._chosen(guard, action))
+            guard.amend(row_of(step, self._columns))
         self._history.append(observation, self._sent)
         command = action
         if self.intervened:
@@ -207,23 +204,23 @@ class LeRobotGuard(Adapter):
         """Keep what there is to say of an alarm, and log the first of several."""
         report = reports[-1]
         was_alarm = self.alarm
-        self.alarm = bool(report.alarm[0])
+        self.alarm = bool(report.robots["alarm"][0])
         if not self.alarm:
             return
         self.last_alarm = self._description(report, target)
-        if not (was_alarm or report.intervened[0]):
+        if not (was_alarm or report.robots["overridden"][0]):
             _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
 
-    def _engine_for(self, action: Mapping[str, Any]) -> Guard:
-        """Return the engine, which is made for the names of the first action."""
+    def _guard_for(self, action: Mapping[str, Any]) -> Guard:
+        """Return the guard, which is made for the names of the first action."""
         if self._guard is None:
             commanded = [column.motor for column in self._columns if column.group == COMMANDED]
             self._names = tuple(dict.fromkeys([*commanded, *action]))
-            self._guard = self._new_engine()
+            self._guard = self._new_guard()
         return self._guard
 
-    def _new_engine(self) -> Guard:
-        """Return the engine of one arm whose actions are known by name.
+    def _new_guard(self) -> Guard:
+        """Return the guard of one arm whose actions are known by name.
 
         Raises:
             ValueError: the actions are to be held, and some are torques, or neither a position nor
@@ -251,9 +248,9 @@ class LeRobotGuard(Adapter):
         if self._pace.change:
             _log.warning(self._pace.change)
 
-    def _chosen(self, engine: Guard, action: Mapping[str, Any]) -> dict[str, float]:
+    def _chosen(self, guard: Guard, action: Mapping[str, Any]) -> dict[str, float]:
         """Return the action that the guard chooses, the policy's or a hold; some may be NaN."""
-        executed = engine.act(self._numbers(action), lambda _: None).actions[0]
+        executed = guard.act(self._numbers(action), lambda _: None).actions[0]
         return dict(zip(self._names, executed.tolist(), strict=True))
 
     def _numbers(self, action: Mapping[str, Any]) -> Floats32:
@@ -262,18 +259,19 @@ class LeRobotGuard(Adapter):
 
     def _description(self, report: RowReport, step: LoopStep) -> dict[str, Any]:
         """Return what there is to say of an alarm."""
+        robot = report.robots[0]
         row = row_of(step, self._columns)[0]
         cause = reason(row)
-        if report.failure:
+        if report.failures:
             cause = FAILURE
         channel = ""
         motor = ""
-        column = blamed(row, report.surprise.attribution[0])
+        column = blamed(row, report.attribution[0])
         if column is not None:
             channel = self._spec.labels[column]
             motor = self._columns[column].motor
         return {
-            "surprise": float(report.surprise.value[0] / report.threshold[0]),
+            "surprise": float(robot["surprise"] / robot["threshold"]),
             "reason": cause,
             "channel": channel,
             "servo": servo_of(motor),

@@ -16,7 +16,7 @@ from asm_gym.guard.preview import Preview, checked_chunk
 from asm_gym.guard.report import AsmInfo, LazyInfo, RowReport, asm_info
 from asm_gym.guard.robot_facts import NOTHING
 from asm_gym.monitors import Monitor
-from asm_gym.policies.hold import HoldsItself, changed_by, outside
+from asm_gym.policies.hold import HoldsItself, why_changed
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, load_felt, sensed_row
@@ -103,9 +103,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._source = StreamSource(env)
         self._spec = self._source.spec
         self._rows_per_step = self._source.rows_per_step
-        wrapper = changed_by(env)
-        if self._rows_per_step > 1 and wrapper is not None:
-            raise ValueError(outside(wrapper, "a reflex within a step"))
+        changed = why_changed(env, "a reflex within a step")
+        if self._rows_per_step > 1 and changed:
+            raise ValueError(changed)
         self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
         self._inner: Any = env.unwrapped
         self._holds_itself = isinstance(self._inner, HoldsItself)

@@ -26,7 +26,6 @@ from asm_gym.detection.base import Array, Floats, ModelOutput
 from asm_gym.detection.evidence import (
     CONTEXT_GAIN,
     POWER,
-    TAIL_INDEX,
     TINY,
     Evidence,
     accumulated,

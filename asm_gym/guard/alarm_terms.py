@@ -1,7 +1,7 @@
 """Alarm terms: the named causes of an alarm, each a function of the table of robots to a mask.
 
-A row is an alarm where any term holds; of several, the one with the least priority gives the reason. To add a term, such
-as a light curtain, ``register_alarm_term("curtain", lambda robots: robots.info("curtain", 0.0) > 0.0)``.
+A row is an alarm where any term holds; of several, the one with the least priority gives the reason. To add a term of
+your own: ``register_alarm_term("curtain", lambda robots: robots.info("curtain", 0.0) > 0.0)``.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ from asm_gym.compilation import compiled
 from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import FeltMotion, Motion
-from asm_gym.guard.robot_facts import NOTHING, RobotFacts
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import REFLEX, RobotTable
 from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold, HoldingActions
@@ -34,7 +34,7 @@ class Command:
     actions: Floats32  # (n, A) finite, in the action space
     brakes: Mask  # (n,) the robot stays, whatever the action is
     overridden: Mask  # (n,) something else than the policy's action is done
-    failures: Mapping[int, str] = NOTHING  # what failed when it was chosen, by robot
+    failures: Mapping[int, str] = field(default_factory=dict)  # what failed when it was chosen, by robot
 
 
 class Commander:
@@ -146,7 +146,7 @@ class Commander:
         return failure
 
     def _react(self, robot: int, reflex: str, observe: Observe) -> tuple[Motion, str]:
-        """Return what a robot does in an override, within its bounds, and what failed: then, or by default, it stays."""
+        """Return what a robot does in an override, within its bounds, and what failed: then the robot stays."""
         facts = self._facts
         stay = Motion(self.holding.stay(robot), brakes=facts.brakes, keeps_grip=facts.rest_is_known)
         motion = stay

@@ -1,6 +1,6 @@
 """Tells what presses, in a stream with external torques, by one completion of all that a contact shows in.
 
-    z_j = (τ_j - τ̂_j) / ε_j      τ̂: external torque of joint j, completed from senses in which no contact shows; ε: its error
+    z_j = (τ_j - τ̂_j) / ε_j      τ̂, ε: external torque of joint j, completed from senses without contact, and its error
     pressed: |z_j| > PRESSED
 """
 

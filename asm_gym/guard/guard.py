@@ -59,9 +59,9 @@ class Row:
     ends_step: bool
     attribution: NDArray[np.float64]  # (n, D)
     failures: dict[int, str] = field(default_factory=dict)  # by robot
-    unreported: Mapping[int, str] = NOTHING  # what failed without a consequence for the row, by robot
-    lost: Mapping[int, tuple[str, ...]] = NOTHING  # numbers that are not finite, by robot
-    contradictions: Mapping[int, Any] = NOTHING  # by robot
+    unreported: Mapping[int, str] = field(default_factory=dict)  # what failed without a consequence, by robot
+    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # numbers that are not finite, by robot
+    contradictions: Mapping[int, Any] = field(default_factory=dict)  # by robot
     terms: Mapping[str, Mask] = field(default_factory=dict)  # where each alarm term holds (n,)
     outcomes: dict[int, Outcome] = field(default_factory=dict)  # by robot
 
@@ -408,7 +408,8 @@ class Guard:
         else:
             response = self._diagnostician.watch(evidence, policy_acts=bool(robot.state == POLICY))
         if not robot.overridden and np.isfinite(robot.surprise):
-            if warning := self._arbiter.count_policy_row(evidence):
+            warning = self._arbiter.count_policy_row(evidence)
+            if warning:
                 warnings.warn(warning, stacklevel=5)
 
         decision = self._arbiter.decide(evidence, response)

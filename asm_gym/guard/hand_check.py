@@ -1,6 +1,6 @@
 """The hand against its joints: two senses of one thing, of which one is wrong where they contradict each other.
 
-    z = (x - x(q)) / σ                       x: the hand as it is sensed; x(q): by the angles of the joints, see ``Chain``
+    z = (x - x(q)) / σ                       x: the hand as it is sensed; x(q): by the joints' angles, see ``Chain``
     m ← m + g (z - m)                        |m| > LIMIT is a contradiction, at whatever rate it came about
     q̂_S = argmin |z|² + |q_S - q̄_S|²/ε²      what the angles S at fault must be; q̄, ε: completion, and its error
 

@@ -239,9 +239,8 @@ class LiveWatch(Adapter):
 
     def _judge(self, numbers: NDArray[np.float64], is_bridged: bool) -> RowReport:
         """Return the report of a row (D,); a bridged row raises no alarm."""
-        sensed = self.sense_rows(numbers)
         is_active = np.array([not is_bridged])
-        return self._guard.judge(sensed.rows, self._no_action, active=is_active)
+        return self._guard.judge(self.sense_rows(numbers), self._no_action, active=is_active)
 
     def _check_watchdog(self) -> None:
         """Tell the watchdog that a row was judged; its death is one alarm."""
@@ -260,18 +259,19 @@ class LiveWatch(Adapter):
         """Say alarms and events of the row that the reports are of."""
         for report in reports:
             self._report_surprise(report, target.numbers)
-            self._report_event(EVENTS[report.event[0]])
+            self._report_event(EVENTS[report.robots["event"][0]])
 
     def _report_surprise(self, report: RowReport, numbers: NDArray[np.float64]) -> None:
         """Raise an alarm where surprise is over its threshold for a cause that is new."""
-        excess = float(report.surprise.value[0] / report.threshold[0])
-        if not excess > 1.0:
+        robot = report.robots[0]
+        if not robot["over"]:
             self._cause = ""
             return
 
+        excess = float(robot["surprise"] / robot["threshold"])
         cause = self._cause or reason(numbers)
         if (self.rows - self._newest.get(cause, -math.inf)) * self._spec.dt > TOGETHER_S:
-            self._alarm_surprise(cause, excess, blamed(numbers, report.surprise.attribution[0]))
+            self._alarm_surprise(cause, excess, blamed(numbers, report.attribution[0]))
         self._cause = cause
         self._newest[cause] = self.rows
 

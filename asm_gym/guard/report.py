@@ -16,7 +16,6 @@ from asm_gym.guard.arbiter import Decision
 from asm_gym.guard.contact_state import severity_info
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
-from asm_gym.guard.robot_facts import NOTHING
 from asm_gym.guard.robot_table import ENDED, STATES, Mask
 from asm_gym.spec import StreamSpec
 
@@ -58,10 +57,10 @@ class RowReport:
 
     robots: NDArray[Any]
     attribution: NDArray[np.float64]
-    outcomes: Mapping[int, Outcome] = NOTHING
-    failures: Mapping[int, str] = NOTHING
-    repairs: Mapping[int, tuple[str, ...]] = NOTHING
-    lost: Mapping[int, tuple[str, ...]] = NOTHING
+    outcomes: Mapping[int, Outcome] = field(default_factory=dict)
+    failures: Mapping[int, str] = field(default_factory=dict)
+    repairs: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def gave_up(self) -> Mask:

@@ -1,11 +1,11 @@
-"""The rows of n robots as the monitor is to see them: compared with the hand, and completed where a sense has failed."""
+"""The rows of n robots as the monitor is to see them: compared with the hand, completed where a sense has failed."""
 
 from __future__ import annotations
 
 import logging
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from asm_gym.compilation import compiled
 from asm_gym.guard.hand_check import Contradiction, HandChecks, compare_hands_of
 from asm_gym.guard.recent_rows import Floats32, Mask, RecentRows, leave_out_stale, make_room
 from asm_gym.guard.repair import Repair
-from asm_gym.guard.robot_facts import NOTHING, RobotFacts
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import RobotTable
 from asm_gym.memory.completion import Completion
 from asm_gym.spec import StreamSpec
@@ -28,9 +28,9 @@ class ValidatedRows:
     """The next row of each robot, as the monitor is to see it; mappings hold the robots with something to say."""
 
     rows: Floats32  # (n, D)
-    lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
-    contradictions: Mapping[int, Contradiction] = NOTHING  # of hand and joints
-    failures: Mapping[int, str] = NOTHING  # what can no longer be relied on
+    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # the numbers that were not finite
+    contradictions: Mapping[int, Contradiction] = field(default_factory=dict)  # of hand and joints
+    failures: Mapping[int, str] = field(default_factory=dict)  # what can no longer be relied on
 
 
 class RowValidator:
