@@ -8,7 +8,8 @@ from gymnasium import spaces
 
 from asm_gym.guard.reflexes import FeltMotion
 from asm_gym.guard.robot_facts import RobotFacts
-from asm_gym.guard.rows import Rows
+from asm_gym.guard.robot_table import RobotTable
+from asm_gym.guard.row_validation import RowValidator
 from asm_gym.memory.completion import Completion
 from asm_gym.monitors import Surprise
 from asm_gym.monitors.diagnosis import CLASSES, Diagnosis
@@ -134,15 +135,15 @@ class Repaired:
 
     def __init__(self):
         robots = RobotFacts.unknown(SPEC, np.ones(SPEC.size, bool))
-        self.rows = Rows(robots, SPEC, MEMORY, kept=10)
+        self.rows = RowValidator(robots, RobotTable(1, SPEC, 1.0), MEMORY, kept=10)
 
     def read(self, row):
         self.rows.drop_repairs()
-        return self.rows.next(row[None].astype(np.float32), EVERYONE).rows[0].copy()
+        return self.rows.validate(row[None].astype(np.float32)).rows[0].copy()
 
     def suspect(self, columns):
         self.rows.suspect(0, columns)
-        return self.rows.last(0, 1)[0].copy()
+        return self.rows.last(0)[-1].copy()
 
     @property
     def names(self):

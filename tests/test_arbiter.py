@@ -8,14 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asm_gym.guard.arbiter import STATES, Arbiter, Judged, Situation, State, following
+from asm_gym.guard.alarm_terms import CONTACT, SURPRISE
+from asm_gym.guard.arbiter import POLICY_ACTS, Arbiter, Situation, following
 from asm_gym.guard.options import ReleaseRule
 from asm_gym.guard.reflexes import COMPLIANCE, FeltMotion
 from asm_gym.guard.responses import GOING_ON, NO_RESPONSE, RESPONSES
 from asm_gym.guard.robot_facts import RobotFacts
+from asm_gym.guard.robot_table import ENDED, POLICY, REFLEX, STATES, RobotTable
+from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
-ACTING = (State.POLICY, State.TRIAL)
+SPEC = StreamSpec((Channel("external_torque", 2), Channel("action", 2, group=MOTOR)), 0.05)
 EVERYONE = np.ones(1, bool)
 
 
@@ -29,16 +32,16 @@ def reachable(situation):
     return not (situation.presses and (situation.calm or situation.free or situation.waited or situation.goes_on))
 
 
-@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("state", range(len(STATES)))
 def test_from_every_state_nothing_leads_to_the_policy_while_the_arm_presses(state):
     for situation in situations():
-        if situation.presses and reachable(situation) and state is not State.ENDED:
+        if situation.presses and reachable(situation) and state != ENDED:
             found = following(state, situation)
             after = state if found is None or found.to is None else found.to
-            assert after in (State.REFLEX, State.ENDED), (situation, found)
+            assert after in (REFLEX, ENDED), (situation, found)
 
 
-@pytest.mark.parametrize("state", ACTING)
+@pytest.mark.parametrize("state", POLICY_ACTS)
 def test_every_alarm_of_the_policy_is_answered_with_something_that_is_said(state):
     for situation in situations():
         if situation.alarm and reachable(situation):
@@ -48,16 +51,37 @@ def test_every_alarm_of_the_policy_is_answered_with_something_that_is_said(state
 
 
 def test_an_ended_episode_stays_ended():
-    assert all(following(State.ENDED, s) is None for s in situations())
+    assert all(following(ENDED, s) is None for s in situations())
 
 
-def decided(arbiter, surprise, presses=False, response="", touched=None, impulse=0.0):
+def table_of(count=1):
+    return RobotTable(count, SPEC, 1.0)
+
+
+def evidence(table, surprise, presses=False, impulse=0.0, index=0):
+    """A row of a robot whose record says so."""
+    robot = table.robot(index)
+    robot.surprise, robot.over, robot.presses, robot.pressed_impulse = surprise, not surprise <= 1.0, presses, impulse
+    robot.overridden = robot.state == REFLEX
+    terms = [name for name, holds in ((CONTACT, presses), (SURPRISE, robot.over)) if holds]
+    nothing = np.zeros(SPEC.size)
+    return RowEvidence(
+        index=index,
+        robot=robot,
+        rows=nothing[None].astype(np.float32),
+        attribution=nothing,
+        accounted_for=nothing.astype(bool),
+        terms=tuple(terms),
+        contradiction=None,
+        completed=None,
+        may_go_on=True,
+    )
+
+
+def decided(arbiter, table, surprise, presses=False, response="", touched=None, impulse=0.0):
     """Whether a row is an alarm, and what it led to."""
-    over = not surprise <= 1.0
-    intervened = STATES[arbiter.state[0]] is State.REFLEX
-    said = NO_RESPONSE._replace(name=response, touched=touched)
-    row = Judged(surprise, over, False, over or presses, presses, impulse, intervened, False, said)
-    return row.alarm, arbiter.decide(0, row)
+    row = evidence(table, surprise, presses, impulse)
+    return row.alarm, arbiter.decide(row, NO_RESPONSE._replace(name=response, touched=touched))
 
 
 @given(
@@ -73,28 +97,31 @@ def decided(arbiter, surprise, presses=False, response="", touched=None, impulse
 )
 @settings(max_examples=200, deadline=None)
 def test_whatever_the_rows_a_pressing_arm_is_never_left_to_the_policy(rows):
-    arbiter = Arbiter(1, ReleaseRule(3, try_after=3, max_override=9, strikes=3), 1.0)
+    table = table_of()
+    arbiter = Arbiter(table, ReleaseRule(3, try_after=3, max_override=9, strikes=3))
+    robot = table.robot(0)
     strikes = 0
     for surprise, presses, response, touched in rows:
-        before = STATES[arbiter.state[0]]
-        if before is State.ENDED:
+        before = int(robot.state)
+        if before == ENDED:
             break
-        alarm, said = decided(arbiter, surprise, presses, response, touched)
-        after = STATES[arbiter.state[0]]
-        strikes += presses and before in ACTING
+        alarm, said = decided(arbiter, table, surprise, presses, response, touched)
+        after = int(robot.state)
+        strikes += presses and before in POLICY_ACTS
         if presses:
-            assert after in (State.REFLEX, State.ENDED)
-        if before is State.REFLEX and after is not State.REFLEX:
+            assert after in (REFLEX, ENDED)
+        if before == REFLEX and after != REFLEX:
             assert said.transition in ("release", "trial", "give_up", *GOING_ON)
-        if alarm and before in ACTING and after in ACTING:
+        if alarm and before in POLICY_ACTS and after in POLICY_ACTS:
             assert response in GOING_ON
         assert strikes <= 3
 
 
 def held_by_a_contact():
-    arbiter = Arbiter(1, ReleaseRule(10, try_after=10), 1.0)
-    assert decided(arbiter, 2.0, response="hold")[1].transition == "override"
-    return lambda surprise, **kw: decided(arbiter, surprise, **kw)[1].transition
+    table = table_of()
+    arbiter = Arbiter(table, ReleaseRule(10, try_after=10))
+    assert decided(arbiter, table, 2.0, response="hold")[1].transition == "override"
+    return lambda surprise, **kw: decided(arbiter, table, surprise, **kw)[1].transition
 
 
 def test_control_goes_back_once_nothing_presses_though_surprise_is_not_low_and_later_each_time_it_was_too_early():
@@ -111,14 +138,15 @@ def test_control_does_not_go_back_while_something_presses_though_surprise_is_low
 
 
 def test_an_episode_that_begins_leaves_the_other_robots_as_they_are():
-    arbiter = Arbiter(2, ReleaseRule(), 1.0)
-    for robot in range(2):
-        arbiter.decide(robot, Judged(2.0, True, False, True, False, 0.0, False, False, NO_RESPONSE))
-    arbiter.begin(np.array([True, False]))
-    assert [STATES[s] for s in arbiter.state] == [State.POLICY, State.REFLEX]
+    table = table_of(2)
+    arbiter = Arbiter(table, ReleaseRule())
+    for index in range(2):
+        arbiter.decide(evidence(table, 2.0, index=index), NO_RESPONSE)
+    for part in (table, arbiter):
+        part.begin(np.array([True, False]))
+    assert table.records["state"].tolist() == [POLICY, REFLEX]
 
 
-SPEC = StreamSpec((Channel("external_torque", 2), Channel("action", 2, group=MOTOR)), 0.05)
 
 
 def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> FeltMotion:

@@ -22,7 +22,8 @@ import pytest
 
 import asm_gym
 from asm_gym.faults.suite import KINDS
-from asm_gym.guard.report import RowReport, report
+from asm_gym.guard.report import RowReport, asm_info
+from asm_gym.guard.robot_table import RobotTable
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import POLICIES
 from asm_gym.scripts import command as command_of
@@ -215,7 +216,7 @@ def test_code_of_a_notebook_runs_and_no_output_is_kept(path: Path, tmp_path: Pat
 
 def test_the_page_on_info_names_every_field():
     spec = StreamSpec((Channel("q", 1),), dt=0.1)
-    said = report([RowReport.nothing(1, 1, np.ones(1))], 0, spec)
+    said = asm_info([RowReport(RobotTable(1, spec, 1.0).records, np.zeros((1, 1)))], 0, spec)
     page = (DOCS / "reference" / "info.md").read_text(encoding="utf-8")
     assert [name for name in (*said, *said["severity"], "alarms", "slowed") if f"`{name}`" not in page] == []
 

@@ -4,13 +4,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.guard.arbiter import Arbiter
-from asm_gym.guard.diagnosis import Alarm, Diagnostician
+from asm_gym.guard.alarm_terms import SURPRISE
+from asm_gym.guard.contact_state import contact_columns, measure_contacts, no_load
+from asm_gym.guard.diagnostician import Diagnostician
 from asm_gym.guard.options import IMPULSE, GuardOptions
 from asm_gym.guard.responses import DEFAULT
-from asm_gym.guard.severity import SeverityEstimator, nothing_felt
+from asm_gym.guard.robot_table import RobotTable
+from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.memory.completion import Completion
-from asm_gym.monitors import Surprise
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -166,9 +167,20 @@ def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_m
     diagnostician = Diagnostician(spec, diagnosis, DEFAULT, asked=True)
     no, shares = np.zeros(spec.size, bool), np.full(spec.size, 1.0 / spec.size)
     rows = np.zeros((3, spec.size), np.float32)
-    found = {"over": True, "knocked": False, "lost": False, "contradiction": None, "failed": False, "presses": False}
-    alarm = Alarm(rows, shares, no, **found, feels=True, force=force, speed=0.1, may_go_on=True, completed=())
-    assert diagnostician.respond(0, alarm)[0].name == ("go on" if goes_on else "hold")
+    robot = RobotTable(1, spec, 1.0).robot(0)
+    robot.over, robot.contact_force, robot.hand_speed = True, force, 0.1
+    alarm = RowEvidence(
+        index=0,
+        robot=robot,
+        rows=rows,
+        attribution=shares,
+        accounted_for=no,
+        terms=(SURPRISE,),
+        contradiction=None,
+        completed=(),
+        may_go_on=True,
+    )
+    assert diagnostician.prescribe(alarm).response.name == ("go on" if goes_on else "hold")
 
 
 def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
@@ -191,13 +203,15 @@ def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
 def weighed(loads, speed=np.nan):
     """Force, impulse, and whether it presses, in rows (T,) of what a wrist bears along its axis [N]."""
     spec = StreamSpec((Channel("wrist_force", 3, "N"), Channel("hand_velocity", 3, "m/s")), 0.05)
-    estimator = SeverityEstimator(1, spec, (), Arbiter(1, GuardOptions().rule(True, 0.05, 1), 10.0))
-    calm, yes, no = Surprise(np.zeros(1), np.zeros((1, 6))), np.ones(1, bool), np.zeros(1, bool)
+    table = RobotTable(1, spec, 10.0)
+    columns = contact_columns((), spec)
+    most_impulse = GuardOptions().rule(True, 0.05, 1).impulse
     found = []
     for load in loads:
         row = np.array([[0.0, 0.0, load, 0.0, 0.0, speed]], np.float32)
-        severity = estimator.weigh(row, nothing_felt(1, 0), no, calm, yes, no.copy())[0]
-        found.append((*severity.numbers[0, :2], severity.presses[0]))
+        measure_contacts(table.records, row, no_load(1, 0), columns, spec.dt, most_impulse)
+        robot = table.robot(0)
+        found.append((robot.contact_force, robot.pressed_impulse, robot.presses))
     return np.array(found)
 
 
