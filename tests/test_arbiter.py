@@ -147,8 +147,6 @@ def test_an_episode_that_begins_leaves_the_other_robots_as_they_are():
     assert table.records["state"].tolist() == [POLICY, REFLEX]
 
 
-
-
 def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> FeltMotion:
     low, rest, high = (np.full(2, value, np.float32) for value in (-1, 0, 1))
     robots = RobotFacts(

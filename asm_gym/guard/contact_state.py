@@ -1,10 +1,10 @@
 """How hard an arm presses: contact force, what it adds up to, for how long the arm leans, how fast its hand goes.
 
-    F = max(max_w |f_w - g_w|, max_j |τ_j| / LEVER)    f: force at a wrist; g: its hand's weight; τ: external torque
-    I ← I + (F - FREE_FORCE)₊ dt                       impulse of an episode [N s]
-    t ← t + dt (1 + (F - FREE_FORCE)/SLOW_FORCE)       leaning: the second part with a slow hand, which feels no inertia
-    t ← t - dt                                         where F is under FREE_FORCE: a moment below does not end it
-    presses: a limit was passed within the step, or t > LEANS_S / (1 + SOONER · strikes), or I ends the episode
+F = max(max_w |f_w - g_w|, max_j |τ_j| / LEVER)    f: force at a wrist; g: its hand's weight; τ: external torque
+I ← I + (F - FREE_FORCE)₊ dt                       impulse of an episode [N s]
+t ← t + dt (1 + (F - FREE_FORCE)/SLOW_FORCE)       leaning: the second part with a slow hand, which feels no inertia
+t ← t - dt                                         where F is under FREE_FORCE: a moment below does not end it
+presses: a limit was passed within the step, or t > LEANS_S / (1 + SOONER · strikes), or I ends the episode
 """
 
 from __future__ import annotations

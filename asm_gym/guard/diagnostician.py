@@ -144,9 +144,7 @@ class Diagnostician:
         name = "hold" if self._asked else ""
         return Response(name, _certain("contact"), self._touched(incident, evidence.rows), "contact")
 
-    def _look_up(
-        self, incident: Incident, family: str, cause: Cause | None, evidence: RowEvidence
-    ) -> tuple[str, str]:
+    def _look_up(self, incident: Incident, family: str, cause: Cause | None, evidence: RowEvidence) -> tuple[str, str]:
         """Return the row of the table that holds, and the response."""
         case = PRESSING if evidence.robot.presses else family
         if case in (PRESSING, "contact") and self._lasts(incident, case):

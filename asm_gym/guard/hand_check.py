@@ -105,9 +105,7 @@ class HandChecks:
         for arm, own in enumerate(checked):
             for robot, chain in enumerate(own):
                 _describe(self.geometry[robot, arm], chain, spec)
-        self.arms = tuple(
-            HandCheck(self.geometry[:, arm], self.state[:, arm], spec) for arm in range(len(checked))
-        )
+        self.arms = tuple(HandCheck(self.geometry[:, arm], self.state[:, arm], spec) for arm in range(len(checked)))
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""

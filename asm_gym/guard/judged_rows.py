@@ -74,14 +74,21 @@ def apply_alarm_rule(robots: Any, judged: Any, attribution: Any) -> int:
         robot.event = benign_event(robot.raw_surprise, robot.surprise, robot.excuse, robot.threshold)
         robot.knocked = robot.event == KNOCKED
         robot.alarm = False
-        eventful = robot.presses or robot.over or robot.knocked or robot.state != POLICY
-        reported = robot.policy_rows == MOSTLY_AFTER - 1
-        robot.must_decide = robot.active and (robot.must_decide or eventful or reported)
+        robot.must_decide = robot.active and (robot.must_decide or is_eventful(robot))
         if robot.must_decide:
             to_decide += 1
         elif robot.active:
             count_quiet_row(robot)
     return to_decide
+
+
+@inner
+def is_eventful(robot: Any) -> bool:
+    """Return whether there is something to decide about a judged row."""
+    judged = robot.presses or robot.over or robot.knocked
+    sensed = robot.lost or robot.contradicts or robot.refused
+    reported = robot.policy_rows == MOSTLY_AFTER - 1
+    return judged or sensed or reported or robot.state != POLICY
 
 
 @inner

@@ -109,9 +109,7 @@ class AsmInfo(TypedDict, total=False):
     level: float  # share of episodes so far with a false alarm, likewise
 
 
-def asm_info(
-    rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, **step: Any
-) -> AsmInfo:
+def asm_info(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, **step: Any) -> AsmInfo:
     """Return what ``info["asm"]`` says of a robot, from the rows of a step.
 
     Args:

@@ -72,9 +72,7 @@ class RowValidator:
 
     def validate(self, rows: Floats32) -> ValidatedRows:
         """Return the next rows (n, D), which are written to, as the monitor is to see them."""
-        unusual = validate_rows(
-            self._table.records, rows, self.recent.arrays, self.hands.geometry, self.hands.state
-        )
+        unusual = validate_rows(self._table.records, rows, self.recent.arrays, self.hands.geometry, self.hands.state)
         return self.repair(rows) if unusual or self.repairs else ValidatedRows(rows)
 
     def repair(self, rows: Floats32) -> ValidatedRows:

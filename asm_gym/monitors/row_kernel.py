@@ -279,9 +279,7 @@ def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> Sc
 
 
 @partial(inner, inlined=True)
-def carry_on(
-    layout: Layout, before: MemoryState, after: MemoryState, reading: ScaledRows, wants_context: bool
-) -> None:
+def carry_on(layout: Layout, before: MemoryState, after: MemoryState, reading: ScaledRows, wants_context: bool) -> None:
     """Write traces and expected state, where the temporal network takes up the row, else those of before."""
     steps = before.history.steps
     lag = before.history.before.shape[1]
