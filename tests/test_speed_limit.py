@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.detection.hand_speed_map import HandSpeedMap, cell_near
+from asm_gym.detection.hand_speed import cell_near
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.envs.speed_limit import BESIDE
 from asm_gym.monitors import NeuralASM
 from tests.hand_motion import hand_momentum, hand_speed, joint_twist, present_twist

@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.hand_speed_map import HandSpeedMap, SpeedLimit, allowed_share
+from asm_gym.detection.hand_speed import Floats, SpeedLimit, allowed_share
+from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
-
-Floats = NDArray[np.float64]
 
 LIMITED = ("external_torque", "wrist_force")  # ends of the names of the channels that are limited
 HARDEST_EPISODES = 0.05  # no limit makes room for this share of healthy episodes, those that pressed hardest
@@ -124,7 +123,7 @@ class ContactLimits:
         )
 
     def share(self, arm: int, place: Floats, twist: Floats, speed: float, momentum: float = 0.0) -> float:
-        """Return the share that a hand may have of a motion; see ``hand_speed_map.allowed_share``."""
+        """Return the share that a hand may have of a motion; see ``hand_speed.allowed_share``."""
         return allowed_share(self.speed_limit(), arm, place, twist, speed, momentum)
 
 

@@ -6,16 +6,13 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.envs.arms import CHANGES, gripper_actions
+from asm_gym.envs.arms import CHANGES, gripper_actions, unit_change
 from asm_gym.envs.mujoco_views import Floats
 from asm_gym.envs.simulation import Simulation
-from asm_gym.envs.speed_limit import ActionScale, SpeedLimiter
+from asm_gym.envs.speed_limit import Action, SpeedLimiter
 from asm_gym.validation import as_float32
-
-Action = NDArray[np.float32]
 
 
 class Actions:
@@ -38,8 +35,12 @@ class Actions:
         self._rest = np.zeros(self.size, np.float32)
         if simulation.compiled:
             self._rest = self.turning(np.zeros(len(simulation.motors)))
-        scale = ActionScale(middle=self._middle, half=self._half, rest=self._rest)
-        self._limiter = SpeedLimiter(simulation.views, simulation.arms, scale, simulation.speed_limits)
+        self._limiter = SpeedLimiter(
+            views=simulation.views,
+            arms=simulation.arms,
+            rest=self._rest,
+            brake_speeds=simulation.speed_limits,
+        )
 
     def checked(self, action: Action) -> Action:
         """Return the action (A,) clipped to [-1, 1]; raise ValueError for another shape, or one that is not finite."""
@@ -83,5 +84,4 @@ class Actions:
         if controller.name != "JOINT_POSITION":
             change = self._simulation.hand_change(a, turns)
         middle = (controller.output_max + controller.output_min) / 2
-        half = (controller.output_max - controller.output_min) / 2
-        return np.clip((change - middle) / half, -1.0, 1.0)
+        return np.clip((change - middle) / unit_change(controller), -1.0, 1.0)

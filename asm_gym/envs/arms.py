@@ -16,6 +16,7 @@ from asm_gym.envs.mujoco_views import (
     JOINTS,
     OSC_POSE,
     Arms,
+    Floats,
     Ints,
 )
 
@@ -41,6 +42,11 @@ def controller_of(part: Part) -> Any:
     """Return robosuite's controller of an arm."""
     robot, arm = part
     return robot.composite_controller.part_controllers[arm]
+
+
+def unit_change(controller: Any) -> Floats:
+    """Return (inputs,) the change of the arm's pose that a unit of each input asks for [m], [rad]."""
+    return (controller.output_max - controller.output_min) / 2
 
 
 def is_compilable(part: Part) -> bool:
@@ -73,8 +79,9 @@ def describe_inputs(arms: Arms, a: int, model: mujoco.MjModel, controller: Any, 
     if controller.input_type != "delta":
         return
 
-    # Asked for a change again and again, a controller comes to the velocity Kp/Kd times the change.
-    arms.gain[a, :size] = (controller.kp / controller.kd)[:size]
+    # A controller that is asked for a change again and again comes to the velocity Kp/Kd times the change.
+    gains = controller.kp / controller.kd
+    arms.speeds[a, :size] = gains[:size] * unit_change(controller)
     if controller.name == "JOINT_POSITION":
         arms.changes[a] = JOINT_ANGLES
     else:
@@ -97,7 +104,7 @@ def _unset(parts: list[Part], model: mujoco.MjModel) -> Arms:
     indices = ("joints", "site", "site_body", "root", "base", "wrench", "kind", "first", "inputs", "changes")
     fields: dict[str, Any] = {name: np.zeros(count, np.int64) for name in indices}
     fields |= {name: np.zeros((count, JOINTS), np.int64) for name in ("qpos", "dofs", "motors")}
-    fields |= {name: np.zeros((count, JOINTS)) for name in ("kp", "kd", "rest", "gain")}
+    fields |= {name: np.zeros((count, JOINTS)) for name in ("kp", "kd", "rest", "speeds")}
     return Arms(
         bodies=_padded(moving),
         links=_padded(links),

@@ -91,7 +91,7 @@ class Arms(NamedTuple):
     inputs: Ints  # (A,) how many numbers it has
     scaling: Floats  # (A, 5, JOINTS) of them; see ``commands``
     changes: Ints  # (A,) what they change: UNKNOWN_CHANGE, JOINT_ANGLES or HAND_POSE
-    gain: Floats  # (A, JOINTS) Kp/Kd: the velocity that a change asked for again and again leads to [1/s]
+    speeds: Floats  # (A, JOINTS) that a unit of them, asked for again and again, leads to [m/s], [rad/s]
 
 
 class Goals(NamedTuple):

@@ -68,41 +68,56 @@ class Simulation:
 
     def begin_episode(self) -> None:
         """Take up the controllers, which robosuite makes anew in every reset."""
-        self._done = self._row_began = 0
-        self._force_before, self._pressed = 0.0, False
+        self._done = 0
+        self._row_began = 0
+        self._force_before = 0.0
+        self._pressed = False
         self._fresh = False
-        self.controllers = [controller_of(part) for part in self.parts]
-        """Robosuite's, of each arm."""
-        # Asked once an episode: robosuite puts these together anew at every look.
-        starts = np.cumsum([0, *(robot.action_dim for robot, _ in self.parts)]).tolist()
-        splits = [robot._action_split_indexes[arm] for robot, arm in self.parts]
-        self.moves = [slice(start + low, start + high) for start, (low, high) in zip(starts, splits, strict=False)]
-        """Each arm's part of the action."""
-        grips = [self._gripper(start, *part) for start, part in zip(starts, self.parts, strict=False)]
-        self._grips = [grip for grip in grips if grip is not None]
-        self.compiled = all(is_compilable(part) for part in self.parts)  # whether control runs compiled
-        self.arms = describe(self.parts, self.model)
-        self.speed_limits[:] = np.inf
-        for a, (controller, move) in enumerate(zip(self.controllers, self.moves, strict=True)):
-            describe_inputs(self.arms, a, self.model, controller, move)
+        self._samples[:] = 0.0
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
-        self._limits.state[:] = 0, 0, 0, -1, 0, 0
-        self._limits_set: ContactLimits | None = None
-        # Arm and index in the limits of each number that limits apply to, and its column in a sample.
-        self._limited = np.nonzero([[i >= JOINTS or i < count for i in range(FELT)] for count in self.arms.joints])
-        self._columns = np.where(
-            self._limited[1] < JOINTS, self._limited[1], self._limited[1] - JOINTS + kernels.WRENCH.start
-        )
-        size = sum(robot.action_dim for robot in self.env.robots)
-        self._goals, self._work = Goals.of(len(self.parts), size), Work.empty()
+        self._work = Work.empty()
         self._bound: tuple[NominalViews, Bound] | None = None
-        self._samples[:] = 0.0
+        self._take_up_controllers()
+        self._forget_limits()
+
         if must_compile(kernels.run):
             print("asm-gym: compiling the simulation loop, once on this machine (about 10 s)", file=sys.stderr)
             self._run(0)
         kernels.sample(self.views, self.nominal.now(), self.arms, 0, self._samples)
         self._add_up(1)
+
+    def _take_up_controllers(self) -> None:
+        self.compiled = all(is_compilable(part) for part in self.parts)  # whether control runs compiled
+        self.arms = describe(self.parts, self.model)
+        self.controllers = [controller_of(part) for part in self.parts]
+        """Robosuite's, of each arm."""
+        self.moves: list[slice] = []
+        """Each arm's part of the action, asked for once an episode: robosuite makes it anew at every look."""
+        self._grips: list[Callable[[Floats], None]] = []
+        start = 0
+        for a, (robot, arm) in enumerate(self.parts):
+            low, high = robot._action_split_indexes[arm]
+            move = slice(start + low, start + high)
+            self.moves.append(move)
+            describe_inputs(self.arms, a, self.model, self.controllers[a], move)
+            grip = self._gripper(start, robot, arm)
+            if grip is not None:
+                self._grips.append(grip)
+            start += robot.action_dim
+        self._goals = Goals.of(len(self.parts), start)
+
+    def _forget_limits(self) -> None:
+        self.speed_limits[:] = np.inf
+        self._limits.state[:] = 0, 0, 0, -1, 0, 0
+        self._limits_set: ContactLimits | None = None
+        # Arm and index in the limits of each number that limits apply to, and its column in a sample.
+        used = np.ones((len(self.parts), FELT), bool)
+        for a, joints in enumerate(self.arms.joints):
+            used[a, joints:JOINTS] = False
+        self._limited = np.nonzero(used)
+        number = self._limited[1]
+        self._columns = np.where(number < JOINTS, number, number - JOINTS + kernels.WRENCH.start)
 
     def begin(self, limits: ContactLimits | None = None, limited: Sequence[Channel] = ()) -> None:
         """Begin a control step under ``limits`` of the ``limited`` channels."""

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import reduce
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
+from mujoco import mjtWarning
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
@@ -21,7 +20,7 @@ from asm_gym.envs.sensors import Corruption, Reading, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.spec import Channel
 
-_UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}")) for what in ("QPOS", "QVEL", "QACC")]
+_UNSTABLE = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
 
 
 class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
@@ -67,39 +66,58 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._limits_of_guards
 
     @limits_of_guard.setter
-    def limits_of_guard(self, told: tuple[str, ContactLimits | None]) -> None:
-        self._limits_of_guards.update([told])
-        known = [limits for limits in self._limits_of_guards.values() if limits is not None]
-        self.contact_limits = reduce(lambda a, b: a.and_those_of(b, self.felt_channels), known) if known else None
+    def limits_of_guard(self, named_limits: tuple[str, ContactLimits | None]) -> None:
+        guard, limits = named_limits
+        self._limits_of_guards[guard] = limits
+        self.contact_limits = None
+        for own in self._limits_of_guards.values():
+            if self.contact_limits is None:
+                self.contact_limits = own
+            elif own is not None:
+                self.contact_limits = self.contact_limits.and_those_of(own, self.felt_channels)
 
     def _run(self, action: NDArray[np.float32]) -> None:
         """Run the substeps of a control step, and read the rows of the stream before its end."""
-        limits, self._rows, self._finite = self.contact_limits, [], True
+        limits = self.contact_limits
+        self._rows: list[NDArray[np.float32]] = []
+        self._finite = True
         self.simulation.begin(limits, self.felt_channels)
         self._command(action)
-        stride = 1 if self.substep_hooks else self._row_substeps
+
+        stride = self._row_substeps
+        if self.substep_hooks:
+            stride = 1
         for done in range(stride, self.substeps + 1, stride):
             self.simulation.advance(stride)
             for hook in self.substep_hooks:
                 hook(done - 1)
             if done % self._row_substeps == 0 and done < self.substeps:
-                reading = self._read(within_step=True)
-                self._finite &= reading.stream_finite
-                self.simulation.begin_row()
-                self._rows.append(reading.stream)
-                for row_hook in self.row_hooks:
-                    row_hook(reading.stream)
+                self._end_row()
+
         if limits is not None and limits.stays and self.simulation.passed_limit is not None:
-            # What was done last is what the stream says was commanded.
+            # The stream says that the last action of the step was commanded.
             self._action = self._actions.resting(self._action)
+
+    def _end_row(self) -> None:
+        """Read a row of the stream within the control step."""
+        reading = self._read(within_step=True)
+        self._finite &= reading.stream_finite
+        self.simulation.begin_row()
+        self._rows.append(reading.stream)
+        for hook in self.row_hooks:
+            hook(reading.stream)
 
     def command(self, action: NDArray[np.float32]) -> None:
         """From within a hook: command another action (A,) for the rest of the control step, efference copy included."""
         self._command(self._actions.checked(action))
 
     def _command(self, action: NDArray[np.float32]) -> None:
-        held, self.holding = self.holding, self.holding and self.keeps_holding
-        self._action = self._actions.resting(self._action) if held else self._slowed(action)
+        held = self.holding
+        self.holding = held and self.keeps_holding
+        if held:
+            self._action = self._actions.resting(self._action)
+        else:
+            self._action = self._slowed(action)
         self.simulation.command(self._delivered(self._action), held)
 
     def _slowed(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -125,22 +143,33 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
         return self._read().row
 
     def _read(self, within_step: bool = False) -> Reading:
-        rest = self._action, self.corruptions, self.np_random
-        return self._senses.read(self.simulation.sense, self._objects, *rest, within_step=within_step)
+        return self._senses.read(
+            self.simulation.sense,
+            self._objects,
+            self._action,
+            self.corruptions,
+            self.np_random,
+            within_step=within_step,
+        )
 
     def _forces(self, unstable: bool) -> dict[str, Any]:
         """Return what ``info`` says of contact; NaN, or infinite, where the simulation diverged."""
-        sim = self.simulation
-        found: dict[str, Any] = {"contact_force": np.nan if unstable else sim.contact_force}
+        simulation = self.simulation
+        forces: dict[str, Any] = {"contact_force": simulation.contact_force}
         if self.contact_limits is not None:
-            passed = sim.passed_limit
-            found["braked"] = sim.braked
-            found["contact_load"] = np.inf if unstable else sim.load
-            found["contact_left_s"] = np.inf if passed is None else (passed + 1) / PHYSICS_FREQ
-            found["contact_felt"] = sim.felt_mean
-        return found
+            forces["braked"] = simulation.braked
+            forces["contact_load"] = simulation.load
+            forces["contact_left_s"] = np.inf
+            if simulation.passed_limit is not None:
+                forces["contact_left_s"] = (simulation.passed_limit + 1) / PHYSICS_FREQ
+            forces["contact_felt"] = simulation.felt_mean
+        if unstable:
+            forces["contact_force"] = np.nan
+            if "contact_load" in forces:
+                forces["contact_load"] = np.inf
+        return forces
 
     def _divergences(self) -> int:
         """Return how often MuJoCo found the simulation unstable; it resets itself then, and says so nowhere else."""
         counts = self.simulation.warnings
-        return sum(int(counts[w]) for w in _UNSTABLE)
+        return sum(int(counts[int(warning)]) for warning in _UNSTABLE)

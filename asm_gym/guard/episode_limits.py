@@ -36,15 +36,16 @@ class EpisodeLimits:
     """
 
     def __init__(self, facts: RobotFacts, limits: ContactLimits | None, acts: bool) -> None:
-        self._usual = limits
-        self._careful = limits
+        careful = None
         if limits is not None:
             if facts.limits_contact:
                 limits.most(facts.felt_channels)  # which refuses limits of another arm
             if not acts:
-                self._usual = replace(limits, stays=False, hand_speed=np.inf)
-            self._careful = self._usual.stricter(CAREFUL_FORCES, CAREFUL_SPEED * self._usual.hand_speed)
+                limits = replace(limits, stays=False, hand_speed=np.inf)
+            careful = limits.stricter(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
 
+        self._usual = limits
+        self._careful = careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))
         self._steps_left = np.zeros(facts.count, np.int64)  # (n,) of the policy, under the careful limits
         self.now = (self._usual,) * facts.count
