@@ -14,8 +14,8 @@ from threadpoolctl import threadpool_limits
 from asm_gym.data.episode import Episode
 from asm_gym.detection import Blocks, EvidenceDetection, conformal_episodes
 from asm_gym.detection.base import Array
-from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, episode_threshold, hourly_threshold
 from asm_gym.detection.benign_events import BenignEvents
+from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, episode_threshold, hourly_threshold
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.spec import StreamSpec

@@ -6,7 +6,7 @@ row → standardise → memory: expect, infer, associate → ε_t/σ_t, and the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
