@@ -84,11 +84,11 @@ def checked_maxima(maxima: Array) -> Array:
 
 
 class Tail(NamedTuple):
-    """A Pareto tail of the largest maxima: beyond q > u, ``count (q/u)^(-1/ξ)`` of them are to be expected."""
+    """A Pareto tail of the largest maxima: beyond q > u, ``size (q/u)^(-1/ξ)`` of them are to be expected."""
 
-    count: int  # k
+    size: int  # k
     lowest: float  # u, below the tail
-    index: float  # ξ
+    exponent: float  # ξ
 
     @classmethod
     def of(cls, maxima: Array, expected: float) -> Tail | None:
@@ -96,20 +96,20 @@ class Tail(NamedTuple):
         if len(maxima) < FEWEST_IN_TAIL or expected >= ENOUGH:
             return None
         values = np.sort(maxima)
-        count = len(values) // TAIL_SHARE
-        lowest = float(values[-count - 1])
+        size = len(values) // TAIL_SHARE
+        lowest = float(values[-size - 1])
         if not 0.0 < lowest < values[-1] < np.inf:
             return None
-        hill = float(np.log(values[-count:] / lowest).mean())
-        return cls(count=count, lowest=lowest, index=hill * (1.0 + SURER / math.sqrt(count)))
+        hill = float(np.log(values[-size:] / lowest).mean())
+        return cls(size=size, lowest=lowest, exponent=hill * (1.0 + SURER / math.sqrt(size)))
 
     def threshold(self, expected: float) -> float:
         """Return what so many are expected to exceed."""
-        return self.lowest * (self.count / expected) ** self.index
+        return self.lowest * (self.size / expected) ** self.exponent
 
     def expected(self, threshold: float) -> float:
         """Return how many are expected to exceed a threshold above u: half of one at least, where the model ends."""
-        return max(self.count * (threshold / self.lowest) ** (-1.0 / self.index), 0.5)
+        return max(self.size * (threshold / self.lowest) ** (-1.0 / self.exponent), 0.5)
 
 
 def episode_threshold(maxima: Array, rate: float) -> float:
