@@ -18,7 +18,8 @@ from asm_gym.detection import (
     conformal_episodes,
     conformal_threshold,
 )
-from asm_gym.detection.conformal import MINUTE, Promise, episode_threshold, hourly_promise, hourly_threshold
+from asm_gym.detection.alarm_rule import MINUTE
+from asm_gym.detection.conformal import Promise, episode_threshold, hourly_promise, hourly_threshold
 from asm_gym.detection.detector import USUAL, habituate, usual_levels
 from asm_gym.detection.evidence import (
     CONTEXT_GAIN,

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from asm_gym import Episode, NeuralASM
+from asm_gym.detection.alarm_rule import EVENTS
+from asm_gym.detection.benign_events import EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, BenignEvents
 from asm_gym.detection.detector import GAINS
-from asm_gym.detection.alarm_rule import EVENTS, EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, Excuses
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -16,11 +17,11 @@ from tests.streams import UNEVENTFUL
 
 
 def excused(rows, spec=ARM):
-    excuses = Excuses(spec)
-    state, found = excuses.start(1), []
+    events = BenignEvents(spec)
+    state, found = events.start(1), []
     for row in rows:
-        state, kind, divisor = excuses.step(state, np.asarray(row, np.float64)[None])
-        found.append((EVENTS[kind[0]], divisor[0]))
+        state, judged = events.step(state, np.asarray(row, np.float64)[None])
+        found.append((EVENTS[judged["excuse"][0]], judged["divisor"][0]))
     return found
 
 
@@ -76,8 +77,9 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
 
 
 def test_an_excused_surprise_is_divided():
-    excuses = Excuses(ARM)
-    _, kind, divisor = excuses.step(excuses.start(1), changed(5, 80.0)[None])
+    events = BenignEvents(ARM)
+    _, judged = events.step(events.start(1), changed(5, 80.0)[None])
+    kind, divisor = judged["excuse"], judged["divisor"]
     value, shares = np.array([60.0]), np.array([[20.0, 40.0]])
     left = Surprise(value / divisor, shares / divisor, raw=value, excuse=kind)
     assert left.value == pytest.approx(60.0 / EXCUSED)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.validation import check_number
 
 
@@ -43,12 +44,22 @@ class AdaptiveThreshold:
 
 
 class RunningThreshold:
-    """A threshold that begins at ``threshold``, q_1, and moves at the end of every episode; ``ceiling`` is c."""
+    """A threshold that moves at the end of every episode.
 
-    def __init__(self, how: AdaptiveThreshold, threshold: float) -> None:
-        self._how, self.ceiling = how, how.ceiling * threshold
+    Args:
+        settings: rate and step.
+        threshold: q_1, that it begins at.
+
+    Attributes:
+        ceiling: c.
+    """
+
+    def __init__(self, settings: AdaptiveThreshold, threshold: float) -> None:
+        self._settings = settings
+        self.ceiling = settings.ceiling * threshold
         self._log = math.log(threshold)  # of q
-        self._episodes = self._alarms = 0
+        self._episodes = 0
+        self._alarms = 0
 
     @property
     def value(self) -> float:
@@ -58,12 +69,17 @@ class RunningThreshold:
     @property
     def level(self) -> float:
         """Share of the counted episodes so far that had a false alarm; NaN before the first."""
-        return self._alarms / self._episodes if self._episodes else math.nan
+        if not self._episodes:
+            return math.nan
+        return self._alarms / self._episodes
 
     def follow(self, largest: float, judged_by: float | None = None, confirmed: bool = False) -> None:
         """Move after an episode of this greatest surprise, unless an alarm in it was ``confirmed`` as true."""
-        alarm = not largest <= (self.value if judged_by is None else judged_by)
-        if alarm and (confirmed or not largest <= self.ceiling):
+        if judged_by is None:
+            judged_by = self.value
+        alarm = bool(rows_over(largest, judged_by))
+        if alarm and (confirmed or rows_over(largest, self.ceiling)):
             return
-        self._episodes, self._alarms = self._episodes + 1, self._alarms + alarm
-        self._log += self._how.step * (alarm - self._how.rate)
+        self._episodes += 1
+        self._alarms += alarm
+        self._log += self._settings.step * (alarm - self._settings.rate)

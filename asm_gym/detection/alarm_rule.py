@@ -50,9 +50,9 @@ def benign_event(raw: Any, surprise: Any, excuse: Any, threshold: Any) -> Any:
     return 0
 
 
-def rows_over(surprise: Values, threshold: Any) -> Mask:
+def rows_over(surprise: Values | float, threshold: Any) -> Mask:
     """Return which rows (…) are alarms, see ``over_threshold``."""
-    return np.logical_not(np.asarray(surprise) <= threshold)
+    return np.asarray(np.logical_not(np.asarray(surprise) <= threshold))
 
 
 def rows_excused(raw: Values, surprise: Values, threshold: Any) -> Mask:

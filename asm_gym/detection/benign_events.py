@@ -40,20 +40,24 @@ FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))  # rows in which it, and
 KNOCK_EVENT = EVENTS.index(KNOCK)
 STOP_EVENT = EVENTS.index(STOP)
 
-ROWS_LEFT = np.dtype([("knock", np.int64), ("stop", np.int64), ("slide", np.int64)])
-"""Rows for which each event goes on to excuse surprise."""
-
 
 class EventState(NamedTuple):
     """State of B streams; never changed in place."""
 
-    left: NDArray[Any]  # (B,) of ``ROWS_LEFT``
+    knock: NDArray[np.int64]  # (B,) rows that a knock goes on to excuse
+    stop: NDArray[np.int64]  # (B,) rows that a joint at its stop does
+    slide: NDArray[np.int64]  # (B,) rows that a sliding finger does
     approached: NDArray[np.bool_]  # (B, J) which joints may be at their stops in the next row
 
     @classmethod
     def start(cls, batch: int, joints: int) -> EventState:
         """Return the state before the first row."""
-        return cls(left=np.zeros(batch, ROWS_LEFT), approached=np.ones((batch, joints), np.bool_))
+        return cls(
+            knock=np.zeros(batch, np.int64),
+            stop=np.zeros(batch, np.int64),
+            slide=np.zeros(batch, np.int64),
+            approached=np.ones((batch, joints), np.bool_),
+        )
 
 
 class EventSenses(NamedTuple):
@@ -136,35 +140,32 @@ def _is_finger_speed(channel: Channel) -> bool:
 def find_events(senses: EventSenses, before: EventState, after: EventState, rows: Any, judged: Any) -> None:
     """Write the new state, and ``excuse`` and ``divisor`` of rows (B, D) to ``judged`` (B,)."""
     for n in range(len(rows)):
-        left = after.left[n]
-        left.knock = max(before.left[n].knock - 1, 0)
-        left.stop = max(before.left[n].stop - 1, 0)
-        left.slide = max(before.left[n].slide - 1, 0)
-
+        knock = max(before.knock[n] - 1, 0)
+        stop = max(before.stop[n] - 1, 0)
+        slide = max(before.slide[n] - 1, 0)
         if exceeds(rows[n], senses.wrist, KNOCKING):
-            left.knock = senses.knock_rows
+            knock = senses.knock_rows
         if reaches_stop(senses, before.approached[n], after.approached[n], rows[n]):
-            left.stop = FADING + 1
+            stop = FADING + 1
         if exceeds(rows[n], senses.fingers, MOVING):
-            left.slide = senses.slide_rows
+            slide = senses.slide_rows
 
-        judged[n].divisor = max(divisor_after(left.knock), divisor_after(left.stop))
-        if left.slide > 0:
+        after.knock[n] = knock
+        after.stop[n] = stop
+        after.slide[n] = slide
+        judged[n].divisor = max(divisor_after(knock), divisor_after(stop))
+        if slide > 0:
             judged[n].divisor = max(judged[n].divisor, SLIPPED)
-        judged[n].excuse = 0
-        if left.stop > 0:
-            judged[n].excuse = STOP_EVENT
-        if left.knock > 0:
-            judged[n].excuse = KNOCK_EVENT
+        judged[n].excuse = event_of(knock, stop)
 
 
 @inner
 def exceeds(row: Any, columns: Any, limit: float) -> bool:
     """Return whether a number is beyond a limit, |x_i| > limit; one that is missing or infinite is not."""
+    exceeding = False
     for i in columns:
-        if abs(row[i]) > limit and np.isfinite(row[i]):
-            return True
-    return False
+        exceeding = exceeding or (abs(row[i]) > limit and np.isfinite(row[i]))
+    return exceeding
 
 
 @inner
@@ -193,3 +194,13 @@ def divisor_after(left: int) -> float:
     if left <= 0:
         return 1.0
     return max(EXCUSED * FADE ** max(FADING - left + 1, 0), 1.0)
+
+
+@inner
+def event_of(knock: int, stop: int) -> int:
+    """Return the index in ``EVENTS`` of what excuses a row, by the rows that a knock and a stop excuse."""
+    if knock > 0:
+        return KNOCK_EVENT
+    if stop > 0:
+        return STOP_EVENT
+    return 0

@@ -29,14 +29,16 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import betaincinv
 
+from asm_gym.detection.alarm_rule import rows_of_a_minute, rows_over
 from asm_gym.detection.base import Array, Floats
 from asm_gym.validation import check_number, short_repr
 
-EPISODE, HOUR = "episode", "hour"  # units of a rate of false alarms
+EPISODE = "episode"  # units of a rate of false alarms
+HOUR = "hour"
 LEAST_RATE = 1e-15  # rates are not taken to be smaller, as the inverse of the smallest floats is infinite
 CONFIDENCE = 0.95  # share of calibrations in which ``Promise.at_most`` holds
-MINUTE = 60.0  # longest block, and time below the threshold before another alarm counts [s]
-LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 1e6  # limits of a rate
+LEAST_PER_HOUR = 1e-6  # limits of a rate
+MOST_PER_HOUR = 1e6
 ROUNDING = 1e-9
 ENOUGH = 5.0  # maxima that may exceed a threshold, from which on they are counted
 FEWEST_IN_TAIL = 50  # maxima that a model of their tail takes
@@ -47,7 +49,7 @@ SURER = 0.6  # standard errors added to its index: with these a Pareto law keeps
 def conformal_episodes(rate: float) -> int:
     """Return the least number of nominal episodes that a false-alarm rate needs: ⌈1/rate⌉ - 1."""
     check_number("false_alarm_rate", rate, above=0.0, below=1.0)
-    return math.ceil(1.0 / max(rate, LEAST_RATE) - 1e-9) - 1
+    return math.ceil(1.0 / max(rate, LEAST_RATE) - ROUNDING) - 1
 
 
 def conformal_threshold(maxima: Array, rate: float) -> float:
@@ -56,53 +58,68 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
     The fresh episode and the n calibration episodes, of ``maxima`` (n,), must be exchangeable. Raises ValueError where
     there are too few.
     """
-    try:
-        found = np.asarray(maxima)
-    except ValueError:  # rows of several lengths
-        found = np.array(None)
-    if found.ndim != 1 or found.dtype.kind not in "iuf" or np.isnan(found).any():
-        raise ValueError(f"maxima must be numbers in the shape (n,), got {short_repr(maxima)}")
-    n, needed = len(found), conformal_episodes(rate)
-    if n < needed:
+    values = checked_maxima(maxima)
+    episodes = len(values)
+    needed = conformal_episodes(rate)
+    if episodes < needed:
+        possible = math.ceil(1e3 / (episodes + 1)) / 1e3
         raise ValueError(
-            f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {n}, which can promise "
-            f"{math.ceil(1e3 / (n + 1)) / 1e3:g} at best"
+            f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {episodes}, "
+            f"which can promise {possible:g} at best"
         )
-    rank = math.ceil((n + 1) * (1.0 - rate) - 1e-9)  # (n + 1)(1 - rate) is often whole, but not in floating point
-    return float(np.sort(found)[rank - 1])
+    # (n + 1)(1 - rate) is often whole, but not in floating point.
+    rank = math.ceil((episodes + 1) * (1.0 - rate) - ROUNDING)
+    return float(np.sort(values)[rank - 1])
+
+
+def checked_maxima(maxima: Array) -> Array:
+    """Return maxima (n,). Raises ValueError unless they are numbers in this shape."""
+    try:
+        values = np.asarray(maxima)
+    except ValueError:  # rows of several lengths
+        values = np.array(None)
+    if values.ndim != 1 or values.dtype.kind not in "iuf" or np.isnan(values).any():
+        raise ValueError(f"maxima must be numbers in the shape (n,), got {short_repr(maxima)}")
+    return values
 
 
 class Tail(NamedTuple):
-    """A Pareto tail of the largest maxima: beyond q > u, ``k (q/u)^(-1/ξ)`` of them are to be expected."""
+    """A Pareto tail of the largest maxima: beyond q > u, ``size (q/u)^(-1/ξ)`` of them are to be expected."""
 
-    k: int
-    u: float
-    xi: float
+    size: int  # k
+    lowest: float  # u, below the tail
+    exponent: float  # ξ
 
     @classmethod
-    def of(cls, maxima: Array, expected: float) -> Self | None:
+    def of(cls, maxima: Array, expected: float) -> Tail | None:
         """Return the tail of maxima (n,), ``expected`` of which may exceed a threshold; None where they are counted."""
-        found, n = np.sort(maxima), len(maxima)
-        k = n // TAIL_SHARE
-        if n < FEWEST_IN_TAIL or expected >= ENOUGH or not 0.0 < found[-k - 1] < found[-1] < np.inf:
+        if len(maxima) < FEWEST_IN_TAIL or expected >= ENOUGH:
             return None
-        hill = float(np.log(found[-k:] / found[-k - 1]).mean())
-        return cls(k, float(found[-k - 1]), hill * (1.0 + SURER / math.sqrt(k)))
+        values = np.sort(maxima)
+        size = len(values) // TAIL_SHARE
+        lowest = float(values[-size - 1])
+        if not 0.0 < lowest < values[-1] < np.inf:
+            return None
+        hill = float(np.log(values[-size:] / lowest).mean())
+        return cls(size=size, lowest=lowest, exponent=hill * (1.0 + SURER / math.sqrt(size)))
 
     def threshold(self, expected: float) -> float:
         """Return what so many are expected to exceed."""
-        return self.u * (self.k / expected) ** self.xi
+        return self.lowest * (self.size / expected) ** self.exponent
 
     def expected(self, threshold: float) -> float:
         """Return how many are expected to exceed a threshold above u: half of one at least, where the model ends."""
-        return max(self.k * (threshold / self.u) ** (-1.0 / self.xi), 0.5)
+        return max(self.size * (threshold / self.lowest) ** (-1.0 / self.exponent), 0.5)
 
 
 def episode_threshold(maxima: Array, rate: float) -> float:
     """Return ``conformal_threshold``, or what the tail of few maxima (n,) makes of it; raises as that."""
     counted = conformal_threshold(maxima, rate)
-    tail = Tail.of(maxima, len(maxima) * rate)
-    return tail.threshold(len(maxima) * rate) if tail else counted
+    expected = len(maxima) * rate
+    tail = Tail.of(maxima, expected)
+    if tail is None:
+        return counted
+    return tail.threshold(expected)
 
 
 class Promise(NamedTuple):
@@ -121,12 +138,20 @@ class Promise(NamedTuple):
     @classmethod
     def of(cls, maxima: Array, threshold: float) -> Self:
         """Return the promise by the episode, from the maxima (n,) of nominal ones."""
-        n, beyond = len(maxima), int((maxima > threshold).sum())
-        tail = None if threshold in maxima else Tail.of(maxima, 0.0)
-        modelled = tail is not None and threshold > tail.u
-        rate = tail.expected(threshold) / n if tail and modelled else (beyond + 1) / (n + 1)
-        at_most = float(betaincinv(beyond + 1, n - beyond, CONFIDENCE)) if beyond < n else 1.0
-        return cls(n, rate, max(rate, at_most), modelled=modelled)
+        episodes = len(maxima)
+        beyond = int(rows_over(maxima, threshold).sum())
+        at_most = 1.0
+        if beyond < episodes:
+            at_most = float(betaincinv(beyond + 1, episodes - beyond, CONFIDENCE))
+
+        tail = None
+        if threshold not in maxima:
+            tail = Tail.of(maxima, 0.0)
+        if tail is None or not threshold > tail.lowest:
+            rate = (beyond + 1) / (episodes + 1)
+            return cls(episodes=episodes, rate=rate, at_most=max(rate, at_most))
+        rate = tail.expected(threshold) / episodes
+        return cls(episodes=episodes, rate=rate, at_most=max(rate, at_most), modelled=True)
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
@@ -144,12 +169,21 @@ class Blocks(NamedTuple):
     @classmethod
     def of(cls, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> Blocks:
         """Cut the values (T,) of whole episodes, a row each ``dt`` [s]; ``each`` names the group of every episode."""
-        rows, number = _rows(dt), {name: n for n, name in enumerate(dict.fromkeys(each))}
-        named = zip(values, each or [""] * len(values), strict=True)
-        cut = [(v[at : at + rows], number.get(name, 0)) for v, name in named for at in range(0, len(v), rows)]
-        kept = [(float(v.max()), len(v) * dt / 3600, group) for v, group in cut]
-        maxima, hours, group = np.array(kept, float).reshape(-1, 3).T
-        return cls(maxima, hours, group) if len(number) > 1 else cls(maxima, hours)
+        most = rows_of_a_minute(dt)
+        names = list(dict.fromkeys(each))
+        maxima = []
+        hours = []
+        groups = []
+        for value, name in zip(values, each or [""] * len(values), strict=True):
+            for first in range(0, len(value), most):
+                block = value[first : first + most]
+                maxima.append(float(block.max()))
+                hours.append(len(block) * dt / 3600)
+                groups.append(names.index(name) if names else 0)
+        blocks = Blocks(maxima=np.array(maxima, float), hours=np.array(hours, float))
+        if len(names) < 2:
+            return blocks
+        return blocks._replace(group=np.array(groups, float))
 
     @classmethod
     def restored(cls, kept: Floats) -> Blocks:
@@ -168,18 +202,13 @@ class Blocks(NamedTuple):
         """The blocks of each group."""
         if not self.group.size:
             return [self]
-        return [Blocks(*(part[self.group == group] for part in self[:2])) for group in np.unique(self.group)]
+        masks = [self.group == group for group in np.unique(self.group)]
+        return [Blocks(maxima=self.maxima[mask], hours=self.hours[mask]) for mask in masks]
 
     @property
     def total(self) -> float:
         """Total duration [h]."""
         return float(self.hours.sum())
-
-
-def alarms_in(value: Array, threshold: float, dt: float) -> int:
-    """Count the alarms in an episode's values (T,); one that persists, or returns within a minute, is one."""
-    over = np.flatnonzero(np.asarray(value) > threshold)
-    return int(1 + (np.diff(over) > _rows(dt)).sum()) if len(over) else 0
 
 
 def check_per_hour(rate: float) -> float:
@@ -189,14 +218,15 @@ def check_per_hour(rate: float) -> float:
 
 def check_hours(rate: float, hours: float) -> None:
     """Raise ValueError, naming the missing hours, where ``hours`` are too few for this rate."""
-    if math.floor(rate * hours + ROUNDING) < 1:
-        unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
-        possible = math.ceil(1.0 / hours / unit) * unit  # rounded up to three digits
-        raise ValueError(
-            f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
-            f"record {math.ceil(100 * (1.0 / rate - hours)) / 100:.4g} hours more, "
-            f"or promise {possible:.4g}"
-        )
+    if math.floor(rate * hours + ROUNDING) >= 1:
+        return
+    unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
+    possible = math.ceil(1.0 / hours / unit) * unit  # rounded up to three digits
+    missing = math.ceil(100 * (1.0 / rate - hours)) / 100
+    raise ValueError(
+        f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
+        f"record {missing:.4g} hours more, or promise {possible:.4g}"
+    )
 
 
 def hourly_threshold(blocks: Blocks, rate: float) -> float:
@@ -205,26 +235,37 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     The rate holds in each group. Raises ValueError where there are too few hours for it.
     """
     check_per_hour(rate)
-    if len(groups := blocks.groups) > 1:
-        return max(hourly_threshold(own, rate) for own in groups)
+    groups = blocks.groups
+    if len(groups) > 1:
+        return max(hourly_threshold(group, rate) for group in groups)
     check_hours(rate, blocks.total)
-    if tail := Tail.of(blocks.maxima, rate * blocks.total):
-        return tail.threshold(rate * blocks.total)
-    allowed = math.floor(rate * blocks.total + ROUNDING) - 1  # blocks that may exceed it
+    expected = rate * blocks.total
+    tail = Tail.of(blocks.maxima, expected)
+    if tail is not None:
+        return tail.threshold(expected)
+    allowed = math.floor(expected + ROUNDING) - 1  # blocks that may exceed it
     maxima = np.sort(blocks.maxima)
     return float(maxima[max(len(maxima) - 1 - allowed, 0)])
 
 
 def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:
     """Return the promise of a threshold, in the group with most alarms; ``episodes`` were cut into the blocks."""
-    if len(groups := blocks.groups) > 1:
-        worst = max((hourly_promise(own, threshold, episodes) for own in groups), key=lambda each: each.rate)
+    groups = blocks.groups
+    if len(groups) > 1:
+        promises = [hourly_promise(group, threshold, episodes) for group in groups]
+        worst = max(promises, key=lambda promise: promise.rate)
         return worst._replace(hours=blocks.total)
-    n, hours, one = len(blocks.maxima), blocks.total, Promise.of(blocks.maxima, threshold)
-    rate = one.rate * (n if one.modelled else n + 1) / hours
-    return Promise(episodes, rate, one.at_most * n / hours, HOUR, hours, one.modelled)
 
-
-def _rows(dt: float) -> int:
-    """Return the rows of a minute."""
-    return max(1, round(MINUTE / dt))
+    each = Promise.of(blocks.maxima, threshold)
+    count = len(blocks.maxima)
+    blocks_alarming = each.rate * (count + 1)
+    if each.modelled:
+        blocks_alarming = each.rate * count
+    return Promise(
+        episodes=episodes,
+        rate=blocks_alarming / blocks.total,
+        at_most=each.at_most * count / blocks.total,
+        per=HOUR,
+        hours=blocks.total,
+        modelled=each.modelled,
+    )

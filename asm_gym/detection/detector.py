@@ -192,8 +192,9 @@ def whiten(detector: Detector, errors: Any) -> Any:
 def add_evidence(detector: Detector, before: Any, after: Any, whitened: Any) -> None:
     """Write w_t (G, X) = w_{t-1} + a (ẽ_t - w_{t-1})."""
     for g in range(len(detector.gains)):
+        gain = detector.gains[g]
         for i in range(len(whitened)):
-            after[g, i] = before[g, i] + detector.gains[g] * (whitened[i] - before[g, i])
+            after[g, i] = before[g, i] + gain * (whitened[i] - before[g, i])
 
 
 @inner

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 
 HAND = 9  # how many numbers say where a hand is
+ORIGIN = np.zeros(3)
 
 
 class Chain(NamedTuple):
@@ -39,18 +40,25 @@ class Chain(NamedTuple):
 @compiled
 def hand_at(angles: Any, axes: Any, anchors: Any, hand: Any, place: Any) -> None:
     """Write ``place`` (9,), see ``Chain.at``."""
-    x = place.reshape((3, 3))
+    vectors = place.reshape((3, 3))
     for k in range(3):
         for i in range(3):
-            x[k, i] = hand[k, i]
+            vectors[k, i] = hand[k, i]
     for j in range(len(angles) - 1, -1, -1):
-        s, c = np.sin(angles[j]), np.cos(angles[j])
-        a0, a1, a2 = axes[j, 0], axes[j, 1], axes[j, 2]
-        for k in range(3):
-            # The place turns about the joint, directions by themselves.
-            o0, o1, o2 = (anchors[j, 0], anchors[j, 1], anchors[j, 2]) if k == 0 else (0.0, 0.0, 0.0)
-            v0, v1, v2 = x[k, 0] - o0, x[k, 1] - o1, x[k, 2] - o2
-            along = (1.0 - c) * (a0 * v0 + a1 * v1 + a2 * v2)
-            x[k, 0] = o0 + c * v0 + s * (a1 * v2 - a2 * v1) + along * a0
-            x[k, 1] = o1 + c * v1 + s * (a2 * v0 - a0 * v2) + along * a1
-            x[k, 2] = o2 + c * v2 + s * (a0 * v1 - a1 * v0) + along * a2
+        turn(vectors[0], axes[j], anchors[j], angles[j])  # the place turns about the joint
+        turn(vectors[1], axes[j], ORIGIN, angles[j])  # directions turn by themselves
+        turn(vectors[2], axes[j], ORIGIN, angles[j])
+
+
+@inner
+def turn(vector: Any, axis: Any, anchor: Any, angle: float) -> None:
+    """Turn a vector (3,) about an axis a through an anchor o: o + c v + s a × v + (1 - c)(a · v) a, v from o."""
+    sine = np.sin(angle)
+    cosine = np.cos(angle)
+    x = vector[0] - anchor[0]
+    y = vector[1] - anchor[1]
+    z = vector[2] - anchor[2]
+    along = (1.0 - cosine) * (axis[0] * x + axis[1] * y + axis[2] * z)
+    vector[0] = anchor[0] + cosine * x + sine * (axis[1] * z - axis[2] * y) + along * axis[0]
+    vector[1] = anchor[1] + cosine * y + sine * (axis[2] * x - axis[0] * z) + along * axis[1]
+    vector[2] = anchor[2] + cosine * z + sine * (axis[0] * y - axis[1] * x) + along * axis[2]

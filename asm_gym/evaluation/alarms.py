@@ -11,6 +11,7 @@ import numpy as np
 from asm_gym.data.episode import spans
 from asm_gym.data.logs import Log
 from asm_gym.data.timing import TOGETHER_S, blamed, bridged, reason
+from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.spec import StreamSpec
 
@@ -80,4 +81,6 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
 
 def excused_in(trace: ScoredEpisode) -> dict[str, int]:
     """Count how often a knock, and a stop, alone kept surprise from being an alarm."""
-    return {e: len(spans((raw > trace.threshold) & ~trace.alarm)) for e, raw in trace.excused.items()}
+    return {
+        event: len(spans(rows_excused(raw, trace.surprise, trace.threshold))) for event, raw in trace.excused.items()
+    }

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection import Blocks
+from asm_gym.detection.alarm_rule import alarms_begin, rows_over
 from asm_gym.detection.conformal import HOUR
 from asm_gym.evaluation.scored_episode import ScoredEpisode, window_steps
 from asm_gym.evaluation.statistics import Estimate, Floats
@@ -99,8 +100,8 @@ class Windows:
 
     def detected(self, threshold: float) -> NDArray[np.bool_]:
         """Return (F,) which faults are detected at a threshold."""
-        over = self._surprise > threshold
-        return np.asarray((over[:, 1:] & ~over[:, :-1]).any(axis=1))
+        alarm = rows_over(self._surprise, threshold)
+        return np.asarray(alarms_begin(alarm).any(axis=1))
 
 
 def resample(

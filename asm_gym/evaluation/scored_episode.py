@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode, spans
+from asm_gym.detection.alarm_rule import rows_over
 from asm_gym.evaluation.defaults import TRANSIENT
 
 Floats = NDArray[np.floating[Any]]
@@ -83,7 +84,7 @@ class ScoredEpisode:
     @cached_property
     def alarm(self) -> NDArray[np.bool_]:
         """(T,) the rows in alarm."""
-        return np.asarray(self.surprise > self.threshold)
+        return rows_over(self.surprise, self.threshold)
 
     @cached_property
     def alarms(self) -> tuple[int, ...]:

@@ -38,8 +38,8 @@ class Layout(NamedTuple):
         integers = _Line(np.int64)
         line_of = {line.kind: line for line in (singles, doubles, integers)}
 
-        fields = []
-        values = []
+        fields: list[Any] = []
+        values: list[Any] = []
         for name, array in arrays.items():
             fields.append((name, np.int64, (3,)))
             values.append(line_of[array.dtype].append(array))

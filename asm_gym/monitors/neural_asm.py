@@ -53,8 +53,8 @@ class NeuralASM(CalibratedMonitor):
             a memory that watches any policy.
         dynamics: how the temporal network represents the past: ``"traces"`` of senses and actions, or ``"settling"``,
             the temporal predictive coding network of the papers, whose state is inferred on every row.
-        excuses: do not count knocks, joints at their stops and moving fingers as faults (``detection.benign_events``): for a
-            memory that watches any policy, including policies that hit things.
+        excuses: do not count knocks, joints at their stops and moving fingers as faults
+            (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
         values: judge values, such as torques, beside changes (``monitors.values``), if other senses predict them: for
             lasting pushes, in logs of real arms.
         urdf: text of the arm's body model, from ``body_model.read_urdf``, to predict torques from the weight and the

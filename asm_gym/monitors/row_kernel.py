@@ -120,11 +120,13 @@ class RowKernel:
         with ONE_THREAD if len(rows) > 1 else nullcontext():  # one row calls no BLAS
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
+        value = judged["surprise"].copy()
         divisor = judged["divisor"].copy()
-        surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
-        if self._excuses:
-            surprise = surprise._replace(raw=judged["raw_surprise"].copy(), excuse=judged["excuse"].copy())
-        return out, surprise, divisor
+        if not self._excuses:
+            return out, Surprise(value=value, attribution=attribution), divisor
+        raw = judged["raw_surprise"].copy()
+        excuse = judged["excuse"].copy()
+        return out, Surprise(value=value, attribution=attribution, raw=raw, excuse=excuse), divisor
 
 
 def expected_errors(memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]) -> Any:
@@ -162,7 +164,7 @@ def state_of(arrays: Any) -> RowState:
     return RowState(
         memory=MemoryState(traces, expected, history, skill),
         detection=EvidenceState(evidence, repetition),
-        events=EventState(arrays[12], arrays[13]),
+        events=EventState(arrays[12], arrays[13], arrays[14], arrays[15]),
     )
 
 
@@ -172,7 +174,7 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
 
     Numba takes longer to look through nested named tuples that Python hands over than through arrays.
     """
-    return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
+    return Bound((learned, state_of(arrays[:16]), state_of(arrays[16:])))  # type: ignore[no-untyped-call]
 
 
 def uninitialised(state: Any) -> Any:
