@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from asm_gym.envs import robots
 from asm_gym.policies import make_policy
 from asm_gym.spec import MOTOR
 from asm_gym.tasks import ROBOTS, TASKS
@@ -201,6 +202,13 @@ def test_vectors_of_environments_agree_with_single_ones(lift, mode):
 
 
 @pytest.mark.slow
+def test_every_robot_that_tasks_list_has_a_file():
+    assert tuple(robots.ROBOTS) == ROBOTS
+    assert [name for name in ROBOTS if robots.robot_named(name).has_inverse_kinematics] == ["Panda", "Sawyer"]
+    with pytest.raises(ValueError, match="Panda"):
+        robots.robot_named("Baxter")
+
+
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("name", TASKS)
 def test_every_robot_does_every_task(name, robot):

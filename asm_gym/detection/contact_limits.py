@@ -99,14 +99,16 @@ class ContactLimits:
             return other
 
         pace = None
-        if self.pace is not None and other.pace is not None and np.array_equal(self.pace.cells, other.pace.cells):
-            pace = self.pace
+        if self.pace is not None and other.pace is not None:
+            same = np.array_equal(self.pace.cells, other.pace.cells)
+            pace = self.pace if same else None
+        healthy = np.minimum(self.most(felt), other.most(felt))
         return replace(
             self,
             wrist_force=min(self.wrist_force, other.wrist_force),
             external_torque=min(self.external_torque, other.external_torque),
             hand_speed=min(self.hand_speed, other.hand_speed),
-            healthy=tuple(np.minimum(self.most(felt), other.most(felt)).tolist()),
+            healthy=tuple(healthy.tolist()),
             pace=pace,
         )
 
@@ -140,15 +142,20 @@ def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpe
     felt = [channel for channel in spec.channels if channel.name.endswith(LIMITED)]
     if not streams or not felt:
         return ()
-    peaks = [spec.slices.get(f"{channel.name}_peak", spec.slices[channel.name]) for channel in felt]
-    columns = np.concatenate([np.arange(spec.size)[peak] for peak in peaks])
-    largest = [np.nanmax(np.abs(stream[:, columns].astype(np.float64)), axis=0) for stream in streams]
-    reached = np.stack(largest)  # (episodes, N)
+    numbers = np.arange(spec.size)
+    columns: list[int] = []
+    for channel in felt:
+        mean = spec.slices[channel.name]
+        peak = spec.slices.get(f"{channel.name}_peak", mean)
+        columns += numbers[peak].tolist()
+    largest = [np.nanmax(np.abs(stream[:, columns]), axis=0) for stream in streams]
+    reached = np.array(largest, np.float64)  # (episodes, N)
 
     usual = ContactLimits().most(felt)
     loads = (reached / usual).max(axis=1)
     kept = loads <= _highest_kept(loads)
-    return tuple(np.minimum(reached[kept].max(axis=0), HIGHEST_HEALTHY * usual).tolist())
+    highest = reached[kept].max(axis=0)
+    return tuple(np.minimum(highest, HIGHEST_HEALTHY * usual).tolist())
 
 
 def _highest_kept(loads: Floats) -> np.float64:

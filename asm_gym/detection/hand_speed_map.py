@@ -9,7 +9,7 @@ where the fastest 5 % of the episodes that visit a cell, and 0.2 % of all, are l
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
@@ -67,8 +67,9 @@ class HandSpeedMap:
         np.maximum.at(grid, at, cells[:, FASTEST])
 
         # A hand may go as fast as others beside its cell; downwards, only as those at the same height.
+        downward = grid[..., DOWN]
         self.grid = maximum_filter(grid, (1, 3, 3, 3, 1))
-        self.grid[..., DOWN] = maximum_filter(grid[..., DOWN], (1, 3, 3, 1))
+        self.grid[..., DOWN] = maximum_filter(downward, (1, 3, 3, 1))
 
     @classmethod
     def of(cls, cells_by_task: Mapping[str, AnyFloats], task: str = "") -> Self | None:
@@ -82,28 +83,33 @@ class HandSpeedMap:
     @classmethod
     def by_task(cls, episodes: Sequence[Episode], spec: StreamSpec) -> dict[str, NDArray[np.float32]]:
         """Return the cells of each task with ``OWN_MAP_EPISODES``, and of all others under an empty name."""
-        tasks = [episode.label.task if episode.label else "" for episode in episodes]
-        counts = Counter(tasks)
         streams: defaultdict[str, list[NDArray[np.float32]]] = defaultdict(list)
-        for task, episode in zip(tasks, episodes, strict=True):
-            if counts[task] < OWN_MAP_EPISODES:
-                task = ""
+        for episode in episodes:
+            task = episode.label.task if episode.label else ""
             streams[task].append(episode.stream)
+        for task in list(streams):
+            if len(streams[task]) < OWN_MAP_EPISODES:
+                streams[""] = streams.pop(task) + streams[""]
 
-        learned = {task: cls.learned(own, spec) for task, own in streams.items()}
-        return {task: cells for task, cells in learned.items() if cells is not None}
+        cells_by_task = {}
+        for task, own in streams.items():
+            cells = cls.learned(own, spec)
+            if cells is not None:
+                cells_by_task[task] = cells
+        return cells_by_task
 
     @staticmethod
     def learned(streams: Sequence[AnyFloats], spec: StreamSpec) -> NDArray[np.float32] | None:
         """Return the cells (N, 16) of healthy streams (T, D); None where these do not tell how hands move."""
         cells = []
+        columns = np.arange(spec.size)
         hands = [name for name in spec.slices if name.endswith("hand_position")]
         for arm, position in enumerate(hands):
             hand = position.removesuffix("position")
             names = (position, f"{hand}velocity", f"{hand}angular_velocity")
             if all(name in spec.slices for name in names):
-                columns = [np.arange(spec.size)[spec.slices[name]] for name in names]
-                rows = _motions(streams, np.concatenate(columns))
+                parts = [columns[spec.slices[name]] for name in names]
+                rows = _motions(streams, np.concatenate(parts))
                 cells.append(_cells_of(arm, rows, len(streams)))
         if not cells:
             return None
@@ -118,37 +124,47 @@ class HandSpeedMap:
 
 
 def _are_cells(cells: AnyFloats) -> bool:
-    if cells.ndim != 2 or cells.shape[1] != FASTEST.stop or len(cells) == 0:
+    if cells.ndim != 2 or cells.size == 0:
         return False
+    if cells.shape[1] != FASTEST.stop:
+        return False
+
     near = np.abs(cells[:, ARM_AND_PLACE]) <= FARTHEST_CELL
-    return bool(near.all() and (cells[:, 0] >= 0).all() and (cells[:, FASTEST] >= 0).all())
+    arms = cells[:, 0]
+    speeds = cells[:, FASTEST]
+    return bool(np.all(near) and np.all(arms >= 0) and np.all(speeds >= 0))
 
 
 def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
     lengths = [len(stream) for stream in streams]
-    episodes = np.repeat(np.arange(len(streams)), lengths)
+    indices = np.arange(len(streams))
+    episodes = np.repeat(indices, lengths)
     motions = np.concatenate([stream[:, columns] for stream in streams])
     rows = np.column_stack((episodes, motions)).astype(np.float64)
 
     places = rows[:, 1:4] / CELL_SIZE
-    near = (np.abs(places) < FARTHEST_CELL).all(axis=1)
     rows[:, 1:4] = np.floor(places)
-    return rows[near & np.isfinite(rows).all(axis=1)]
+    near = np.abs(places) < FARTHEST_CELL
+    known = np.isfinite(rows).all(axis=1)
+    return rows[known & near.all(axis=1)]
 
 
 def _cells_of(arm: int, rows: Floats, episodes: int) -> Floats:
     """Return the cells (N, 16) of an arm, by the motions of its hand in so many episodes."""
-    visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)  # of a cell by an episode
+    # A visit is all rows of an episode in a cell.
+    visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)
     twists = rows[:, 4:]
+    directions = np.hstack((twists, -twists))
     fastest = np.zeros((len(visits), 2 * AXES))
-    np.maximum.at(fastest, visit_of.ravel(), np.hstack((twists, -twists)))
+    np.maximum.at(fastest, visit_of.ravel(), directions)
 
     cells = []
-    for place in np.unique(visits[:, 1:], axis=0):
-        here = (visits[:, 1:] == place).all(axis=1)
-        ranked = np.sort(fastest[here], axis=0)[::-1]
-        left_out = int(FASTEST_EPISODES * len(ranked) + ODD_EPISODES * episodes)
-        if left_out < len(ranked):
-            cells.append(np.hstack((arm, place, ranked[left_out])))
+    visited = visits[:, 1:]
+    for place in np.unique(visited, axis=0):
+        here = np.all(visited == place, axis=1)
+        ascending = np.sort(fastest[here], axis=0)
+        kept = len(ascending) - int(FASTEST_EPISODES * len(ascending) + ODD_EPISODES * episodes)
+        if kept > 0:
+            cells.append(np.hstack((arm, place, ascending[kept - 1])))
     return np.reshape(cells, (-1, FASTEST.stop))

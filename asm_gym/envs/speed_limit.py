@@ -39,9 +39,10 @@ ASKED, PRESENT = range(2)
 
 Action = NDArray[np.float32]
 
-_ADDRESSES = (types.intp,) * 4
-_site_jacobian: Any = types.ExternalFunction("mj_jacSite", types.void(*_ADDRESSES, types.int32))
-_solve_mass: Any = types.ExternalFunction("mj_solveM", types.void(*_ADDRESSES, types.int32))
+_address = types.intp
+_on_arrays = types.void(_address, _address, _address, _address, types.int32)
+_site_jacobian: Any = types.ExternalFunction("mj_jacSite", _on_arrays)
+_solve_mass: Any = types.ExternalFunction("mj_solveM", _on_arrays)
 
 
 class Motions(NamedTuple):
@@ -197,7 +198,18 @@ def is_beside_base(views: Views, arms: Arms, a: int) -> bool:
     """Whether arm ``a``'s hand is near the axis of its own base."""
     hand = views.site_xpos[arms.site[a]]
     base = views.xpos[arms.root[a]]
-    return np.hypot(hand[0] - base[0], hand[1] - base[1]) < BESIDE
+    x = hand[0] - base[0]
+    y = hand[1] - base[1]
+    return np.hypot(x, y) < BESIDE
+
+
+@partial(inner, inlined=True)
+def scale_part(arms: Arms, a: int, share: np.float32, rest: Action, action: Action) -> None:
+    """Leave a share of arm ``a``'s part of an action, in place."""
+    first = arms.first[a]
+    for number in range(first, first + arms.inputs[a]):
+        asked = action[number] - rest[number]
+        action[number] = rest[number] + share * asked
 
 
 @partial(compiled, nogil=True, calls=("detection",))
@@ -230,5 +242,4 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         if fastest > limit.hand_speed:
             brake_speeds[a] = fastest
         if share < 1.0:
-            for n in range(arms.first[a], arms.first[a] + arms.inputs[a]):
-                slowed[n] = rest[n] + np.float32(share) * (action[n] - rest[n])
+            scale_part(arms, a, np.float32(share), rest, slowed)

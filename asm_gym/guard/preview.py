@@ -127,9 +127,11 @@ class Hands:
     def beyond(self, speed_map: HandSpeedMap) -> str:
         """Return what no healthy hand did near the place of any: be there, or be so fast; else empty."""
         for hand, velocity in enumerate(self._velocities):
-            along, against = speed_map.fastest_near(hand, self._places[hand])[:, :3]
-            if not along.any() and not against.any():
+            fastest = speed_map.fastest_near(hand, self._places[hand])[:, :3]
+            if not fastest.any():
                 return PLACE
-            if (np.abs(velocity) > np.where(velocity > 0.0, along, against) + SLACK).any():
+            along, against = fastest
+            healthy = np.where(velocity > 0.0, along, against)
+            if np.any(np.abs(velocity) > healthy + SLACK):
                 return PACE
         return ""
