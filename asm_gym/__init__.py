@@ -39,7 +39,9 @@ if TYPE_CHECKING:
 
 _HOME = {
     **dict.fromkeys(("NeuralASM", "make_monitor", "register_monitor"), "monitors"),
-    **dict.fromkeys(("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"),
+    **dict.fromkeys(
+        ("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"
+    ),
     **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
     "Episode": "data.episode",
     "collect": "rollouts.collect",

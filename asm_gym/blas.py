@@ -23,8 +23,13 @@ class _OneThread:
         with self._lock:
             if self._inside == 0:
                 # Looks through all libraries, once.
-                self._libraries = self._libraries or ThreadpoolController().select(user_api="blas").lib_controllers
-                self._limited = [(library, n) for library in self._libraries if (n := library.num_threads) != 1]
+                self._libraries = (
+                    self._libraries
+                    or ThreadpoolController().select(user_api="blas").lib_controllers
+                )
+                self._limited = [
+                    (library, n) for library in self._libraries if (n := library.num_threads) != 1
+                ]
                 self._set([(library, 1) for library, _ in self._limited])
             self._inside += 1
 

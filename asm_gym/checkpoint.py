@@ -30,7 +30,16 @@ MOST_EXPANDED = 30
 """Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1."""
 
 DAMAGE = (
-    *(zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, RuntimeError, NotImplementedError),
+    *(
+        zipfile.BadZipFile,
+        zlib.error,
+        ValueError,
+        KeyError,
+        EOFError,
+        OSError,
+        RuntimeError,
+        NotImplementedError,
+    ),
     *(MemoryError, OverflowError, SyntaxError),
 )
 """Errors that reading a damaged zip may raise."""
@@ -49,7 +58,9 @@ class Checkpoint(NamedTuple):
         array = self.arrays.get(name)
         if array is None or array.shape != shape or array.dtype.kind != "f":
             found = "none" if array is None else f"{array.dtype} {array.shape}"
-            raise ValueError(f"the checkpoint is damaged: {name} should be an array of shape {shape}, found {found}")
+            raise ValueError(
+                f"the checkpoint is damaged: {name} should be an array of shape {shape}, found {found}"
+            )
         if not np.isfinite(array).all():
             raise ValueError(f"the checkpoint is damaged: {name} should be finite")
         return array
@@ -68,7 +79,9 @@ def write_checkpoint(
     about = {"format": FORMAT, "version": VERSION, "kind": kind, **header, "arrays": declared}
     text = json.dumps(about, allow_nan=False)
     with written_whole(path) as file, zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(zipfile.ZipInfo(HEADER), text)  # dated 1980: the same content has the same bytes at any time
+        archive.writestr(
+            zipfile.ZipInfo(HEADER), text
+        )  # dated 1980: the same content has the same bytes at any time
         for name, array in held.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 _npy.write_array(member, array, allow_pickle=False)
@@ -91,11 +104,15 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     if header.get("kind") != kind:
         raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
     with _opened(path) as file:
-        arrays = {n.removesuffix(".npy"): _read(file, n) for n in sorted(file.namelist()) if n != HEADER}
+        arrays = {
+            n.removesuffix(".npy"): _read(file, n) for n in sorted(file.namelist()) if n != HEADER
+        }
         declared = header.pop("arrays", None)  # the shipped agents declare none
         found = {name: [array.dtype.str, *array.shape] for name, array in arrays.items()}
         if declared is not None and found != declared:
-            wrong = sorted(n for n in found.keys() | declared.keys() if found.get(n) != declared.get(n))
+            wrong = sorted(
+                n for n in found.keys() | declared.keys() if found.get(n) != declared.get(n)
+            )
             raise ValueError(f"its header declares otherwise: {', '.join(wrong)}")
     return Checkpoint(header, arrays)
 
@@ -133,7 +150,9 @@ def _opened(
             if expanded == 1 and any(m.compress_type != zipfile.ZIP_STORED for m in members):
                 raise ValueError("its members are compressed, and those of asm-gym never are")
             if sum(m.file_size for m in members) > expanded * size:
-                raise ValueError(f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}")
+                raise ValueError(
+                    f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}"
+                )
             yield file
     except FileNotFoundError:
         raise

@@ -30,7 +30,9 @@ T = TypeVar("T")
 KEEP_NOWHERE = "asm-gym-numba-"  # begins the name of a folder that goes when the process ends
 
 
-def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), nogil: bool = False) -> F:
+def compiled(
+    function: F, fastmath: bool = False, calls: tuple[str, ...] = (), nogil: bool = False
+) -> F:
     """Compile ``function``, once a machine.
 
     Args:
@@ -40,13 +42,20 @@ def compiled(function: F, fastmath: bool = False, calls: tuple[str, ...] = (), n
         calls: other folders of the package that hold functions which it calls; ``"."`` for the package's own.
         nogil: let other threads run Python meanwhile.
     """
-    how: dict[str, Any] = {"nogil": nogil, "fastmath": fastmath, "forceinline": fastmath, "error_model": "numpy"}
+    how: dict[str, Any] = {
+        "nogil": nogil,
+        "fastmath": fastmath,
+        "forceinline": fastmath,
+        "error_model": "numpy",
+    }
     dispatcher: Any = somewhere(lambda: numba.njit(cache=True, **how)(function))
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
         own, package = Path(function.__code__.co_filename).parent, Path(__file__).parent
-        cache._source_stamp = f"{how}" + "".join(map(_digest, (own, *(package / name for name in calls))))
+        cache._source_stamp = f"{how}" + "".join(
+            map(_digest, (own, *(package / name for name in calls)))
+        )
         cache._load_index = partial(_index_of, cache._load_index)
     return cast(F, dispatcher)
 
@@ -85,7 +94,9 @@ def must_compile(function: Any) -> bool:
     cache = _cache_of(function)
     if cache is None or function.signatures:
         return False
-    processor = cpu_target.target_context.codegen().magic_tuple()  # code that another one compiled is none
+    processor = (
+        cpu_target.target_context.codegen().magic_tuple()
+    )  # code that another one compiled is none
     return not any(processor in key for key in cache._load_index())
 
 
@@ -102,8 +113,16 @@ def _cache_of(dispatcher: Any) -> Any:
 
 def inner(function: F, fastmath: bool = False, inlined: bool = False) -> F:
     """Compile ``function`` for compiled functions to call; ``inlined``, as a part of each of them."""
-    how: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
-    how |= {"fastmath": fastmath, "forceinline": fastmath, "inline": "always" if inlined else "never"}
+    how: dict[str, Any] = {
+        "no_cpython_wrapper": True,
+        "no_cfunc_wrapper": True,
+        "error_model": "numpy",
+    }
+    how |= {
+        "fastmath": fastmath,
+        "forceinline": fastmath,
+        "inline": "always" if inlined else "never",
+    }
     return cast(F, numba.njit(**how)(function))
 
 

@@ -40,7 +40,9 @@ def check_simulator() -> None:
     for name, tested in TESTED.items():
         with suppress(PackageNotFoundError):  # its importer says so
             if not tested.contains(found := version(name), prereleases=True):
-                raise ImportError(f"the environments need {name}{tested}, got {found}: {fitting(name)}")
+                raise ImportError(
+                    f"the environments need {name}{tested}, got {found}: {fitting(name)}"
+                )
 
 
 def fitting(name: str) -> str:
@@ -50,7 +52,11 @@ def fitting(name: str) -> str:
 
 def remedy(package: str) -> str:
     """Return the line that installs a package of an extra."""
-    return INSTALL_ROBOSUITE if package == "robosuite" else f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
+    return (
+        INSTALL_ROBOSUITE
+        if package == "robosuite"
+        else f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
+    )
 
 
 def require(module: str, *, what: str) -> Any:

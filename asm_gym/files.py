@@ -33,7 +33,10 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{token_hex(4)}{UNFINISHED}")
     try:
-        with named(path), temporary.open("xb") as file:  # "x" follows no link; who may read it, the umask says
+        with (
+            named(path),
+            temporary.open("xb") as file,
+        ):  # "x" follows no link; who may read it, the umask says
             yield file
         os.replace(temporary, path)
     except BaseException:

@@ -38,6 +38,11 @@ def draws_a_frame(backend: str) -> bool:
     env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
     command = [sys.executable, "-c", ONE_FRAME]
     try:  # a driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds
-        return subprocess.run(command, env=env, capture_output=True, timeout=120, check=False).returncode == 0
+        return (
+            subprocess.run(
+                command, env=env, capture_output=True, timeout=120, check=False
+            ).returncode
+            == 0
+        )
     except subprocess.TimeoutExpired:
         return False

@@ -57,4 +57,6 @@ def _median(values: NDArray[np.float64]) -> float:
 def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
     edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
-    return list(zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True))
+    return list(
+        zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True)
+    )

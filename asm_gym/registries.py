@@ -47,7 +47,10 @@ class Registry(dict[str, Row]):
 
 def added() -> Added:
     """Return the rows that were added to each registry of this process."""
-    new = {at: {n: row for n, row in rows.items() if n not in rows.own} for at, rows in _REGISTRIES.items()}
+    new = {
+        at: {n: row for n, row in rows.items() if n not in rows.own}
+        for at, rows in _REGISTRIES.items()
+    }
     return {where: rows for where, rows in new.items() if rows}
 
 

@@ -101,7 +101,9 @@ class StreamScaler:
     def groups(self) -> NDArray[np.intp]:
         """(X,) the group of each change, by number; where all are of one group, every number is its own."""
         names = [c.group for c in self.spec.channels for _ in range(c.size)]
-        found = np.unique([names[i] for i in self.spec.sensory], return_inverse=True)[1].astype(np.intp)
+        found = np.unique([names[i] for i in self.spec.sensory], return_inverse=True)[1].astype(
+            np.intp
+        )
         return found if found.any() else np.arange(len(found))
 
     @cached_property
@@ -170,7 +172,10 @@ def read_rows(
         for j in range(L):
             i = slow[j]
             if finite[n, i] and np.isfinite(before[n, i]):
-                senses[n, X + j], seen[n, X + j] = _bounded((rows[n, i] - before[n, i]) / change[i]), 1.0
+                senses[n, X + j], seen[n, X + j] = (
+                    _bounded((rows[n, i] - before[n, i]) / change[i]),
+                    1.0,
+                )
             if np.isfinite(before[n, i]) and np.isfinite(earlier[n, i]):
                 inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
         for j in range(A):
@@ -186,7 +191,9 @@ def rows_apart(dt: float) -> int:
     return max(1, round(LAPSE / dt))
 
 
-def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spread(
+    rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the standard deviations (D,); of a constant column its sensor noise, or 1 where that is 0."""
     spread = rows.std(axis=0)
     constant = spread <= 1e-6 * np.abs(mean)  # the rounding of float32 is not a signal
@@ -194,11 +201,15 @@ def _spread(rows: NDArray[np.float64], mean: NDArray[np.float64], noise: NDArray
     return np.where(constant, fallback, np.maximum(spread, noise))
 
 
-def _least_change(streams: Sequence[NDArray[np.float32]], noise: NDArray[np.float64]) -> NDArray[np.float64]:
+def _least_change(
+    streams: Sequence[NDArray[np.float32]], noise: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the least spread of changes (D,): √2 of half the noise, and of the spread of rounding.
 
     Otherwise a channel that moves by one of its steps in a thousand rows would surprise at each step.
     """
     shown = [s[:MOST_SHOWN] for s in streams[: max(1, MOST_SHOWN // max(1, len(streams[0])))]]
-    rounded = [[resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown]  # (N, D)
+    rounded = [
+        [resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown
+    ]  # (N, D)
     return np.sqrt(2.0) * np.maximum(noise / 2, np.max(rounded, axis=0) / np.sqrt(12.0))

@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, short_repr, typed
 
-CLOCKS = ("time", "sim_time", "simulation_time", "elapsed_time", "t")  # what environments call their clock [s]
+CLOCKS = (
+    "time",
+    "sim_time",
+    "simulation_time",
+    "elapsed_time",
+    "t",
+)  # what environments call their clock [s]
 MOTOR = "action"  # the group that holds the commanded action
 
 
@@ -63,9 +69,13 @@ class Channel:
         check_number(f"{who}: noise", self.noise, low=0.0, infinite=True)
         check_number(f"{who}: resolution", self.resolution, low=0.0)
         if not isinstance(self.elements, tuple):
-            raise TypeError(f"{who}: elements must be a tuple of names, got {short_repr(self.elements)}")
+            raise TypeError(
+                f"{who}: elements must be a tuple of names, got {short_repr(self.elements)}"
+            )
         if not isinstance(self.stops, tuple) or not all(map(_is_pair, self.stops)):
-            raise TypeError(f"{who}: stops must be a tuple of pairs (least, most), got {short_repr(self.stops)}")
+            raise TypeError(
+                f"{who}: stops must be a tuple of pairs (least, most), got {short_repr(self.stops)}"
+            )
         for what, values in (("element names", self.elements), ("pairs of stops", self.stops)):
             if values and len(values) != self.size:
                 raise ValueError(f"{who} has size {self.size} but {len(values)} {what}")
@@ -79,7 +89,9 @@ class Channel:
 
 
 def _is_pair(stops: Any) -> bool:
-    numbers = isinstance(stops, tuple) and len(stops) == 2 and all(isinstance(x, Real) for x in stops)
+    numbers = (
+        isinstance(stops, tuple) and len(stops) == 2 and all(isinstance(x, Real) for x in stops)
+    )
     return numbers and bool(stops[0] < stops[1])
 
 
@@ -106,8 +118,12 @@ class StreamSpec:
     missing: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.channels, tuple) or not all(isinstance(c, Channel) for c in self.channels):
-            raise TypeError(f"channels must be a tuple of Channel objects, got {short_repr(self.channels)}")
+        if not isinstance(self.channels, tuple) or not all(
+            isinstance(c, Channel) for c in self.channels
+        ):
+            raise TypeError(
+                f"channels must be a tuple of Channel objects, got {short_repr(self.channels)}"
+            )
         names = [c.name for c in self.channels]
         if len(set(names)) != len(names):
             raise ValueError(f"channel names must be unique, got {names}")
@@ -139,7 +155,9 @@ class StreamSpec:
     def slices(self) -> dict[str, slice]:
         """Columns of each channel in a row."""
         ends = np.cumsum([c.size for c in self.channels])
-        return {c.name: slice(int(e) - c.size, int(e)) for c, e in zip(self.channels, ends, strict=True)}
+        return {
+            c.name: slice(int(e) - c.size, int(e)) for c, e in zip(self.channels, ends, strict=True)
+        }
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:
@@ -172,7 +190,9 @@ class StreamSpec:
     def difference(self, other: StreamSpec) -> list[str]:
         """Return one line for each reason why a memory of this spec cannot read streams of ``other``."""
         mine, theirs = ({c.name: c for c in s.channels} for s in (self, other))
-        lines = [f"{n}: missing" for n in mine if n not in theirs] + [f"{n}: new" for n in theirs if n not in mine]
+        lines = [f"{n}: missing" for n in mine if n not in theirs] + [
+            f"{n}: new" for n in theirs if n not in mine
+        ]
         for name in (n for n in mine if n in theirs):
             a, b = mine[name], theirs[name]
             pairs = ("size", a.size, b.size), ("unit", a.unit, b.unit), ("group", a.group, b.group)
@@ -199,16 +219,26 @@ class StreamSpec:
         try:
             raw = json.loads(text)
             channels = tuple(
-                Channel(**{**c, "elements": tuple(c["elements"]), "stops": tuple(map(tuple, c.get("stops", ())))})
+                Channel(
+                    **{
+                        **c,
+                        "elements": tuple(c["elements"]),
+                        "stops": tuple(map(tuple, c.get("stops", ()))),
+                    }
+                )
                 for c in raw["channels"]
             )
             return cls(channels, raw["dt"], raw["source"], tuple(raw.get("missing", ())))
         except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(f"the text of a stream's spec is damaged ({error}): {short_repr(text)}") from error
+            raise ValueError(
+                f"the text of a stream's spec is damaged ({error}): {short_repr(text)}"
+            ) from error
 
     @classmethod
     @typed
-    def from_spaces(cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0) -> StreamSpec:
+    def from_spaces(
+        cls, observation: spaces.Space[Any], action: spaces.Space[Any], dt: float = 1.0
+    ) -> StreamSpec:
         """Return the spec of an environment that has no stream of its own: its observation, then the action.
 
         A dict observation has a channel for each key, ``outer.inner`` where nested; discrete values are one-hot.
@@ -218,7 +248,9 @@ class StreamSpec:
         """
         for name, space in (("observation", observation), ("action", action)):
             if not space.is_np_flattenable:
-                raise TypeError(f"the {name} space must be numbers to be read as a stream, got {space}")
+                raise TypeError(
+                    f"the {name} space must be numbers to be read as a stream, got {space}"
+                )
         motor = Channel("action", spaces.flatdim(action), group=MOTOR)
         return cls((*_channels("observation", observation), motor), dt, "spaces")
 
@@ -234,7 +266,11 @@ def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
 
 def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
     """Return an observation or action (n,) as ``StreamSpec.from_spaces`` lays it out."""
-    return np.ravel(value) if isinstance(space, spaces.Box) else np.asarray(spaces.flatten(space, value))
+    return (
+        np.ravel(value)
+        if isinstance(space, spaces.Box)
+        else np.asarray(spaces.flatten(space, value))
+    )
 
 
 def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.float32]:
@@ -243,7 +279,9 @@ def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.fl
         return np.hstack([flat_rows(part, values[key], rows) for key, part in space.items()])
     if isinstance(space, spaces.Box):
         return np.asarray(values, np.float32).reshape(rows, -1)
-    return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(rows, -1)
+    return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(
+        rows, -1
+    )
 
 
 def control_period(env: gym.Env[Any, Any]) -> float:

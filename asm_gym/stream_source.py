@@ -27,7 +27,9 @@ class StreamSource:
         self._env, self.own = env, env.has_wrapper_attr("stream_spec")
         if not self.own:
             refuse_running_statistics(env)
-            self._spaces = StreamSpec.from_spaces(env.observation_space, env.action_space, control_period(env))
+            self._spaces = StreamSpec.from_spaces(
+                env.observation_space, env.action_space, control_period(env)
+            )
 
     @property
     def spec(self) -> StreamSpec:
@@ -46,7 +48,9 @@ class StreamSource:
                 raise KeyError('info has no "stream"')
             return info["stream"]
         spaces = self._env.observation_space, self._env.action_space
-        parts = [flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)]
+        parts = [
+            flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)
+        ]
         return as_float32(np.concatenate(parts))
 
     def first(self, observation: Any, info: dict[str, Any]) -> NDArray[np.float32]:
@@ -61,7 +65,9 @@ class StreamSource:
         return info["streams"] if "streams" in info else self.row(observation, action, info)[None]
 
 
-def stepped(env: gym.Env[Any, Any], action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+def stepped(
+    env: gym.Env[Any, Any], action: Any
+) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
     """Return what a step of an environment returns. Raises TypeError unless it is the five values of Gymnasium."""
     found: Any = env.step(action)
     if not isinstance(found, tuple) or len(found) != 5:
@@ -84,7 +90,10 @@ def layers(env: Any) -> Iterator[Any]:
 def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:
     """Raise ValueError for a wrapper, of one or many, by which the same sense reads differently the longer it runs."""
     for layer in layers(env):
-        if isinstance(layer, NormalizeObservation | VectorNormalizeObservation) and layer.update_running_mean:
+        if (
+            isinstance(layer, NormalizeObservation | VectorNormalizeObservation)
+            and layer.update_running_mean
+        ):
             raise ValueError(
                 "NormalizeObservation inside the guard changes its scaling over time: put it outside, as in "
                 f"NormalizeObservation({guard}(env, monitor)), or set its update_running_mean to False"

@@ -31,7 +31,9 @@ def _gravity(position: Floats) -> Floats:
 
 
 @compiled
-def _advance(q: Floats, v: Floats, command: Floats, load: float, inverse: Floats) -> tuple[Floats, Floats, Floats]:
+def _advance(
+    q: Floats, v: Floats, command: Floats, load: float, inverse: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Return position, velocity and torque (7,) after a control step."""
     torque = command
     for _ in range(SUBSTEPS):
@@ -65,10 +67,14 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3 * JOINTS,), np.float32)
         self.action_space = gym.spaces.Box(-3.0, 3.0, (JOINTS,), np.float32)
         coupled = np.diag(np.full(JOINTS - 1, COUPLING), 1)
-        self._inverse = np.linalg.inv(np.diag(MASS) + (coupled + coupled.T) * np.sqrt(np.outer(MASS, MASS)))
+        self._inverse = np.linalg.inv(
+            np.diag(MASS) + (coupled + coupled.T) * np.sqrt(np.outer(MASS, MASS))
+        )
         self._noise = self.stream_spec.noise[: 3 * JOINTS]
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self._q, self._v, self._steps = np.zeros(JOINTS), np.zeros(JOINTS), 0
         self._load = 0.7 + 0.3 * self.np_random.uniform(0.5, 1.5)
@@ -86,4 +92,6 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _sense(self, torque: Floats) -> NDArray[np.float32]:
         exact = np.concatenate([self._q, self._v, torque])
-        return np.asarray(exact + self._noise * self.np_random.standard_normal(len(exact)), np.float32)
+        return np.asarray(
+            exact + self._noise * self.np_random.standard_normal(len(exact)), np.float32
+        )

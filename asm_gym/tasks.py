@@ -14,7 +14,14 @@ from asm_gym.extras import needed_for
 from asm_gym.registries import Registry
 from asm_gym.validation import check_choice, check_number, check_text
 
-ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")  # arms that the tasks are tested with
+ROBOTS = (
+    "Panda",
+    "Sawyer",
+    "UR5e",
+    "Kinova3",
+    "IIWA",
+    "Jaco",
+)  # arms that the tasks are tested with
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,9 @@ class TaskSpec:
     horizon: int  # control steps before an episode is truncated, at the default 20 Hz
     success: str  # meaning of ``info["success"]``
     arms: int = 1  # number of robots
-    draws_shapes: bool = False  # of its objects, when robosuite loads the model; see ``asm_gym.envs.shapes``
+    draws_shapes: bool = (
+        False  # of its objects, when robosuite loads the model; see ``asm_gym.envs.shapes``
+    )
 
     @property
     def id(self) -> str:
@@ -43,23 +52,47 @@ TASKS = {
         TaskSpec("Door", 200, "the door stands open by more than 0.3 rad"),
         TaskSpec("Wipe", 400, "every marker on the table is wiped off"),
         TaskSpec("ToolHang", 700, "the frame stands in its base and the tool hangs on it"),
-        TaskSpec("NutAssembly", 700, "both nuts are around their pegs, and the hand has let go of them"),
+        TaskSpec(
+            "NutAssembly", 700, "both nuts are around their pegs, and the hand has let go of them"
+        ),
         *(TaskSpec(f"NutAssembly{kind}", 350, _ON_PEG) for kind in ("Single", "Square", "Round")),
-        TaskSpec("PickPlace", 1000, "all four objects are in their bins, and the hand has left them"),
-        *(TaskSpec(f"PickPlace{kind}", 300, _IN_BIN) for kind in ("Single", "Can", "Milk", "Bread", "Cereal")),
+        TaskSpec(
+            "PickPlace", 1000, "all four objects are in their bins, and the hand has left them"
+        ),
+        *(
+            TaskSpec(f"PickPlace{kind}", 300, _IN_BIN)
+            for kind in ("Single", "Can", "Milk", "Bread", "Cereal")
+        ),
         TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", 2),
         TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", 2, True),
-        TaskSpec("TwoArmHandover", 400, "the second arm alone holds the hammer by its handle, off the table", 2, True),
-        TaskSpec("TwoArmTransport", 700, "the payload is in the target bin and the trash in the trash bin", 2, True),
+        TaskSpec(
+            "TwoArmHandover",
+            400,
+            "the second arm alone holds the hammer by its handle, off the table",
+            2,
+            True,
+        ),
+        TaskSpec(
+            "TwoArmTransport",
+            700,
+            "the payload is in the target bin and the trash in the trash bin",
+            2,
+            True,
+        ),
     )
 }
 """Every task by its name."""
 
-OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")  # tasks of ``register_task``, by name
+OWN: Registry[EnvSpec] = Registry(
+    "task", "asm_gym.tasks:OWN"
+)  # tasks of ``register_task``, by name
 
 
 def register_task(
-    name: str, make: Callable[..., gym.Env[Any, Any]] | type[Any] | str, horizon: int, **arguments: Any
+    name: str,
+    make: Callable[..., gym.Env[Any, Any]] | type[Any] | str,
+    horizon: int,
+    **arguments: Any,
 ) -> None:
     """Register an environment as a task, in this process and its workers; raise ValueError if the name is taken.
 
@@ -83,7 +116,9 @@ def register_task(
     if isinstance(make, type) and any(c.__module__.startswith("robosuite.") for c in make.__mro__):
         make, arguments = "asm_gym.envs.user_environment:OwnRobosuite", {"make": make} | arguments
     entry: Any = make
-    spec = EnvSpec(f"asm_gym/{name}-v0", entry_point=entry, max_episode_steps=horizon, kwargs=arguments)
+    spec = EnvSpec(
+        f"asm_gym/{name}-v0", entry_point=entry, max_episode_steps=horizon, kwargs=arguments
+    )
     OWN.register(name, spec)
     gym.registry[spec.id] = spec
 

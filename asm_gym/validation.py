@@ -30,13 +30,23 @@ SHOWN = 80  # characters of a refused value that a message shows
 
 @typing.overload
 def check_number(
-    name: str, value: object, *, whole: Literal[True], infinite: bool = False, **bounds: float | None
+    name: str,
+    value: object,
+    *,
+    whole: Literal[True],
+    infinite: bool = False,
+    **bounds: float | None,
 ) -> int: ...
 
 
 @typing.overload
 def check_number(
-    name: str, value: object, *, whole: Literal[False] = False, infinite: bool = False, **bounds: float | None
+    name: str,
+    value: object,
+    *,
+    whole: Literal[False] = False,
+    infinite: bool = False,
+    **bounds: float | None,
 ) -> float: ...
 
 
@@ -62,7 +72,9 @@ def check_number(
     return number
 
 
-def check_numbers(name: str, values: ArrayLike, *shape: int, **bounds: float | None) -> NDArray[np.float64]:
+def check_numbers(
+    name: str, values: ArrayLike, *shape: int, **bounds: float | None
+) -> NDArray[np.float64]:
     """Return ``values`` as float64. Raises ValueError unless they are finite, within bounds and of this shape."""
     wanted = f"{_described('finite numbers', **bounds)} in the shape {shape}"
     try:
@@ -106,7 +118,11 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
     with suppress(ValueError):  # of arrays, which compare number by number
         if got in names:
             return
-    near = difflib.get_close_matches(got[:SHOWN], map(str, names), 1, 0.75) if isinstance(got, str) else []
+    near = (
+        difflib.get_close_matches(got[:SHOWN], map(str, names), 1, 0.75)
+        if isinstance(got, str)
+        else []
+    )
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(map(str, names))}{hint}")
 
@@ -119,7 +135,9 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
         raise ValueError(f"{name} must be numbers, and some are masked: {short_repr(values)}")
     try:
         given: NDArray[Any] = np.asarray(values)
-        if given.dtype.kind not in "biufO":  # complex numbers would lose a part, and text would pass for numbers
+        if (
+            given.dtype.kind not in "biufO"
+        ):  # complex numbers would lose a part, and text would pass for numbers
             raise TypeError(given.dtype)
         with np.errstate(over="ignore"):
             return given.astype(np.float32)
@@ -166,7 +184,9 @@ def _kinds(call: Callable[..., Any]) -> dict[str, Any]:
         if parameter.kind in many or parameter.annotation is inspect.Parameter.empty:
             continue
         with suppress(NameError):  # imported for type checkers only
-            found |= get_type_hints(SimpleNamespace(__annotations__={name: parameter.annotation}), namespace)
+            found |= get_type_hints(
+                SimpleNamespace(__annotations__={name: parameter.annotation}), namespace
+            )
     return found
 
 
@@ -194,7 +214,12 @@ def _fits(value: Any, kind: Any) -> bool:
 def _methods(protocol: type) -> list[str]:
     """Return the public methods; properties are not asked for, since asking runs them."""
     bases = [base for base in protocol.__mro__ if getattr(base, "_is_protocol", False)]
-    return [name for base in bases for name, m in vars(base).items() if inspect.isfunction(m) and name[0] != "_"]
+    return [
+        name
+        for base in bases
+        for name, m in vars(base).items()
+        if inspect.isfunction(m) and name[0] != "_"
+    ]
 
 
 def _within(number: float, **bounds: float | None) -> bool:

@@ -18,9 +18,18 @@ from asm_gym.scripts.cli import COMMANDS  # noqa: E402
 project = html_title = "asm-gym"
 release = version = __version__
 
-extensions = ["myst_parser", "sphinx.ext.apidoc", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.apidoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+]
 exclude_patterns = ["_build"]
-suppress_warnings = ["ref.python", "docutils"]  # docstrings are plain text first, reStructuredText second
+suppress_warnings = [
+    "ref.python",
+    "docutils",
+]  # docstrings are plain text first, reStructuredText second
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
@@ -55,7 +64,9 @@ def write_commands(app: Sphinx) -> None:
     (HERE / "reference" / "commands.md").write_text("\n\n".join(parts) + "\n", encoding="utf-8")
 
 
-def indented_blocks_are_literal(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+def indented_blocks_are_literal(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
     """Mark the equations and drawings of a docstring, which are indented, as literal blocks; escape its bars."""
     out: list[str] = []
     for block in "\n".join(lines).split("\n\n"):
@@ -63,7 +74,9 @@ def indented_blocks_are_literal(app: Sphinx, what: str, name: str, obj: Any, opt
             out.append("::")
         if not block.startswith(" "):
             parts = block.split("``")
-            block = "``".join(part if n % 2 else part.replace("|", r"\|") for n, part in enumerate(parts))
+            block = "``".join(
+                part if n % 2 else part.replace("|", r"\|") for n, part in enumerate(parts)
+            )
         out.append(block)
     lines[:] = "\n\n".join(out).split("\n")
 

@@ -37,7 +37,9 @@ class StatefulPolicy(ABC):
         return None
 
     @abstractmethod
-    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+    def act(
+        self, observation: Any, state: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
         """Return the action (A,) and the next state."""
 
     def predict(
@@ -76,7 +78,9 @@ def rollout(
     state, success, done, taken = None, False, False, 0
     start = np.ones(1, dtype=bool)
     while not done:
-        action, next_state = policy.predict(observation, state=state, episode_start=start, deterministic=False)
+        action, next_state = policy.predict(
+            observation, state=state, episode_start=start, deterministic=False
+        )
         observation, _, terminated, truncated, info = env.step(action)
         if not info.get("overridden", False):
             state, start = next_state, np.zeros(1, dtype=bool)

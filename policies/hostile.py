@@ -31,11 +31,16 @@ class Hostile(StatefulPolicy):
     def begin(self, observation: Any) -> tuple[int, np.random.Generator]:
         return 0, np.random.default_rng(self.seed)
 
-    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+    def act(
+        self, observation: Any, state: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
         step, rng = state
         first = self._speed * np.asarray(self._rule(self, step, rng), np.float64)
         action = np.pad(first, (0, self.size - len(first)))
-        return np.clip(action, self._space.low, self._space.high).astype(np.float32), (step + 1, rng)
+        return np.clip(action, self._space.low, self._space.high).astype(np.float32), (
+            step + 1,
+            rng,
+        )
 
 
 Rule = Callable[[Hostile, int, np.random.Generator], Floats | tuple[float, ...]]
@@ -60,9 +65,13 @@ class _Spoilt(StatefulPolicy):
     def begin(self, observation: Any) -> tuple[int, Any, tuple[NDArray[np.float32], ...]]:
         return 0, None, ()
 
-    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+    def act(
+        self, observation: Any, state: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
         step, inner, late = state
-        action, inner = self._policy.predict(observation, inner, np.array([step == 0]), deterministic)
+        action, inner = self._policy.predict(
+            observation, inner, np.array([step == 0]), deterministic
+        )
         action = np.array(action, np.float32)
         late = (*late, action.copy())[-LATE_STEPS - 1 :]
         if self._how == "stale":
@@ -84,14 +93,41 @@ RULES: dict[str, Rule] = {
     "ramp": lambda policy, t, rng: (0.0, 0.0, -min(1.0, t / 100)),
     "hammering": lambda policy, t, rng: (0.0, 0.0, -1.0 if t % 20 < 12 else 1.0),
     "grinding": lambda policy, t, rng: (np.cos(t / 5), np.sin(t / 5), -0.5),
-    "squeezing": lambda policy, t, rng: (0.0, 0.0, -1.0 * (t < 60), 0.0, 0.0, 0.0, -1.0 if t < 60 else 1.0),
-    "flinging": lambda policy, t, rng: (0.0, 1.0 if t % 12 < 6 else -1.0, 0.0, 0.0, 0.0, 0.0, (-1.0) ** (t // 6)),
+    "squeezing": lambda policy, t, rng: (
+        0.0,
+        0.0,
+        -1.0 * (t < 60),
+        0.0,
+        0.0,
+        0.0,
+        -1.0 if t < 60 else 1.0,
+    ),
+    "flinging": lambda policy, t, rng: (
+        0.0,
+        1.0 if t % 12 < 6 else -1.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        (-1.0) ** (t // 6),
+    ),
     "to joint limits": lambda policy, t, rng: (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
     "into itself": lambda policy, t, rng: (-1.0, 0.0, -0.3),
     "turning": lambda policy, t, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
     "rolling": lambda policy, t, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
-    "waits for the hand-back": lambda policy, t, rng: (0.0, 0.0, -1.0 * (t % 36 < 24)),  # a trial comes after 10
-    "first rows": lambda policy, t, rng: (1.0 * (t < 12), 0.0, -1.0 * (t < 12), 0.0, 1.0 * (t < 12), 0.0),
+    "waits for the hand-back": lambda policy, t, rng: (
+        0.0,
+        0.0,
+        -1.0 * (t % 36 < 24),
+    ),  # a trial comes after 10
+    "first rows": lambda policy, t, rng: (
+        1.0 * (t < 12),
+        0.0,
+        -1.0 * (t < 12),
+        0.0,
+        1.0 * (t < 12),
+        0.0,
+    ),
 }
 HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
     **{name: partial(Hostile, rule=rule) for name, rule in RULES.items()},

@@ -49,18 +49,28 @@ class NetworkPolicy(StatefulPolicy):
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
         shapes = [W.shape for W, _ in self.layers]
         if not shapes or len(shapes[0]) != 2:
-            raise ValueError(f"a network needs at least one layer, with weights in two dimensions, got {shapes[:1]}")
+            raise ValueError(
+                f"a network needs at least one layer, with weights in two dimensions, got {shapes[:1]}"
+            )
         size = inputs = self.observation_size = int(shapes[0][1])
         for n, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
-                raise ValueError(f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}")
+                raise ValueError(
+                    f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}"
+                )
             size = len(W)
         self.action_size = size
         self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
         self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
-        if self.mean.shape != (inputs,) or self.scale.shape != (inputs,) or not (self.scale > 0).all():
+        if (
+            self.mean.shape != (inputs,)
+            or self.scale.shape != (inputs,)
+            or not (self.scale > 0).all()
+        ):
             raise ValueError(f"mean and scale must be {inputs} numbers, and scale positive")
-        if not all(np.isfinite(a).all() for a in (self.mean, self.scale, *itertools.chain(*self.layers))):
+        if not all(
+            np.isfinite(a).all() for a in (self.mean, self.scale, *itertools.chain(*self.layers))
+        ):
             raise ValueError("weights, biases, mean and scale must be finite")
         self.trained_in = dict(trained_in or {})
         self._low, self._high = np.full(size, -1.0, np.float32), np.ones(size, np.float32)
@@ -68,11 +78,19 @@ class NetworkPolicy(StatefulPolicy):
     def fit_to(self, env: gym.Env[Any, Any], whose: str) -> NetworkPolicy:
         """Return this policy, bound to the actions of ``env``; raise ValueError where it was trained in another one."""
         spaces_of = {"observations": env.observation_space, "actions": env.action_space}
-        for (what, space), size in zip(spaces_of.items(), (self.observation_size, self.action_size), strict=True):
+        for (what, space), size in zip(
+            spaces_of.items(), (self.observation_size, self.action_size), strict=True
+        ):
             if not isinstance(space, spaces.Box) or space.shape != (size,):
-                raise ValueError(f"{whose} takes {what} of {size} numbers, {env.unwrapped} has {space}")
+                raise ValueError(
+                    f"{whose} takes {what} of {size} numbers, {env.unwrapped} has {space}"
+                )
         here = describe(env)
-        other = [f"{n}: {v} there, {here[n]} here" for n, v in self.trained_in.items() if n in here and here[n] != v]
+        other = [
+            f"{n}: {v} there, {here[n]} here"
+            for n, v in self.trained_in.items()
+            if n in here and here[n] != v
+        ]
         if other:
             raise ValueError(f"{whose} was trained in another environment ({'; '.join(other)})")
         assert isinstance(env.action_space, spaces.Box)
@@ -119,5 +137,9 @@ def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
     if hasattr(inner, "robots") and hasattr(inner, "controller"):
         rate = int(inner.metadata["render_fps"])
-        found |= {"robots": list(inner.robots), "controller": inner.controller, "control_freq": rate}
+        found |= {
+            "robots": list(inner.robots),
+            "controller": inner.controller,
+            "control_freq": rate,
+        }
     return found

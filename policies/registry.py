@@ -27,7 +27,10 @@ EXPERTS: dict[str, Callable[..., Policy]] = {
     "Door": DoorExpert,
     "Wipe": WipeExpert,
     **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
-    **{f"PickPlace{which}": PickPlaceExpert for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")},
+    **{
+        f"PickPlace{which}": PickPlaceExpert
+        for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")
+    },
 }
 """The scripted expert of each task."""
 
@@ -38,7 +41,9 @@ def scripted(env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> 
     task = getattr(env.unwrapped, "task", None)
     key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
     if key not in experts:
-        raise ValueError(f"{key or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}")
+        raise ValueError(
+            f"{key or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}"
+        )
     return experts[key](env, seed=seed, **kwargs)
 
 
@@ -86,7 +91,9 @@ def _agent_file(name: str) -> Path:
 
 
 @typed
-def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
+def make_policy(
+    name: str, env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any
+) -> Policy:
     """Return a policy by name.
 
     Args:
@@ -124,4 +131,6 @@ def make_policy(name: str, env: gym.Env[Any, Any], seed: int | None = None, **kw
     if name.endswith(".npz") or name in agents():
         return NetworkPolicy.load(_agent_file(name)).fit_to(env, name)
     known = ", ".join((*POLICIES, *agents()))
-    raise ValueError(f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .asm, SAC:….zip)")
+    raise ValueError(
+        f"unknown policy {name!r}; known: {known}, or the path of an agent (.npz, .asm, SAC:….zip)"
+    )

@@ -48,12 +48,22 @@ from asm_gym.tasks import ROBOTS, TASKS
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import check_choice
 
-SHOWN = ("Lift", "Stack", "Door", "NutAssemblySquare", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
+SHOWN = (
+    "Lift",
+    "Stack",
+    "Door",
+    "NutAssemblySquare",
+    "PickPlaceCan",
+    "PickPlaceBread",
+    "PickPlaceCereal",
+)
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
 HOURS_SEED = 11  # seed of the healthy hours
 _PANDAS = {"Door", "NutAssemblySquare", "NutAssemblyRound"}
 """Tasks whose experts often fail with other arms than the Panda."""
-_GRIPPED = tuple(name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe")
+_GRIPPED = tuple(
+    name for name, task in TASKS.items() if task.arms == 1 and name in EXPERTS and name != "Wipe"
+)
 """Tasks of one arm with a gripper, whose streams are alike."""
 
 
@@ -105,7 +115,9 @@ class Args(Options):
     @property
     def shown(self) -> tuple[str, ...]:
         """Tasks to babble in."""
-        return self.tasks if self.tasks is not None else self._able(SHOWN)[: 2 if self.quick else None]
+        return (
+            self.tasks if self.tasks is not None else self._able(SHOWN)[: 2 if self.quick else None]
+        )
 
     def _able(self, tasks: Sequence[str]) -> tuple[str, ...]:
         return tuple(t for t in tasks if self.robot == "Panda" or t not in _PANDAS)
@@ -118,10 +130,16 @@ class Args(Options):
     @property
     def exams(self) -> list[Exam]:
         """Policies and tasks to examine it on; shipped agents were trained with the Panda."""
-        homes = {p: task_spec(trained_in(p)).name for p in agents()} if self.robot == "Panda" else {}
+        homes = (
+            {p: task_spec(trained_in(p)).name for p in agents()} if self.robot == "Panda" else {}
+        )
         return [
             *(Exam(t, "scripted", known=True) for t in self.shown),
-            *(Exam(t, "scripted", known=False) for t in self._able(LEFT_OUT) if t not in self.shown),
+            *(
+                Exam(t, "scripted", known=False)
+                for t in self._able(LEFT_OUT)
+                if t not in self.shown
+            ),
             *(Exam(t, p, known=False) for p, t in homes.items()),
         ]
 
@@ -131,15 +149,25 @@ def learn(args: Args, console: Console) -> NeuralASM:
     wanted = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     with stage("babbling", console, {}) as progress:
         make = partial(record_lesson, config=args.config, folder=args.out.resolve())
-        files = make_missing(make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress)
-    lessons = healthy([load_episode(file) for file in sorted(files)])  # in whichever order tasks were named
+        files = make_missing(
+            make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress
+        )
+    lessons = healthy(
+        [load_episode(file) for file in sorted(files)]
+    )  # in whichever order tasks were named
     seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy(task)) for task in args.shown}
-    trials = [trial for task, own in seeds.items() for trial in nominal_trials(task_spec(task).id, "nominal", own)]
+    trials = [
+        trial
+        for task, own in seeds.items()
+        for trial in nominal_trials(task_spec(task).id, "nominal", own)
+    ]
     with stage("healthy hours", console, {}) as progress:
         files = record_missing(trials, args.config, args.out / "hours", args.workers, progress)
     found = [load_episode(file) for file in files]
     if args.corpus is not None:
-        found += Corpus.open(args.corpus).episodes(*NOMINAL_ROLES, policies=("scripted",), tasks=args.shown)
+        found += Corpus.open(args.corpus).episodes(
+            *NOMINAL_ROLES, policies=("scripted",), tasks=args.shown
+        )
     hours = [episode for episode in found if episode.success]
     inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     with stage("learning", console, {}) as progress:
@@ -170,7 +198,9 @@ def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
         kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
         trials = exam.trials(args.exam_episodes, kinds, args.seed)
         with stage(exam.name, console, {}) as progress:
-            files = record_missing(trials, config, args.out / "exams" / exam.policy, args.workers, progress)
+            files = record_missing(
+                trials, config, args.out / "exams" / exam.policy, args.workers, progress
+            )
             recordings = [load_episode(file) for file in files]
             expected = usual.setdefault(exam.task, usual_force(recordings))
             marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))

@@ -64,7 +64,9 @@ class Args(Options):
     """Folder of benchmark.md."""
 
 
-def take_turns(rivals: Rivals, turns: int, seed: int, console: Console) -> dict[str, NDArray[np.float64]]:
+def take_turns(
+    rivals: Rivals, turns: int, seed: int, console: Console
+) -> dict[str, NDArray[np.float64]]:
     """Return the seconds of each rival's calls (turns,); the first call of each does not count."""
     for call in rivals.values():
         call()
@@ -82,15 +84,22 @@ def take_turns(rivals: Rivals, turns: int, seed: int, console: Console) -> dict[
 def ratio(seconds: NDArray[np.float64], others: NDArray[np.float64]) -> Spread:
     """Return how many times as long a call takes as another: mean and spread over parts of the measurement."""
     parts = min(PARTS, len(seconds))
-    one, other = (np.array([np.median(p) for p in np.array_split(s, parts)]) for s in (seconds, others))
+    one, other = (
+        np.array([np.median(p) for p in np.array_split(s, parts)]) for s in (seconds, others)
+    )
     return Spread.of((one / other).tolist())
 
 
 def measure_monitor(args: Args, console: Console) -> Table:
     """Compare one call of ``observe`` with that of a GRU under the same detection, on one thread."""
     senses = (Channel(f"sense_{k}", 12, noise=0.01, group=f"group_{k}") for k in range(5))
-    spec, rng = StreamSpec((*senses, Channel("action", 7, group=MOTOR)), dt=0.05), np.random.default_rng(args.seed)
-    learned = [Episode.from_stream(rng.normal(size=(60, spec.size)), spec) for _ in range(60)]  # enough for all parts
+    spec, rng = (
+        StreamSpec((*senses, Channel("action", 7, group=MOTOR)), dt=0.05),
+        np.random.default_rng(args.seed),
+    )
+    learned = [
+        Episode.from_stream(rng.normal(size=(60, spec.size)), spec) for _ in range(60)
+    ]  # enough for all parts
     memory = NeuralASM(spec, epochs=1).fit(learned)
     gru = make_monitor("gru+evidence", spec, hidden_size=256).fit(learned[:8])
 
@@ -104,7 +113,11 @@ def measure_monitor(args: Args, console: Console) -> Table:
         return call
 
     many, rival = "neural_asm, each of 64 streams", "gru+evidence"
-    rivals = {"neural_asm, one stream": observing(memory), many: observing(memory, 64), rival: observing(gru)}
+    rivals = {
+        "neural_asm, one stream": observing(memory),
+        many: observing(memory, 64),
+        rival: observing(gru),
+    }
     with threadpool_limits(1):
         seconds = take_turns(rivals, 5 * args.steps, args.seed, console)
     seconds[many] /= 64
@@ -120,7 +133,9 @@ def _made(task: str, rate: int | None = None) -> gym.Env[Any, Any]:
     return gym.make(env_id(task), horizon=10**9, stream_freq=rate, disable_env_checker=True)
 
 
-def vectors_of(envs: Sequence[gym.Env[Any, Any]], counts: Iterable[int]) -> dict[int, ThreadedVectorEnv]:
+def vectors_of(
+    envs: Sequence[gym.Env[Any, Any]], counts: Iterable[int]
+) -> dict[int, ThreadedVectorEnv]:
     """Return vectors of the first few environments, which share them and close them when they are collected."""
     return {n: ThreadedVectorEnv([partial(envs.__getitem__, i) for i in range(n)]) for n in counts}
 
@@ -156,7 +171,9 @@ def measure_safety(args: Args, console: Console) -> Table:
 
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
         bare, inner = _made(args.task, rate), _made(args.task, rate)
-        memory = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)  # no step is overridden
+        memory = body_memory(inner, StreamSource(inner).spec).with_threshold(
+            1e300
+        )  # no step is overridden
         guarded = NeuralASMSafety(inner, memory)
         compare(name, 1, bare, guarded)
         bare.close()
@@ -170,7 +187,9 @@ def measure_safety(args: Args, console: Console) -> Table:
     return Table(f"Control steps of {args.task} a second, shipped memory", headings, rows)
 
 
-def physics_alone(envs: Sequence[gym.Env[Any, Any]], actions: NDArray[np.float32]) -> Callable[[], None]:
+def physics_alone(
+    envs: Sequence[gym.Env[Any, Any]], actions: NDArray[np.float32]
+) -> Callable[[], None]:
     """Return a function that simulates the next second by ``mujoco.rollout``, on as many threads as there are cores.
 
     It has the environments' models, states and motor commands, recorded here as they take ``actions`` (T, n, A): the
@@ -195,7 +214,10 @@ def physics_alone(envs: Sequence[gym.Env[Any, Any]], actions: NDArray[np.float32
             controls.append(torques)
         recorded.append([np.array(part) for part in (states, controls, warm)])
     turns, threads = iter(recorded), min(cores(), len(envs))
-    pool, data = Rollout(nthread=threads if threads > 1 else 0), [mujoco.MjData(models[0]) for _ in range(threads)]
+    pool, data = (
+        Rollout(nthread=threads if threads > 1 else 0),
+        [mujoco.MjData(models[0]) for _ in range(threads)],
+    )
 
     def second() -> None:
         states, controls, warm = next(turns)
@@ -212,7 +234,12 @@ def measure_env(args: Args, console: Console) -> Table:
     control = [robosuite.load_composite_controller_config(robot=robot) for robot in robots]
     blind = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
     theirs = robosuite.make(
-        args.task, robots, controller_configs=control, reward_shaping=True, ignore_done=True, **blind
+        args.task,
+        robots,
+        controller_configs=control,
+        reward_shaping=True,
+        ignore_done=True,
+        **blind,
     )
     for n, ours in vectors_of(envs, args.members).items():
         rng = np.random.default_rng(args.seed)
@@ -231,7 +258,14 @@ def measure_env(args: Args, console: Console) -> Table:
         seconds = take_turns(rivals, turns, args.seed, console)
         seconds["robosuite"] *= n  # which has no vectors
         rows.append(speeds(n, n, seconds))
-    headings = "members", "asm_gym", "mujoco.rollout", "robosuite", "asm_gym / mujoco.rollout", "asm_gym / robosuite"
+    headings = (
+        "members",
+        "asm_gym",
+        "mujoco.rollout",
+        "robosuite",
+        "asm_gym / mujoco.rollout",
+        "asm_gym / robosuite",
+    )
     return Table(f"Control steps of {args.task} a second, at 20 Hz", headings, rows)
 
 

@@ -48,7 +48,9 @@ def main(argv: list[str] | None = None) -> int:
     def work() -> int:
         check_choice("command", name, COMMANDS)
         with needed_for("this command"):
-            module: Any = import_module("asm_gym.scripts." + ("inspect_log" if name == "inspect" else name))
+            module: Any = import_module(
+                "asm_gym.scripts." + ("inspect_log" if name == "inspect" else name)
+            )
         return module.main(rest)
 
     return exit_code(name if name in COMMANDS else "", work)

@@ -64,7 +64,9 @@ def collect(args: Args, console: Console) -> None:
         episodes = [load_episode(file) for file in files]
         kept = [e for e in episodes if e.success or not args.only_successful]
         if not kept:
-            raise ValueError(f"none of {len(episodes)} episodes succeeded, so none is left for the dataset")
+            raise ValueError(
+                f"none of {len(episodes)} episodes succeeded, so none is left for the dataset"
+            )
         details = {"algorithm_name": args.policy, "versions": versions(), "settings": settings}
         with closing(gym.make(task, **settings)) as env:
             folder = write_dataset(args.out, name, kept, env, details)

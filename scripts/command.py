@@ -36,7 +36,13 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Args = TypeVar("Args")
 DONE, BAD_NEWS, REFUSED = 0, 1, 2
-USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)  # errors that a user can put right
+USAGE_ERRORS = (
+    ValueError,
+    TypeError,
+    OSError,
+    ImportError,
+    gym.error.Error,
+)  # errors that a user can put right
 MOST_NAMES = 7  # that the help of an option lists; a wrong name lists all
 _SAME: Any = object()
 _ANNOTATED: Any = Annotated
@@ -54,8 +60,11 @@ def option(
     *,
     quick: T = _SAME,  # default with ``--quick``
     least: float | None = None,  # lowest number, or the least length of a tuple
-    known: Iterable[str] = (),  # names that the help lists; no others are accepted, unless ``check`` decides
-    check: Callable[[Any], object] | None = None,  # raises for a value, or an element of a tuple, that is not accepted
+    known: Iterable[
+        str
+    ] = (),  # names that the help lists; no others are accepted, unless ``check`` decides
+    check: Callable[[Any], object]
+    | None = None,  # raises for a value, or an element of a tuple, that is not accepted
     metavar: str = "",  # placeholder of the value in the help
     positional: bool = False,  # whether the option is given without its name
 ) -> T:
@@ -75,7 +84,9 @@ class Checked:
                 continue
             if (least := about.get("least")) is not None:
                 many = isinstance(value, Sequence)
-                name, number = (f"the number of {each.name}", len(value)) if many else (each.name, value)
+                name, number = (
+                    (f"the number of {each.name}", len(value)) if many else (each.name, value)
+                )
                 if not number >= least:
                     raise ValueError(f"{name} must be at least {least:g}, got {number}")
             for one in value if isinstance(value, tuple) else (value,):
@@ -106,7 +117,11 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
 
     args = list(sys.argv[1:] if argv is None else argv)
     text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
-    named = [each.name.replace("_", "-") for each in fields(cast(Any, kind)) if not each.metadata.get("positional")]
+    named = [
+        each.name.replace("_", "-")
+        for each in fields(cast(Any, kind))
+        if not each.metadata.get("positional")
+    ]
     options = [f"--{name}" for name in (*named, "help")]
     for word in args:
         if word.startswith("--") and not word.startswith("--tyro-"):
@@ -129,8 +144,12 @@ def _readable(kind: type[Any], quick: bool) -> Any:
         shown = marks.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
         hint = _ANNOTATED[hint, shown]
         hint = marks.Positional[hint] if about.get("positional") else hint
-        default = about["quick"] if quick and about.get("quick", _SAME) is not _SAME else each.default
-        made.append((each.name, hint, field(default=tyro.MISSING if default is MISSING else default)))
+        default = (
+            about["quick"] if quick and about.get("quick", _SAME) is not _SAME else each.default
+        )
+        made.append(
+            (each.name, hint, field(default=tyro.MISSING if default is MISSING else default))
+        )
     unchecked = {"__post_init__": lambda self: None}
     return make_dataclass(kind.__name__, made, bases=(kind,), frozen=True, namespace=unchecked)
 
@@ -145,7 +164,9 @@ def _hint(about: Any) -> Callable[[str], str]:
         if default not in ("", "None", "True", "False"):
             parts.append("required" if default == "(required)" else f"default: {default}")
         if quick is not _SAME:
-            parts.append(f"--quick: {' '.join(map(str, quick)) if isinstance(quick, tuple) else quick}")
+            parts.append(
+                f"--quick: {' '.join(map(str, quick)) if isinstance(quick, tuple) else quick}"
+            )
         return f"({'; '.join(parts)})" if parts else ""
 
     return hint
@@ -155,7 +176,10 @@ def _hint(about: Any) -> Callable[[str], str]:
 
 
 def run(
-    name: str, kind: type[Args], work: Callable[[Args, Console], int | None], argv: Sequence[str] | None = None
+    name: str,
+    kind: type[Args],
+    work: Callable[[Args, Console], int | None],
+    argv: Sequence[str] | None = None,
 ) -> int:
     """Run one command and return its exit code, which ``work`` returns; None is 0.
 
@@ -190,14 +214,20 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
 def origin() -> dict[str, str]:
     """Return how to make a report again: the whole command, the version, and when it was made."""
     made = datetime.now(UTC).astimezone().isoformat(timespec="seconds")
-    return {"command": shlex.join(["asm-gym", *sys.argv[1:]]), "version": f"asm-gym {__version__}", "date": made}
+    return {
+        "command": shlex.join(["asm-gym", *sys.argv[1:]]),
+        "version": f"asm-gym {__version__}",
+        "date": made,
+    }
 
 
 def one_line(error: BaseException) -> str:
     """Return the message of an error as one line."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    head, *rest = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    head, *rest = [line.strip() for line in str(error).splitlines() if line.strip()] or [
+        type(error).__name__
+    ]
     return " ".join([head, "; ".join(rest)]) if rest else head
 
 

@@ -41,7 +41,9 @@ def make(args: Args, console: Console) -> None:
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
                     record_corpus(args.out, sources[part], number, total, args.workers, progress)
     files = Corpus.open(args.out).files
-    console.print(f"Corpus {VERSION} in {args.out}: {len(files)} episodes, {(files.role != 'faulty').sum()} healthy")
+    console.print(
+        f"Corpus {VERSION} in {args.out}: {len(files)} episodes, {(files.role != 'faulty').sum()} healthy"
+    )
 
 
 main = partial(run, "corpus", Args, make)

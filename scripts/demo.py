@@ -45,7 +45,9 @@ class Args(Options):
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task."""
-    on_alarm: Literal["graded", "hold", "terminate"] = option("graded", known=("graded", "hold", "terminate"))
+    on_alarm: Literal["graded", "hold", "terminate"] = option(
+        "graded", known=("graded", "hold", "terminate")
+    )
     """Response of the wrapper to an alarm; graded depends on the cause."""
     workers: int = option(os.cpu_count() or 1, least=1)
     """Number of processes."""
@@ -69,12 +71,19 @@ def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
     Onsets fall between 0.5 s and 2.3 s, while the arm is on its way.
     """
     rng = np.random.default_rng([seed, 7])
-    made: dict[str, list[Fault]] = {"frozen encoder": [], "push": [], "weak joint": [], "collision": []}
+    made: dict[str, list[Fault]] = {
+        "frozen encoder": [],
+        "push": [],
+        "weak joint": [],
+        "collision": [],
+    }
     for _ in range(episodes):
         onset = int(rng.integers(10, 46))
         direction = rng.standard_normal(3)
         x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
-        made["push"].append(Push(body=PUSHED, newtons=20.0, direction=(x, y, z), onset=onset, duration=10))
+        made["push"].append(
+            Push(body=PUSHED, newtons=20.0, direction=(x, y, z), onset=onset, duration=10)
+        )
         made["weak joint"].append(WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset))
         made["frozen encoder"].append(FrozenEncoder(joint=int(rng.integers(7)), onset=onset))
         made["collision"].append(Collision(onset=onset, duration=20))
@@ -96,7 +105,9 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
     """Fit, calibrate and save a memory of the task; return its file and how often the expert succeeded."""
     with stage("collecting nominal episodes", console, {}) as progress:
         count = args.fit_episodes + args.calibration_episodes
-        episodes = collect(env_id(args.task), "scripted", count, args.seed, args.workers, progress=progress)
+        episodes = collect(
+            env_id(args.task), "scripted", count, args.seed, args.workers, progress=progress
+        )
     memory = NeuralASM(episodes[0].spec, epochs=args.epochs, seed=args.seed)
     with stage("learning", console, {}) as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
@@ -114,7 +125,9 @@ def demonstrate(args: Args, console: Console) -> None:
     todo = trials(args)
     with stage("testing, policy alone and wrapped", console, {}) as progress:
         work = partial(watch_pair, config=RolloutConfig(), memory=memory)
-        traces = [trace for pair in parallel_map(work, todo, args.workers, progress) for trace in pair]
+        traces = [
+            trace for pair in parallel_map(work, todo, args.workers, progress) for trace in pair
+        ]
     rows = by_condition(traces, WINDOW_S)
     title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
     table = tabulate(title, CONDITION_COLUMNS, rows)
@@ -127,7 +140,11 @@ def demonstrate(args: Args, console: Console) -> None:
     console.print(result)
     examples = [typical(m.watched) for m in rows]
     details = origin() | asdict(args) | versions("numba") | {"window_s": WINDOW_S}
-    drawn = {"Surprise over time in a typical episode of each condition": figures.surprise_figure(examples)}
+    drawn = {
+        "Surprise over time in a typical episode of each condition": figures.surprise_figure(
+            examples
+        )
+    }
     intro = (
         f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
         f"watched others, some of them faulty. {result}"

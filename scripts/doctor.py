@@ -20,7 +20,17 @@ from asm_gym.extras import BROUGHT_BY, TESTED, fitting, remedy
 from asm_gym.graphics import GET_RENDERING, rendering_backend
 from asm_gym.scripts.command import BAD_NEWS, DONE, run
 
-PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "mujoco", "robosuite", "pyarrow", "stable-baselines3", "torch")
+PACKAGES = (
+    "gymnasium",
+    "numpy",
+    "numba",
+    "scipy",
+    "mujoco",
+    "robosuite",
+    "pyarrow",
+    "stable-baselines3",
+    "torch",
+)
 NAME_CACHE = "export NUMBA_CACHE_DIR=FOLDER, one that you can write to, then asm-gym warmup"
 REINSTALL = "install asm-gym anew (in a clone: make clean, then make doctor)"
 
@@ -45,7 +55,11 @@ def run_checks() -> list[Check]:
     return [
         *map(package, PACKAGES),
         cache(),
-        Check("rendering", f"MUJOCO_GL={backend}" if backend else "no video", "" if backend else GET_RENDERING),
+        Check(
+            "rendering",
+            f"MUJOCO_GL={backend}" if backend else "no video",
+            "" if backend else GET_RENDERING,
+        ),
     ]
 
 
@@ -55,16 +69,29 @@ def package(name: str) -> Check:
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        return Check(name, "not installed", remedy(module) if extra else REINSTALL, needed=not extra)
+        return Check(
+            name, "not installed", remedy(module) if extra else REINSTALL, needed=not extra
+        )
     asked = [r for r in map(Requirement, metadata.requires("asm-gym") or []) if r.name == name]
-    wanted = next((r.specifier for r in asked if not r.marker or r.marker.evaluate({"extra": extra})), SpecifierSet())
+    wanted = next(
+        (r.specifier for r in asked if not r.marker or r.marker.evaluate({"extra": extra})),
+        SpecifierSet(),
+    )
     if name in TESTED and not TESTED[name].contains(version, prereleases=True):
         return Check(name, f"{version}, but needs {TESTED[name]}", fitting(name), needed=True)
-    if name == "pyarrow" and Version(version).major >= 26 and Version(metadata.version("numpy")).major < 2:
-        return Check(name, f"{version}, but needs NumPy 2", "pip install 'pyarrow<26'")  # pip does not know
+    if (
+        name == "pyarrow"
+        and Version(version).major >= 26
+        and Version(metadata.version("numpy")).major < 2
+    ):
+        return Check(
+            name, f"{version}, but needs NumPy 2", "pip install 'pyarrow<26'"
+        )  # pip does not know
     if wanted.contains(version, prereleases=True):
         return Check(name, version)
-    return Check(name, f"{version}, but needs {wanted}", f"pip install '{name}{wanted}'", needed=True)
+    return Check(
+        name, f"{version}, but needs {wanted}", f"pip install '{name}{wanted}'", needed=True
+    )
 
 
 def cache() -> Check:
@@ -77,7 +104,9 @@ def cache() -> Check:
     folder = kept_in(observe_rows)
     if folder is None or KEEP_NOWHERE in str(folder):
         return Check(
-            "cache", "compiled code is lost with the process: neither the install nor HOME is writable", NAME_CACHE
+            "cache",
+            "compiled code is lost with the process: neither the install nor HOME is writable",
+            NAME_CACHE,
         )
     return Check("cache", str(folder))
 
@@ -86,17 +115,27 @@ def report(args: Args, console: Console) -> int:
     """Print the table and its verdict; return the exit code."""
     table, checks = Table("check", "state", "found"), run_checks()
     for check in checks:
-        state = "[green]ok" if not check.remedy else "[red]needed" if check.needed else "[yellow]optional"
+        state = (
+            "[green]ok"
+            if not check.remedy
+            else "[red]needed"
+            if check.needed
+            else "[yellow]optional"
+        )
         table.add_row(check.name, state, escape(check.found))
     missing = [check for check in checks if check.remedy]
     console.print(table)
     for check in missing:  # whole lines, to be copied
-        console.print(f"{check.name}: {check.remedy}", markup=False, highlight=False, soft_wrap=True)
+        console.print(
+            f"{check.name}: {check.remedy}", markup=False, highlight=False, soft_wrap=True
+        )
     if any(check.needed for check in missing):
         console.print("[red]asm-gym cannot run here yet:[/] follow the lines above, from the top.")
         return BAD_NEWS
     names = escape(", ".join(check.name for check in missing))
-    console.print(f"asm-gym runs here, without {names}." if missing else "[green]Everything is here.")
+    console.print(
+        f"asm-gym runs here, without {names}." if missing else "[green]Everything is here."
+    )
     return DONE
 
 

@@ -49,7 +49,9 @@ _QUICK = (
 class Args(Options):
     """Options of a comparison: tasks × monitors × faults."""
 
-    tasks: tuple[str, ...] = option(SKILLS, quick=("Lift", "Stack", "Door"), least=1, check=env_id, metavar="TASK")
+    tasks: tuple[str, ...] = option(
+        SKILLS, quick=("Lift", "Stack", "Door"), least=1, check=env_id, metavar="TASK"
+    )
     """Names of tasks; or one Gymnasium id with Box spaces, such as Pusher-v5 or gymnasium_robotics:FetchReach-v4."""
     robot: str = option("Panda", known=ROBOTS)
     """The arm, for robosuite's tasks."""
@@ -57,7 +59,9 @@ class Args(Options):
     """Policy: scripted, sway, or the path of an agent."""
     steps: int | None = option(None, check=partial(check_number, "steps", low=2, whole=True))
     """Length of an episode of an environment given by its id; by default its own."""
-    monitors: tuple[str, ...] = option(tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name)
+    monitors: tuple[str, ...] = option(
+        tuple(MONITORS), quick=_QUICK, least=1, check=check_monitor_name
+    )
     """Names of monitors; MODEL+DETECTION combines any two, as in external_torque_limit+evidence."""
     faults: tuple[str, ...] = option((), metavar="KIND")
     """Kinds of fault, by default all; development or test for one half of the suite."""
@@ -71,7 +75,9 @@ class Args(Options):
     """Nominal episodes of each task to test on."""
     faulty_episodes: int = option(20, quick=3, least=1)
     """Episodes of each task for each kind and severity, each the twin of a nominal one."""
-    false_alarm_rate: float = option(REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes)
+    false_alarm_rate: float = option(
+        REPORTED_RATE, quick=FALSE_ALARM_RATE, check=conformal_episodes
+    )
     """Share of nominal episodes that may raise an alarm."""
     workers: int = option(2, least=1)
     """Number of processes."""
@@ -83,7 +89,9 @@ class Args(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.elsewhere and len(self.tasks) > 1:
-            raise ValueError(f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}")
+            raise ValueError(
+                f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}"
+            )
         if self.steps is not None and not self.elsewhere:
             raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
         for name in self.faults if self.elsewhere else ():
@@ -114,14 +122,18 @@ class Args(Options):
     @property
     def elsewhere(self) -> bool:
         """Whether the environment is not one of robosuite's tasks."""
-        return not all(name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS for name in self.tasks)
+        return not all(
+            name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS for name in self.tasks
+        )
 
     @property
     def config(self) -> RolloutConfig:
         """How episodes are made."""
         if not self.elsewhere:
             return RolloutConfig(self.policy, self.robot)
-        return RolloutConfig(self.policy, env_kwargs=(("max_episode_steps", self.steps),) if self.steps else ())
+        return RolloutConfig(
+            self.policy, env_kwargs=(("max_episode_steps", self.steps),) if self.steps else ()
+        )
 
 
 def without_unfit_monitors(args: Args, console: Console) -> Args:
@@ -144,7 +156,9 @@ def without_unfit_monitors(args: Args, console: Console) -> Args:
 
 def trials_of(args: Args, task: str) -> list[Trial]:
     """Return every trial of a task."""
-    return evaluation_trials(env_id(task), task, args.config, args.episodes, args.faults, args.severities, args.seed)
+    return evaluation_trials(
+        env_id(task), task, args.config, args.episodes, args.faults, args.severities, args.seed
+    )
 
 
 def evaluate(args: Args, console: Console) -> None:
@@ -152,7 +166,9 @@ def evaluate(args: Args, console: Console) -> None:
     args = without_unfit_monitors(args, console)
     workers, seconds = args.workers, dict[str, float]()
     timed = partial(stage, console=console, seconds=seconds)
-    claim: dict[str, Any] = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
+    claim: dict[str, Any] = {
+        name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")
+    }
     if args.corpus is not None:
         files = skill_files(args.corpus, args.fit_episodes, args.tasks)
         claim["corpus"] = VERSION
@@ -169,7 +185,11 @@ def evaluate(args: Args, console: Console) -> None:
             result = benchmark(args.out, files, args.monitors, *how, each)
         with timed("drawing"):
             details = origin() | json.loads(json.dumps(asdict(args), default=str))
-            details |= {"python": platform.python_version(), "machine": platform.machine(), "seconds": seconds}
+            details |= {
+                "python": platform.python_version(),
+                "machine": platform.machine(),
+                "seconds": seconds,
+            }
             publish(args.out, result, details)
     tables = [brief_monitors_table(result), kept_table(result)]
     if args.elsewhere:

@@ -42,7 +42,10 @@ from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
 SILENCE_S = 2.0  # a live source without a row for this long has ended [s]
-PIECE_S, SPARE = 5.0, 4  # longest pieces of a live recording [s], and how many more there are than the promise needs
+PIECE_S, SPARE = (
+    5.0,
+    4,
+)  # longest pieces of a live recording [s], and how many more there are than the promise needs
 ANY_EPISODE = 0.5  # a rate that one episode can promise: a promise by the hour needs hours
 CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are not learned from
 QUICK_EPISODES, QUICK_EPOCHS = 20, 5  # most episodes and passes with ``--quick``
@@ -66,11 +69,15 @@ class Args(LogOptions):
     """Alarms per hour of normal motion, in place of --false-alarm-rate."""
     action: tuple[str, ...] = option((), metavar="COLUMN")
     """Columns of commands: names, or patterns such as 'cmd*'."""
-    bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    bridge: float | None = option(
+        None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS"
+    )
     """Longest gap to interpolate, by default two rows; a log is cut at longer gaps."""
     urdf: Path | None = option(None, metavar="FILE")
     """Body model of the arm, to predict torques from the weight of its links, which finds weaker pushes."""
-    split: float | None = option(None, check=partial(check_number, "split", above=0), metavar="SECONDS")
+    split: float | None = option(
+        None, check=partial(check_number, "split", above=0), metavar="SECONDS"
+    )
     """Cut long logs into pieces of this length; each piece counts as an episode."""
     minutes: float = option(10.0, check=partial(check_number, "minutes", above=0))
     """Longest recording of a live source."""
@@ -109,7 +116,9 @@ def record_live(args: Args, say: Callable[[str], None]) -> Args:
     return replace(args, data=to, split=max(split, SHORTEST_S))
 
 
-def divide(args: Args, logs: list[list[Episode]], in_time: bool) -> tuple[list[Episode], list[Episode]]:
+def divide(
+    args: Args, logs: list[list[Episode]], in_time: bool
+) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from, and to calibrate on. Raises ValueError where they are too few for the promise."""
     by_episode = args.promise.per == EPISODE
     if in_time or (args.split is not None and not by_episode):
@@ -145,7 +154,11 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
     parts = [part for of_one in cut for part in of_one]
     if not parts:
         missing = np.mean([np.isnan(e.stream).mean(axis=0) for e in episodes], axis=0)  # (D,)
-        worst = [f"{episodes[0].spec.labels[k]} in {missing[k]:.0%}" for k in np.argsort(-missing)[:4] if missing[k]]
+        worst = [
+            f"{episodes[0].spec.labels[k]} in {missing[k]:.0%}"
+            for k in np.argsort(-missing)[:4]
+            if missing[k]
+        ]
         raise ValueError(
             f"no stretch of {SHORTEST_S:g} s is complete: rows that lack a number are {', '.join(worst)} of all; "
             "--ignore leaves such columns out, --bridge SECONDS fills longer gaps"
@@ -154,18 +167,31 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
         int((np.isnan(a.stream) != np.isnan(b.stream)).any(axis=1).sum())
         for a, b in zip(episodes, bridged, strict=True)
     )
-    said = [f"Filled {rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."] if rows else []
-    holed = [of_one for of_one, whole in zip(cut, bridged, strict=True) if not np.isfinite(whole.stream).all()]
+    said = (
+        [f"Filled {rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."]
+        if rows
+        else []
+    )
+    holed = [
+        of_one
+        for of_one, whole in zip(cut, bridged, strict=True)
+        if not np.isfinite(whole.stream).all()
+    ]
     if holed:
         hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
         made = sum(map(len, holed))
-        said.append(f"Rows were lost: {len(holed)} of {len(cut)} episodes were cut there, into {made} parts.{hint}")
+        said.append(
+            f"Rows were lost: {len(holed)} of {len(cut)} episodes were cut there, into {made} parts.{hint}"
+        )
     return parts, said
 
 
 def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
     """Return the hyperparameters that suit the recordings."""
-    suitable: dict[str, Any] = {"seed": args.seed, "values": spec.source == "table" or judged_by_values(spec)}
+    suitable: dict[str, Any] = {
+        "seed": args.seed,
+        "values": spec.source == "table" or judged_by_values(spec),
+    }
     if args.quick:
         suitable["epochs"] = QUICK_EPOCHS
     if args.urdf is not None:
@@ -194,7 +220,11 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         yield f"{args.urdf} is not used: {left}; check its masses, and that it names joints as the log does"
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
-    how = "by name" if model.links.by_name else "by the best fit to the torques, as no column names a joint"
+    how = (
+        "by name"
+        if model.links.by_name
+        else "by the best fit to the torques, as no column names a joint"
+    )
     yield f"{args.urdf} is used: {left}; angles are assigned {how}: {joints}"
 
 
@@ -212,33 +242,66 @@ def fit(args: Args, console: Console) -> int:
     writable(args.out)
     layout = args.layout(action=args.action, by_name=True)
     with stage("reading", console, {}) as progress, noted() as notes:
-        found, reasons = normal_episodes(read_logs(args.data, layout), args.split is not None, progress)
+        found, reasons = normal_episodes(
+            read_logs(args.data, layout), args.split is not None, progress
+        )
     left_out = ", ".join(f"{count} {why}" for why, count in reasons.items())
     if not found:
-        hint = "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
-        hint += "; --ignore a column that is wrongly taken for a label" if reasons["with a fault"] else ""
+        hint = (
+            "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
+        )
+        hint += (
+            "; --ignore a column that is wrongly taken for a label"
+            if reasons["with a fault"]
+            else ""
+        )
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
     parts, cuts = parts_between_gaps(args, with_shared_noise(found))
-    fitting, calibration = divide(args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live)
+    fitting, calibration = divide(
+        args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live
+    )
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:
-        monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(fitting, progress)
+        monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(
+            fitting, progress
+        )
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
-    for line in [*notes, *notes_on_columns(args, spec), *notes_on_body(args, monitor), *mute_channels(fitting)]:
+    for line in [
+        *notes,
+        *notes_on_columns(args, spec),
+        *notes_on_body(args, monitor),
+        *mute_channels(fitting),
+    ]:
         say(f"Note: {line}.")
     rows, hours, used = sum(map(len, fitting)), monitor.blocks_.total, len(monitor.maxima_)
-    say(f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second.")
+    say(
+        f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second."
+    )
     for line in [f"Left out: {left_out}."] * bool(left_out) + cuts:
         say(line)
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
     if args.promise.per == EPISODE:
         promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
-    modelled = ", by a model of the tail of their maxima, as they are few" if monitor.promise.modelled else ""
-    ceilings = f"; {len(calibration) - used} more say how far each sense goes" if used < len(calibration) else ""
-    say(f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}{modelled}{ceilings}.")
+    modelled = (
+        ", by a model of the tail of their maxima, as they are few"
+        if monitor.promise.modelled
+        else ""
+    )
+    ceilings = (
+        f"; {len(calibration) - used} more say how far each sense goes"
+        if used < len(calibration)
+        else ""
+    )
+    say(
+        f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}{modelled}{ceilings}."
+    )
     expected, most = monitor.promise.hourly(hours)
-    more = "" if expected <= 1.0 else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
+    more = (
+        ""
+        if expected <= 1.0
+        else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
+    )
     say(
         f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, at most "
         f"{most:.3g} with 95 % confidence; other motion raises more.{more}"

@@ -23,7 +23,13 @@ from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
 from asm_gym.scripts.log_options import LogOptions, ended
 
-FORMATS = {"from": "{:.4g}", "to": "{:.4g}", "noise": "{:.2g}", "resolution": "{:.2g}", "repeats": "{:.0%}"}
+FORMATS = {
+    "from": "{:.4g}",
+    "to": "{:.4g}",
+    "noise": "{:.2g}",
+    "resolution": "{:.2g}",
+    "repeats": "{:.0%}",
+}
 """How the facts are printed; others as they are."""
 
 
@@ -50,16 +56,23 @@ def inspect(args: Args, console: Console) -> int:
             columns, nominal = table_of_source(source), replace(layout, nominal=source.rate)
             if source.episode is not None:  # its stream is what it is
                 nominal = replace(nominal, channels=("*",))
-            log = inspected(source.name, columns, nominal, [t for t in tables if t is not source.columns])
+            log = inspected(
+                source.name, columns, nominal, [t for t in tables if t is not source.columns]
+            )
             trouble = trouble or bool(log.trouble) or not log.rate
             say(log.caption())
-            lines = [*(table(log.facts) if first is None else []), *(f"- {line}" for line in log.remarks())]
+            lines = [
+                *(table(log.facts) if first is None else []),
+                *(f"- {line}" for line in log.remarks()),
+            ]
             for line in lines:
                 if line not in known:  # of many logs what is alike is said once
                     say(line)
             known.update(line for line in lines if line.startswith("- "))
             if n < args.logs:
-                name = source.name.replace(Path(source.file).suffix, "").replace(os.sep, "_") or "log"
+                name = (
+                    source.name.replace(Path(source.file).suffix, "").replace(os.sep, "_") or "log"
+                )
                 picture = figures.save(figures.log_figure(log), args.out / f"{name}.png")
                 say(f"Wrote {picture}")
             if first is not None and (line := differences(first, log)):
@@ -85,7 +98,9 @@ def table(facts: list[dict[str, Any]]) -> list[str]:
     headings = [h for h in facts[0] if any(row[h] for row in facts)] if facts else []
     rows = [headings, *([_cell(heading, row[heading]) for heading in headings] for row in facts)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [
+        "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
 
 
 def _cell(heading: str, fact: Any) -> str:

@@ -35,8 +35,15 @@ class LogOptions(Checked):
 
     def layout(self, **more: Any) -> LogLayout:
         """Return how to read logs; ``more`` are other fields of it."""
-        said = {"channels": self.channels, "labels": self.label, "columns": self.columns, "ignore": self.ignore}
-        return LogLayout(**{"rate": self.rate, "clock": self.clock, "like": self.like} | said | more)
+        said = {
+            "channels": self.channels,
+            "labels": self.label,
+            "columns": self.columns,
+            "ignore": self.ignore,
+        }
+        return LogLayout(
+            **{"rate": self.rate, "clock": self.clock, "like": self.like} | said | more
+        )
 
 
 def ended(notes: Sequence[str], code: int = DONE) -> int:

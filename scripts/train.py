@@ -70,10 +70,15 @@ def train_agent(args: Args, console: Console) -> None:
     episodes = None if args.dataset is None else read_dataset(args.dataset, env_id=task)
     torch.set_num_threads(1)  # more of them slow networks this small down
     start = time.perf_counter()
-    claim = {name: getattr(args, name) for name in ("task", "robot", "demonstrations", "dataset", "seed")}
+    claim = {
+        name: getattr(args, name) for name in ("task", "robot", "demonstrations", "dataset", "seed")
+    }
     with claimed(args.out, "train.json", claim):
         if episodes is None:
-            folder, seeds = args.out / "demonstrations" / "episodes", episode_seeds(args.seed, args.demonstrations)
+            folder, seeds = (
+                args.out / "demonstrations" / "episodes",
+                episode_seeds(args.seed, args.demonstrations),
+            )
             with stage("recording demonstrations", console, {}) as tick:
                 files = collect_to(folder, task, config, seeds, args.workers, tick)
             episodes = [load_episode(file) for file in files]
@@ -81,15 +86,21 @@ def train_agent(args: Args, console: Console) -> None:
         if not solved:
             raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
         with stage("cloning and learning", console, {}) as tick:
-            agent = train(make, args.out, solved, tick, **{name: getattr(args, name) for name in names})
+            agent = train(
+                make, args.out, solved, tick, **{name: getattr(args, name) for name in names}
+            )
         with stage("judging", console, {}), closing(make()) as env:
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
-            success = float(np.mean([rollout(env, agent.fit_to(env, "the agent"), seed) for seed in seeds]))
+            success = float(
+                np.mean([rollout(env, agent.fit_to(env, "the agent"), seed) for seed in seeds])
+            )
         minutes = round((time.perf_counter() - start) / 60, 1)
         result = {"success": success, "episodes": args.final_episodes, "minutes": minutes}
         agent.save(args.out / "agent.npz", **result)
         write_text(args.out / "result.json", json.dumps(result, indent=2) + "\n")
-    console.print(f"success {success:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}")
+    console.print(
+        f"success {success:.0%} of {args.final_episodes} episodes: {args.out / 'agent.npz'}"
+    )
 
 
 main = partial(run, "train", Args, train_agent)

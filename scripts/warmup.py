@@ -32,14 +32,21 @@ class Args:
 def warm_up(args: Args, console: Console) -> None:
     """Compile memory and simulation in two processes (plain ones: the core has no loky), and print where it is kept."""
     seconds: dict[str, float] = {}
-    with stage("compiling", console, seconds) as progress, ProcessPoolExecutor(2, get_context("spawn")) as processes:
+    with (
+        stage("compiling", console, seconds) as progress,
+        ProcessPoolExecutor(2, get_context("spawn")) as processes,
+    ):
         for done, part in enumerate(as_completed(map(processes.submit, (_learn, _step))), 1):
             part.result()
             progress(done, 3)
         _step(NeuralASMSafety)
         progress(3, 3)
     where = kept_in(observe_rows) or "memory only"
-    console.print(f"Compiled after {sum(seconds.values()):.0f} s; kept in {where}", soft_wrap=True, markup=False)
+    console.print(
+        f"Compiled after {sum(seconds.values()):.0f} s; kept in {where}",
+        soft_wrap=True,
+        markup=False,
+    )
 
 
 def _learn() -> None:

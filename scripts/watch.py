@@ -61,7 +61,9 @@ class Args(LogOptions):
     """The memory, written by asm-gym fit."""
     out: Path = option(Path("runs/watch"), metavar="FOLDER")
     """Folder of the table, the figures and the report of a recording."""
-    bridge: float | None = option(None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS")
+    bridge: float | None = option(
+        None, check=partial(check_number, "bridge", low=0.0), metavar="SECONDS"
+    )
     """Longest gap without an alarm, by default two rows; rows in a gap are not judged."""
     wait: float = option(600.0, check=partial(check_number, "wait", low=0), metavar="SECONDS")
     """How long to wait for the first row of a live source, or for UDP or ROS 2 that died to return."""
@@ -73,7 +75,9 @@ class Args(LogOptions):
     """Shell command to run at every alarm of a live source; it gets the alarm as JSON on its standard input."""
     topic: str = option("", metavar="TOPIC")
     """Topic of ROS 2 on which every alarm of a live source is published, as JSON in a std_msgs/String."""
-    watchdog: float | None = option(None, check=partial(check_number, "watchdog", above=0.0), metavar="SECONDS")
+    watchdog: float | None = option(
+        None, check=partial(check_number, "watchdog", above=0.0), metavar="SECONDS"
+    )
     """Also run the hook from a second process: after this time without a row, and if this process dies."""
     policy: int | None = option(None, least=1, metavar="PID")
     """Process id of the policy; the watchdog treats its death as an alarm."""
@@ -92,35 +96,53 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     writable(args.out / "alarms.csv")
     with stage("watching", console, {}) as progress, noted() as notes:
         logs = iter(read_logs(args.source, args.layout(spec=monitor.spec)))
-        while group := list(islice(logs, AT_ONCE)):  # a folder of recordings may be larger than memory
+        while group := list(
+            islice(logs, AT_ONCE)
+        ):  # a folder of recordings may be larger than memory
             traces = recorded.traces_of(group, monitor, bridge)
-            over += sum(int(bridged(log.episode.stream, monitor.spec.dt, bridge).sum()) for log in group)
+            over += sum(
+                int(bridged(log.episode.stream, monitor.spec.dt, bridge).sum()) for log in group
+            )
             alarms += [alarm for trace in traces for alarm in recorded.alarms_of(trace)]
-            excused.update(event for trace in traces for event in Counter(recorded.excused_in(trace)).elements())
-            worst = sorted([*worst, *traces], key=lambda trace: -recorded.sensed_peak(trace))[: args.figures]
+            excused.update(
+                event
+                for trace in traces
+                for event in Counter(recorded.excused_in(trace)).elements()
+            )
+            worst = sorted([*worst, *traces], key=lambda trace: -recorded.sensed_peak(trace))[
+                : args.figures
+            ]
             episodes += len(group)
             progress(episodes, episodes)
     summary = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
     summary += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
     table = io.StringIO(newline="")
-    csv.writer(table).writerows([HEADINGS, *(map(recorded.plain_cell, alarm.cells()) for alarm in alarms)])
+    csv.writer(table).writerows(
+        [HEADINGS, *(map(recorded.plain_cell, alarm.cells()) for alarm in alarms)]
+    )
     write_text(args.out / "alarms.csv", table.getvalue())
     written = publish(args, summary, alarms, worst)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     for line in notes:
         say(f"Note: {line}.")
     if over:
-        say(f"Bridged {over} rows that lack a number, in gaps of at most {bridge:.3g} s: they are not judged.")
+        say(
+            f"Bridged {over} rows that lack a number, in gaps of at most {bridge:.3g} s: they are not judged."
+        )
     shown = sorted(alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))[:SHOWN_ROWS]
     say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} largest:"))
     width = max((len(alarm.channel) for alarm in shown), default=0)
-    for log, start, end, channel, why, excess in [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []:
+    for log, start, end, channel, why, excess in (
+        [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []
+    ):
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(written)
     return ended(notes, BAD_NEWS if alarms else DONE)
 
 
-def publish(args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]) -> str:
+def publish(
+    args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]
+) -> str:
     """Write a report with the most surprising episodes; return what was written, and what is missing for more."""
     try:
         with needed_for("the report"):
@@ -148,7 +170,9 @@ def watch(args: Args, console: Console) -> int:
     live = live_source(args.source)
     wrong, given, own = (RECORDED_ONLY, *KINDS[::-1]) if live else (LIVE_ONLY, *KINDS)
     if said := [n for n in wrong if getattr(args, n)]:
-        raise ValueError(f"--{said[0].replace('_', '-')} is for {given}, and {args.source} is {own}")
+        raise ValueError(
+            f"--{said[0].replace('_', '-')} is for {given}, and {args.source} is {own}"
+        )
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")

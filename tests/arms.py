@@ -35,7 +35,9 @@ def arm(steps: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     t = 0.05 * np.arange(steps)[:, None] + rng.uniform(0, 6, 2)
     q = np.array([0.4, 0.9]) + 0.35 * np.sin(t * np.array([1.0, 1.6]))
-    hand = np.stack([np.cos(q[:, 0]) + np.cos(q.sum(axis=1)), np.sin(q[:, 0]) + np.sin(q.sum(axis=1))], axis=1)
+    hand = np.stack(
+        [np.cos(q[:, 0]) + np.cos(q.sum(axis=1)), np.sin(q[:, 0]) + np.sin(q.sum(axis=1))], axis=1
+    )
     lone = np.cumsum(0.1 * rng.standard_normal((steps, 1)), axis=0)
     sensed = np.hstack([q, hand, lone]) + 0.001 * rng.standard_normal((steps, 5))
     return np.hstack([sensed, np.cos(t)]).astype(np.float32)
@@ -92,7 +94,9 @@ class Judge(CueMonitor):
     def __init__(self, cue, family="sensor"):
         super().__init__(cue, GENERIC)
         streams = STREAMS
-        self.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(GENERIC, streams), streams), Named(family))
+        self.diagnosis_ = Diagnosis(
+            Completion.fit(StreamScaler.fit(GENERIC, streams), streams), Named(family)
+        )
 
     def observe(self, state, stream):
         attribution = np.zeros((1, self.spec.size))

@@ -50,7 +50,9 @@ CHECKS = {
     "rllib": Check("report", "tests/test_learners.py", "ray[rllib] torch", pins="gymnasium"),
     "notebooks": Check("robosuite,report,notebooks", "tests/test_docs.py -k notebook"),
     "environments": Check("environments,report", "tests/test_elsewhere.py"),
-    "robosuite": Check("robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'", "stable-baselines3"),
+    "robosuite": Check(
+        "robosuite,report,video", "tests/test_robosuite_env.py -m 'not slow'", "stable-baselines3"
+    ),
 }
 
 
@@ -60,7 +62,9 @@ def check(name: str, wheel: Path) -> str:
     with TemporaryDirectory() as folder:
         venv.create(folder, with_pip=True)
         tested = (ROOT / "constraints.txt").read_text().splitlines(keepends=True)
-        Path(folder, "constraints.txt").write_text("".join(t for t in tested if t.split("==")[0] != pins))
+        Path(folder, "constraints.txt").write_text(
+            "".join(t for t in tested if t.split("==")[0] != pins)
+        )
         install = f"pip install -q -c {folder}/constraints.txt '{wheel}[{extras}]' {also} pytest"
         if "robosuite" in extras:
             install += f" && {folder}/bin/python -m pip install -q --no-deps {ROBOSUITE}"
@@ -69,12 +73,16 @@ def check(name: str, wheel: Path) -> str:
         there = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         command = f"{folder}/bin/python -m pytest -q -rs {tests}"
         print(f"{name}: {command}", flush=True)
-        done = subprocess.run(command, shell=True, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            command, shell=True, cwd=ROOT, env=there, stdout=subprocess.PIPE, text=True
+        )
     print(done.stdout, flush=True)
     wrong = [] if done.returncode == 0 else [f"pytest ended with {done.returncode}"]
     ours = re.compile(rf"asm-gym\[({extras.replace(',', '|')})\]")
     skipped = [line for line in done.stdout.splitlines() if line.startswith("SKIPPED")]
-    return "; ".join(wrong + [line for line in skipped if "pip install" not in line or ours.search(line)])
+    return "; ".join(
+        wrong + [line for line in skipped if "pip install" not in line or ours.search(line)]
+    )
 
 
 EXTRAS = (
@@ -103,13 +111,19 @@ def pairs(wheel: Path) -> str:
             versions = dict(line.split("==") for line in done.stdout.splitlines() if "==" in line)
             if done.returncode:
                 wrong.append(f"{'+'.join(two)}: {done.stderr.strip()}")
-            print("+".join(two), *(f"{n} {versions.get(n)}" for n in ("mujoco", "numpy", "torch")), flush=True)
+            print(
+                "+".join(two),
+                *(f"{n} {versions.get(n)}" for n in ("mujoco", "numpy", "torch")),
+                flush=True,
+            )
         # PyTorch as in constraints.txt, of which this machine may have the small build.
         tested = Path(folder, "constraints.txt")
         lines = (ROOT / "constraints.txt").read_text().splitlines()
         tested.write_text("".join(f"{line}\n" for line in lines if line.startswith("torch==")))
         install = [*uv, "install", "-q", "--python", python, "-c", str(tested)]
-        subprocess.run([*install, f"asm-gym[robosuite] @ {wheel.as_uri()}"], cwd=folder, env=there, check=True)
+        subprocess.run(
+            [*install, f"asm-gym[robosuite] @ {wheel.as_uri()}"], cwd=folder, env=there, check=True
+        )
         subprocess.run([*install, "--no-deps", ROBOSUITE], cwd=folder, env=there, check=True)
         for extra in EXTRAS[1:]:
             steps = ([*install, f"asm-gym[{extra}] @ {wheel.as_uri()}"], [python, "-c", STILL_RUNS])
@@ -121,7 +135,12 @@ def pairs(wheel: Path) -> str:
 
 MATRIX = ("3.11 numpy<2", "3.12 numpy<2", "3.11 numpy>=2", "3.12 numpy>=2", "3.13 numpy>=2")
 """Pythons and NumPys; NumPy 1.26 has no build for Python 3.13."""
-OURS = "PYTHONPATH", "VIRTUAL_ENV", "MAKEFLAGS", "ARGS"  # variables that a fresh environment must not see
+OURS = (
+    "PYTHONPATH",
+    "VIRTUAL_ENV",
+    "MAKEFLAGS",
+    "ARGS",
+)  # variables that a fresh environment must not see
 
 
 def matrix(asked: str = "") -> int:
@@ -132,7 +151,11 @@ def matrix(asked: str = "") -> int:
         # The tested versions; with NumPy 1 what still goes with it, but the same PyTorch.
         keep, others = ("torch==", "'pyarrow<26'") if numpy == "numpy<2" else ("", "")
         with TemporaryDirectory(prefix="asm-gym-matrix-") as folder:
-            pins = (line for line in (ROOT / "constraints.txt").read_text().splitlines(keepends=True) if keep in line)
+            pins = (
+                line
+                for line in (ROOT / "constraints.txt").read_text().splitlines(keepends=True)
+                if keep in line
+            )
             Path(folder, "pins.txt").write_text("".join(pins))
             steps = (
                 f"git clone -q --depth 1 file://{ROOT} tree",
@@ -143,7 +166,14 @@ def matrix(asked: str = "") -> int:
                 "make -C tree test",
             )
             there = {key: value for key, value in os.environ.items() if key not in OURS}
-            failed = next((s for s in steps if subprocess.run(s, shell=True, cwd=folder, env=there).returncode), None)
+            failed = next(
+                (
+                    s
+                    for s in steps
+                    if subprocess.run(s, shell=True, cwd=folder, env=there).returncode
+                ),
+                None,
+            )
         print(f"{name:<14} {failed or 'ok'}", flush=True)
         wrong += failed is not None
     return wrong

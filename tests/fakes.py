@@ -35,7 +35,9 @@ class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if own_stream:
             self.stream_spec = SPEC
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.t = 0
         self.actions = []
@@ -61,7 +63,9 @@ class FakeEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 class CueMonitor:
     """Surprised (value 10, threshold 1) in the steps of ``cue``; keeps every row it was shown."""
 
-    def __init__(self, cue: Sequence[int] = (), spec: StreamSpec = SPEC, threshold: float | None = 1.0) -> None:
+    def __init__(
+        self, cue: Sequence[int] = (), spec: StreamSpec = SPEC, threshold: float | None = 1.0
+    ) -> None:
         self.spec, self.cue, self._threshold = spec, frozenset(cue), threshold
         self.rows: list[NDArray[np.float32]] = []
 
@@ -109,7 +113,11 @@ class FadingMonitor(CueMonitor):
 
     def observe(self, state: Remembered, stream: NDArray[Any]) -> tuple[Remembered, Surprise]:
         self.spec.check_row(stream)
-        evidence = state.evidence * 2 / 3 + 2.0 * np.isin(stream[:, 0], list(self.cue)) + 0.001 * state.steps
+        evidence = (
+            state.evidence * 2 / 3
+            + 2.0 * np.isin(stream[:, 0], list(self.cue))
+            + 0.001 * state.steps
+        )
         attribution = np.zeros((len(stream), self.spec.size))
         attribution[:, 0] = evidence
         return Remembered(evidence, state.steps + 1), Surprise(evidence, attribution)

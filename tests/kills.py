@@ -27,7 +27,9 @@ from asm_gym.data.episode import load_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.scripts import cli
 
-FULL = 20 * 1024  # no file can grow larger in a run whose disk is full [bytes]; less than an episode takes
+FULL = (
+    20 * 1024
+)  # no file can grow larger in a run whose disk is full [bytes]; less than an episode takes
 
 EVALUATE = """evaluate --tasks Lift --monitors kalman --faults push --severities strong
     --fit-episodes 2 --calibration-episodes 5 --nominal-episodes 1 --faulty-episodes 1
@@ -52,7 +54,10 @@ def tables_in(folder: Path) -> Any:
     return {path.name: path.read_text() for path in sorted(folder.glob("*.md"))}
 
 
-WORKS = {"collect": Work("collect Lift --episodes 3", episodes_in), "evaluate": Work(EVALUATE, tables_in)}
+WORKS = {
+    "collect": Work("collect Lift --episodes 3", episodes_in),
+    "evaluate": Work(EVALUATE, tables_in),
+}
 
 
 def start(work: Work, folder: Path, full_disk: bool = False) -> int:

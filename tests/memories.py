@@ -13,7 +13,11 @@ SMALL = {"hidden_size": 48, "association_size": 240, "epochs": 25, "seed": 1}
 @cache
 def sine_memory() -> NeuralASM:
     """Fitted to sines and calibrated at 5 %; a test must leave it as it is."""
-    return NeuralASM(sine_spec(), **SMALL).fit(sine_episodes(50)).calibrate(sine_episodes(60, seed=1), 0.05)
+    return (
+        NeuralASM(sine_spec(), **SMALL)
+        .fit(sine_episodes(50))
+        .calibrate(sine_episodes(60, seed=1), 0.05)
+    )
 
 
 def learned_bytes(asm: NeuralASM) -> list[bytes]:
@@ -21,5 +25,13 @@ def learned_bytes(asm: NeuralASM) -> list[bytes]:
     detector = [asm.learned_[name] for name in asm.detection.arrays]
     network = *asm.model.network_.weights, *asm.model.network_.association
     return [
-        a.tobytes() for a in (*network, senses.mean, senses.spread, senses.change, *detector, asm.learned_["energy"])
+        a.tobytes()
+        for a in (
+            *network,
+            senses.mean,
+            senses.spread,
+            senses.change,
+            *detector,
+            asm.learned_["energy"],
+        )
     ]

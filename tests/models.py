@@ -24,7 +24,9 @@ class Persistence(StreamModel):
         self.margin = margin
 
     def fit(self, episodes, rng, progress):
-        steps = np.concatenate([np.diff(e.stream[:, self.spec.sensory].astype(float), axis=0) for e in episodes])
+        steps = np.concatenate(
+            [np.diff(e.stream[:, self.spec.sensory].astype(float), axis=0) for e in episodes]
+        )
         return self.restore({"spread": self.margin * steps.std(axis=0)})
 
     def start(self, batch, told=()):

@@ -25,17 +25,27 @@ def energy(z, mu, x, W_F, pi_z, pi_x):
     return 0.5 * pi_z * np.sum((z - mu) ** 2, axis=1) + 0.5 * np.sum(pi_x * error**2, axis=1)
 
 
-def problem(seed: int, batch: int = 3, hidden: int = 8, sensory: int = 5, scale: float = 1.0, dtype=np.float32):
+def problem(
+    seed: int,
+    batch: int = 3,
+    hidden: int = 8,
+    sensory: int = 5,
+    scale: float = 1.0,
+    dtype=np.float32,
+):
     """Random (z, mu, x, W_F, pi_z, pi_x) of an energy."""
     rng = np.random.default_rng(seed)
     arrays = [
-        rng.normal(size=s) * scale for s in ((batch, hidden), (batch, hidden), (batch, sensory), (sensory, hidden))
+        rng.normal(size=s) * scale
+        for s in ((batch, hidden), (batch, hidden), (batch, sensory), (sensory, hidden))
     ]
     pi_x = rng.uniform(0.0, 3.0, size=(batch, sensory))
     return *(a.astype(dtype) for a in arrays), 1.5, pi_x.astype(dtype)
 
 
-def some_association(rng: np.random.Generator, inputs: int, units: int, changes: int) -> Association:
+def some_association(
+    rng: np.random.Generator, inputs: int, units: int, changes: int
+) -> Association:
     shapes = association_shapes(inputs, units, changes).values()
     drawn = Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
     known = {"remainder": np.exp(drawn.remainder), "span_S": unbounded(changes)}

@@ -25,7 +25,9 @@ def too_few(successes: int, n: int, rate: float) -> bool:
     return bool(binomtest(successes, n, rate, alternative="less").pvalue < CHANCE)
 
 
-def failures(trial: Callable[[int], str], seeds: Iterable[int], rate: float, first: int = 2) -> list[str]:
+def failures(
+    trial: Callable[[int], str], seeds: Iterable[int], rate: float, first: int = 2
+) -> list[str]:
     """What went wrong, where ``trial`` succeeds too seldom; empty where it may well succeed as often as ``rate``.
 
     Where the ``first`` few succeed the others are not tried: a rate that holds then fails no more often, and a test of
@@ -54,7 +56,12 @@ def attempt(seed: int, task: str, robot: str) -> Attempt:
     """Run the scripted expert's episode of ``seed``, which also seeds the expert."""
     env = environment(f"asm_gym/{task}-v0", (("robot", robot), ("stream", ())))
     success: list[bool] = []
-    solved = rollout(env, make_policy("scripted", env, seed=seed), seed, lambda info: success.append(info["success"]))
+    solved = rollout(
+        env,
+        make_policy("scripted", env, seed=seed),
+        seed,
+        lambda info: success.append(info["success"]),
+    )
     return Attempt(bool(solved), bool(success[-1]))
 
 
@@ -62,7 +69,11 @@ def room_to_the_stops(env: Any) -> float:
     """Return the distance of the arm joint nearest to one of its stops [rad]; joints without stops are left out."""
     simulation = env.unwrapped.simulation
     names = [name for robot in env.unwrapped.robosuite_env.robots for name in robot.robot_joints]
-    arms = [joint for joint in map(simulation.model.joint, names) if simulation.model.jnt_limited[joint.id]]
+    arms = [
+        joint
+        for joint in map(simulation.model.joint, names)
+        if simulation.model.jnt_limited[joint.id]
+    ]
     angles = np.array([simulation.data.joint(joint.name).qpos[0] for joint in arms])
     low, high = np.array([joint.range for joint in arms]).T
     return float(np.minimum(angles - low, high - angles).min())

@@ -19,7 +19,11 @@ def sine_spec(sensory: int = 12, motor: int = 2) -> StreamSpec:
 
 
 def sine_episodes(
-    count: int, seed: int = 0, spec: StreamSpec | None = None, steps: tuple[int, int] = (40, 60), noise: float = 0.02
+    count: int,
+    seed: int = 0,
+    spec: StreamSpec | None = None,
+    steps: tuple[int, int] = (40, 60),
+    noise: float = 0.02,
 ) -> list[Episode]:
     """Episodes whose channels mix four sines of fixed frequency and random phase, and an integrated action.
 

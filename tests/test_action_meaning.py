@@ -18,7 +18,14 @@ class Arm(gym.Env):
     """Joints [rad] whose actions mean what ``means`` says, each a name of how it moves; senses are noisy."""
 
     def __init__(self, means, noise=1e-3, lag=1.0, unit=1.0, rates=True, **more):
-        self.means, self.noise, self.lag, self.unit, self.rates, self.more = means, noise, lag, unit, rates, more
+        self.means, self.noise, self.lag, self.unit, self.rates, self.more = (
+            means,
+            noise,
+            lag,
+            unit,
+            rates,
+            more,
+        )
         size = JOINTS * (2 if rates else 1)
         self.observation_space = gym.spaces.Box(-1e3, 1e3, (size,), np.float32)
         self.action_space = gym.spaces.Box(-400, 400, (JOINTS,), np.float32)
@@ -35,7 +42,9 @@ class Arm(gym.Env):
         return sensed.astype(np.float32)
 
     def step(self, action):
-        for j, (how, u) in enumerate(zip(self.means, np.asarray(action, float) / self.unit, strict=True)):
+        for j, (how, u) in enumerate(
+            zip(self.means, np.asarray(action, float) / self.unit, strict=True)
+        ):
             if how == "target":
                 self.v[j] = np.clip(self.lag * (u - self.q[j]), -0.06, 0.06)
             elif how in ("delta", "velocity"):
@@ -99,7 +108,11 @@ def test_recorded_episodes_tell_what_actions_mean(case):
     assert all(f in LIKE.get(m, (m,)) for f, m in zip(found.means, env.means, strict=True)), found
     for j, means in enumerate(env.means):
         if means == "target":
-            assert (found.senses[j], found.slopes[j], found.offsets[j]) == (j, pytest.approx(env.unit), 0.0)
+            assert (found.senses[j], found.slopes[j], found.offsets[j]) == (
+                j,
+                pytest.approx(env.unit),
+                0.0,
+            )
     assert ActionMeaning.from_json(found.to_json()) == found
 
 
@@ -122,7 +135,9 @@ class Surprised:
 def guarded(env, means=None, on_alarm="hold", at=40):
     recorder = StreamRecorder(env)
     found = None if means else found_meaning(recorded(env))
-    return NeuralASMSafety(env, Surprised(recorder.stream_spec, at, found), on_alarm, action_means=means)
+    return NeuralASMSafety(
+        env, Surprised(recorder.stream_spec, at, found), on_alarm, action_means=means
+    )
 
 
 def travel(env, means, rows=30, at=40):
@@ -169,9 +184,13 @@ def test_a_held_arm_stays_though_the_sense_of_its_place_lies(case, many, lie):
 
     if many:
         made = gym.vector.SyncVectorEnv([make, make])
-        env = VectorNeuralASMSafety(made, Surprised(StreamRecorder(make()).stream_spec, 40, found), "hold")
+        env = VectorNeuralASMSafety(
+            made, Surprised(StreamRecorder(make()).stream_spec, 40, found), "hold"
+        )
     else:
-        env = NeuralASMSafety(make(), Surprised(StreamRecorder(make()).stream_spec, 40, found), "hold")
+        env = NeuralASMSafety(
+            make(), Surprised(StreamRecorder(make()).stream_spec, 40, found), "hold"
+        )
     env.reset(seed=5)
     places = []
     for t in range(70):
@@ -207,13 +226,17 @@ def test_a_hold_is_refused_where_nothing_tells_what_actions_mean_and_the_option_
     with pytest.raises(ValueError, match="torques"):
         guarded(CASES["torques"])
     with pytest.warns(UserWarning, match="contradicts the recorded episodes: number 0"):
-        NeuralASMSafety(env, Surprised(spec, 5, found_meaning(recorded(env))), "hold", action_means="velocity")
+        NeuralASMSafety(
+            env, Surprised(spec, 5, found_meaning(recorded(env))), "hold", action_means="velocity"
+        )
 
 
 def test_an_environment_may_say_what_its_actions_mean():
     env = Arm(SAME)
     env.action_means = "target"
-    held, _ = travel(NeuralASMSafety(env, Surprised(StreamRecorder(env).stream_spec, 40), "hold"), SAME)
+    held, _ = travel(
+        NeuralASMSafety(env, Surprised(StreamRecorder(env).stream_spec, 40), "hold"), SAME
+    )
     assert held < 0.03
 
 

@@ -29,7 +29,10 @@ def situations():
 
 def reachable(situation):
     """What ``Arbiter`` never says together: control is handed back only where nothing presses."""
-    return not (situation.presses and (situation.calm or situation.free or situation.waited or situation.goes_on))
+    return not (
+        situation.presses
+        and (situation.calm or situation.free or situation.waited or situation.goes_on)
+    )
 
 
 @pytest.mark.parametrize("state", range(len(STATES)))
@@ -61,7 +64,12 @@ def table_of(count=1):
 def evidence(table, surprise, presses=False, impulse=0.0, index=0):
     """A row of a robot whose record says so."""
     robot = table.robot(index)
-    robot.surprise, robot.over, robot.presses, robot.pressed_impulse = surprise, not surprise <= 1.0, presses, impulse
+    robot.surprise, robot.over, robot.presses, robot.pressed_impulse = (
+        surprise,
+        not surprise <= 1.0,
+        presses,
+        impulse,
+    )
     robot.overridden = robot.state == REFLEX
     terms = [name for name, holds in ((CONTACT, presses), (SURPRISE, robot.over)) if holds]
     nothing = np.zeros(SPEC.size)
@@ -147,10 +155,18 @@ def test_an_episode_that_begins_leaves_the_other_robots_as_they_are():
     assert table.records["state"].tolist() == [POLICY, REFLEX]
 
 
-def reflexes(on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None) -> FeltMotion:
+def reflexes(
+    on_alarm: str, spec: StreamSpec = SPEC, refused: dict[str, str] | None = None
+) -> FeltMotion:
     low, rest, high = (np.full(2, value, np.float32) for value in (-1, 0, 1))
     robots = RobotFacts(
-        1, low, high, rest, dt=0.05, turning_action=lambda _, turns: np.float32(turns), refused=refused or {}
+        1,
+        low,
+        high,
+        rest,
+        dt=0.05,
+        turning_action=lambda _, turns: np.float32(turns),
+        refused=refused or {},
     )
     made = FeltMotion.of(robots, spec, on_alarm)
     made.begin(np.ones(1, bool))

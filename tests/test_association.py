@@ -49,7 +49,9 @@ def test_precision_recovers_noise_that_depends_on_context(rows, monkeypatch):
     W_S, b_S = learn_precision(f, error.astype(np.float32), rng)
     learned = log_variance(f, W_S, b_S, unbounded(2))
     np.testing.assert_allclose(learned.mean(axis=0), truth.mean(axis=0), atol=0.1)
-    assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15  # against 1.15 and 0.8 for the best constant
+    assert (
+        np.sqrt(np.mean((learned - truth) ** 2)) < 0.15
+    )  # against 1.15 and 0.8 for the best constant
 
 
 def test_no_group_predicts_itself():
@@ -64,11 +66,23 @@ def test_all_rules_of_the_memory_descend_one_energy():
     rng = np.random.default_rng(3)
     B, H, S, A, units, inputs = 4, 6, 5, 2, 7, 13
     w = initial_weights(H, S, A, rng)
-    W = {"W_C": w.W_C, "W_F": 3 * w.W_F, "W_D": 0.1 * rng.normal(size=w.W_D.shape) * direct_synapses(S, A)}
-    W |= {"V": rng.normal(size=(units, inputs)), "U": rng.normal(size=(S, units)), "D": rng.normal(size=(S, inputs))}
+    W = {
+        "W_C": w.W_C,
+        "W_F": 3 * w.W_F,
+        "W_D": 0.1 * rng.normal(size=w.W_D.shape) * direct_synapses(S, A),
+    }
+    W |= {
+        "V": rng.normal(size=(units, inputs)),
+        "U": rng.normal(size=(S, units)),
+        "D": rng.normal(size=(S, inputs)),
+    }
     W = {name: np.asarray(array, np.float64) for name, array in W.items()}
     c, u, x, z = (rng.normal(size=(B, n)) for n in (w.W_C.shape[1], A + 1, S, H))
-    a, delta, spread = rng.normal(size=(B, inputs)), rng.normal(size=(B, S)), rng.uniform(1.0, 4.0, S)
+    a, delta, spread = (
+        rng.normal(size=(B, inputs)),
+        rng.normal(size=(B, S)),
+        rng.uniform(1.0, 4.0, S),
+    )
 
     def left(W):
         return np.hstack([x, u[:, :-1]]) - np.hstack([c, u]) @ W["W_D"].T
@@ -93,15 +107,21 @@ def test_all_rules_of_the_memory_descend_one_energy():
                 moved = array.copy()
                 moved[index] += step
                 ends.append(total({**W, name: moved}))
-            assert rules[name][index] == pytest.approx(-(ends[0] - ends[1]) / 2e-5, rel=1e-3, abs=1e-4), name
+            assert rules[name][index] == pytest.approx(
+                -(ends[0] - ends[1]) / 2e-5, rel=1e-3, abs=1e-4
+            ), name
 
 
 def test_hidden_units_learn_what_is_not_linear():
     rng = np.random.default_rng(0)
     cause = rng.normal(size=(3000, 2))
-    delta = np.hstack([cause, np.sin(2 * cause) + 0.05 * rng.normal(size=cause.shape)]).astype(np.float32)
+    delta = np.hstack([cause, np.sin(2 * cause) + 0.05 * rng.normal(size=cause.shape)]).astype(
+        np.float32
+    )
     a = np.hstack([delta, np.ones((len(delta), 2))]).astype(np.float32)
-    w, _ = learn_association(a, delta, np.array([0, 0, 1, 1]), slice(0, 4), 20, np.random.default_rng(1))
+    w, _ = learn_association(
+        a, delta, np.array([0, 0, 1, 1]), slice(0, 4), 20, np.random.default_rng(1)
+    )
     left = (delta - complete(hidden_units(a, w.V), a, w.U, w.D))[:, 2:].std()
     assert left < 0.45  # 0.65 by a line, 0.05 by the noise alone
 
@@ -110,11 +130,15 @@ def test_doubt_is_learned_from_how_errors_grow_with_leverage():
     rng = np.random.default_rng(0)
     far = np.exp(rng.normal(size=(20_000, 3)) + 3.0).astype(np.float32)
     truth = np.array([0.0, 0.1, 1.0])
-    errors = rng.normal(size=far.shape) * np.sqrt((1 + truth * far / np.median(far, axis=0)) / (1 + truth))
+    errors = rng.normal(size=far.shape) * np.sqrt(
+        (1 + truth * far / np.median(far, axis=0)) / (1 + truth)
+    )
     steady, slope, most = learn_doubt(errors.astype(np.float32), far)
     np.testing.assert_allclose(1 / steady - 1, truth, rtol=0.5, atol=0.02)
     np.testing.assert_allclose(steady + slope * np.median(far, axis=0), 1.0, rtol=1e-4)
-    np.testing.assert_array_equal(most, far.max(axis=0))  # a fault that takes the body further is excused no more
+    np.testing.assert_array_equal(
+        most, far.max(axis=0)
+    )  # a fault that takes the body further is excused no more
 
 
 def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
@@ -139,7 +163,9 @@ def test_leverage_is_the_distance_of_each_group_s_inputs_by_an_inverse_of_their_
         b = a[:, others].astype(np.float64)
         C = b.T @ b / len(b) + LEAST_VARIANCE * np.eye(len(others))
         by_hand = np.sum(b[:batch] @ np.linalg.inv(C) * b[:batch], axis=1)
-        np.testing.assert_allclose(found[:, g == GROUPS], np.repeat(by_hand[:, None], sum(g == GROUPS), 1), rtol=2e-3)
+        np.testing.assert_allclose(
+            found[:, g == GROUPS], np.repeat(by_hand[:, None], sum(g == GROUPS), 1), rtol=2e-3
+        )
 
 
 def test_crossfit_predicts_every_row_without_it():

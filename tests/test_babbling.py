@@ -53,11 +53,18 @@ def test_fewer_lessons_are_the_first_of_more():
 def test_a_task_has_the_experts_own_course_disturbed_courses_noise_alone_and_pressing(reaching):
     lessons = curriculum(["Lift", "Door"], 40, seed=0, reaching=reaching)
     lessons, limited = [n for n in lessons if not n.limit], [n for n in lessons if n.limit]
-    own, pressing = ([n for n in lessons if n.task == "Door" and bool(n.press) is press] for press in (False, True))
+    own, pressing = (
+        [n for n in lessons if n.task == "Door" and bool(n.press) is press]
+        for press in (False, True)
+    )
     alone = {"": ALONE, "reaching": REACHING}
     kinds = [alone.get(n.guide, LED if n.noise == 0 else DRIVEN) for n in own]
     assert kinds[2::3] == [LED] * 13  # the threshold is set on those
-    assert [kinds.count(kind) for kind in (LED, DRIVEN, REACHING if reaching else ALONE)] == [23, 12, 5]
+    assert [kinds.count(kind) for kind in (LED, DRIVEN, REACHING if reaching else ALONE)] == [
+        23,
+        12,
+        5,
+    ]
     assert [n.drift > 0 for n in own] == [n.noise > 0 for n in own]
     assert NOISE[0] <= min(n.noise for n in own if n.noise) < 0.04
     assert 0.15 < max(n.noise for n in own) <= NOISE[1]
@@ -65,7 +72,9 @@ def test_a_task_has_the_experts_own_course_disturbed_courses_noise_alone_and_pre
     assert [n.number for n in pressing] == (list(range(0, 40, 3)) if reaching else [])
     assert not any(held_out(n.number) for n in pressing)
     assert {(n.guide, n.noise, n.drift) for n in pressing} <= {("scripted", NOISE[0], 0.0)}
-    assert [(n.task, n.number) for n in limited] == [(t, n) for t in ("Lift", "Door") for n in range(0, 40, 3)]
+    assert [(n.task, n.number) for n in limited] == [
+        (t, n) for t in ("Lift", "Door") for n in range(0, 40, 3)
+    ]
     assert {bool(n.noise) for n in limited} == {True, False}
     assert len({n.seed for n in [*lessons, *limited]}) == len(lessons) + len(limited)
 
@@ -84,7 +93,9 @@ def test_a_hand_that_reaches_comes_near_one_place_after_another_and_turns(robot)
             aims.append(state)
             progress.append(0.0)
         observation = env.step(action)[0]
-        progress[-1] = max(progress[-1], 1 - np.linalg.norm(read(observation, "hand_position") - state.place) / far)
+        progress[-1] = max(
+            progress[-1], 1 - np.linalg.norm(read(observation, "hand_position") - state.place) / far
+        )
     env.close()
     assert len(aims) >= 2
     assert progress[0] > 0.3  # of the way
@@ -134,7 +145,9 @@ def test_what_is_held_is_pressed_down_or_aside_for_a_while_and_the_grip_is_kept(
 
 
 def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(tmp_path):
-    lesson = next(n for n in curriculum(["Lift"], 40, seed=0) if n.noise and n.guide and n.weight != 1)
+    lesson = next(
+        n for n in curriculum(["Lift"], 40, seed=0) if n.noise and n.guide and n.weight != 1
+    )
     make = partial(record_lesson, config=RolloutConfig())
     first = load_episode(make(lesson, folder=tmp_path / "a"))
     make(lesson._replace(weight=1.4, seed=lesson.seed + 1), folder=tmp_path / "b")
@@ -152,7 +165,10 @@ def test_the_limit_of_a_hands_speed_changes_now_and_then_and_slows_it_down():
     env, found = gym.make("asm_gym/Lift-v0"), {}
     for limit in (0.0, 0.05):
         lesson = Lesson("Lift", 0, seed=3, speed=1.5, limit=limit)
-        found[limit] = [(info.get("braked", 0.0), env.unwrapped.contact_limits) for info in steps_of(env, lesson)]
+        found[limit] = [
+            (info.get("braked", 0.0), env.unwrapped.contact_limits)
+            for info in steps_of(env, lesson)
+        ]
     env.close()
     assert {limits for _, limits in found[0.0]} == {None}
     speeds = [limits.hand_speed for _, limits in found[0.05]]
@@ -169,7 +185,9 @@ def steps_of(env, lesson):
         yield info
 
 
-ARM = StreamSpec((Channel("external_torque_peak", 2, "N m"), Channel("action", 1, group="action")), dt=0.05)
+ARM = StreamSpec(
+    (Channel("external_torque_peak", 2, "N m"), Channel("action", 1, group="action")), dt=0.05
+)
 
 
 def lesson_of(forces, torques, noise=0.0, number=0, task="Lift", rows=1):
@@ -180,7 +198,12 @@ def lesson_of(forces, torques, noise=0.0, number=0, task="Lift", rows=1):
     lesson = Lesson(task, number, seed=number, noise=noise)
     about = {"skill": task, "lesson": lesson._asdict()}
     return Episode(
-        stream, ARM, success=True, contact_force=np.array(forces, np.float32), label=lesson.trial.label, info=about
+        stream,
+        ARM,
+        success=True,
+        contact_force=np.array(forces, np.float32),
+        label=lesson.trial.label,
+        info=about,
     )
 
 
@@ -191,9 +214,17 @@ def test_what_presses_harder_than_is_learned_is_cut_out_with_what_is_near(noise,
     hits = replace(hits, success=False)  # what is usual is asked of solved lessons
     at_stop = lesson_of([0] * 60, [torque] * 22 + [torque + 0.1] + [0] * 37, noise, number=3)
     at_stop = replace(at_stop, success=False)
-    assert [len(e) for e in healthy([*calm, hits, at_stop, undisturbed()]).fit] == [60, 60, 23, 28, 33]
+    assert [len(e) for e in healthy([*calm, hits, at_stop, undisturbed()]).fit] == [
+        60,
+        60,
+        23,
+        28,
+        33,
+    ]
     careful = lesson_of([5, 9, 0] * 20, [1, 2, 3] * 20)
-    firm = lesson_of([KNOWN.force] * 27 + [KNOWN.force + 1] + [0] * 32, [KNOWN.torque] * 60, noise, number=1)
+    firm = lesson_of(
+        [KNOWN.force] * 27 + [KNOWN.force + 1] + [0] * 32, [KNOWN.torque] * 60, noise, number=1
+    )
     firm = replace(firm, success=False)
     assert [len(e) for e in healthy([careful, firm, undisturbed()]).fit] == [60, 23, 28]
 
@@ -225,10 +256,13 @@ def test_of_a_policys_own_episodes_crashes_are_left_out_and_what_is_kept_is_whol
     crash = lesson_of([0] * 27 + [18.1] + [0] * 32, [3] * 60)
     assert [len(e) for e in harmless([*calm, crash])] == [60, 60, 60, 23, 28]
     unfelt = [
-        replace(e, contact_force=np.zeros(0, np.float32)) for e in [*calm, lesson_of([0] * 60, [3] * 40 + [6.1] * 20)]
+        replace(e, contact_force=np.zeros(0, np.float32))
+        for e in [*calm, lesson_of([0] * 60, [3] * 40 + [6.1] * 20)]
     ]
     assert [len(e) for e in harmless(unfelt)] == [60, 60, 60, 36]
-    acted = replace(calm[0], actions=np.zeros((60, 1), np.float32), observations=np.zeros((61, 2), np.float32))
+    acted = replace(
+        calm[0], actions=np.zeros((60, 1), np.float32), observations=np.zeros((61, 2), np.float32)
+    )
     np.testing.assert_array_equal(harmless([acted])[0].stream, acted.stream)
 
 
@@ -247,7 +281,10 @@ def test_a_task_needs_a_solved_lesson_without_noise_and_something_must_be_left()
         ({"tasks": ("Wipe",)}, "unknown task of one arm with a gripper 'Wipe'"),
         ({"tasks": ()}, "at least one task"),
         ({"exam_episodes": -1}, "exam_episodes must be at least 0, got -1"),
-        ({"false_alarms_per_hour": 1.0, "healthy_episodes": 0, "tasks": ("Lift",)}, "1 false alarms an hour need"),
+        (
+            {"false_alarms_per_hour": 1.0, "healthy_episodes": 0, "tasks": ("Lift",)},
+            "1 false alarms an hour need",
+        ),
     ],
 )
 def test_the_command_refuses_what_makes_no_sense(given, why):
@@ -284,13 +321,17 @@ def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path)
     assert len(written) == 2 * 24
     assert main(["--quick", "--workers", "1", "--out", str(folder)]) == 0
     assert {f: f.stat().st_mtime_ns for f in folder.rglob("*.npz")} == written
-    assert main(["--quick", "--workers", "1", "--robot", "Sawyer", "--out", str(folder)]) == 2  # it is another's
+    assert (
+        main(["--quick", "--workers", "1", "--robot", "Sawyer", "--out", str(folder)]) == 2
+    )  # it is another's
 
 
 def test_an_exam_pairs_every_fault_with_a_healthy_twin():
     labels = Exam("Lift", "scripted", known=False).trials(3, ["push", "slip"], seed=5)
     nominal = [n for n in labels if n.role == "nominal"]
-    assert [n.seed for n in nominal] == [n.seed for n in Exam("Lift", "lift_sac", known=True).trials(3, [], 5)]
+    assert [n.seed for n in nominal] == [
+        n.seed for n in Exam("Lift", "lift_sac", known=True).trials(3, [], 5)
+    ]
     faulty = [n for n in labels if n.role == "faulty"]
     assert [n.kind for n in faulty] == ["push", "push", "slip", "slip"]
     assert {n.seed for n in faulty} == {n.seed for n in nominal}
@@ -305,14 +346,21 @@ def test_alarms_are_counted_by_event_and_faults_at_any_threshold():
         excused = {"knock": rows[1], "stop": rows[2]}
         return ScoredEpisode(kind[0], 0, 1.0, 4.0, rows[0], onset, kind[1], excused=excused)
 
-    solved = [trace(5.0, 150.0), *[trace(3.0, 90.0)] * 2, *[trace(2.0, stop=60.0)] * 3, *[trace(1.0)] * 94]
+    solved = [
+        trace(5.0, 150.0),
+        *[trace(3.0, 90.0)] * 2,
+        *[trace(2.0, stop=60.0)] * 3,
+        *[trace(1.0)] * 94,
+    ]
     found = [hourly_alarms(solved, *event) for event in ((), ("knock",), ("stop",))]
     assert [rate.k for rate in found] == [1, 2, 3]  # what is a fault is no knock beside it
     assert found[0].hours == pytest.approx(1.0)
     marks = Marks("Lift", solved, [], DetectionMetrics("Lift", [trace(3.5, onset=1)], solved, 1.0))
     assert summary([marks]).endswith("in 1.00 healthy hours, 0 of 1 faults found.")
     assert summary([marks.at(3.2)]).endswith("1 of 1 faults found.")
-    calm = marks._replace(solved=[trace(1.0)] * 100).adapted(20.0)  # surprises less often than it may
+    calm = marks._replace(solved=[trace(1.0)] * 100).adapted(
+        20.0
+    )  # surprises less often than it may
     assert summary([calm]).endswith("1 of 1 faults found.")
     louder = marks._replace(solved=[trace(5.0)] * 100)
     adapted = louder.adapted(5.0)
@@ -327,7 +375,9 @@ def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usua
 
     agents_own = [nominal(0, 9), nominal(1, 80), nominal(2, 90), nominal(3, 500, success=False)]
     assert usual_force(agents_own) == 80
-    memory = SimpleNamespace(threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes])
+    memory = SimpleNamespace(
+        threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes]
+    )
     marks = examine(memory, "Lift", agents_own, 1.0, usual=10.0)
     assert [[t.seed for t in own] for own in (marks.solved, marks.failed)] == [[0, 1, 2], [3]]
 
@@ -342,9 +392,14 @@ def test_a_fault_begins_in_the_row_of_its_step_where_a_step_has_several(rows):
     label = EpisodeLabel("Lift", "faulty", "push", "strong", seed=1, onset=12)
     jump = replace(lesson_of([0] * 40, [0] * (40 * rows), rows=rows), label=label)
     jump.stream[12 * rows :, 0] += 5.0
-    twin = replace(lesson_of([0] * 40, [0] * (40 * rows), rows=rows), label=replace(label, role="nominal", onset=None))
+    twin = replace(
+        lesson_of([0] * 40, [0] * (40 * rows), rows=rows),
+        label=replace(label, role="nominal", onset=None),
+    )
     assert onset_row(jump) == 12 * rows
     assert onset_row(twin) is None
-    assert onset_row(replace(jump, contact_force=np.zeros(0, np.float32))) == 12  # nobody says otherwise
+    assert (
+        onset_row(replace(jump, contact_force=np.zeros(0, np.float32))) == 12
+    )  # nobody says otherwise
     (seen,) = detectability_of([twin], [jump], window_s=0.05)
     assert seen.delay == pytest.approx(0.05)

@@ -43,19 +43,28 @@ def copied(stream):
 def test_a_sense_that_never_moves_and_one_that_is_another_s_copy_are_watched_too(name, change):
     """Fresh episodes are judged as learned ones are, and the sense is blamed once it does otherwise."""
     monitor = fresh(name, sine_episodes(1)[0].spec).fit(changed(sine_episodes(12), change))
-    nominal = [s.value.max() for s in monitor.score_episodes(changed(sine_episodes(6, seed=1), change))]
+    nominal = [
+        s.value.max() for s in monitor.score_episodes(changed(sine_episodes(6, seed=1), change))
+    ]
     assert np.isfinite(nominal).all()
-    column, stream = {constant: 3, copied: 4}[change], changed(sine_episodes(1, seed=2), change)[0].stream.copy()
+    column, stream = (
+        {constant: 3, copied: 4}[change],
+        changed(sine_episodes(1, seed=2), change)[0].stream.copy(),
+    )
     stream[20:, column] += 5.0
     score = monitor.score(Episode.from_stream(stream, sine_episodes(1)[0].spec))
     assert score.value[20:].max() > 2 * max(nominal)
-    assert np.argmax(score.attribution[20:23].sum(axis=0)) in ({3} if change is constant else {4, 5})
+    assert np.argmax(score.attribution[20:23].sum(axis=0)) in (
+        {3} if change is constant else {4, 5}
+    )
 
 
 @pytest.mark.parametrize("change", [constant, copied])
 def test_senses_that_tell_nothing_are_named_and_no_precision_is_infinite(change):
     episodes = changed(sine_episodes(12), change)
-    named = {constant: ["joint_position[3]"], copied: ["joint_position[5]", "joint_position[4]"]}[change]
+    named = {constant: ["joint_position[3]"], copied: ["joint_position[5]", "joint_position[4]"]}[
+        change
+    ]
     (line,) = mute_channels(episodes)
     assert all(name in line for name in named)
     assert mute_channels(sine_episodes(12)) == []
@@ -80,7 +89,10 @@ def test_one_episode_fits_and_says_what_its_threshold_lacks(name):
     (only,) = sine_episodes(1)
     monitor = fresh(name, only.spec).fit([only])
     assert np.isfinite(monitor.score(only).value).all()
-    with pytest.raises(ValueError, match=r"needs at least 19 nominal episodes, got 1, which can promise 0\.5 at best"):
+    with pytest.raises(
+        ValueError,
+        match=r"needs at least 19 nominal episodes, got 1, which can promise 0\.5 at best",
+    ):
         monitor.calibrate([only], 0.05)
 
 

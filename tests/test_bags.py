@@ -19,7 +19,9 @@ RATE, ROWS = 50.0, 80
 pytestmark = pytest.mark.filterwarnings("default::asm_gym.data.reader_notes.LogWarning")
 
 
-def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = True, finger: bool = False) -> Path:
+def bag(
+    folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = True, finger: bool = False
+) -> Path:
     """A wrist at twice the rate of two joints, and their commands; perhaps a finger at three times that."""
     rosbag2 = needs("rosbags.rosbag2")
     typesys = needs("rosbags.typesys")
@@ -39,16 +41,24 @@ def bag(folder: Path, plugin: str, lost: tuple[int, ...] = (), joints: bool = Tr
 
     storage = getattr(rosbag2.StoragePlugin, plugin)
     with rosbag2.Writer(folder, version=9, storage_plugin=storage) as writer:
-        topics = {"/joint_states": "sensor_msgs/msg/JointState", "/wrist": "geometry_msgs/msg/WrenchStamped"}
+        topics = {
+            "/joint_states": "sensor_msgs/msg/JointState",
+            "/wrist": "geometry_msgs/msg/WrenchStamped",
+        }
         topics |= {"/target": "std_msgs/msg/Float64MultiArray"}
         made = {t: writer.add_connection(t, kind, typestore=store) for t, kind in topics.items()}
         for k in range(2 * ROWS):
             t = 100.0 + k / (2 * RATE)
-            force = types["geometry_msgs/msg/Wrench"](vector(3 * k, 0.0, 1.0), vector(0.0, 0.0, 0.0))
+            force = types["geometry_msgs/msg/Wrench"](
+                vector(3 * k, 0.0, 1.0), vector(0.0, 0.0, 0.0)
+            )
             kind = types["geometry_msgs/msg/WrenchStamped"]
             write(writer, made["/wrist"], t, kind(header(stamp(int(t), 0), "tool"), force))
             for part in range(3 if finger else 0):
-                state, numbers = types["sensor_msgs/msg/JointState"], (np.array([1.0]), np.zeros(3), np.zeros(0))
+                state, numbers = (
+                    types["sensor_msgs/msg/JointState"],
+                    (np.array([1.0]), np.zeros(3), np.zeros(0)),
+                )
                 message = state(header(stamp(int(t), 0), ""), ["finger"], *numbers)
                 write(writer, made["/joint_states"], t + part / (6 * RATE) + 1e-4, message)
             if k % 2 == 0 and k // 2 not in lost and joints:
@@ -68,7 +78,9 @@ def test_a_bag_is_a_table_at_the_rate_of_its_joints(plugin, tmp_path):
     column = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}
     np.testing.assert_array_equal(column["joint_states.position[j1]"], 2 * np.arange(ROWS))
     np.testing.assert_array_equal(column["joint_states.velocity[j2]"], -4 * np.arange(ROWS))
-    np.testing.assert_array_equal(column["wrist.force[x]"], 6 * np.arange(ROWS))  # what it said last
+    np.testing.assert_array_equal(
+        column["wrist.force[x]"], 6 * np.arange(ROWS)
+    )  # what it said last
     assert episode.spec.dt == pytest.approx(1 / RATE)
     assert len(episode.spec.motor) == 1
 
@@ -79,7 +91,9 @@ def test_joint_states_that_a_bag_lost_are_marked(tmp_path):
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(episode.stream[:, 0])), [20, 21])
 
 
-def test_rows_are_those_of_the_arm_and_not_of_a_faster_finger_whose_velocities_fit_no_name(tmp_path):
+def test_rows_are_those_of_the_arm_and_not_of_a_faster_finger_whose_velocities_fit_no_name(
+    tmp_path,
+):
     ((_, episode),) = read_logs(bag(tmp_path / "bag", "MCAP", finger=True))
     assert len(episode) == ROWS
     labels = episode.spec.labels
@@ -92,7 +106,9 @@ def test_a_bag_that_is_cut_off_or_has_no_joints_is_named(tmp_path):
     (tmp_path / "cut.mcap").write_bytes(whole.read_bytes()[:3000])
     with pytest.raises(ValueError, match=r"cut\.mcap"):
         list(read_logs(tmp_path / "cut.mcap"))
-    with pytest.raises(ValueError, match=r"no sensor_msgs/JointState; its topics: /joint_states.*/wrist"):
+    with pytest.raises(
+        ValueError, match=r"no sensor_msgs/JointState; its topics: /joint_states.*/wrist"
+    ):
         list(read_logs(bag(tmp_path / "none", "MCAP", joints=False)))
 
 

@@ -62,7 +62,9 @@ def test_attribution_adds_up_and_scores_are_what_observing_gives(monitor):
 
 def test_the_calibrated_rate_is_kept(monitor):
     """At most 5 % of fresh nominal episodes on average; of 200, 24 or more would be a one in 10⁴ chance at 10 %."""
-    alarms = sum(s.value.max() > monitor.threshold for s in monitor.score_episodes(episodes(200, seed=3)))
+    alarms = sum(
+        s.value.max() > monitor.threshold for s in monitor.score_episodes(episodes(200, seed=3))
+    )
     assert alarms < 34
 
 
@@ -82,7 +84,10 @@ def test_a_checkpoint_keeps_every_bit(monitor, tmp_path):
     assert loaded.detection.name == monitor.detection.name
     episode = episodes(1, seed=5)[0]
     np.testing.assert_array_equal(loaded.score(episode).value, monitor.score(episode).value)
-    assert (loaded.threshold, loaded.threshold_at(0.2)) == (monitor.threshold, monitor.threshold_at(0.2))
+    assert (loaded.threshold, loaded.threshold_at(0.2)) == (
+        monitor.threshold,
+        monitor.threshold_at(0.2),
+    )
     (tmp_path / "m.asm").write_bytes(b"nonsense")
     with pytest.raises(ValueError, match=r"m\.asm"):
         load_monitor(tmp_path / "m.asm")
@@ -111,8 +116,14 @@ def test_limits_are_what_they_say():
     torque = make_monitor("external_torque_limit", SPEC).fit(episodes(5))
     rows = np.concatenate([e.stream for e in episodes(5)]).astype(float)
     row = np.arange(float(SPEC.size))[None]
-    weight, mean, spread = rows[:, 3:6].mean(axis=0), rows[:, :3].mean(axis=0), rows[:, :3].std(axis=0)
-    assert force.observe(force.initial_state(), row)[1].value[0] == pytest.approx(((row[0, 3:6] - weight) ** 2).sum())
+    weight, mean, spread = (
+        rows[:, 3:6].mean(axis=0),
+        rows[:, :3].mean(axis=0),
+        rows[:, :3].std(axis=0),
+    )
+    assert force.observe(force.initial_state(), row)[1].value[0] == pytest.approx(
+        ((row[0, 3:6] - weight) ** 2).sum()
+    )
     expected = np.abs(row[0, :3] - mean) / spread
     surprise = torque.observe(torque.initial_state(), row)[1]
     assert surprise.value[0] == pytest.approx(expected.max())
@@ -120,7 +131,8 @@ def test_limits_are_what_they_say():
 
 
 @pytest.mark.parametrize(
-    ("name", "lacks"), [("force_limit", "wrist_force"), ("external_torque_limit", "external_torque")]
+    ("name", "lacks"),
+    [("force_limit", "wrist_force"), ("external_torque_limit", "external_torque")],
 )
 def test_a_limit_needs_its_channel(name, lacks):
     with pytest.raises(ValueError, match=f"no {lacks}.*joint_position"):

@@ -9,7 +9,14 @@ from asm_gym.scripts.benchmark import main, ratio
 def test_each_benchmark_prints_its_rivals_and_writes_them(tmp_path):
     assert main(["--quick", "--steps", "3", "--members", "2", "--out", str(tmp_path)]) == 0
     shown = (tmp_path / "benchmark.md").read_text()
-    for rival in ("gru+evidence", "64 streams", "stream at 100 Hz", "vector of 2", "mujoco.rollout", "robosuite"):
+    for rival in (
+        "gru+evidence",
+        "64 streams",
+        "stream at 100 Hz",
+        "vector of 2",
+        "mujoco.rollout",
+        "robosuite",
+    ):
         assert rival in shown
 
 

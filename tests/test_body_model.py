@@ -18,7 +18,9 @@ from asm_gym.scripts.cli import main
 
 
 def link(name: str, mass: float, centre: str, inertia: tuple[float, ...]) -> str:
-    tensor = " ".join(f'i{ij}="{v}"' for ij, v in zip(("xx", "yy", "zz", "xy", "xz", "yz"), inertia, strict=True))
+    tensor = " ".join(
+        f'i{ij}="{v}"' for ij, v in zip(("xx", "yy", "zz", "xy", "xz", "yz"), inertia, strict=True)
+    )
     return (
         f'<link name="{name}"><visual><geometry><box size="1 1 1"/></geometry></visual><inertial>'
         f'<origin xyz="{centre}"/><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
@@ -26,7 +28,11 @@ def link(name: str, mass: float, centre: str, inertia: tuple[float, ...]) -> str
 
 
 def joint(name: str, kind: str, parent: str, child: str, origin: str, axis: str) -> str:
-    limit = "" if kind in ("fixed", "continuous") else '<limit lower="-3" upper="3" effort="99" velocity="9"/>'
+    limit = (
+        ""
+        if kind in ("fixed", "continuous")
+        else '<limit lower="-3" upper="3" effort="99" velocity="9"/>'
+    )
     return (
         f'<joint name="{name}" type="{kind}"><origin {origin}/><parent link="{parent}"/><child link="{child}"/>'
         f'<axis xyz="{axis}"/>{limit}</joint>'
@@ -45,8 +51,12 @@ def arm() -> str:
             link("head", 1.0, "0 0.1 0", (0.01, 0.01, 0.01, 0.0, 0.0, 0.0)),
             joint("lift", "prismatic", "base", "torso", 'xyz="0 0 0.5" rpy="0.1 0.2 0"', "0 0 1"),
             joint("look", "revolute", "torso", "head", 'xyz="0 0 0.6"', "0 0 1"),
-            joint("shoulder", "revolute", "torso", "upper", 'xyz="0.1 0 0.4" rpy="1.2 0 0.3"', "0 1 0"),
-            joint("elbow", "continuous", "upper", "lower", 'xyz="0.3 0 0" rpy="0 0.4 0"', "0 0.6 0.8"),
+            joint(
+                "shoulder", "revolute", "torso", "upper", 'xyz="0.1 0 0.4" rpy="1.2 0 0.3"', "0 1 0"
+            ),
+            joint(
+                "elbow", "continuous", "upper", "lower", 'xyz="0.3 0 0" rpy="0 0.4 0"', "0 0.6 0.8"
+            ),
             joint("grip", "fixed", "lower", "tool", 'xyz="0.3 0 0.1" rpy="0 0 0.5"', "1 0 0"),
             "</robot>",
         )
@@ -66,9 +76,13 @@ def test_torques_are_those_of_mujoco():
     for n in range(6):
         for k, name in enumerate(("elbow", "lift", "shoulder")):
             there = model.joint(name)
-            data.qpos[there.qposadr], data.qvel[there.dofadr], data.qacc[there.dofadr] = told[:, n, k]
+            data.qpos[there.qposadr], data.qvel[there.dofadr], data.qacc[there.dofadr] = told[
+                :, n, k
+            ]
         mujoco.mj_inverse(model, data)
-        expected = [data.qfrc_inverse[model.joint(name).dofadr[0]] for name in ("elbow", "lift", "shoulder")]
+        expected = [
+            data.qfrc_inverse[model.joint(name).dofadr[0]] for name in ("elbow", "lift", "shoulder")
+        ]
         np.testing.assert_allclose(found[n], expected, rtol=1e-9, atol=1e-9)
 
 
@@ -106,7 +120,9 @@ def test_several_roots_stand_side_by_side():
     more = arm().replace("</robot>", '<link name="camera"/></robot>')
     told = np.random.default_rng(0).uniform(-1, 1, (3, 6, 3))
     for one, other in zip(
-        BodyModel.of(arm(), SENSED).torques(*told), BodyModel.of(more, SENSED).torques(*told), strict=True
+        BodyModel.of(arm(), SENSED).torques(*told),
+        BodyModel.of(more, SENSED).torques(*told),
+        strict=True,
     ):
         np.testing.assert_allclose(one, other)
 
@@ -115,12 +131,16 @@ def test_several_roots_stand_side_by_side():
 def test_unnamed_joints_are_taken_in_the_order_that_explains_the_torques(order):
     columns = recorded(20)
     q, v, torque = (columns[name][:, order] for name in ("position", "velocity", "effort"))
-    body = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"]).in_best_order(q, v, np.gradient(v, 0.01, axis=0), torque)
+    body = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"]).in_best_order(
+        q, v, np.gradient(v, 0.01, axis=0), torque
+    )
     assert [order[k] for k in body.columns] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("case", ["named", "unnamed", "without masses"])
-def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_found_in_any_order(case):
+def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_found_in_any_order(
+    case,
+):
     names, order = ("lift", "shoulder", "elbow"), [2, 0, 1]
     named = "[{}]" if case == "named" else "_{}"
     columns = recorded(30)
@@ -134,11 +154,15 @@ def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_fo
     found = {}
     for body in ("", urdf):
         monitor = (
-            make_monitor("association_values+largest", cut[0].spec, urdf=body).fit(cut[:20]).calibrate(cut[20:], 0.1)
+            make_monitor("association_values+largest", cut[0].spec, urdf=body)
+            .fit(cut[:20])
+            .calibrate(cut[20:], 0.1)
         )
         stream = cut[25].stream.copy()
         stream[50:, -1] += 1.5
-        found[body] = monitor.score(Episode.from_stream(stream, cut[0].spec)).value.max() / monitor.threshold
+        found[body] = (
+            monitor.score(Episode.from_stream(stream, cut[0].spec)).value.max() / monitor.threshold
+        )
     model = monitor.model
     assert isinstance(model, ValueAssociation)
     if case == "without masses":
@@ -153,10 +177,14 @@ def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_wit
     carried = BodyModel.of(arm(), SENSED[1:2]).torques(*np.zeros((3, 1, 1)))[0].item()
     up = np.cos(0.1) * np.cos(0.2)  # of the lift's axis
     assert carried == pytest.approx((4 + 3 + 2 + 0.7 + 1) * 9.81 * up)
-    mimic = arm().replace('<axis xyz="0 0.6 0.8"/>', '<axis xyz="0 0.6 0.8"/><mimic joint="shoulder"/>')
+    mimic = arm().replace(
+        '<axis xyz="0 0.6 0.8"/>', '<axis xyz="0 0.6 0.8"/><mimic joint="shoulder"/>'
+    )
     assert BodyModel.of(mimic, SENSED[1:]).names == ("lift", "shoulder")
     massless = re.sub("<inertial>.*?</inertial>", "", arm())
-    np.testing.assert_allclose(BodyModel.of(massless, SENSED).torques(*np.ones((3, 1, 3))), 0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        BodyModel.of(massless, SENSED).torques(*np.ones((3, 1, 3))), 0.0, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,7 +199,10 @@ def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_wit
         (arm().replace('xyz="0 0.6 0.8"', 'xyz="0 0 0"'), "cannot be read: .*axis"),
         (arm().replace('value="3.0"', 'value="nan"'), "the body cannot be read: .*mass"),
         (arm().replace('<parent link="base"/>', ""), "the body cannot be read: .*parent"),
-        (arm().replace('"elbow" type="continuous"', '"elbow" type="fixed"'), "3 joints are sensed, and .* 2 that move"),
+        (
+            arm().replace('"elbow" type="continuous"', '"elbow" type="fixed"'),
+            "3 joints are sensed, and .* 2 that move",
+        ),
     ],
 )
 def test_what_is_no_body_of_the_arm_is_refused_in_a_line(urdf, said):
@@ -191,7 +222,9 @@ def recorded(seconds: float, seed: int = 0, rate: float = 100.0) -> dict[str, np
     a = -sum(size * w[k] ** 2 * np.sin(np.outer(t, w[k]) + phase[k]) for k in range(2))
     load = np.add(*BodyModel.of(arm(), ["q"] * 3).torques(q, v, a))
     said = {"position": q, "velocity": v, "effort": load + 0.5 * np.tanh(v / 0.02) + 0.2 * v}
-    return {"time": t} | {n: x + s * rng.normal(size=q.shape) for (n, x), s in zip(said.items(), NOISE, strict=True)}
+    return {"time": t} | {
+        n: x + s * rng.normal(size=q.shape) for (n, x), s in zip(said.items(), NOISE, strict=True)
+    }
 
 
 NOISE = (1e-4, 1e-3, 0.05)
@@ -207,7 +240,9 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
         monitor = make_monitor("association_values+evidence", cut[0].spec, urdf=model).fit(cut)
         told[model] = 1 - monitor.learned_["R2_values"][6:]
     assert (told[urdf] < 0.5 * told[""]).all()
-    asm = NeuralASM(cut[0].spec, hidden_size=8, association_size=16, epochs=1, values=True, urdf=urdf)
+    asm = NeuralASM(
+        cut[0].spec, hidden_size=8, association_size=16, epochs=1, values=True, urdf=urdf
+    )
     asm.fit(cut[:20]).calibrate(cut[20:], 0.1).save(tmp_path / "x.asm")
     assert isinstance(asm.values_.monitor.model, ValueAssociation)
     assert asm.values_.monitor.model._derived.links is not None
@@ -222,15 +257,34 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
 
 
 def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
-    columns = {f"{n}_{k}": v for n, c in recorded(60).items() for k, v in enumerate(c.T if c.ndim > 1 else [c])}
-    columns["finger_position"] = 0.02 * np.sin(3 * columns["time_0"])  # of a gripper that tells no speed
-    pd.DataFrame(columns).rename(columns={"time_0": "time"}).to_csv(tmp_path / "log.csv", index=False)
+    columns = {
+        f"{n}_{k}": v
+        for n, c in recorded(60).items()
+        for k, v in enumerate(c.T if c.ndim > 1 else [c])
+    }
+    columns["finger_position"] = 0.02 * np.sin(
+        3 * columns["time_0"]
+    )  # of a gripper that tells no speed
+    pd.DataFrame(columns).rename(columns={"time_0": "time"}).to_csv(
+        tmp_path / "log.csv", index=False
+    )
     (tmp_path / "arm.urdf").write_text(arm())
-    command = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "x.asm"), "--split", "1", "--quick"]
+    command = [
+        "fit",
+        str(tmp_path / "log.csv"),
+        "--out",
+        str(tmp_path / "x.asm"),
+        "--split",
+        "1",
+        "--quick",
+    ]
     command += ["--urdf", str(tmp_path / "arm.urdf")]
     command += ["--monitor", "association_values+evidence", "--false-alarm-rate", "0.1"]
     assert main(command) == 2
-    assert "4 numbers are angles and 3 are speeds; leave out others, as --ignore '*finger*'" in capsys.readouterr().err
+    assert (
+        "4 numbers are angles and 3 are speeds; leave out others, as --ignore '*finger*'"
+        in capsys.readouterr().err
+    )
     assert main([*command, "--ignore", "*finger*"]) == 0
     said = capsys.readouterr().out
     assert "position[0] for lift, position[1] for shoulder, position[2] for elbow" in said

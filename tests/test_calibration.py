@@ -37,14 +37,18 @@ def test_a_promise_by_the_hour_is_kept_saved_and_loaded(monitor, tmp_path):
     asm = monitor.calibrate(NOMINAL, false_alarms_per_hour=3.0)
     assert HOUR == 1.0
     maxima = np.sort([s.value.max() for s in asm.score_episodes(NOMINAL)])
-    assert asm.threshold == pytest.approx(episode_threshold(maxima, 3.0 / 120))  # three of 120 are few: by their tail
+    assert asm.threshold == pytest.approx(
+        episode_threshold(maxima, 3.0 / 120)
+    )  # three of 120 are few: by their tail
     assert asm.promise[:2] == (120, pytest.approx(3.0))
     assert asm.promise.modelled
     assert (asm.promise.per, asm.promise.hours) == ("hour", pytest.approx(1.0))
     asm.save(tmp_path / "by_hour.asm")
     again = load_monitor(tmp_path / "by_hour.asm")
     assert (again.threshold, again.promise) == (asm.threshold, asm.promise)
-    assert again.threshold_at(false_alarms_per_hour=6.0) == maxima[-6]  # five may exceed it: 5 + 1 <= 6 * 1 h
+    assert (
+        again.threshold_at(false_alarms_per_hour=6.0) == maxima[-6]
+    )  # five may exceed it: 5 + 1 <= 6 * 1 h
     assert again.threshold_at(0.05) == asm.threshold_at(false_alarm_rate=0.05)
     assert monitor.calibrate(NOMINAL, 0.05).promise.per == "episode"
 
@@ -53,14 +57,28 @@ def test_a_promise_by_the_hour_is_kept_saved_and_loaded(monitor, tmp_path):
     ("episodes", "asked", "message"),
     [
         (NOMINAL, {}, "give either false_alarm_rate .* or false_alarms_per_hour .*, got neither"),
-        (NOMINAL, {"false_alarm_rate": 0.1, "false_alarms_per_hour": 1.0}, "give either .* got both"),
-        (NOMINAL[:30], {"false_alarms_per_hour": 1.0}, "got 0.25: record 0.75 hours more, or promise 4"),
-        (NOMINAL, {"false_alarms_per_hour": -2.0}, r"must be a number in \[1e-06, 1e\+06\], got -2"),
+        (
+            NOMINAL,
+            {"false_alarm_rate": 0.1, "false_alarms_per_hour": 1.0},
+            "give either .* got both",
+        ),
+        (
+            NOMINAL[:30],
+            {"false_alarms_per_hour": 1.0},
+            "got 0.25: record 0.75 hours more, or promise 4",
+        ),
+        (
+            NOMINAL,
+            {"false_alarms_per_hour": -2.0},
+            r"must be a number in \[1e-06, 1e\+06\], got -2",
+        ),
         ([*NOMINAL, NOMINAL[7]], {"false_alarms_per_hour": 1.0}, "episodes 7 and 120 are the same"),
         ([*NOMINAL, episode(3)], {"false_alarms_per_hour": 1.0}, "episode 120 was learned from"),
     ],
 )
-def test_what_cannot_be_promised_is_refused_in_a_line_and_nothing_changes(monitor, episodes, asked, message):
+def test_what_cannot_be_promised_is_refused_in_a_line_and_nothing_changes(
+    monitor, episodes, asked, message
+):
     monitor.calibrate(NOMINAL, false_alarms_per_hour=2.0)
     before = monitor.threshold, monitor.promise
     with pytest.raises(ValueError, match=message) as refused:
@@ -90,16 +108,23 @@ ROWS = 40
 def pressing(seed: int, force: float | None = None, task: str = "") -> Episode:
     """Two joints that wander, and torques of about 1 N m."""
     rng = np.random.default_rng(seed)
-    stream = np.hstack([np.cumsum(rng.normal(size=(ROWS, 2)), axis=0), rng.normal(size=(ROWS, 2)).clip(-2, 2)])
+    stream = np.hstack(
+        [np.cumsum(rng.normal(size=(ROWS, 2)), axis=0), rng.normal(size=(ROWS, 2)).clip(-2, 2)]
+    )
     felt = {} if force is None else {"contact_force": np.full(ROWS, force, np.float32)}
-    return Episode.from_stream(stream, ARM, label=EpisodeLabel(task, "nominal") if task else None, **felt)
+    return Episode.from_stream(
+        stream, ARM, label=EpisodeLabel(task, "nominal") if task else None, **felt
+    )
 
 
 CALM = [pressing(100 + n) for n in range(40)]
 
 
 def test_what_presses_twice_as_hard_as_usual_is_a_crash_in_its_own_task():
-    light, heavy = [pressing(n, force=10, task="Lift") for n in range(5)], [pressing(9, force=50, task="Nut")] * 5
+    light, heavy = (
+        [pressing(n, force=10, task="Lift") for n in range(5)],
+        [pressing(9, force=50, task="Nut")] * 5,
+    )
     hit = pressing(7, force=45, task="Lift")
     tasks = [e.labelled.task for e in [*light, *heavy, hit]]
     assert crashes([*light, *heavy, hit], tasks) == {10: pytest.approx(4.5)}
@@ -128,4 +153,6 @@ def test_the_number_of_alarms_is_beta_binomial_whatever_the_surprise(rate):
     assert np.mean(counts) / fresh == pytest.approx(rate, abs=4 * spread / fresh)
     for quantile in (0.1, 0.5, 0.9):
         at_most = np.mean(np.array(counts) <= law.ppf(quantile))
-        assert at_most == pytest.approx(law.cdf(law.ppf(quantile)), abs=4 * np.sqrt(0.25 / len(counts)))
+        assert at_most == pytest.approx(
+            law.cdf(law.ppf(quantile)), abs=4 * np.sqrt(0.25 / len(counts))
+        )

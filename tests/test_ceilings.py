@@ -43,7 +43,9 @@ def test_of_many_episodes_a_third_sets_ceilings_and_the_others_the_threshold(asm
     assert set(asm.ceilings_from_) == set(hashes_of(hours[::3]))
     others = [e for n, e in enumerate(hours) if n % 3]
     np.testing.assert_allclose(asm.maxima_, [s.value.max() for s in asm.score_episodes(others)])
-    np.testing.assert_allclose(asm.calibrate(hours, false_alarm_rate=0.05).detection.detector_.tail, after.tail)
+    np.testing.assert_allclose(
+        asm.calibrate(hours, false_alarm_rate=0.05).detection.detector_.tail, after.tail
+    )
     again = asm.fit(sine_episodes(50)).detection.detector_  # anew: nothing is left of hours
     for name in ("ceiling", "tail"):
         np.testing.assert_array_equal(getattr(again, name), getattr(before, name))
@@ -73,14 +75,19 @@ def test_none_are_taken_where_the_promise_needs_all_which_is_said(asm, asked, ca
     assert len(asm.maxima_) == 300
     asm.calibrate(hours[:200], false_alarm_rate=0.05)  # too few
     assert asm.ceilings_from_ is None
-    other = make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0)).calibrate(hours, 0.05)
+    other = (
+        make_monitor("kalman", sine_spec()).fit(sine_episodes(30, seed=0)).calibrate(hours, 0.05)
+    )
     assert len(other.maxima_) == 300  # its detection has no ceilings
 
 
 def test_a_sense_that_jumps_in_healthy_hours_sets_no_threshold_for_the_others(asm):
     hours = list(shaken(sine_episodes(525, seed=22)))
     faults = [
-        Episode.from_stream(e.stream + np.r_[np.zeros(7), 2.0, np.zeros(6)] * (np.arange(len(e))[:, None] > 20), e.spec)
+        Episode.from_stream(
+            e.stream + np.r_[np.zeros(7), 2.0, np.zeros(6)] * (np.arange(len(e))[:, None] > 20),
+            e.spec,
+        )
         for e in sine_episodes(60, seed=23)
     ]
 

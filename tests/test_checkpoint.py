@@ -16,7 +16,10 @@ from asm_gym.checkpoint import read_arrays, read_checkpoint, read_header, write_
 
 
 def test_checkpoint_keeps_every_bit(tmp_path):
-    arrays = {"a": np.random.default_rng(0).normal(size=(3, 4)), "empty": np.zeros((0, 3), np.float32)}
+    arrays = {
+        "a": np.random.default_rng(0).normal(size=(3, 4)),
+        "empty": np.zeros((0, 3), np.float32),
+    }
     write_checkpoint(tmp_path / "new" / "x.asm", "test", {"n": 0.1, "none": None}, arrays)
     header, back = read_checkpoint(tmp_path / "new" / "x.asm", "test")
     assert header["n"] == 0.1
@@ -104,7 +107,9 @@ def test_hostile_checkpoints_are_refused_with_a_reason(how, message, tmp_path):
 def test_what_claims_to_be_larger_than_its_file_is_refused_before_it_is_read(tmp_path, monkeypatch):
     bomb = packed(tmp_path / "x.npz", compression=zipfile.ZIP_DEFLATED, a=npy(np.zeros(10**6)))
     assert bomb.stat().st_size < 20_000
-    monkeypatch.setattr(zipfile.ZipFile, "read", None)  # calling it would be a TypeError, which nothing here catches
+    monkeypatch.setattr(
+        zipfile.ZipFile, "read", None
+    )  # calling it would be a TypeError, which nothing here catches
     with pytest.raises(ValueError, match="its members claim 8000"):
         read_arrays(bomb)
     with pytest.raises(ValueError, match="compressed"):

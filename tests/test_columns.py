@@ -72,7 +72,11 @@ def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat()
         coded = Q.copy()
         coded[[5, 60, 61, 150]] = code
         assert code_of(coded) == code
-    for code, rest in ((-1.0, 200 + Q), (0.0, 5 + 0.1 * Q), (9.99, 0.1 * Q)):  # a small one stands in single rows
+    for code, rest in (
+        (-1.0, 200 + Q),
+        (0.0, 5 + 0.1 * Q),
+        (9.99, 0.1 * Q),
+    ):  # a small one stands in single rows
         coded = rest.copy()
         coded[7::15] = code
         assert code_of(coded) == code
@@ -122,7 +126,8 @@ def test_a_label_that_is_constant_in_training_is_said_and_changes_nothing_when_i
         assert any(name in line and "--channels" in line for line in notes)
         marked = HEALTHY | {name: np.where(T > 2, 3.0, 0.0)}
         np.testing.assert_array_equal(
-            read_recorded(marked, LogLayout(spec)).stream, read_recorded(healthy, LogLayout(spec)).stream
+            read_recorded(marked, LogLayout(spec)).stream,
+            read_recorded(healthy, LogLayout(spec)).stream,
         )
         assert read_recorded(marked, LogLayout()).faults.sum() == (T > 2).sum()
 
@@ -168,7 +173,9 @@ def test_a_bias_of_an_angle_is_the_same_wherever_it_turns_over_in_files_and_live
     assert found.spec.labels == ("yaw[sin]", "yaw[cos]", "q")
     np.testing.assert_allclose(found.stream[:, 0], np.sin(2 * np.pi * angle / turn), atol=1e-6)
     saved = StreamSpec.from_json(found.spec.to_json())
-    lines = [json.dumps({name: float(values[k]) for name, values in table.items()}) for k in range(20)]
+    lines = [
+        json.dumps({name: float(values[k]) for name, values in table.items()}) for k in range(20)
+    ]
     live = np.array([row.numbers for row, _ in RowReader(saved).rows(lines)])
     np.testing.assert_allclose(live, found.stream[:20], atol=1e-6)
 
@@ -186,16 +193,20 @@ def test_clocks_that_disagree_are_said_and_the_user_chooses():
     with pytest.warns(LogWarning, match="'time' and 'stamp' disagree, 50 and 25 rows a second"):
         assert Episode.from_table(table).spec.dt == pytest.approx(0.02)
     assert Episode.from_table(table, clock="stamp").spec.dt == pytest.approx(0.04)
-    assert Episode.from_table(HEALTHY | {"tick": 40 * np.arange(ROWS)}, clock="tick [ms]").spec.dt == pytest.approx(
-        0.04
-    )
+    assert Episode.from_table(
+        HEALTHY | {"tick": 40 * np.arange(ROWS)}, clock="tick [ms]"
+    ).spec.dt == pytest.approx(0.04)
     with pytest.warns(LogWarning, match="by --rate 500 it is not read"):
         assert Episode.from_table(HEALTHY, rate=500).spec.dt == pytest.approx(0.002)
     with pytest.warns(LogWarning, match="'time' and 'stamp' disagree, 50 and 49"):
         Episode.from_table(HEALTHY | {"stamp": 1.02 * T + 7})
     with warnings.catch_warnings():
-        warnings.simplefilter("error", LogWarning)  # one of them jitters, as a clock of arrival does
-        Episode.from_table(HEALTHY | {"recv_time": T + 0.004 * np.random.default_rng(1).random(ROWS)})
+        warnings.simplefilter(
+            "error", LogWarning
+        )  # one of them jitters, as a clock of arrival does
+        Episode.from_table(
+            HEALTHY | {"recv_time": T + 0.004 * np.random.default_rng(1).random(ROWS)}
+        )
     both = {"time_s": T, "time_us": 1e6 * T, "q": Q}  # no pair: each counts all the time
     assert Episode.from_table(both).spec.dt == pytest.approx(0.02)
     backwards = HEALTHY | {"time": T[::-1]}
@@ -203,16 +214,29 @@ def test_clocks_that_disagree_are_said_and_the_user_chooses():
 
 
 def rows_of(header: str, *columns: np.ndarray) -> str:
-    return "\n".join(filter(None, [header, *(",".join(map(str, row)) for row in zip(*columns, strict=True))])) + "\n"
+    return (
+        "\n".join(
+            filter(None, [header, *(",".join(map(str, row)) for row in zip(*columns, strict=True))])
+        )
+        + "\n"
+    )
 
 
 @pytest.mark.parametrize(
     ("lines", "message", "remedy"),
     [
-        (rows_of("time,q,w", T, Q, np.where(np.arange(ROWS) == 3, "?", Q.astype(str))), "in row 4", ["--ignore", "w"]),
+        (
+            rows_of("time,q,w", T, Q, np.where(np.arange(ROWS) == 3, "?", Q.astype(str))),
+            "in row 4",
+            ["--ignore", "w"],
+        ),
         (rows_of("time,q,q", T, Q, -Q), "differs", ["--ignore", "q #2"]),
         (rows_of("q,p", Q, Q * Q), "--rate", ["--rate", "50"]),
-        (rows_of("time,q,p", np.roll(T, 1) * (-1) ** np.arange(ROWS), Q, Q * Q), "--rate", ["--rate", "50"]),
+        (
+            rows_of("time,q,p", np.roll(T, 1) * (-1) ** np.arange(ROWS), Q, Q * Q),
+            "--rate",
+            ["--rate", "50"],
+        ),
         (rows_of("", T, Q, Q * Q), "--columns x0 x1 x2", ["--columns", "t", "x1", "x2"]),
     ],
 )
@@ -243,7 +267,9 @@ def test_alarms_of_one_cause_are_one_and_missing_data_are_apart():
     surprise, stream = np.zeros(300), np.zeros((300, 1), np.float32)
     surprise[[50, 60, 70, 200]] = 2.0  # at 50 Hz: a push, and another one
     surprise[65], stream[65] = np.inf, np.nan
-    trace = ScoredEpisode("x", 0, 0.02, 1.0, surprise, attribution=stream, channels=("q",), stream=stream)
+    trace = ScoredEpisode(
+        "x", 0, 0.02, 1.0, surprise, attribution=stream, channels=("q",), stream=stream
+    )
     found = alarms_of(trace)
     assert [(a.why, round(a.start, 2)) for a in found if a.why == "surprise"] == [
         ("surprise", 1.02),
@@ -260,9 +286,13 @@ def test_columns_that_the_first_log_lacks_are_said(tmp_path):
     assert any("seventh" in line for line in notes)
 
 
-def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_in_time(tmp_path, capsys):
+def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_in_time(
+    tmp_path, capsys
+):
     (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "x.parquet").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    (tmp_path / "a" / "x.parquet").write_text(
+        "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"
+    )
     assert main(["fit", str(tmp_path / "a")]) == 2
     assert "git lfs pull" in capsys.readouterr().err
     (tmp_path / "b").mkdir()
@@ -273,12 +303,26 @@ def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_i
     said = capsys.readouterr().err
     assert "1.csv: the memory reads channels that are not there: torque" in said
     assert f"or {other}" in said
-    pd.DataFrame(HEALTHY | {"time": 3 * HEALTHY["time"]}).to_csv(tmp_path / "b" / "2.csv", index=False)  # at its rate
+    pd.DataFrame(HEALTHY | {"time": 3 * HEALTHY["time"]}).to_csv(
+        tmp_path / "b" / "2.csv", index=False
+    )  # at its rate
     logs = read_logs(tmp_path / "b", LogLayout(like=other))
     assert [log.name for log in logs] == ["1.csv"]
-    how = ["--out", str(tmp_path / "m.asm"), "--monitor", "kalman", "--split", "0.2", "--false-alarm-rate", "0.2"]
+    how = [
+        "--out",
+        str(tmp_path / "m.asm"),
+        "--monitor",
+        "kalman",
+        "--split",
+        "0.2",
+        "--false-alarm-rate",
+        "0.2",
+    ]
     assert main(["fit", str(tmp_path / "b"), *how, "--like", str(other)]) == 0
-    assert main(["inspect", str(tmp_path / "b"), "--out", str(tmp_path / "i"), "--like", str(other)]) == 0
+    assert (
+        main(["inspect", str(tmp_path / "b"), "--out", str(tmp_path / "i"), "--like", str(other)])
+        == 0
+    )
     (tmp_path / "file").write_text("")
     assert main(["fit", str(tmp_path / "b"), "--out", str(tmp_path / "file" / "m.asm")]) == 2
     assert str(tmp_path / "file") in capsys.readouterr().err

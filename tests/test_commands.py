@@ -84,7 +84,8 @@ def test_help_names_defaults_choices_known_names_and_quick_values(capsys, monkey
 
 
 @pytest.mark.parametrize(
-    ("typed", "near"), [("docter", "doctor"), ("reproduce pandas", "panda"), ("watch --monitr x", "--monitor")]
+    ("typed", "near"),
+    [("docter", "doctor"), ("reproduce pandas", "panda"), ("watch --monitr x", "--monitor")],
 )
 def test_a_misspelt_command_or_option_is_answered_with_the_nearest_one(typed, near, capsys):
     assert cli.main(typed.split()) == 2

@@ -29,7 +29,9 @@ def test_the_process_that_compiles_computes_the_same_to_the_last_bit(tmp_path):
     said = []
     for code in (INFER, INFER, LOADED_FIRST):
         env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "OPENBLAS_NUM_THREADS": "1"}
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env=env, check=True
+        )
         said.append(done.stdout.split())
     compiles, *numbers = zip(*said, strict=True)
     assert compiles == ("True", "False", "False")
@@ -56,7 +58,9 @@ def test_code_is_kept_in_a_temporary_folder_where_neither_install_nor_home_can_b
         ({"NUMBA_CACHE_DIR": str(tmp_path)}, str(tmp_path)),
     ):
         run = [sys.executable, "-c", NOWHERE]
-        done = subprocess.run(run, capture_output=True, text=True, env=env | named, check=True, cwd=ROOT)
+        done = subprocess.run(
+            run, capture_output=True, text=True, env=env | named, check=True, cwd=ROOT
+        )
         assert done.stdout.startswith(kept)
     assert not any((tmp_path / "tmp").iterdir())
 
@@ -77,21 +81,35 @@ print(must_compile(twice), twice(TYPE(2.0)))
 
 
 def test_code_that_was_kept_for_a_type_that_is_gone_is_compiled_anew(tmp_path):
-    said, env = [], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    said, env = (
+        [],
+        os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"},
+    )
     for name in ("Before", "After", "After"):
         (tmp_path / "arm.py").write_text(OF_A_TYPE.replace("TYPE", name))
         run = [sys.executable, "-c", "import arm"]
-        said.append(subprocess.run(run, capture_output=True, text=True, env=env, check=True, cwd=tmp_path).stdout)
+        said.append(
+            subprocess.run(
+                run, capture_output=True, text=True, env=env, check=True, cwd=tmp_path
+            ).stdout
+        )
     assert said == ["True 4.0\n", "True 4.0\n", "False 4.0\n"]
 
 
 def test_code_that_another_processor_compiled_is_none(tmp_path):
     (tmp_path / "arm.py").write_text(OF_A_TYPE.replace("TYPE", "Arm"))
-    said, env = [], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    said, env = (
+        [],
+        os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"},
+    )
     generic = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
     for processor in ({}, generic, generic, {}):
         run, own = [sys.executable, "-c", "import arm"], env | processor
-        said.append(subprocess.run(run, capture_output=True, text=True, env=own, check=True, cwd=tmp_path).stdout)
+        said.append(
+            subprocess.run(
+                run, capture_output=True, text=True, env=own, check=True, cwd=tmp_path
+            ).stdout
+        )
     assert said == ["True 4.0\n", "True 4.0\n", "False 4.0\n", "False 4.0\n"]
 
 
@@ -112,7 +130,9 @@ print(kept_in(import_robosuite().utils.transform_utils.quat2mat))
 
 def test_robosuites_code_is_kept_in_the_temporary_folder_too(tmp_path):
     needs("robosuite")
-    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"TMPDIR": str(tmp_path)}
+    env = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {
+        "TMPDIR": str(tmp_path)
+    }
     run = [sys.executable, "-c", ROBOSUITE_NOWHERE]
     done = subprocess.run(run, capture_output=True, text=True, env=env, check=True, cwd=ROOT)
     assert done.stdout.startswith(f"{tmp_path}/asm-gym-numba-")

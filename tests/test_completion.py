@@ -35,7 +35,9 @@ def test_completion_is_the_conditional_mean_of_a_gaussian():
     P = np.linalg.inv(MEMORY.covariance + 1e-4 * np.eye(len(y)))
     # The energy ½ yᵀPy is least, over all that involves the missing sense, where its gradient there is 0.
     centred = y - MEMORY.centre
-    inside = np.linalg.solve(P[np.ix_(involved, involved)], -P[np.ix_(involved, ~involved)] @ centred[~involved])
+    inside = np.linalg.solve(
+        P[np.ix_(involved, involved)], -P[np.ix_(involved, ~involved)] @ centred[~involved]
+    )
     expected = SENSES.mean[0] + SENSES.spread[0] * (MEMORY.centre[0] + inside[0])
     np.testing.assert_allclose(MEMORY.complete(filling, y[None])[0, 0], expected, rtol=1e-6)
     alone = MEMORY.unexplained(y[None])[0, 0]
@@ -61,7 +63,9 @@ def test_a_sense_is_repaired_until_it_is_well_again():
             seen = repair.suspect(np.array([0]))
         expected = 0.3 if 20 <= t < 22 else 0.0
         assert abs(seen[0] - row[0] - expected) < 0.05, t
-        np.testing.assert_array_equal(seen[1:], row[1:])  # whatever else is sensed is handed on to the bit
+        np.testing.assert_array_equal(
+            seen[1:], row[1:]
+        )  # whatever else is sensed is handed on to the bit
         assert repair.names == (("encoder[0]",) if 22 <= t < 79 else ()), t
     repair.rows.begin(np.ones(1, bool))
     assert not repair.names
@@ -77,7 +81,9 @@ def test_numbers_that_are_none_are_completed_at_once_and_several_together():
         assert np.isfinite(seen).all()
         np.testing.assert_allclose(seen, row, atol=0.06)
     lost = np.full(SPEC.size, np.nan, np.float32)
-    assert not np.isfinite(Repaired().read(lost)).all()  # nothing is left to go by, and nobody pretends
+    assert not np.isfinite(
+        Repaired().read(lost)
+    ).all()  # nothing is left to go by, and nobody pretends
 
 
 def test_what_nothing_else_tells_of_is_trusted_for_a_second_only():
@@ -123,7 +129,9 @@ def test_a_policy_under_the_guard_sees_what_a_faulty_sense_should_say():
 
 def test_an_observation_that_a_wrapper_has_changed_is_refused():
     env = gym.make("asm_gym/Lift-v0")
-    shorter = gym.wrappers.TransformObservation(env, lambda o: o[:5], spaces.Box(-100, 100, (5,), np.float32))
+    shorter = gym.wrappers.TransformObservation(
+        env, lambda o: o[:5], spaces.Box(-100, 100, (5,), np.float32)
+    )
     robots, places = robots_of(shorter, env.unwrapped.stream_spec)
     assert places is None
     assert "has changed the observation" in robots.refused["complete"]

@@ -35,7 +35,11 @@ def persistence():
 
 @pytest.fixture(scope="module")
 def kalman():
-    return make_monitor("kalman", sine_spec()).fit(sine_episodes(30)).calibrate(sine_episodes(60, 1), 0.05)
+    return (
+        make_monitor("kalman", sine_spec())
+        .fit(sine_episodes(30))
+        .calibrate(sine_episodes(60, 1), 0.05)
+    )
 
 
 @pytest.mark.parametrize("detection", DETECTIONS)
@@ -44,7 +48,9 @@ def test_any_model_goes_under_any_detection(detection):
     monitor.calibrate(sine_episodes(60, 1), 0.05)
     surprise = monitor.score(frozen(sine_episodes(1, 2)[0], 3, 20))
     np.testing.assert_allclose(surprise.attribution.sum(axis=1), surprise.value)
-    alarms = np.mean([s.value.max() > monitor.threshold for s in monitor.score_episodes(sine_episodes(100, 3))])
+    alarms = np.mean(
+        [s.value.max() > monitor.threshold for s in monitor.score_episodes(sine_episodes(100, 3))]
+    )
     assert alarms < 0.05 + 3 * np.sqrt(0.05 * 0.95 * (1 / 60 + 1 / 100))
 
 
@@ -67,10 +73,14 @@ def test_one_fit_serves_the_score_of_the_authors_and_the_evidence(kalman):
     np.testing.assert_array_equal(evidence.score(episode).value, fitted.score(episode).value)
     assert kalman.detection.name == "mahalanobis"
     assert kalman.threshold > 0
-    assert json.dumps(kalman.get_params()) == json.dumps(fitted.get_params())  # runs keep fitted monitors by these
+    assert json.dumps(kalman.get_params()) == json.dumps(
+        fitted.get_params()
+    )  # runs keep fitted monitors by these
 
 
-def test_a_file_that_was_calibrated_for_one_detection_has_no_threshold_under_another(kalman, tmp_path):
+def test_a_file_that_was_calibrated_for_one_detection_has_no_threshold_under_another(
+    kalman, tmp_path
+):
     kalman.save(tmp_path / "k.asm")
     assert monitor_class("kalman").load(tmp_path / "k.asm").threshold == kalman.threshold
     other = monitor_class("kalman+evidence").load(tmp_path / "k.asm")
@@ -94,7 +104,9 @@ def test_a_model_of_ones_own_is_registered_by_one_call(persistence, tmp_path):
 
 
 def test_a_file_of_a_model_that_is_not_registered_says_so(tmp_path):
-    monitor = CalibratedMonitor(Persistence(sine_spec()), Squares(sine_spec())).fit(sine_episodes(5))
+    monitor = CalibratedMonitor(Persistence(sine_spec()), Squares(sine_spec())).fit(
+        sine_episodes(5)
+    )
     monitor.save(tmp_path / "p.asm")
     with pytest.raises(ValueError, match="unknown monitor 'persistence'; known: neural_asm"):
         load_monitor(tmp_path / "p.asm")
@@ -106,7 +118,9 @@ def test_two_parts_must_not_learn_arrays_of_one_name():
             return self.restore({"spread": np.ones(12), "tail": np.ones(12)})
 
     with pytest.raises(ValueError, match="tail"):
-        CalibratedMonitor(Careless(sine_spec()), EvidenceDetection(sine_spec())).fit(sine_episodes(5))
+        CalibratedMonitor(Careless(sine_spec()), EvidenceDetection(sine_spec())).fit(
+            sine_episodes(5)
+        )
 
 
 def test_the_threshold_at_any_rate_is_that_of_the_kept_maxima(kalman, tmp_path):
@@ -115,9 +129,13 @@ def test_the_threshold_at_any_rate_is_that_of_the_kept_maxima(kalman, tmp_path):
     for monitor in (kalman, load_monitor(tmp_path / "k.asm")):
         for rate in (0.02, 0.05, 0.3):
             assert monitor.threshold_at(rate) == episode_threshold(maxima, rate)
-        with pytest.raises(ValueError, match=r"rate of 0\.01 needs at least 99 nominal episodes, got 60"):
+        with pytest.raises(
+            ValueError, match=r"rate of 0\.01 needs at least 99 nominal episodes, got 60"
+        ):
             monitor.threshold_at(0.01)
-        with pytest.raises(ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got 2"):
+        with pytest.raises(
+            ValueError, match=r"false_alarm_rate must be a number in \(0, 1\), got 2"
+        ):
             monitor.threshold_at(2.0)
     with pytest.raises(RuntimeError, match="call calibrate"):
         kalman.with_detection("evidence").threshold_at(0.05)
@@ -145,10 +163,14 @@ def test_scores_of_the_literature_are_what_they_say():
     assert white.attribute_step((), output, rows, place)[1].tolist() == [[9.0, 4.0]]
     mean, state, said = MovingMean(spec), MovingMean(spec).start(1, 2), []
     for n in range(WINDOW + 1):
-        state, parts = mean.attribute_step(state, ModelOutput(np.full((1, 2), n), output.contexts), rows, place)
+        state, parts = mean.attribute_step(
+            state, ModelOutput(np.full((1, 2), n), output.contexts), rows, place
+        )
         said.append(parts[0, 0])
     squares = np.arange(WINDOW + 1) ** 2
-    np.testing.assert_allclose(said, [*(np.cumsum(squares) / np.arange(1, WINDOW + 2))[:WINDOW], squares[1:].mean()])
+    np.testing.assert_allclose(
+        said, [*(np.cumsum(squares) / np.arange(1, WINDOW + 2))[:WINDOW], squares[1:].mean()]
+    )
 
 
 def test_units_of_any_size_make_no_difference():
@@ -171,8 +193,14 @@ def episode(seed: int, fan: float = 0.0, rows: int = 120) -> Episode:
     temperature = 30 + 0.0625 * np.rint(np.arange(rows) / 40 + rng.random())
     still = np.zeros(rows)
     still[rows // 2 :] = fan
-    columns = {"q": command + 0.01 * rng.normal(size=command.shape), "temperature": temperature, "fan": still}
-    return Episode.from_table(columns | {"action": command}, channels=tuple(columns), rate=50.0, success=True)
+    columns = {
+        "q": command + 0.01 * rng.normal(size=command.shape),
+        "temperature": temperature,
+        "fan": still,
+    }
+    return Episode.from_table(
+        columns | {"action": command}, channels=tuple(columns), rate=50.0, success=True
+    )
 
 
 def test_a_rounded_channel_changes_by_no_less_than_its_rounding():
@@ -188,7 +216,9 @@ def test_a_rounded_channel_changes_by_no_less_than_its_rounding():
 
 @pytest.mark.parametrize("name", ["association_linear+evidence", "neural_asm"])
 def test_a_channel_that_moves_for_the_first_time_while_calibrating_is_named(name):
-    settings = {"epochs": 2, "hidden_size": 16, "association_size": 32} if name == "neural_asm" else {}
+    settings = (
+        {"epochs": 2, "hidden_size": 16, "association_size": 32} if name == "neural_asm" else {}
+    )
     monitor = make_monitor(name, episode(0).spec, **settings).fit([episode(n) for n in range(40)])
     quiet = [episode(n) for n in range(100, 130)]
     threshold = monitor.calibrate(quiet, 0.05).threshold
@@ -205,16 +235,25 @@ def test_a_channel_that_moves_for_the_first_time_while_calibrating_is_named(name
         assert monitor.threshold == before
     else:
         assert monitor.threshold < 1e6  # what it was set by, a fault in any channel passes too
-        assert blind_to(monitor.detection, monitor.model.error_columns, monitor.spec, monitor.threshold) == []
+        assert (
+            blind_to(
+                monitor.detection, monitor.model.error_columns, monitor.spec, monitor.threshold
+            )
+            == []
+        )
 
 
 def test_a_threshold_that_no_fault_could_pass_names_the_channels():
-    monitor = make_monitor("association_linear+evidence", episode(0).spec).fit([episode(n) for n in range(40)])
+    monitor = make_monitor("association_linear+evidence", episode(0).spec).fit(
+        [episode(n) for n in range(40)]
+    )
     columns = monitor.model.error_columns
     reach = monitor.detection.reach_of(np.arange(len(columns)))
     middle = float(np.sort(reach)[len(reach) // 2])
     blind = blind_to(monitor.detection, columns, monitor.spec, middle)
-    assert set(blind) == {monitor.spec.labels[columns[k]] for k in range(len(columns)) if reach[k] <= middle}
+    assert set(blind) == {
+        monitor.spec.labels[columns[k]] for k in range(len(columns)) if reach[k] <= middle
+    }
     assert blind_to(object(), columns, monitor.spec, 1e9) == []  # a detection that does not know
 
 
@@ -231,9 +270,13 @@ def returning(name, change):
     return type(name, (Persistence,), {"kind": name, "predict": predict})
 
 
-Lopsided = returning("lopsided", lambda state, output: (state, output._replace(errors=output.errors[:, 1:])))
+Lopsided = returning(
+    "lopsided", lambda state, output: (state, output._replace(errors=output.errors[:, 1:]))
+)
 Stateless = returning("stateless", lambda state, output: output)
-NotFinite = returning("not_finite", lambda state, output: (state, output._replace(errors=output.errors * np.nan)))
+NotFinite = returning(
+    "not_finite", lambda state, output: (state, output._replace(errors=output.errors * np.nan))
+)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,10 @@ def test_a_hand_that_rams_the_table_is_stopped_by_default(lift):
 
 
 def test_a_held_cube_that_is_slammed_on_the_table_and_pressed_is_an_alarm_and_held(lift):
-    env, expert = NeuralASMSafety(lift, NeuralASM.pretrained("panda")), make_policy("scripted", lift, seed=0)
+    env, expert = (
+        NeuralASMSafety(lift, NeuralASM.pretrained("panda")),
+        make_policy("scripted", lift, seed=0),
+    )
     observation, _ = env.reset(seed=1000)
     action, state = np.array([0, 0, -1, 0, 0, 0, 1], np.float32), None
     while lift.unwrapped.simulation.data.body("cube_main").xpos[2] < 0.9:
@@ -107,7 +110,9 @@ def test_limits_that_are_none_are_refused(given, message):
 
 def test_limits_of_another_arm_are_refused_at_construction(lift):
     with pytest.raises(ValueError, match="healthy must say 10 numbers"):
-        NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits=ContactLimits(healthy=(1.0, 2.0)))
+        NeuralASMSafety(
+            lift, NeuralASM.pretrained("panda"), contact_limits=ContactLimits(healthy=(1.0, 2.0))
+        )
     with pytest.raises(ValueError, match="contact_limits must be ContactLimits"):
         NeuralASMSafety(lift, NeuralASM.pretrained("panda"), contact_limits="none")
 
@@ -121,11 +126,16 @@ def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_
     for _ in range(21):
         told.append(limits.now[0])
         limits.follow(yes, no)
-    assert told[:20] == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
+    assert (
+        told[:20]
+        == [ContactLimits(wrist_force=40.0, external_torque=20.0, hand_speed=0.15 / 3)] * 20
+    )
     assert told[20] == ContactLimits()
 
 
-def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twenty_and_saved(tmp_path, lift):
+def test_the_healthy_range_is_learned_from_calibration_less_the_hardest_of_twenty_and_saved(
+    tmp_path, lift
+):
     spec = lift.unwrapped.stream_spec
     streams = [np.zeros((5, spec.size), np.float32) for _ in range(40)]
     torque, force = spec.slices["external_torque_peak"], spec.slices["wrist_force_peak"]
@@ -159,7 +169,11 @@ def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_
 @pytest.mark.parametrize("controller", ["OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "IK_POSE"])
 @pytest.mark.parametrize("turns", [False, True])
 def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(controller, turns):
-    env, rng, speeds = gym.make("asm_gym/Lift-v0", controller=controller), np.random.default_rng(0), []
+    env, rng, speeds = (
+        gym.make("asm_gym/Lift-v0", controller=controller),
+        np.random.default_rng(0),
+        [],
+    )
     env.reset(seed=0)
     arm = env.unwrapped
     arm.contact_limits = ContactLimits(1e3, 1e3, hand_speed=0.15)
@@ -170,7 +184,9 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
             action[: 3 * (turns and controller.endswith("POSE"))] = 0.0
         env.step(action)
     env.close()
-    assert 0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)  # that one pulls between substeps
+    assert (
+        0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)
+    )  # that one pulls between substeps
 
 
 def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_healthy_hand_was(lift):
@@ -200,7 +216,10 @@ def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():
 
     def feel(_):
         simulation = arm.simulation
-        hand, base = simulation.views.site_xpos[simulation.arms.site[0]], np.array([-0.56, 0.0, 0.912])
+        hand, base = (
+            simulation.views.site_xpos[simulation.arms.site[0]],
+            np.array([-0.56, 0.0, 0.912]),
+        )
         speed = hand_speed(present_twist(simulation, 0))
         found.append((np.hypot(*(hand - base)[:2]), speed, simulation.contact_forces[-1]))
 
@@ -224,13 +243,19 @@ def test_what_is_fixed_to_the_world_belongs_to_it(lift):
 
 def hands(*twists, place=(0.1, 0.2, 0.91)):
     """A spec of one hand, and a stream in which it has these twists at one place."""
-    spec = StreamSpec(tuple(Channel(f"hand_{n}", 3, "m") for n in ("position", "velocity", "angular_velocity")), 0.05)
+    spec = StreamSpec(
+        tuple(Channel(f"hand_{n}", 3, "m") for n in ("position", "velocity", "angular_velocity")),
+        0.05,
+    )
     return spec, np.array([[*place, *twist] for twist in twists], np.float32)
 
 
 def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual_one(tmp_path):
     spec, stream = hands([0.4, 0.0, -0.1, 0, 0, 1.0], [0.0, 0.0, -0.3, 0, 0, 0])
-    limits, here = ContactLimits(pace=HandSpeedMap(HandSpeedMap.learned([stream], spec))), np.array([0.1, 0.2, 0.91])
+    limits, here = (
+        ContactLimits(pace=HandSpeedMap(HandSpeedMap.learned([stream], spec))),
+        np.array([0.1, 0.2, 0.91]),
+    )
 
     def most(*twist, place=here, momentum=0.0):
         speed = float(np.linalg.norm(twist[:3]) + 0.15 * np.linalg.norm(twist[3:]))
@@ -240,11 +265,20 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
     assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
     assert most(0.4, 0, 0, 0, 0, 0, place=here + 0.3) == pytest.approx(0.15 / 0.4)  # another place
     assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
-    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(0.15 / 0.3)  # with whatever is behind it
-    assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2  # not so where no healthy hand went down
+    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(
+        0.15 / 0.3
+    )  # with whatever is behind it
+    assert (
+        most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2
+    )  # not so where no healthy hand went down
     assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == 0.5
     assert HandSpeedMap.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
-    for bad in (np.zeros((0, 16)), np.full((1, 16), np.nan), np.full((1, 16), 1e9), np.zeros((1, 15))):
+    for bad in (
+        np.zeros((0, 16)),
+        np.full((1, 16), np.nan),
+        np.full((1, 16), 1e9),
+        np.zeros((1, 15)),
+    ):
         with pytest.raises(ValueError, match="pace must be rows"):
             HandSpeedMap(bad)
 

@@ -14,7 +14,18 @@ import numpy as np
 from asm_gym.extras import BROUGHT_BY
 from tests.wheel import LINKS, ROOT, build_wheel
 
-CORE = ("filelock", "gymnasium", "numpy", "numba", "packaging", "pandas", "rich", "scipy", "threadpoolctl", "tyro")
+CORE = (
+    "filelock",
+    "gymnasium",
+    "numpy",
+    "numba",
+    "packaging",
+    "pandas",
+    "rich",
+    "scipy",
+    "threadpoolctl",
+    "tyro",
+)
 WATCH = """
 import gymnasium, numpy as np
 import asm_gym, asm_gym.monitors, asm_gym.wrappers
@@ -76,8 +87,12 @@ SAID = [
 ]
 
 ONE_IMPORT = {
-    **dict.fromkeys(("NeuralASM", "NeuralASMSafety", "VectorNeuralASMSafety", "StreamRecorder"), None),
-    **dict.fromkeys(("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy", "harmless"), None),
+    **dict.fromkeys(
+        ("NeuralASM", "NeuralASMSafety", "VectorNeuralASMSafety", "StreamRecorder"), None
+    ),
+    **dict.fromkeys(
+        ("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy", "harmless"), None
+    ),
     **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
     "register_fault": "register_fault needs mujoco: pip install 'asm-gym[robosuite]'",
     **dict.fromkeys(("FaultInjection", "collect"), SAID[0]),
@@ -98,16 +113,26 @@ sys.meta_path.insert(0, Absent())
 
 def test_the_core_watches_a_stream_and_names_what_the_rest_needs(tmp_path):
     code = NOTHING_ELSE.replace("ABSENT", repr(set(BROUGHT_BY))) + WATCH
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == [*SAID, ONE_IMPORT]
 
 
 def test_a_command_says_which_extra_it_lacks(tmp_path):
-    code = NOTHING_ELSE.replace("ABSENT", "{'matplotlib'}") + "from asm_gym.scripts.cli import main; sys.exit(main())"
-    done = subprocess.run([sys.executable, "-c", code, "evaluate"], capture_output=True, text=True, check=False)
+    code = (
+        NOTHING_ELSE.replace("ABSENT", "{'matplotlib'}")
+        + "from asm_gym.scripts.cli import main; sys.exit(main())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "evaluate"], capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "asm-gym evaluate: this command needs matplotlib: pip install 'asm-gym[report]'\n"
+    assert (
+        done.stderr
+        == "asm-gym evaluate: this command needs matplotlib: pip install 'asm-gym[report]'\n"
+    )
 
 
 def test_logs_are_watched_without_a_simulator(tmp_path):
@@ -116,7 +141,9 @@ def test_logs_are_watched_without_a_simulator(tmp_path):
     for k in range(40):
         rows = np.sin(0.2 * np.arange(60)[:, None] + np.array((k, 2 * k, 3.0)))
         rows[30:, 0] += 9.0 * (k == 39)
-        np.savetxt(log / f"{k:02}.csv", rows, delimiter=",", header="a,b,c", comments="", fmt="%.6f")
+        np.savetxt(
+            log / f"{k:02}.csv", rows, delimiter=",", header="a,b,c", comments="", fmt="%.6f"
+        )
     (log / "39.csv").rename(tmp_path / "torn.csv")
     code = NOTHING_ELSE.replace("ABSENT", repr(set(BROUGHT_BY))) + (
         "from asm_gym.scripts.cli import main\n"
@@ -124,7 +151,9 @@ def test_logs_are_watched_without_a_simulator(tmp_path):
         "watch = 'watch torn.csv --rate 20 --monitor m.asm --out seen'.split()\n"
         "print(main(['doctor']), main(fit), main(watch))"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.stdout.endswith("0 0 1\n"), done.stdout + done.stderr
     assert "alarms.csv; the report needs matplotlib: pip install 'asm-gym[report]'" in done.stdout
     assert [p.name for p in (tmp_path / "seen").iterdir()] == ["alarms.csv"]
@@ -136,11 +165,18 @@ def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under
 
     def names(requirements):
         found = [re.match(r"[\w.-]+", line).group() for line in requirements]
-        ours = "cloudpickle", "asm-gym"  # gymnasium brings the one, and the other brings what another extra names
+        ours = (
+            "cloudpickle",
+            "asm-gym",
+        )  # gymnasium brings the one, and the other brings what another extra names
         return {imported_as.get(n, n.replace("-", "_")) for n in found if n not in ours}
 
     assert names(project["dependencies"]) == set(CORE)
-    extras = {e: names(r) for e, r in project["optional-dependencies"].items() if e not in ("all", "dev", "docs")}
+    extras = {
+        e: names(r)
+        for e, r in project["optional-dependencies"].items()
+        if e not in ("all", "dev", "docs")
+    }
     bounded = (
         ("environments", "mujoco"),
         ("robosuite", "PIL"),
@@ -155,6 +191,11 @@ def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under
 def test_a_wheel_holds_every_file_of_the_package(tmp_path):
     """An editable install finds them all, whatever pyproject.toml says."""
     folders = {"asm_gym": ROOT / "asm_gym", **{f"asm_gym/{name}": ROOT / name for name in LINKS}}
-    there = {f"{name}/{p.relative_to(top)}" for name, top in folders.items() for p in top.rglob("*") if p.is_file()}
+    there = {
+        f"{name}/{p.relative_to(top)}"
+        for name, top in folders.items()
+        for p in top.rglob("*")
+        if p.is_file()
+    }
     with zipfile.ZipFile(build_wheel(tmp_path)) as wheel:
         assert {name for name in there if "__pycache__" not in name} <= set(wheel.namelist())

@@ -11,7 +11,16 @@ import numpy as np
 import pytest
 
 from asm_gym.rollouts import corpus as module
-from asm_gym.rollouts.corpus import CLAIM, ROUNDS, VERSION, Corpus, Source, record_corpus, skill_files, trials
+from asm_gym.rollouts.corpus import (
+    CLAIM,
+    ROUNDS,
+    VERSION,
+    Corpus,
+    Source,
+    record_corpus,
+    skill_files,
+    trials,
+)
 from asm_gym.rollouts.trial import faulty_trial
 from asm_gym.scripts.evaluate import main as evaluate
 from tests.streams import sine_episodes
@@ -61,7 +70,10 @@ def test_episodes_are_chosen_by_role_policy_and_task_and_checked(recorded):
     corpus = Corpus.open(recorded[0])
     assert len(corpus.episodes("nominal")) == 6
     assert [e.label.task for e in corpus.episodes(policies=("stack_sac",))] == ["Stack"] * 2
-    assert {e.label.role for e in corpus.episodes("fit", "calibration", tasks=("Lift",))} == {"fit", "calibration"}
+    assert {e.label.role for e in corpus.episodes("fit", "calibration", tasks=("Lift",))} == {
+        "fit",
+        "calibration",
+    }
     labels = [e.label for e in corpus.episodes()]
     assert corpus.files[["task", "role", "kind", "severity"]].to_numpy().tolist() == [
         [label.task, label.role, label.kind, label.severity] for label in labels
@@ -105,7 +117,9 @@ def pushed(tmp_path, monkeypatch):
         (episode,) = sine_episodes(1, trial.seed % 1000, steps=(60, 60))
         stream, onset = episode.stream.copy(), trial.onset or 60
         stream[onset:, :12] += 3.0
-        return replace(episode, stream=stream, faults=np.arange(60) >= onset, label=trial.label, success=True)
+        return replace(
+            episode, stream=stream, faults=np.arange(60) >= onset, label=trial.label, success=True
+        )
 
     monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record_stream", record)
     monkeypatch.setattr(module, "trials", lambda *_: wanted)
@@ -114,7 +128,16 @@ def pushed(tmp_path, monkeypatch):
 
 
 def test_monitors_are_judged_by_a_corpus(pushed, tmp_path):
-    asked = ["--corpus", str(pushed), "--workers", "1", "--false-alarm-rate", "0.05", "--out", str(tmp_path / "out")]
+    asked = [
+        "--corpus",
+        str(pushed),
+        "--workers",
+        "1",
+        "--false-alarm-rate",
+        "0.05",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert evaluate([*asked, "--monitors", "kalman+evidence", "association_linear"]) == 0
     text = (tmp_path / "out/results.md").read_text()
     assert re.search(r"\| kalman\+evidence \| 1.000 \(1.000–1.000\) \|.* 100 % \(100–100\)", text)
@@ -124,7 +147,12 @@ def test_monitors_are_judged_by_a_corpus(pushed, tmp_path):
 
 def test_fewer_episodes_to_learn_from_leave_all_others_as_they_are(pushed):
     roles = [file.parent.name for file in skill_files(pushed, fit=2)]
-    assert [roles.count(role) for role in ("fit", "calibration", "nominal", "faulty")] == [2, 24, 8, 4]
+    assert [roles.count(role) for role in ("fit", "calibration", "nominal", "faulty")] == [
+        2,
+        24,
+        8,
+        4,
+    ]
 
 
 def test_only_the_tasks_that_are_asked_for_are_judged(pushed):

@@ -77,7 +77,17 @@ def test_collecting_touches_nothing_outside_its_folder(tmp_path, monkeypatch):
 
 
 def test_a_killed_run_loses_only_what_was_running(tmp_path):
-    command = [sys.executable, "-m", "asm_gym", "collect", "Lift", *ONE, "400", "--out", str(tmp_path)]
+    command = [
+        sys.executable,
+        "-m",
+        "asm_gym",
+        "collect",
+        "Lift",
+        *ONE,
+        "400",
+        "--out",
+        str(tmp_path),
+    ]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while len(list((tmp_path / "episodes").glob("[0-9]*.npz"))) < 2 and time.monotonic() < deadline:
@@ -90,7 +100,9 @@ def test_a_killed_run_loses_only_what_was_running(tmp_path):
     more = len(kept) + 1
     assert main(["collect", "Lift", *ONE, str(more), "--out", str(tmp_path)]) == 0
     assert len(read_dataset(tmp_path)) == more
-    assert all((tmp_path / "episodes" / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items())
+    assert all(
+        (tmp_path / "episodes" / name).stat().st_mtime_ns == stamp for name, stamp in stamps.items()
+    )
     assert not [p.name for p in tmp_path.rglob("*") if p.name.endswith(UNFINISHED)]
 
 
@@ -119,7 +131,10 @@ def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7, changed
     """A dataset that somebody else recorded, with Minari alone."""
     observations = gym.spaces.Box(-np.inf, np.inf, (23,), np.float64)
     path.mkdir(parents=True)
-    spaces = {"observation_space": observations, "action_space": gym.spaces.Box(-2, 2, (actions,), np.float32)}
+    spaces = {
+        "observation_space": observations,
+        "action_space": gym.spaces.Box(-2, 2, (actions,), np.float32),
+    }
     storage = MinariStorage.new(path, **spaces, env_spec=gym.spec(env_id))
     rng = np.random.default_rng(0)
     columns = [
@@ -136,7 +151,9 @@ def foreign(path, env_id="Pusher-v5", episodes=3, infos=None, actions=7, changed
     ]
     buffers = [EpisodeBuffer(**(c | (changed or {}))) for c in columns]
     storage.update_episodes(buffers)
-    storage.update_metadata({"dataset_id": "somebody/thing-v0", "minari_version": minari.__version__})
+    storage.update_metadata(
+        {"dataset_id": "somebody/thing-v0", "minari_version": minari.__version__}
+    )
     return buffers
 
 
@@ -145,7 +162,9 @@ def test_a_dataset_of_somebody_elses_environment_is_read_as_observation_and_acti
     episodes = read_dataset(tmp_path / "theirs")
     env = StreamRecorder(gym.make("Pusher-v5"))
     for n, (episode, buffer) in enumerate(zip(episodes, buffers, strict=True)):
-        expected = np.concatenate([buffer.observations[1:], buffer.actions], axis=1).astype(np.float32)
+        expected = np.concatenate([buffer.observations[1:], buffer.actions], axis=1).astype(
+            np.float32
+        )
         np.testing.assert_array_equal(episode.stream, expected)
         assert episode.seed == n
         assert not episode.success
@@ -161,8 +180,12 @@ def test_streams_that_run_faster_than_control_are_kept_whole(tmp_path):
     assert (len(episode.stream), len(episode.actions)) == (20, 4)
     write_dataset(tmp_path, "asm_gym/lift-v0", [episode], env, {})
     assert_same(read_dataset(tmp_path)[0], episode)
-    with pytest.raises(ValueError, match="episode 0 needs an action, a reward and a flat observation"):
-        write_dataset(tmp_path, "asm_gym/lift-v0", [replace(episode, observations=np.zeros((0, 0)))], env, {})
+    with pytest.raises(
+        ValueError, match="episode 0 needs an action, a reward and a flat observation"
+    ):
+        write_dataset(
+            tmp_path, "asm_gym/lift-v0", [replace(episode, observations=np.zeros((0, 0)))], env, {}
+        )
     env.close()
 
 
@@ -195,7 +218,21 @@ def test_no_name_leads_out_of_the_root_and_nothing_of_others_is_removed(tmp_path
     (tmp_path / "elsewhere").mkdir()
     (root / "link").symlink_to(tmp_path / "elsewhere")
     episodes = _observed(sine_episodes(2))
-    for name in ("..", "", ".", "/etc", "a/../..", "a//b", "~", "../root", "a/", None, 3, "link", "link/a-v0"):
+    for name in (
+        "..",
+        "",
+        ".",
+        "/etc",
+        "a/../..",
+        "a//b",
+        "~",
+        "../root",
+        "a/",
+        None,
+        3,
+        "link",
+        "link/a-v0",
+    ):
         with pytest.raises(ValueError, match=r"dataset_id must be|is a link"):
             write_dataset(root, name, episodes, _Sines(), {})
     (root / "mine" / "data").mkdir(parents=True)
@@ -204,7 +241,9 @@ def test_no_name_leads_out_of_the_root_and_nothing_of_others_is_removed(tmp_path
         write_dataset(root, "mine", episodes, _Sines(), {})
     with pytest.raises(ValueError, match=r"did not write .*mine\.txt"):
         write_dataset(root, "mine.txt", episodes, _Sines(), {})
-    assert {f.read_text() for f in (others, root / "mine.txt", root / "mine" / "data" / "notes.txt")} == {"kept"}
+    assert {
+        f.read_text() for f in (others, root / "mine.txt", root / "mine" / "data" / "notes.txt")
+    } == {"kept"}
     write_dataset(root, "ours", episodes, _Sines(), {})
     write_dataset(root, "ours", episodes[:1], _Sines(), {})
     assert len(read_dataset(root / "ours")) == 1
@@ -222,12 +261,17 @@ def test_a_full_disk_is_a_line_that_names_the_file_and_nothing_is_lost(tmp_path,
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"rewards": np.array([0.0] * 9 + [np.nan])}, "the reward of step 9 must be finite, got nan"),
+        (
+            {"rewards": np.array([0.0] * 9 + [np.nan])},
+            "the reward of step 9 must be finite, got nan",
+        ),
         ({"actions": np.zeros((20, 7), np.float32)}, "10 rewards need 10 actions, got 20"),
         ({"observations": np.zeros((10, 23))}, "10 rewards need 11 observations, got 10"),
     ],
 )
-def test_rewards_that_are_no_numbers_and_arrays_of_other_lengths_are_refused(changed, message, tmp_path):
+def test_rewards_that_are_no_numbers_and_arrays_of_other_lengths_are_refused(
+    changed, message, tmp_path
+):
     foreign(tmp_path / "theirs", episodes=1, changed=changed)
     with pytest.raises(ValueError, match=message):
         read_dataset(tmp_path / "theirs")
@@ -245,7 +289,9 @@ def test_what_a_file_declares_must_be_in_it(tmp_path):
             opened["episode_0"].create_dataset("observations", **more)
 
     declare(shape=(11, 23), dtype="f8")
-    with pytest.raises(ValueError, match="observations declares 2024 bytes that were never written"):
+    with pytest.raises(
+        ValueError, match="observations declares 2024 bytes that were never written"
+    ):
         read_dataset(tmp_path / "theirs")
     file.write_bytes(whole)
     with h5py.File(file, "a") as opened:

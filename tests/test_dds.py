@@ -62,9 +62,13 @@ def publish() -> Iterator[Callable[..., None]]:
     """Publishes messages on a topic at 200 Hz, for so many seconds, in a thread."""
     over, threads = threading.Event(), []
 
-    def start(name: str, message: Callable[[int], object], seconds: float = 5.0, quality: object = None) -> None:
+    def start(
+        name: str, message: Callable[[int], object], seconds: float = 5.0, quality: object = None
+    ) -> None:
         participant = domain.DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
-        writer = pub.DataWriter(participant, topic.Topic(participant, f"rt{name}", type(message(0))), qos=quality)
+        writer = pub.DataWriter(
+            participant, topic.Topic(participant, f"rt{name}", type(message(0))), qos=quality
+        )
 
         def run() -> None:
             for k in range(int(seconds * RATE)):
@@ -84,7 +88,9 @@ def publish() -> Iterator[Callable[..., None]]:
 def joints(k: int) -> JointState:
     stamp = 1000 + k / RATE
     numbers = [float(k), float(-k)]
-    return JointState(Header(Time(int(stamp), round(1e9 * (stamp % 1))), ""), NAMES, numbers, numbers, [])
+    return JointState(
+        Header(Time(int(stamp), round(1e9 * (stamp % 1))), ""), NAMES, numbers, numbers, []
+    )
 
 
 def lines(topics: str = "/joint_states", silence: float = 0.5) -> Iterator[str]:
@@ -95,16 +101,24 @@ def test_joints_are_read_by_the_names_that_a_bag_gives_them(publish):
     publish("/joint_states", joints)
     rows = [json.loads(line) for _, line in zip(range(20), lines(), strict=False)]
     kinds = ("position", "velocity")
-    assert set(rows[0]) == {"time", *(f"joint_states.{kind}[{name}]" for kind in kinds for name in NAMES)}
+    assert set(rows[0]) == {
+        "time",
+        *(f"joint_states.{kind}[{name}]" for kind in kinds for name in NAMES),
+    }
     np.testing.assert_allclose(np.diff([row["time"] for row in rows]), 1 / RATE, rtol=1e-4)
     for row in rows:
         k = round((row["time"] - 1000) * RATE)
-        assert (row["joint_states.position[shoulder]"], row["joint_states.velocity[elbow]"]) == (k, -k)
+        assert (row["joint_states.position[shoulder]"], row["joint_states.velocity[elbow]"]) == (
+            k,
+            -k,
+        )
 
 
 def test_a_row_holds_the_newest_of_other_topics_and_nothing_of_one_that_fell_silent(publish):
     publish("/joint_states", joints, 4.0)
-    publish("/gripper", lambda k: JointState(Header(Time(0, 0), ""), ["finger"], [7.0], [], []), 1.0)
+    publish(
+        "/gripper", lambda k: JointState(Header(Time(0, 0), ""), ["finger"], [7.0], [], []), 1.0
+    )
     found = lines("/joint_states,/gripper")
     until, held = time.monotonic() + 3.0, []
     while time.monotonic() < until:
@@ -115,7 +129,9 @@ def test_a_row_holds_the_newest_of_other_topics_and_nothing_of_one_that_fell_sil
 
 def test_publishers_of_other_joints_on_one_topic_make_one_row(publish):
     def finger(k: int) -> JointState:
-        return JointState(Header(Time(0, 0), ""), ["finger"], [7.0], [1.0, 2.0], [])  # two velocities are whose?
+        return JointState(
+            Header(Time(0, 0), ""), ["finger"], [7.0], [1.0, 2.0], []
+        )  # two velocities are whose?
 
     publish("/joint_states", finger)
     publish("/joint_states", joints)
@@ -150,7 +166,10 @@ def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_r
     core, spec = (
         needs("cyclonedds.core"),
         StreamSpec(
-            tuple(Channel(f"joint_states.{kind}", 2, elements=tuple(NAMES)) for kind in ("position", "velocity")),
+            tuple(
+                Channel(f"joint_states.{kind}", 2, elements=tuple(NAMES))
+                for kind in ("position", "velocity")
+            ),
             1 / RATE,
         ),
     )
@@ -163,7 +182,9 @@ def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_r
         return joints(k + 1) if k in (20, 21) else made  # 20 is dropped, 21 sent twice
 
     reliable = core.Policy.Reliability.Reliable(0)
-    publish("/joint_states", shuffled, quality=core.Qos(reliable, core.Policy.Durability.TransientLocal))
+    publish(
+        "/joint_states", shuffled, quality=core.Qos(reliable, core.Policy.Durability.TransientLocal)
+    )
     reader = RowReader(spec)
     rows = [row for (row, _), _ in zip(reader.rows(lines()), range(80), strict=False)]
     read = [row for row in rows if row.read]
@@ -173,13 +194,19 @@ def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_r
     assert sum(not row.read for row in rows) in (1, 2)  # late, and sent twice
 
 
-def test_alarms_are_published_on_a_topic_and_who_joins_late_gets_the_last_one(tmp_path, monkeypatch, capsys):
+def test_alarms_are_published_on_a_topic_and_who_joins_late_gets_the_last_one(
+    tmp_path, monkeypatch, capsys
+):
     core, sub = needs("cyclonedds.core"), needs("cyclonedds.sub")
     rng = np.random.default_rng(0)
     spec = StreamSpec((Channel("q", 2, noise=1e-3),), 0.01)
     rows = np.sin(np.arange(300)[:, None] / [20, 30]) + 1e-3 * rng.normal(size=(40, 300, 2))
     episodes = [Episode.from_stream(each, spec) for each in rows.astype(np.float32)]
-    monitor = make_monitor("kalman", spec).fit(episodes[:20]).calibrate(episodes[20:], false_alarm_rate=0.05)
+    monitor = (
+        make_monitor("kalman", spec)
+        .fit(episodes[:20])
+        .calibrate(episodes[20:], false_alarm_rate=0.05)
+    )
     monitor.save(tmp_path / "m.asm")
     live = rows[0].copy()
     live[100:, 0] += 1.0
@@ -199,14 +226,30 @@ def test_alarms_are_published_on_a_topic_and_who_joins_late_gets_the_last_one(tm
         while not (found and found[0] and found[1]) and time.monotonic() < until:
             time.sleep(0.02)
             found[:] = [
-                [*before, *new] for before, new in zip(found or ([], []), (read(listener), read(late)), strict=True)
+                [*before, *new]
+                for before, new in zip(found or ([], []), (read(listener), read(late)), strict=True)
             ]
 
     monkeypatch.setattr("asm_gym.scripts.watch.lines_from", lambda *_: lines())
-    assert main(["watch", "-", "--monitor", str(tmp_path / "m.asm"), "--topic", "/asm_gym/alarms", "--json"]) == 1
+    assert (
+        main(
+            [
+                "watch",
+                "-",
+                "--monitor",
+                str(tmp_path / "m.asm"),
+                "--topic",
+                "/asm_gym/alarms",
+                "--json",
+            ]
+        )
+        == 1
+    )
     printed = [line for line in capsys.readouterr().out.splitlines() if '"kind": "alarm"' in line]
     assert [json.loads(text) for text in found[1]] == [json.loads(printed[-1])]
     assert json.loads(found[0][-1])["kind"] == "alarm"
     assert json.loads(printed[0])["channel"] == "q[0]"
-    assert main(["watch", str(tmp_path), "--monitor", str(tmp_path / "m.asm"), "--topic", "/a"]) == 2
+    assert (
+        main(["watch", str(tmp_path), "--monitor", str(tmp_path / "m.asm"), "--topic", "/a"]) == 2
+    )
     assert "--topic is for a live source" in capsys.readouterr().err

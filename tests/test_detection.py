@@ -45,7 +45,9 @@ from tests.streams import frozen, sine_episodes, sine_spec
 def accumulate(evidence, whitened, context, gains):
     """The equation of ``evidence``, the oracle of ``accumulated`` and of the compiled step."""
     vector = evidence.vector + gains[:, None] * (whitened[:, None, :] - evidence.vector)
-    return Evidence(vector, evidence.context + CONTEXT_GAIN * (context - evidence.context), evidence.steps + 1)
+    return Evidence(
+        vector, evidence.context + CONTEXT_GAIN * (context - evidence.context), evidence.steps + 1
+    )
 
 
 def usual(found, context):
@@ -77,7 +79,9 @@ def test_the_evidence_of_a_whole_episode_is_that_of_its_rows(steps):
         evidence = accumulate(evidence, e[None], c[None], gains)
         vectors.append(evidence.vector[0])
         running.append(evidence.context[0])
-    for found, wanted in zip(accumulated(whitened, contexts, gains), (vectors, running), strict=True):
+    for found, wanted in zip(
+        accumulated(whitened, contexts, gains), (vectors, running), strict=True
+    ):
         np.testing.assert_array_equal(found, wanted)
 
 
@@ -121,11 +125,15 @@ def test_habituation_finds_the_quantile_of_each_context_and_no_more_than_nominal
     assert nominal.max() < 2.0 * 3.5 + 2.0
 
 
-@pytest.mark.parametrize(("rate", "episodes"), [(0.5, 1), (0.1, 9), (0.05, 19), (0.01, 99), (0.07, 14), (0.001, 999)])
+@pytest.mark.parametrize(
+    ("rate", "episodes"), [(0.5, 1), (0.1, 9), (0.05, 19), (0.01, 99), (0.07, 14), (0.001, 999)]
+)
 def test_a_rate_needs_its_inverse_in_episodes_less_one(rate, episodes):
     assert conformal_episodes(rate) == episodes
     conformal_threshold(np.arange(episodes), rate)
-    with pytest.raises(ValueError, match=f"at least {episodes} nominal episodes, got {episodes - 1}"):
+    with pytest.raises(
+        ValueError, match=f"at least {episodes} nominal episodes, got {episodes - 1}"
+    ):
         conformal_threshold(np.arange(episodes - 1), rate)
 
 
@@ -133,7 +141,13 @@ def test_threshold_is_the_hand_computed_rank():
     maxima = np.array([5.0, 1.0, 9.0, 3.0, 7.0, 2.0, 8.0, 4.0, 6.0])
     assert [conformal_threshold(maxima, rate) for rate in (0.1, 0.25, 0.3)] == [9.0, 8.0, 7.0]
     blocks = Blocks(np.array([5.0, 1.0, 9.0, 3.0, 7.0]), np.full(5, 0.5))  # 2.5 hours
-    rates = {0.4: 9.0, 0.79: 9.0, 0.8: 7.0, 1.2: 5.0, 100.0: 1.0}  # at 0.8 one may exceed it: 1 + 1 <= 0.8 * 2.5
+    rates = {
+        0.4: 9.0,
+        0.79: 9.0,
+        0.8: 7.0,
+        1.2: 5.0,
+        100.0: 1.0,
+    }  # at 0.8 one may exceed it: 1 + 1 <= 0.8 * 2.5
     assert [hourly_threshold(blocks, rate) for rate in rates] == list(rates.values())
 
 
@@ -142,13 +156,17 @@ def test_a_fresh_episode_exceeds_the_threshold_as_rarely_as_promised(n, rate):
     rng, trials = np.random.default_rng(n), 20_000
     draws = rng.exponential(size=(trials, n + 1))
     rank = np.array([d[-1] > conformal_threshold(d[:-1], rate) for d in draws])
-    exact = (n + 1 - np.ceil((n + 1) * (1 - rate) - 1e-9)) / (n + 1)  # the rank of the fresh one is uniform
+    exact = (n + 1 - np.ceil((n + 1) * (1 - rate) - 1e-9)) / (
+        n + 1
+    )  # the rank of the fresh one is uniform
     assert exact <= rate
     assert rank.mean() == pytest.approx(exact, abs=4 * np.sqrt(exact * (1 - exact) / trials))
 
 
 def test_the_tail_of_few_maxima_is_that_of_hill_and_weissman():
-    maxima = np.concatenate([np.linspace(1.0, 4.0, 90), 4.0 * np.exp(np.arange(1, 11) / 10.0)])  # 10 of 100 above 4
+    maxima = np.concatenate(
+        [np.linspace(1.0, 4.0, 90), 4.0 * np.exp(np.arange(1, 11) / 10.0)]
+    )  # 10 of 100 above 4
     hill = np.mean(np.arange(1, 11) / 10.0)
     expected = 4.0 * (10 / 1.0) ** (hill * (1 + 0.6 / np.sqrt(10)))  # one of 100, as 0.01 allows
     assert episode_threshold(maxima, 0.01) == pytest.approx(expected)
@@ -156,7 +174,11 @@ def test_the_tail_of_few_maxima_is_that_of_hill_and_weissman():
     promise = Promise.of(maxima, episode_threshold(maxima, 0.01))
     assert promise.modelled
     assert promise.rate == pytest.approx(0.01)
-    for sample, rate in ((maxima, 0.05), (maxima[:40], 0.05), (np.ones(100), 0.01)):  # enough; too few; no tail
+    for sample, rate in (
+        (maxima, 0.05),
+        (maxima[:40], 0.05),
+        (np.ones(100), 0.01),
+    ):  # enough; too few; no tail
         assert episode_threshold(sample, rate) == conformal_threshold(sample, rate)
         assert not Promise.of(sample, episode_threshold(sample, rate)).modelled
     with pytest.raises(ValueError, match="at least 99 nominal episodes, got 80"):
@@ -169,7 +191,9 @@ def test_the_tail_of_few_maxima_is_that_of_hill_and_weissman():
 @pytest.mark.parametrize("n", [100, 150, 300])
 def test_a_modelled_threshold_keeps_the_rate_and_varies_less_than_a_counted_one(law, n):
     draws = law.rvs(size=(2000, n), random_state=n)
-    modelled, counted = (law.sf([how(d, 0.01) for d in draws]) for how in (episode_threshold, conformal_threshold))
+    modelled, counted = (
+        law.sf([how(d, 0.01) for d in draws]) for how in (episode_threshold, conformal_threshold)
+    )
     assert modelled.mean() <= 0.01
     assert modelled.std() < counted.std()
 
@@ -193,7 +217,11 @@ def operation(rng: np.random.Generator, hours: float) -> list[np.ndarray]:
 def test_an_alarm_that_persists_or_returns_within_a_minute_is_one():
     value = np.zeros(5 * ROWS)
     counts = [alarms_in(value, 1.0, DT)]
-    for part in (slice(10, 3 * ROWS), slice(3 * ROWS + ROWS // 2, 3 * ROWS + ROWS // 2 + 1), slice(-1, None)):
+    for part in (
+        slice(10, 3 * ROWS),
+        slice(3 * ROWS + ROWS // 2, 3 * ROWS + ROWS // 2 + 1),
+        slice(-1, None),
+    ):
         value[part] = 2.0
         counts.append(alarms_in(value, 1.0, DT))
     assert counts == [0, 1, 1, 2]
@@ -249,7 +277,10 @@ def alarms_of(how: AdaptiveThreshold, maxima: np.ndarray, start: float = 1.0) ->
 @settings(max_examples=200, deadline=None)
 def test_no_sequence_of_episodes_has_more_alarms_than_the_bound(maxima, rate, step):
     how = AdaptiveThreshold(rate, step, ceiling=4.0)
-    assert alarms_of(how, np.array(maxima)).sum() <= rate * len(maxima) + math.log(4.0) / step + 1 + 1e-9
+    assert (
+        alarms_of(how, np.array(maxima)).sum()
+        <= rate * len(maxima) + math.log(4.0) / step + 1 + 1e-9
+    )
 
 
 def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
@@ -274,7 +305,9 @@ def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
 def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
     state, states = Repetition.start(1, rows.shape[1]), []
     for row in rows:
-        state = state.followed_by(row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most))
+        state = state.followed_by(
+            row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most)
+        )
         states.append(state)
     return states
 
@@ -296,9 +329,15 @@ def test_a_sense_that_was_stuck_for_long_is_believed_again_soon():
 
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
-    noisy = replace(sine_spec(), channels=tuple(replace(c, noise=0.5) for c in sine_spec().channels))
+    noisy = replace(
+        sine_spec(), channels=tuple(replace(c, noise=0.5) for c in sine_spec().channels)
+    )
     fit, others = (sine_episodes(30, seed=seed, spec=noisy, noise=0.5) for seed in (0, 1))
-    return NeuralASM(noisy, hidden_size=16, association_size=40, epochs=2).fit(fit).calibrate(others, 0.05)
+    return (
+        NeuralASM(noisy, hidden_size=16, association_size=40, epochs=2)
+        .fit(fit)
+        .calibrate(others, 0.05)
+    )
 
 
 def test_a_frozen_sense_alarms_within_four_rows_however_poor_the_prediction(asm):

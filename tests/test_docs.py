@@ -34,7 +34,11 @@ from asm_gym.tasks import OWN
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-MADE = (DOCS / "_build", DOCS / "reference" / "api", DOCS / "reference" / "commands.md")  # by a build of the site
+MADE = (
+    DOCS / "_build",
+    DOCS / "reference" / "api",
+    DOCS / "reference" / "commands.md",
+)  # by a build of the site
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
     *(p for p in sorted(DOCS.rglob("*.md")) if not any(p.is_relative_to(made) for made in MADE)),
@@ -47,7 +51,9 @@ EXAMPLES = sorted(
 FENCE = re.compile(r"^```([\w{}-]*)\n(.*?)^```\s*$", re.M | re.S)
 CODE = re.compile(r"`[^`\n]*`")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-FILE = re.compile(r"`((?:asm_gym|policies|wrappers|scripts|tests|docs)/[\w./-]+\.\w+)(?:::(\w+))?[^`]*`")
+FILE = re.compile(
+    r"`((?:asm_gym|policies|wrappers|scripts|tests|docs)/[\w./-]+\.\w+)(?:::(\w+))?[^`]*`"
+)
 NEEDS = re.compile(r"<!-- needs: ([\w. ]+) -->\n\Z")
 SMALL = re.compile(r"<!-- small: ([^\n]*) -->\n\Z")
 
@@ -80,7 +86,9 @@ def blocks(path: Path) -> list[Block]:
             long, short = pair.split(" -> ")
             assert long in code, f"{name(path)}: {long!r} of the comment is not in the block"
             code = code.replace(long, short, 1)
-        found.append(Block(match[1], code, above.count("\n") + 2, needs[1].split() if needs else []))
+        found.append(
+            Block(match[1], code, above.count("\n") + 2, needs[1].split() if needs else [])
+        )
     return found
 
 
@@ -91,7 +99,9 @@ def installed(module: str) -> bool:
 
 def python_page(page: Path) -> Any:
     """Pages that record robots and fit memories are slow; README does so too, and is what people try first."""
-    slow = page.name != "README.md" and any("collect(" in b.text for b in blocks(page) if b.language == "python")
+    slow = page.name != "README.md" and any(
+        "collect(" in b.text for b in blocks(page) if b.language == "python"
+    )
     return pytest.param(page, marks=pytest.mark.slow if slow else (), id=name(page))
 
 
@@ -105,8 +115,12 @@ def registries():
         registry.update(before)
 
 
-@pytest.mark.parametrize("page", [python_page(p) for p in PAGES if any(b.language == "python" for b in blocks(p))])
-def test_python_of_a_page_runs_from_top_to_bottom(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    "page", [python_page(p) for p in PAGES if any(b.language == "python" for b in blocks(p))]
+)
+def test_python_of_a_page_runs_from_top_to_bottom(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.chdir(tmp_path)
     module = ModuleType("page")
     monkeypatch.setitem(sys.modules, "page", module)
@@ -146,10 +160,15 @@ def check_command(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert code == 0, line
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if any(b.language == "sh" for b in blocks(p))], ids=name)
+@pytest.mark.parametrize(
+    "page", [p for p in PAGES if any(b.language == "sh" for b in blocks(p))], ids=name
+)
 def test_commands_of_a_page_parse(page: Path, monkeypatch: pytest.MonkeyPatch):
     recorder = "".join(f'{p}() {{ printf "%q " {p} "$@"; echo; }}; ' for p in ("asm-gym", "make"))
-    recorder += "".join(f"{p}() {{ :; }}; " for p in ("apt-get", "pip", "git", "cd", "docker", "uv", "python", "sudo"))
+    recorder += "".join(
+        f"{p}() {{ :; }}; "
+        for p in ("apt-get", "pip", "git", "cd", "docker", "uv", "python", "sudo")
+    )
     for block in blocks(page):
         if block.language == "sh":
             script = ["/bin/bash", "-euc", f"{recorder}\n{block.text}"]
@@ -192,7 +211,9 @@ def test_links_anchors_pictures_and_files_exist(page: Path):
     for target in LINK.findall(CODE.sub("", FENCE.sub("", text))):
         file, _, anchor = target.partition("#")
         place = (page.parent / file).resolve() if file else page
-        if not re.match(r"https?:|mailto:", target) and not any(place.is_relative_to(made) for made in MADE):
+        if not re.match(r"https?:|mailto:", target) and not any(
+            place.is_relative_to(made) for made in MADE
+        ):
             assert place.exists(), target
             assert not anchor or anchor in anchors(place), target
     for file, test in FILE.findall(text):
@@ -203,7 +224,9 @@ def test_links_anchors_pictures_and_files_exist(page: Path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_code_of_a_notebook_runs_and_no_output_is_kept(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_code_of_a_notebook_runs_and_no_output_is_kept(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     if path.stem == "guard_an_agent":
         pytest.importorskip("IPython", reason="pip install 'asm-gym[notebooks]'")
     monkeypatch.chdir(tmp_path)
@@ -218,14 +241,20 @@ def test_the_page_on_info_names_every_field():
     spec = StreamSpec((Channel("q", 1),), dt=0.1)
     said = asm_info([RowReport(RobotTable(1, spec, 1.0).records, np.zeros((1, 1)))], 0, spec)
     page = (DOCS / "reference" / "info.md").read_text(encoding="utf-8")
-    assert [name for name in (*said, *said["severity"], "alarms", "slowed") if f"`{name}`" not in page] == []
+    assert [
+        name for name in (*said, *said["severity"], "alarms", "slowed") if f"`{name}`" not in page
+    ] == []
 
 
 SLOW = ("film_an_alarm", "live_udp")
 
 
 @pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=pytest.mark.slow if p.stem in SLOW else (), id=p.stem) for p in EXAMPLES]
+    "path",
+    [
+        pytest.param(p, marks=pytest.mark.slow if p.stem in SLOW else (), id=p.stem)
+        for p in EXAMPLES
+    ],
 )
 def test_an_example_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
@@ -245,6 +274,19 @@ def test_the_docstring_example_of_a_public_name_runs(public: str):
 
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path: Path):
-    command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "-q", "-d", str(tmp_path / "trees")]
-    done = subprocess.run([*command, str(DOCS), str(tmp_path / "html")], capture_output=True, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-b",
+        "html",
+        "-W",
+        "--keep-going",
+        "-q",
+        "-d",
+        str(tmp_path / "trees"),
+    ]
+    done = subprocess.run(
+        [*command, str(DOCS), str(tmp_path / "html")], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr

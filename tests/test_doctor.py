@@ -63,7 +63,8 @@ def test_what_only_video_needs_is_optional(machine: Any, capsys: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("draws", "backend"), [(("egl", "osmesa"), "egl"), (("egl",), "egl"), (("osmesa",), "osmesa"), ((), None)]
+    ("draws", "backend"),
+    [(("egl", "osmesa"), "egl"), (("egl",), "egl"), (("osmesa",), "osmesa"), ((), None)],
 )
 def test_the_first_backend_that_draws_is_taken_and_looked_for_once(
     machine: Any, draws: tuple[str, ...], backend: str | None, monkeypatch: pytest.MonkeyPatch
@@ -76,8 +77,12 @@ def test_the_first_backend_that_draws_is_taken_and_looked_for_once(
     assert dict(os.environ) == before
 
 
-@pytest.mark.parametrize(("name", "version"), [("mujoco", "3.12.0"), ("mujoco", "3.3.7"), ("robosuite", "1.4.1")])
-def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name: str, version: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "version"), [("mujoco", "3.12.0"), ("mujoco", "3.3.7"), ("robosuite", "1.4.1")]
+)
+def test_a_version_out_of_range_is_needed_and_names_the_range(
+    machine: Any, name: str, version: str
+) -> None:
     machine(**{name: version})
     check = failed().pop(name)
     assert (check.found, check.needed) == (f"{version}, but needs {extras.TESTED[name]}", True)
@@ -88,7 +93,9 @@ def test_a_version_out_of_range_is_needed_and_names_the_range(machine: Any, name
 @pytest.mark.parametrize("numpy", ["1.26.4", "2.4.6"])
 def test_a_pyarrow_that_needs_numpy_2_is_named(machine: Any, numpy: str) -> None:
     machine(numpy=numpy, pyarrow="26.0.1")
-    assert [c.remedy for c in failed().values() if "pyarrow" in c.name] == ["pip install 'pyarrow<26'"] * (numpy < "2")
+    assert [c.remedy for c in failed().values() if "pyarrow" in c.name] == [
+        "pip install 'pyarrow<26'"
+    ] * (numpy < "2")
 
 
 def test_an_old_gymnasium_is_named_with_what_replaces_it(machine: Any) -> None:
@@ -98,7 +105,9 @@ def test_an_old_gymnasium_is_named_with_what_replaces_it(machine: Any) -> None:
     assert check.remedy.startswith("pip install 'gymnasium>=")
 
 
-@pytest.mark.parametrize(("name", "fits", "fails"), [("mujoco", "3.11.0", "3.12.0"), ("robosuite", "1.5.2", "1.5.1")])
+@pytest.mark.parametrize(
+    ("name", "fits", "fails"), [("mujoco", "3.11.0", "3.12.0"), ("robosuite", "1.5.2", "1.5.1")]
+)
 def test_a_simulator_out_of_range_is_refused_before_it_is_imported(
     name: str, fits: str, fails: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -110,21 +119,30 @@ def test_a_simulator_out_of_range_is_refused_before_it_is_imported(
         extras.check_simulator()
 
 
-def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(machine: Any, capsys: Any) -> None:
+def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(
+    machine: Any, capsys: Any
+) -> None:
     machine(numba=None, torch=None, robosuite=None)
     found = failed()
     assert (found["numba"].needed, found["numba"].remedy) == (True, doctor.REINSTALL)
-    assert (found["torch"].needed, found["torch"].remedy) == (False, "pip install 'asm-gym[agents]'")
+    assert (found["torch"].needed, found["torch"].remedy) == (
+        False,
+        "pip install 'asm-gym[agents]'",
+    )
     assert found["robosuite"].remedy == extras.INSTALL_ROBOSUITE
     assert doctor.main([]) == 1
-    assert extras.INSTALL_ROBOSUITE in capsys.readouterr().out  # in one line, however narrow the terminal is
+    assert (
+        extras.INSTALL_ROBOSUITE in capsys.readouterr().out
+    )  # in one line, however narrow the terminal is
 
 
 def test_a_machine_that_keeps_no_compiled_code_is_told_which_variable_names_a_folder(
     machine: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     machine()
-    monkeypatch.setattr(compilation, "kept_in", lambda function: tmp_path / f"{compilation.KEEP_NOWHERE}x")
+    monkeypatch.setattr(
+        compilation, "kept_in", lambda function: tmp_path / f"{compilation.KEEP_NOWHERE}x"
+    )
     assert "NUMBA_CACHE_DIR" in failed()["cache"].remedy
 
 

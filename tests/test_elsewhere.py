@@ -58,7 +58,11 @@ class Both(gym.Env):
         return self.observe(), 0.0, False, self.t >= 6, {}
 
     def observe(self):
-        return {"wheel": np.array([self.t, -self.t]), "lamp": self.t % 3, "gps": {"x": np.float32(0.5 * self.t)}}
+        return {
+            "wheel": np.array([self.t, -self.t]),
+            "lamp": self.t % 3,
+            "gps": {"x": np.float32(0.5 * self.t)},
+        }
 
 
 def test_a_dict_observation_has_a_channel_for_each_key():
@@ -71,8 +75,12 @@ def test_a_dict_observation_has_a_channel_for_each_key():
     rows = np.array([flat(rng_space, s) for s in samples], np.float32)
     wheel = spec.slices["wheel"]
     np.testing.assert_allclose(rows[:, wheel], [s["wheel"] for s in samples], rtol=1e-6)
-    np.testing.assert_array_equal(rows[:, spec.slices["lamp"]].argmax(axis=1), [s["lamp"] for s in samples])
-    columns = {k: [s[k] for s in samples] for k in ("wheel", "lamp")} | {"gps": {"x": [s["gps"]["x"] for s in samples]}}
+    np.testing.assert_array_equal(
+        rows[:, spec.slices["lamp"]].argmax(axis=1), [s["lamp"] for s in samples]
+    )
+    columns = {k: [s[k] for s in samples] for k in ("wheel", "lamp")} | {
+        "gps": {"x": [s["gps"]["x"] for s in samples]}
+    }
     np.testing.assert_array_equal(flat_rows(rng_space, columns, 4), rows)
 
 
@@ -105,9 +113,13 @@ def test_spaces_that_are_no_numbers_cannot_be_a_stream():
 
 def test_a_wrapper_that_changes_with_what_it_has_seen_belongs_outside():
     inside = NormalizeObservation(FakeEnv(own_stream=False))
-    monitor = CueMonitor(spec=StreamSpec((Channel("observation", 2), Channel("action", 3, group=MOTOR)), 0.05))
+    monitor = CueMonitor(
+        spec=StreamSpec((Channel("observation", 2), Channel("action", 3, group=MOTOR)), 0.05)
+    )
     for watch in (StreamRecorder, lambda env: NeuralASMSafety(env, monitor)):
-        with pytest.raises(ValueError, match=r"NormalizeObservation\(NeuralASMSafety\(env, monitor\)\)"):
+        with pytest.raises(
+            ValueError, match=r"NormalizeObservation\(NeuralASMSafety\(env, monitor\)\)"
+        ):
             watch(inside)
     inside.update_running_mean = False
     NeuralASMSafety(inside, monitor)
@@ -138,7 +150,10 @@ AT = 9
         (Bias(**VELOCITY, amount=0.5), lambda x: x[ONSET:] + 0.5),
         (Scale(**VELOCITY, factor=1.5), lambda x: x[ONSET:] * 1.5),
         (Freeze(**VELOCITY), lambda x: np.full(STEPS - ONSET, x[ONSET - 1])),
-        (Freeze(**VELOCITY, duration=2), lambda x: np.concatenate([np.full(2, x[ONSET - 1]), x[ONSET + 2 :]])),
+        (
+            Freeze(**VELOCITY, duration=2),
+            lambda x: np.concatenate([np.full(2, x[ONSET - 1]), x[ONSET + 2 :]]),
+        ),
         (Dropout(**VELOCITY, probability=1.0), lambda x: np.zeros(STEPS - ONSET)),
         (Delay(**VELOCITY, steps=1), lambda x: x[ONSET - 1 : -1]),
     ],
@@ -208,8 +223,18 @@ def named():
     ("env", "fault", "error", "message"),
     [
         (lambda: gym.make(ARM), Push(), ValueError, "Push needs a robosuite environment"),
-        (lambda: gym.make(ARM), Bias(channel="smell"), ValueError, "unknown channel 'smell'; known: joint_position"),
-        (lambda: gym.make(ARM), Bias(element=7), ValueError, r"element of joint_position must be .*\[0, 6\], got 7"),
+        (
+            lambda: gym.make(ARM),
+            Bias(channel="smell"),
+            ValueError,
+            "unknown channel 'smell'; known: joint_position",
+        ),
+        (
+            lambda: gym.make(ARM),
+            Bias(element=7),
+            ValueError,
+            r"element of joint_position must be .*\[0, 6\], got 7",
+        ),
         (
             lambda: gym.make("Pendulum-v1"),
             Noise(channel="observation", element=0, onset=200),
@@ -270,7 +295,16 @@ def test_what_a_dict_environment_did_is_a_dataset_and_comes_back(tmp_path):
 
 
 EVALUATE = [
-    *("--fit-episodes", "8", "--calibration-episodes", "19", "--nominal-episodes", "4", "--faulty-episodes", "3"),
+    *(
+        "--fit-episodes",
+        "8",
+        "--calibration-episodes",
+        "19",
+        "--nominal-episodes",
+        "4",
+        "--faulty-episodes",
+        "3",
+    ),
     *("--false-alarm-rate", "0.05", "--severities", "strong", "--workers", "1"),
     *("--monitors", "kalman+evidence", "association_linear+evidence", "force_limit"),
     *("--faults", "frozen_sense", "lost_rows", "action_scale"),
@@ -297,7 +331,13 @@ def test_any_environment_can_be_evaluated(tmp_path, capsys):
     )
     said = " ".join(capsys.readouterr().out.split())
     assert "force_limit is left out" in said
-    for row in ("ideal observer", "kalman+evidence", "frozen sense strong", "lost rows strong", "action scale strong"):
+    for row in (
+        "ideal observer",
+        "kalman+evidence",
+        "frozen sense strong",
+        "lost rows strong",
+        "action scale strong",
+    ):
         assert row in said
     table = (tmp_path / "run" / "results.md").read_text()
     assert "| frozen sense strong | 1.00 / 100 % | 1.00 / 100 % |" in table
@@ -342,7 +382,9 @@ def test_environments_of_others_give_streams_whose_senses_can_be_struck(package,
     assert episode.stream.shape == (20, episode.spec.size)
     assert np.isfinite(episode.stream).all()
     channel = episode.spec.channels[0]
-    struck = StreamRecorder(FaultInjection(env, [Bias(channel=channel.name, element=0, amount=9.0, onset=2)]))
+    struck = StreamRecorder(
+        FaultInjection(env, [Bias(channel=channel.name, element=0, amount=9.0, onset=2)])
+    )
     acting = make_policy(policy, struck, seed=0)
     observation, _ = struck.reset(seed=0)
     for _ in range(3):
@@ -374,7 +416,12 @@ def own_class():
 def test_robosuites_own_gym_wrapper_is_recorded():
     from robosuite.wrappers import GymWrapper
 
-    options = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False, "control_freq": 10}
+    options = {
+        "has_renderer": False,
+        "has_offscreen_renderer": False,
+        "use_camera_obs": False,
+        "control_freq": 10,
+    }
     recorder = StreamRecorder(GymWrapper(own_class()(robots="Panda", **options)))
     recorder.reset(seed=0)
     for _ in range(3):
@@ -386,11 +433,17 @@ def test_robosuites_own_gym_wrapper_is_recorded():
 
 def test_a_class_of_robosuite_becomes_a_task_with_named_channels():
     register_task("Decant", own_class(), horizon=6, robots="Sawyer", control_freq=10)
-    first, again = (collect("asm_gym/Decant-v0", "hold", episodes=1, seed=3, workers=1)[0] for _ in range(2))
+    first, again = (
+        collect("asm_gym/Decant-v0", "hold", episodes=1, seed=3, workers=1)[0] for _ in range(2)
+    )
     np.testing.assert_array_equal(first.stream, again.stream)
     units = {c.name: c.unit for c in first.spec.channels}
     assert (first.spec.source, first.spec.dt, len(first)) == ("Sawyer", 0.1, 6)
-    assert (units["robot0_joint_pos"], units["robot0_joint_vel"], units["robot0_joint_pos_cos"]) == (
+    assert (
+        units["robot0_joint_pos"],
+        units["robot0_joint_vel"],
+        units["robot0_joint_pos_cos"],
+    ) == (
         "rad",
         "rad/s",
         "1",

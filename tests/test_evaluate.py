@@ -13,7 +13,17 @@ from asm_gym.version import __version__
 
 MONITORS = ("neural_asm", "kalman+evidence", "association_linear", "force_limit")
 SMALL = [
-    *("--tasks", "Lift", "--faults", "push", "frozen_encoder", "gripper_opens", "--severities", "mild", "strong"),
+    *(
+        "--tasks",
+        "Lift",
+        "--faults",
+        "push",
+        "frozen_encoder",
+        "gripper_opens",
+        "--severities",
+        "mild",
+        "strong",
+    ),
     *("--fit-episodes", "4", "--calibration-episodes", "24"),
     *("--monitors", *MONITORS),
     *("--nominal-episodes", "4", "--faulty-episodes", "2"),
@@ -93,9 +103,22 @@ def test_impossible_arguments_are_refused(arguments, message, tmp_path, capsys):
 
 
 def test_quick_is_less_of_everything_that_was_not_asked_for():
-    asked = ["--quick", "--monitors", "neural_asm", "gru", "--tasks", "PickPlaceCan", "--fit-episodes", "60"]
+    asked = [
+        "--quick",
+        "--monitors",
+        "neural_asm",
+        "gru",
+        "--tasks",
+        "PickPlaceCan",
+        "--fit-episodes",
+        "60",
+    ]
     args = command.parse("evaluate", Args, asked)
-    assert (args.monitors, args.tasks, args.severities) == (("neural_asm", "gru"), ("PickPlaceCan",), ("strong",))
+    assert (args.monitors, args.tasks, args.severities) == (
+        ("neural_asm", "gru"),
+        ("PickPlaceCan",),
+        ("strong",),
+    )
     assert [args.episodes[role] for role in ("fit", "nominal", "calibration")] == [60, 8, 19]
 
 

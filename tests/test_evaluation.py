@@ -51,13 +51,17 @@ from asm_gym.monitors.calibration import AlarmRate
 from tests.streams import sine_episodes
 
 
-def a_trace(surprise: Any, onset: int | None = None, kind: str | None = None, **fields: Any) -> ScoredEpisode:
+def a_trace(
+    surprise: Any, onset: int | None = None, kind: str | None = None, **fields: Any
+) -> ScoredEpisode:
     """An episode of 0.1 s steps and the threshold 10."""
     kind = kind or ("nominal" if onset is None else "push")
     values: dict[str, Any] = {"dt": 0.1, "threshold": 10.0, "seed": 0, "onset": onset, **fields}
     outcome = [values.pop(name, default) for name, default in (("success", True), ("force", 0.0))]
     surprise = np.asarray(surprise, np.float64)
-    return ScoredEpisode(kind=kind, surprise=surprise, outcome=InterventionOutcome(*outcome), **values)
+    return ScoredEpisode(
+        kind=kind, surprise=surprise, outcome=InterventionOutcome(*outcome), **values
+    )
 
 
 # ------------------------------------------------------------------ scored episodes
@@ -74,7 +78,9 @@ def a_trace(surprise: Any, onset: int | None = None, kind: str | None = None, **
         ([20, 1, 20, 20], None, (0, 2), None),
     ],
 )
-def test_an_alarm_is_false_before_the_onset_and_a_detection_when_raised_since(surprise, onset, false, after):
+def test_an_alarm_is_false_before_the_onset_and_a_detection_when_raised_since(
+    surprise, onset, false, after
+):
     trace = a_trace(surprise, onset)
     assert (trace.false_alarms, trace.detected_after) == (false, after)
     assert trace.delay == (None if after is None else pytest.approx(0.1 * (after + 1)))
@@ -109,9 +115,16 @@ def test_another_threshold_changes_the_alarms_and_nothing_else():
 def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episodes_of_its_task():
     # Every episode is surprised at step 0, the nominal ones at step 3 too: only steps 1 and 2 may count.
     faulty = a_trace([99, 5, 7, 1], onset=1)
-    nominal = [a_trace([90, 6, 1, 90]), a_trace([90, 1, 8, 90]), a_trace([90, 7, 1, 90]), a_trace([90, 1, 1, 90])]
+    nominal = [
+        a_trace([90, 6, 1, 90]),
+        a_trace([90, 1, 8, 90]),
+        a_trace([90, 7, 1, 90]),
+        a_trace([90, 1, 1, 90]),
+    ]
     nominal.append(a_trace([90, 90, 90, 90], task="Door"))
-    assert Wins([faulty], nominal, 0.2).auroc() == pytest.approx(1 - (1 + 0.5) / 4)  # 8 above, 7 tied
+    assert Wins([faulty], nominal, 0.2).auroc() == pytest.approx(
+        1 - (1 + 0.5) / 4
+    )  # 8 above, 7 tied
     assert math.isnan(Wins([faulty], [a_trace([99])], 1.0).auroc())  # it ended before the onset
     assert math.isnan(Wins([a_trace([0, 9], onset=2)], nominal, 0.2).auroc())
 
@@ -119,7 +132,9 @@ def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episod
 def test_a_delay_is_at_least_one_step_and_a_late_alarm_is_a_miss():
     at_once, late = a_trace([1, 20, 1, 1, 1], onset=1), a_trace([1, 1, 1, 20, 1], onset=1)
     never, nominal = a_trace([1, 1, 1, 1, 1], onset=1), a_trace([20, 20])
-    assert delays_ms([late, at_once, never, nominal], window_s=0.3) == pytest.approx([100, 300, math.inf])
+    assert delays_ms([late, at_once, never, nominal], window_s=0.3) == pytest.approx(
+        [100, 300, math.inf]
+    )
     assert DetectionMetrics("", [late, at_once, never], [], window_s=0.2).detected == Share(1, 3)
 
 
@@ -132,14 +147,18 @@ def test_quantiles_of_the_delay_count_misses_as_infinitely_late():
 
 def test_alarms_an_hour_count_only_the_time_before_the_fault_and_one_a_minute():
     faulty = np.ones(1400)
-    faulty[[5, 6, 20, 50, 60, 661, 1310]] = 20  # the fifth and the sixth are more than a minute apart
+    faulty[[5, 6, 20, 50, 60, 661, 1310]] = (
+        20  # the fifth and the sixth are more than a minute apart
+    )
     nominal = np.ones(60)
     nominal[3] = 20
     found = hourly_alarms([a_trace(faulty, onset=1300), a_trace(nominal)])
     assert found == (3, pytest.approx(136 / 3600))
     excused = {"knock": np.full(60, 99.0)}
     assert hourly_alarms([a_trace(np.ones(60), excused=excused)], "knock").k == 1
-    assert hourly_alarms([a_trace(np.full(60, 20), excused=excused)], "knock").k == 0  # a fault is no knock beside it
+    assert (
+        hourly_alarms([a_trace(np.full(60, 20), excused=excused)], "knock").k == 0
+    )  # a fault is no knock beside it
     assert math.isnan(hourly_alarms([a_trace([1, 1], onset=0)]).value)
 
 
@@ -157,7 +176,11 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
     nominal, push = by_condition(traces, window_s=0.2)
     assert (nominal.name, len(nominal.watched), nominal.delays) == ("nominal", 2, Delays())
     assert (false_alarms(nominal.watched), nominal.detected) == (Share(1, 2), Share(0, 0))
-    assert (push.name, len(push.watched), push.detected) == ("push", 3, Share(1, 3))  # the third alarm is late
+    assert (push.name, len(push.watched), push.detected) == (
+        "push",
+        3,
+        Share(1, 3),
+    )  # the third alarm is late
     assert push.delays == Delays(math.inf, math.inf)
     assert push.auroc == pytest.approx(1 / 6)  # maxima 20, 1, 1 against 3, 30
     alone, held = push.outcomes
@@ -170,20 +193,27 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
 
 
 @pytest.mark.parametrize(
-    ("k", "n", "low", "high"), [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611), (0, 0, 0, 1)]
+    ("k", "n", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0, 0.1611), (0, 0, 0, 1)],
 )
 def test_wilson_gives_the_intervals_of_newcombe_1998(k, n, low, high):
     assert Share(k, n).interval == pytest.approx((low, high), abs=5e-5)
 
 
-@pytest.mark.parametrize(("k", "low", "high"), [(0, 0.0, 3.6889), (1, 0.0253, 5.5716), (100, 81.3640, 121.6268)])
+@pytest.mark.parametrize(
+    ("k", "low", "high"), [(0, 0.0, 3.6889), (1, 0.0253, 5.5716), (100, 81.3640, 121.6268)]
+)
 def test_a_rate_has_the_intervals_of_garwood_1936(k, low, high):
     assert Rate(k, 1.0).interval == pytest.approx((low, high), abs=5e-5)
 
 
 def test_a_rate_is_by_the_hour_and_unknown_without_time():
     assert Rate(5, 2.0).interval == pytest.approx((1.6235 / 2, 11.6683 / 2), abs=5e-5)
-    assert (Rate(5, 2.0).text, Rate(0, 0.0).text, Rate(0, 0.0).interval) == ("2.5 (0.8 to 5.8)", "", (0.0, math.inf))
+    assert (Rate(5, 2.0).text, Rate(0, 0.0).text, Rate(0, 0.0).interval) == (
+        "2.5 (0.8 to 5.8)",
+        "",
+        (0.0, math.inf),
+    )
     assert math.isnan(Rate(0, 0.0).value)
 
 
@@ -206,7 +236,10 @@ def test_the_bounds_are_what_the_likelihood_ratio_reaches():
     S = separation(signal, np.zeros((3, 2)), noise, onset=0)
     assert S[-1] == pytest.approx(((signal / noise) ** 2).sum())
     draws = rng.standard_normal((2, 40_000, 3, 2)) * noise
-    ratio = [((x * signal - signal**2 / 2) / noise**2).sum(axis=(1, 2)) for x in (draws[0], draws[1] + signal)]
+    ratio = [
+        ((x * signal - signal**2 / 2) / noise**2).sum(axis=(1, 2))
+        for x in (draws[0], draws[1] + signal)
+    ]
     assert ratio[1].mean() == pytest.approx(S[-1] / 2, rel=0.03)
     assert auroc(ratio[1], ratio[0]) == pytest.approx(float(auroc_bound(S[-1])), abs=0.005)
     threshold = np.quantile(ratio[0], 0.95)
@@ -235,7 +268,9 @@ def judged(peak, kind="nominal", severity="", onset=None):
     surprise = np.zeros(10)
     surprise[5] = peak
     affected = frozenset("a")
-    trace = ScoredEpisode(kind, 0, 0.05, 3.5, surprise, onset, severity, "Lift", "asm", affected_channels=affected)
+    trace = ScoredEpisode(
+        kind, 0, 0.05, 3.5, surprise, onset, severity, "Lift", "asm", affected_channels=affected
+    )
     return trace.attributed(np.ones((10, 1)), ("a",))
 
 
@@ -255,7 +290,12 @@ RESULT = DetectionMetrics("asm", FAULTY, NOMINAL, 1.0, Calibration({ONE: 3.5, FI
 
 def test_a_kind_is_visible_where_an_ideal_observer_finds_half_of_it():
     # Power at 1 %: Φ(√S - 2.326), one half at S = 5.41.
-    found = [visibility(6.0), visibility(5.0, "touch"), visibility(100.0, "shove"), visibility(0.0, "shove")]
+    found = [
+        visibility(6.0),
+        visibility(5.0, "touch"),
+        visibility(100.0, "shove"),
+        visibility(0.0, "shove"),
+    ]
     assert list(visible_kinds(found).values()) == [True, False, True]
     ideal = Bound.of([visibility(2.0, delay=None), visibility(np.inf, delay=0.1)], 0.01)
     assert ideal.auroc == pytest.approx((0.8413447 + 1) / 2)  # Φ(√(2/2)) and 1
@@ -275,7 +315,11 @@ def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_no
     result = BenchmarkResult({"asm": RESULT}, seen, rate=0.01, window_s=1.0)
     table = monitors_table(result)
     ideal, asm = (dict(zip(table.headings, row, strict=True)) for row in table.rows)
-    assert (ideal["Monitor"], ideal["AUROC, same steps"], ideal["False alarms"]) == ("ideal observer", "1.000", "")
+    assert (ideal["Monitor"], ideal["AUROC, same steps"], ideal["False alarms"]) == (
+        "ideal observer",
+        "1.000",
+        "",
+    )
     assert asm["AUROC, same steps"].startswith("0.750 (")
     assert (asm["Found at 1 %"], asm["Found at 0.5 %"]) == ("50 %", "needs 199")
     assert (asm["False alarms"], asm["Median delay [ms]"]) == ("1 of 4 (5–70 %)", "50")
@@ -287,14 +331,22 @@ def test_the_tables_of_a_benchmark_put_the_ideal_observer_first_and_hide_what_no
 
 def test_a_promise_is_tried_on_random_halves_of_the_nominal_episodes():
     calibrated = np.random.default_rng(1).pareto(3.0, 300) + 1.0
-    nominal = [ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(calibrated[150:])]
+    nominal = [
+        ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p]))
+        for s, p in enumerate(calibrated[150:])
+    ]
     faulty = [
-        ScoredEpisode("push", 0, 0.1, 1.0, np.array([0.0, p, 0.0]), onset=1, severity="mild") for p in (0.5, 99.0)
+        ScoredEpisode("push", 0, 0.1, 1.0, np.array([0.0, p, 0.0]), onset=1, severity="mild")
+        for p in (0.5, 99.0)
     ]
     promises = dict.fromkeys((ONE, FIVE, AlarmRate(1.0, "hour")), 0.0)
     blocks = Blocks.of([t.surprise for t in nominal], 0.1)
-    one = DetectionMetrics("asm", faulty, nominal, 0.5, Calibration(promises, calibrated[:150], blocks))
-    table = splits_table(BenchmarkResult({"asm": one}, [visibility(100.0, severity="mild")], 0.05, 0.5))
+    one = DetectionMetrics(
+        "asm", faulty, nominal, 0.5, Calibration(promises, calibrated[:150], blocks)
+    )
+    table = splits_table(
+        BenchmarkResult({"asm": one}, [visibility(100.0, severity="mild")], 0.05, 0.5)
+    )
     for row in table.rows:
         for cell, rate in zip(row[1:3], (1.0, 5.0), strict=True):
             came, found = cell.split(", ")
@@ -305,7 +357,9 @@ def test_a_promise_is_tried_on_random_halves_of_the_nominal_episodes():
 
 def promised(calibrated, tested):
     """One monitor, by its maxima."""
-    nominal = [ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(tested)]
+    nominal = [
+        ScoredEpisode("nominal", s, 0.1, 1.0, np.array([0.0, p])) for s, p in enumerate(tested)
+    ]
     threshold = conformal_threshold(calibrated, 0.05)
     one = DetectionMetrics("asm", [], nominal, 0.5, Calibration({FIVE: threshold}, calibrated))
     return kept_table(BenchmarkResult({"asm": one}, [], 0.05, 0.5)).rows[0][1]
@@ -325,24 +379,32 @@ def test_a_kept_promise_is_called_broken_as_seldom_as_is_said_and_a_broken_one_i
 def peaked(peak: float, seed: int, onset: int | None = None, before: float = 0.0) -> ScoredEpisode:
     surprise = np.zeros(10)
     surprise[5], surprise[4] = peak, before
-    return ScoredEpisode("nominal" if onset is None else "push", seed, 0.1, 1.0, surprise, onset, task="Lift")
+    return ScoredEpisode(
+        "nominal" if onset is None else "push", seed, 0.1, 1.0, surprise, onset, task="Lift"
+    )
 
 
 def scenes(rng, faults: int, n: int = 60):
     """``faults`` faulty twins of each of ``n`` nominal episodes, which share what their scene adds."""
     height = rng.standard_normal(n)
     nominal = [peaked(float(np.exp(0.2 * h)), s) for s, h in enumerate(height)]
-    return [peaked(float(np.exp(h)), s, onset=5) for s, h in enumerate(height) for _ in range(faults)], nominal
+    return [
+        peaked(float(np.exp(h)), s, onset=5) for s, h in enumerate(height) for _ in range(faults)
+    ], nominal
 
 
 def test_more_faults_of_the_same_scenes_do_not_narrow_the_interval():
     widths = []
     for faults in (1, 20):
         calibration = Calibration({FIVE: 1.0}, np.ones(200))
-        drawn = resample(*scenes(np.random.default_rng(0), faults), calibration, 0.5, draws=200).found[FIVE]
+        drawn = resample(
+            *scenes(np.random.default_rng(0), faults), calibration, 0.5, draws=200
+        ).found[FIVE]
         widths.append(interval(0.5, drawn).high - interval(0.5, drawn).low)
     assert widths[1] == pytest.approx(widths[0], rel=0.05)
-    assert widths[0] == pytest.approx(4 * np.sqrt(0.25 / 60), rel=0.25)  # ± 2 standard errors of 60 scenes
+    assert widths[0] == pytest.approx(
+        4 * np.sqrt(0.25 / 60), rel=0.25
+    )  # ± 2 standard errors of 60 scenes
 
 
 def test_resamples_agree_with_the_results_that_they_are_about():
@@ -351,23 +413,34 @@ def test_resamples_agree_with_the_results_that_they_are_about():
     found = DetectionMetrics("asm", faulty, nominal, 0.5, calibration)
     assert np.mean(found.draws.auroc) == pytest.approx(found.auroc, abs=0.02)
     assert np.mean(found.draws.found[FIVE]) == pytest.approx(found.found[FIVE].value, abs=0.03)
-    up = [peaked(3.0, s, onset=5, before=2.0) for s in range(4)]  # an alarm that was up already is no detection
+    up = [
+        peaked(3.0, s, onset=5, before=2.0) for s in range(4)
+    ]  # an alarm that was up already is no detection
     assert not resample(up, nominal, calibration, 0.5, draws=20).found[FIVE].any()
 
 
 def test_the_lead_over_a_monitor_that_judged_alike_is_nothing():
     faulty, nominal = scenes(np.random.default_rng(4), 1)
-    one = DetectionMetrics("asm", faulty, nominal, 0.5, Calibration({FIVE: 1.0}, np.linspace(0.5, 1.1, 60)))
+    one = DetectionMetrics(
+        "asm", faulty, nominal, 0.5, Calibration({FIVE: 1.0}, np.linspace(0.5, 1.1, 60))
+    )
     seen = [Detectability("Lift", "push", "", t.seed, 100.0, 0.1) for t in faulty]
-    table = lead_table(BenchmarkResult({"asm": one, "twin": replace(one, name="twin")}, seen, 0.05, 0.5))
-    assert table.rows == [("twin", "+0.000 (+0.000 to +0.000), within chance", "+0.0 (+0.0 to +0.0), within chance")]
+    table = lead_table(
+        BenchmarkResult({"asm": one, "twin": replace(one, name="twin")}, seen, 0.05, 0.5)
+    )
+    assert table.rows == [
+        ("twin", "+0.000 (+0.000 to +0.000), within chance", "+0.0 (+0.0 to +0.0), within chance")
+    ]
 
 
 # ------------------------------------------------------------------ fitted monitors
 
 
 def recordings():
-    return [replace(episode, label=EpisodeLabel("Sines", "fit", seed=n)) for n, episode in enumerate(sine_episodes(8))]
+    return [
+        replace(episode, label=EpisodeLabel("Sines", "fit", seed=n))
+        for n, episode in enumerate(sine_episodes(8))
+    ]
 
 
 def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):

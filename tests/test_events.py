@@ -6,7 +6,15 @@ import pytest
 
 from asm_gym import Episode, NeuralASM
 from asm_gym.detection.alarm_rule import EVENTS
-from asm_gym.detection.benign_events import EXCUSED, FADING, FASTEST, KNOCKED_S, NEAR_STOP, SLIPPED, BenignEvents
+from asm_gym.detection.benign_events import (
+    EXCUSED,
+    FADING,
+    FASTEST,
+    KNOCKED_S,
+    NEAR_STOP,
+    SLIPPED,
+    BenignEvents,
+)
 from asm_gym.detection.detector import GAINS
 from asm_gym.monitors import Surprise
 from asm_gym.spec import StreamSpec
@@ -53,11 +61,28 @@ def test_what_the_senses_say_of_a_row(row, event, divisor):
 
 def test_a_joint_that_was_seen_on_its_way_is_at_its_stop_and_one_that_jumps_there_is_not():
     on_its_way = 1.0 - NEAR_STOP - 0.9 * FASTEST * ARM.dt
-    path = [0.5, on_its_way, 0.98, 1.05, 0.98]  # at 20 Hz a joint of 5 rad/s gets from there to its stop in a row
-    assert [event for event, _ in excused([changed(0, q) for q in path])] == ["", "", "stop", "stop", "stop"]
+    path = [
+        0.5,
+        on_its_way,
+        0.98,
+        1.05,
+        0.98,
+    ]  # at 20 Hz a joint of 5 rad/s gets from there to its stop in a row
+    assert [event for event, _ in excused([changed(0, q) for q in path])] == [
+        "",
+        "",
+        "stop",
+        "stop",
+        "stop",
+    ]
     for far in (0.5, -1.5, 1.2):  # across its range, or from past either stop
-        assert {event for event, _ in excused([changed(0, far), changed(0, 0.98), changed(0, 0.99)])} == {""}
-    assert excused([changed(0, 0.5), changed(0, np.nan), changed(0, 0.98)])[-1] == ("stop", EXCUSED)  # nobody saw it
+        assert {
+            event for event, _ in excused([changed(0, far), changed(0, 0.98), changed(0, 0.99)])
+        } == {""}
+    assert excused([changed(0, 0.5), changed(0, np.nan), changed(0, 0.98)])[-1] == (
+        "stop",
+        EXCUSED,
+    )  # nobody saw it
     other = changed(0, 0.98)
     other[1] = -1.98
     assert excused([changed(1, -1.9), other])[-1] == ("stop", EXCUSED)  # each joint by itself
@@ -70,7 +95,9 @@ def test_a_knock_is_felt_for_a_second_at_any_rate_and_fades_as_what_it_has_left_
         second = round(KNOCKED_S / dt)
         assert found[:second] == [("knock", EXCUSED)] * second
         fading = np.array([by for _, by in found[second:]])
-        assert [event for event, _ in found[second:]] == ["knock"] * FADING + [""] * (201 - second - FADING)
+        assert [event for event, _ in found[second:]] == ["knock"] * FADING + [""] * (
+            201 - second - FADING
+        )
         left = EXCUSED * (1 - min(GAINS)) ** (2 * np.arange(1, len(fading) + 1))  # of evidence
         assert (np.diff(fading) <= 0).all()
         np.testing.assert_allclose(fading, np.maximum(left, 1.0))
@@ -99,7 +126,10 @@ def wild(count, knocks=False, seed=0, spec=ARM):
 
 
 def test_knocks_set_no_threshold_of_faults_and_the_choice_is_saved(tmp_path):
-    plain, told = (NeuralASM(ARM, hidden_size=8, association_size=8, epochs=1, excuses=e) for e in (False, True))
+    plain, told = (
+        NeuralASM(ARM, hidden_size=8, association_size=8, epochs=1, excuses=e)
+        for e in (False, True)
+    )
     for memory in (plain, told):
         memory.fit(wild(20)).calibrate(wild(40, knocks=True, seed=1), false_alarms_per_hour=60.0)
     assert told.threshold < plain.threshold / 3
@@ -111,7 +141,9 @@ def test_knocks_set_no_threshold_of_faults_and_the_choice_is_saved(tmp_path):
     loaded = NeuralASM.load(tmp_path / "told.asm")
     assert loaded.excuses
     assert loaded.spec.channels[0].stops == ARM.channels[0].stops
-    np.testing.assert_array_equal(loaded.score(wild(1, knocks=True, seed=2)[0]).value, knocked.value)
+    np.testing.assert_array_equal(
+        loaded.score(wild(1, knocks=True, seed=2)[0]).value, knocked.value
+    )
 
 
 class Eventful(FadingMonitor):
@@ -126,7 +158,9 @@ class Eventful(FadingMonitor):
         value = np.where(excuse > 0, raw / EXCUSED, raw)
         shares = np.zeros((len(stream), self.spec.size))
         shares[:, 0] = value
-        return state._replace(steps=state.steps + 1), Surprise(value, shares, raw=raw, excuse=excuse)
+        return state._replace(steps=state.steps + 1), Surprise(
+            value, shares, raw=raw, excuse=excuse
+        )
 
 
 def lived(env, steps=15):
@@ -134,7 +168,14 @@ def lived(env, steps=15):
     said = []
     for _ in range(steps):
         *_, ended, _, info = env.step(np.array([0.5, -0.5, 1.0], np.float32))
-        said.append((info["asm"]["event"], bool(info["asm_alarm"]), info["asm"]["state"], float(info["cost"])))
+        said.append(
+            (
+                info["asm"]["event"],
+                bool(info["asm_alarm"]),
+                info["asm"]["state"],
+                float(info["cost"]),
+            )
+        )
         if ended:
             break
     return said
@@ -186,7 +227,9 @@ def test_a_knock_that_presses_too_hard_is_held_by_the_limits_all_the_same():
         def observe(self, state, stream):
             kind = np.full(len(stream), EVENTS.index("knock"), np.int8)
             nothing = np.zeros((len(stream), self.spec.size))
-            return state, Surprise(np.zeros(len(stream)), nothing, raw=np.full(len(stream), 9.0), excuse=kind)
+            return state, Surprise(
+                np.zeros(len(stream)), nothing, raw=np.full(len(stream), 9.0), excuse=kind
+            )
 
     lift = gym.make("asm_gym/Lift-v0")
     guarded = NeuralASMSafety(lift, Deaf([], spec=lift.unwrapped.stream_spec), "hold")

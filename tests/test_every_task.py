@@ -21,13 +21,17 @@ from asm_gym.tasks import TASKS
 def digest(env, seed=5, steps=20):
     """The hash of all that an episode returns for given actions."""
     sha = hashlib.sha256()
-    actions = np.random.default_rng(1).uniform(-1, 1, (steps, *env.action_space.shape)).astype(np.float32)
+    actions = (
+        np.random.default_rng(1).uniform(-1, 1, (steps, *env.action_space.shape)).astype(np.float32)
+    )
     observation, info = env.reset(seed=seed)
     sha.update(observation.tobytes() + info["stream"].tobytes())
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(action)
         sha.update(observation.tobytes() + info["stream"].tobytes())
-        sha.update(repr((reward, terminated, truncated, info["success"], info["contact_force"])).encode())
+        sha.update(
+            repr((reward, terminated, truncated, info["success"], info["contact_force"])).encode()
+        )
     # What comes after an unseeded reset is the seed's as well.
     observation, info = env.reset()
     sha.update(observation.tobytes() + info["stream"].tobytes())
@@ -38,8 +42,14 @@ def digest(env, seed=5, steps=20):
 def elsewhere():
     """Function of the same hashes from another process with another hash seed, made in another order."""
     code = "import json, tests.test_every_task as t; print(json.dumps(t.all_digests()))"
-    environment = {**os.environ, "PYTHONHASHSEED": "7", "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    environment = {
+        **os.environ,
+        "PYTHONHASHSEED": "7",
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
+    )
     return cache(lambda: json.loads(process.communicate()[0]))
 
 
@@ -57,7 +67,9 @@ def test_a_task_keeps_the_contract(name, elsewhere):
     env = gym.make(TASKS[name].id, horizon=400)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", "Setting the shape", DeprecationWarning, "robosuite")  # by NumPy 2.5
+        warnings.filterwarnings(
+            "ignore", "Setting the shape", DeprecationWarning, "robosuite"
+        )  # by NumPy 2.5
         check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)
         check_env_sb3(env.unwrapped, skip_render_check=True)
     env.reset(seed=3)
@@ -86,11 +98,15 @@ def test_objects_are_where_robosuite_says(name):
         observation = env.step(0.3 * np.ones(env.action_space.shape, np.float32))[0]
     theirs = env.robosuite_env
     theirs._get_observations(force_update=True)
-    expected = theirs._get_observations(force_update=True)  # relative poses lag behind absolute ones by one update
+    expected = theirs._get_observations(
+        force_update=True
+    )  # relative poses lag behind absolute ones by one update
     shown = [n for n in expected if n in observation]
     assert shown
     for n in shown:
-        np.testing.assert_allclose(observation[n], np.reshape(expected[n], -1), atol=1e-6, err_msg=n)
+        np.testing.assert_allclose(
+            observation[n], np.reshape(expected[n], -1), atol=1e-6, err_msg=n
+        )
     env.close()
 
 

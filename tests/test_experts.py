@@ -82,12 +82,20 @@ def test_fingers_close_along_the_nearest_side_of_a_cube(degrees):
     np.testing.assert_allclose(target[:, 2], [0, 0, -1])
     assert np.linalg.det(target) == pytest.approx(1.0)
     assert np.abs(cube.T @ target[:, 1]).max() == pytest.approx(1.0)
-    assert hand[:, 1] @ target[:, 1] >= np.cos(np.pi / 4) - 1e-9  # never turned further than half a quarter
+    assert (
+        hand[:, 1] @ target[:, 1] >= np.cos(np.pi / 4) - 1e-9
+    )  # never turned further than half a quarter
 
 
 @pytest.mark.parametrize(
     ("joints", "velocity", "since", "settled"),
-    [(2, 9.0, 5, False), (2, 9.0, 6, True), (6, 0.0, 11, False), (6, 0.0, 12, True), (6, 1.0, 29, False)],
+    [
+        (2, 9.0, 5, False),
+        (2, 9.0, 6, True),
+        (6, 0.0, 11, False),
+        (6, 0.0, 12, True),
+        (6, 1.0, 29, False),
+    ],
 )
 def test_fingers_that_turn_are_waited_for_until_they_stand_still(joints, velocity, since, settled):
     assert has_settled(np.full(joints, velocity), since, 6) == settled
@@ -102,7 +110,9 @@ def chosen(x, y, heading):
     closing, room = beside_walls(BREAD, turned, BIN / 2 - np.abs(np.array([x, y]) - BIN_AT))
     along = (turned @ closing)[:2]
     across = np.array([-along[1], along[0]])
-    corners = [(x, y) + a * _PALM[0] * along + b * _PALM[1] * across for a in (-1, 1) for b in (-1, 1)]
+    corners = [
+        (x, y) + a * _PALM[0] * along + b * _PALM[1] * across for a in (-1, 1) for b in (-1, 1)
+    ]
     return closing, room, np.array(corners)
 
 

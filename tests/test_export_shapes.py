@@ -33,7 +33,9 @@ class Motion(NamedTuple):
     def ns(self) -> np.ndarray:
         return START * 10**9 + np.rint(self.t * 1e9).astype(np.int64)
 
-    def columns(self, q: str = "q{}", v: str = "v{}", tau: str = "tau{}", first: int = 0) -> dict[str, np.ndarray]:
+    def columns(
+        self, q: str = "q{}", v: str = "v{}", tau: str = "tau{}", first: int = 0
+    ) -> dict[str, np.ndarray]:
         """The senses, named by patterns; an empty one leaves them out."""
         parts = ((q, self.q), (v, self.v), (tau, self.tau))
         return {n.format(k + first): x[:, k] for n, x in parts if n for k in range(2)}
@@ -47,7 +49,9 @@ def motion(hz: float, rows: int = ROWS, seed: int = 0) -> Motion:
     return Motion(t, q, v, 8 * np.cos(q) + 0.05 * rng.normal(size=(rows, 2)))
 
 
-def csv(path: Path, columns: dict[str, Any], sep: str = ",", encoding: str = "utf-8", **how: Any) -> Path:
+def csv(
+    path: Path, columns: dict[str, Any], sep: str = ",", encoding: str = "utf-8", **how: Any
+) -> Path:
     pd.DataFrame(columns).to_csv(path, sep=sep, index=False, encoding=encoding, **how)
     return path
 
@@ -93,7 +97,11 @@ def kuka_rsi(at: Path, m: Motion) -> Path:
     delay = {"Delay.D": np.zeros(ROWS, int)}
     return csv(
         at / "x.csv",
-        {"Time": stamps} | degrees | currents | delay | {"IPOC": 4_208_163_634 + 12 * np.arange(ROWS)},
+        {"Time": stamps}
+        | degrees
+        | currents
+        | delay
+        | {"IPOC": 4_208_163_634 + 12 * np.arange(ROWS)},
         ";",
     )
 
@@ -105,9 +113,14 @@ def kuka_fri(at: Path, m: Motion) -> Path:
 
 
 def libfranka(at: Path, m: Motion) -> Path:
-    state = {"success_rate": np.ones(ROWS)} | m.columns("state.q[{}]", "state.dq[{}]", "state.tau_J[{}]")
+    state = {"success_rate": np.ones(ROWS)} | m.columns(
+        "state.q[{}]", "state.dq[{}]", "state.tau_J[{}]"
+    )
     return csv(
-        at / "x.csv", {"time": 1000 * np.arange(1, ROWS + 1) // 1000} | state | {"cmd.tau_J_d[0]": 3 * m.tau[:, 0]}
+        at / "x.csv",
+        {"time": 1000 * np.arange(1, ROWS + 1) // 1000}
+        | state
+        | {"cmd.tau_J_d[0]": 3 * m.tau[:, 0]},
     )
 
 
@@ -120,7 +133,8 @@ def abb_egm(at: Path, m: Motion) -> Path:
 def plotjuggler(at: Path, m: Motion) -> Path:
     """Two topics in one table, empty cells where the other one spoke."""
     fast = pd.DataFrame(
-        {"__time": START + m.t} | {f"/joint_states/{n}/position": m.q[:, k] for k, n in enumerate(NAMES)}
+        {"__time": START + m.t}
+        | {f"/joint_states/{n}/position": m.q[:, k] for k, n in enumerate(NAMES)}
     )
     slow = pd.DataFrame({"__time": START + m.t[::5] + 0.002, "/wrench/force/z": m.tau[::5, 0]})
     return csv(at / "x.csv", pd.concat([fast, slow]).sort_values("__time").to_dict("list"))
@@ -128,7 +142,10 @@ def plotjuggler(at: Path, m: Motion) -> Path:
 
 def matlab_table(at: Path, m: Motion) -> Path:
     return csv(
-        at / "x.csv", {"Time": [f"{t:g} sec" for t in m.t]} | {"t_ms": 1000 * m.t} | m.columns("q_{}", "", "tau_{}", 1)
+        at / "x.csv",
+        {"Time": [f"{t:g} sec" for t in m.t]}
+        | {"t_ms": 1000 * m.t}
+        | m.columns("q_{}", "", "tau_{}", 1),
     )
 
 
@@ -149,29 +166,46 @@ def pandas_with_seconds_as_index(at: Path, m: Motion) -> Path:
 
 def influx(at: Path, m: Motion) -> Path:
     stamps = pd.to_datetime(m.ns).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-    return csv(at / "x.csv", {"name": ["arm"] * ROWS, "time": stamps, "host": ["cell 3"] * ROWS} | m.columns())
+    return csv(
+        at / "x.csv",
+        {"name": ["arm"] * ROWS, "time": stamps, "host": ["cell 3"] * ROWS} | m.columns(),
+    )
 
 
 def long_table(at: Path, m: Motion) -> Path:
-    rows = [(m.t[i], name, m.q[i, k], m.tau[i, k]) for i in range(ROWS) for k, name in enumerate(NAMES)]
-    return csv(at / "x.csv", pd.DataFrame(rows, columns=["time_s", "joint", "position", "effort"]).to_dict("list"))
+    rows = [
+        (m.t[i], name, m.q[i, k], m.tau[i, k]) for i in range(ROWS) for k, name in enumerate(NAMES)
+    ]
+    return csv(
+        at / "x.csv",
+        pd.DataFrame(rows, columns=["time_s", "joint", "position", "effort"]).to_dict("list"),
+    )
 
 
 def long_table_of_numbers(at: Path, m: Motion) -> Path:
     rows = [(m.t[i], k + 1, m.q[i, k]) for i in range(ROWS) for k in range(2)]
-    return csv(at / "x.csv", pd.DataFrame(rows, columns=["time", "joint_id", "angle"]).to_dict("list"))
+    return csv(
+        at / "x.csv", pd.DataFrame(rows, columns=["time", "joint_id", "angle"]).to_dict("list")
+    )
 
 
 def german(at: Path, m: Motion) -> Path:
     stamps = [f"24.11.2026 10:00:{t:06.3f}" for t in m.t]
-    columns = {"Zeitstempel_time": np.arange(ROWS), "timestamp": stamps, "Achse 1 [°]": np.degrees(m.q[:, 0])}
-    return csv(at / "x.csv", columns | {"Achse 2 [°]": np.degrees(m.q[:, 1])}, ";", "latin-1", decimal=",")
+    columns = {
+        "Zeitstempel_time": np.arange(ROWS),
+        "timestamp": stamps,
+        "Achse 1 [°]": np.degrees(m.q[:, 0]),
+    }
+    return csv(
+        at / "x.csv", columns | {"Achse 2 [°]": np.degrees(m.q[:, 1])}, ";", "latin-1", decimal=","
+    )
 
 
 def excel_unicode(at: Path, m: Motion) -> Path:
     return csv(
         at / "x.tsv",
-        {"Time": [f"9:59:{59 + t:06.3f}" if t < 1 else f"10:00:{t - 1:06.3f}" for t in m.t]} | m.columns(),
+        {"Time": [f"9:59:{59 + t:06.3f}" if t < 1 else f"10:00:{t - 1:06.3f}" for t in m.t]}
+        | m.columns(),
         "\t",
         "utf-16",
     )
@@ -179,15 +213,26 @@ def excel_unicode(at: Path, m: Motion) -> Path:
 
 def labview(at: Path, m: Motion) -> Path:
     """A preamble, names, units below, and decimals behind a point."""
-    head = ["LabVIEW Measurement", "Writer_Version 2", "Operator: somebody", "time\tq1\tq2", "s\tdeg\tdeg"]
+    head = [
+        "LabVIEW Measurement",
+        "Writer_Version 2",
+        "Operator: somebody",
+        "time\tq1\tq2",
+        "s\tdeg\tdeg",
+    ]
     return text(
-        at / "x.txt", head + [f"{t:.4f}\t{a:.5f}\t{b:.5f}" for t, (a, b) in zip(m.t, np.degrees(m.q), strict=True)]
+        at / "x.txt",
+        head
+        + [f"{t:.4f}\t{a:.5f}\t{b:.5f}" for t, (a, b) in zip(m.t, np.degrees(m.q), strict=True)],
     )
 
 
 def units_in_names(at: Path, m: Motion) -> Path:
     degrees = {f"q{k}(deg)": np.degrees(m.q[:, k]) for k in range(2)}
-    return csv(at / "x.csv", {"time(ms)": 1000 * m.t} | degrees | {f"tau{k}_Nm": m.tau[:, k] for k in range(2)})
+    return csv(
+        at / "x.csv",
+        {"time(ms)": 1000 * m.t} | degrees | {f"tau{k}_Nm": m.tau[:, k] for k in range(2)},
+    )
 
 
 def milliseconds_without_unit(at: Path, m: Motion) -> Path:
@@ -201,12 +246,17 @@ def without_header(at: Path, m: Motion) -> Path:
 
 def words_in_the_first_row(at: Path, m: Motion) -> Path:
     state = ["starting"] + ["moving"] * (ROWS - 1)
-    return text(at / "x.csv", [f"{t:.4f},{a:.5f},{s}" for t, a, s in zip(m.t, m.q[:, 0], state, strict=True)])
+    return text(
+        at / "x.csv",
+        [f"{t:.4f},{a:.5f},{s}" for t, a, s in zip(m.t, m.q[:, 0], state, strict=True)],
+    )
 
 
 def hexadecimal(at: Path, m: Motion) -> Path:
     return csv(
-        at / "x.csv", {"time": m.t, "status": [hex(0x1000 + k % 3) for k in range(ROWS)]} | m.columns("q{}", "", "")
+        at / "x.csv",
+        {"time": m.t, "status": [hex(0x1000 + k % 3) for k in range(ROWS)]}
+        | m.columns("q{}", "", ""),
     )
 
 
@@ -229,17 +279,25 @@ def json_of_ros2(at: Path, m: Motion) -> Path:
     """`ros2 topic echo`, as JSON: names, and lists in their order."""
     stamps = [{"sec": int(ns // 10**9), "nanosec": int(ns % 10**9)} for ns in m.ns]
     rows = zip(stamps, m.q.tolist(), m.tau.tolist(), strict=True)
-    lists = [{"header": {"stamp": s}, "name": NAMES, "position": q, "velocity": [], "effort": f} for s, q, f in rows]
+    lists = [
+        {"header": {"stamp": s}, "name": NAMES, "position": q, "velocity": [], "effort": f}
+        for s, q, f in rows
+    ]
     return json_lines(at / "x.jsonl", lists)
 
 
 def json_of_two_publishers(at: Path, m: Motion) -> Path:
-    arm = [(t, {"t": t, "name": NAMES, "position": q}) for t, q in zip(m.t.tolist(), m.q.tolist(), strict=True)]
+    arm = [
+        (t, {"t": t, "name": NAMES, "position": q})
+        for t, q in zip(m.t.tolist(), m.q.tolist(), strict=True)
+    ]
     gripper = [
         (t, {"t": t, "name": ["finger"], "position": [f]})
         for t, f in zip((m.t[::3] + 0.001).tolist(), m.tau[::3, 0].tolist(), strict=True)
     ]
-    return json_lines(at / "x.jsonl", [row for _, row in sorted(arm + gripper, key=lambda each: each[0])])
+    return json_lines(
+        at / "x.jsonl", [row for _, row in sorted(arm + gripper, key=lambda each: each[0])]
+    )
 
 
 def parquet_with_index(at: Path, m: Motion) -> Path:
@@ -255,18 +313,25 @@ def structured(at: Path, m: Motion) -> Path:
 
 
 def matlab(at: Path, m: Motion) -> Path:
-    needs("scipy.io").savemat(at / "x.mat", {"data": {"time": m.t, "q": m.q.T, "tau": m.tau, "robot": "iiwa"}})
+    needs("scipy.io").savemat(
+        at / "x.mat", {"data": {"time": m.t, "q": m.q.T, "tau": m.tau, "robot": "iiwa"}}
+    )
     return at / "x.mat"
 
 
 def robomimic(at: Path, m: Motion) -> Path:
     with needs("h5py").File(at / "x.hdf5", "w") as file:
         data = file.create_group("data")
-        data.attrs["env_args"] = json.dumps({"env_name": "Lift", "env_kwargs": {"control_freq": 20}})
+        data.attrs["env_args"] = json.dumps(
+            {"env_name": "Lift", "env_kwargs": {"control_freq": 20}}
+        )
         for demo in range(2):
             group = data.create_group(f"demo_{demo}")
             group["actions"], group["rewards"] = m.v, np.zeros(ROWS)
-            group["obs/robot0_joint_pos"], group["obs/image"] = m.q, np.zeros((ROWS, 2, 2, 3), np.uint8)
+            group["obs/robot0_joint_pos"], group["obs/image"] = (
+                m.q,
+                np.zeros((ROWS, 2, 2, 3), np.uint8),
+            )
     return at / "x.hdf5"
 
 
@@ -279,12 +344,20 @@ def lerobot(at: Path, m: Motion, names: Any = NAMES, version: str = "v3.0") -> P
         "timestamp": m.t[keep].astype(np.float32),
     }
     count = int(keep.sum())
-    rows |= {"frame_index": np.arange(count), "episode_index": np.zeros(count, int), "index": np.arange(count)}
+    rows |= {
+        "frame_index": np.arange(count),
+        "episode_index": np.zeros(count, int),
+        "index": np.arange(count),
+    }
     (at / "x" / "meta").mkdir(parents=True)
     (at / "x" / "data").mkdir()
     pd.DataFrame(rows).to_parquet(at / "x" / "data" / "file-000.parquet")
     feature = {"dtype": "float32", "shape": [2], "names": names}
-    features = {"observation.state": feature, "action": feature, "observation.images.top": {"dtype": "video"}}
+    features = {
+        "observation.state": feature,
+        "action": feature,
+        "observation.images.top": {"dtype": "video"},
+    }
     info = {"codebase_version": version, "fps": 30, "features": features}
     (at / "x" / "meta" / "info.json").write_text(json.dumps(info))
     return at / "x"
@@ -292,11 +365,17 @@ def lerobot(at: Path, m: Motion, names: Any = NAMES, version: str = "v3.0") -> P
 
 def bag(at: Path, m: Motion, plugin: str = "SQLITE3", gripper: bool = False) -> Path:
     """Joint states; perhaps of a gripper too, on the same topic at a rate of its own."""
-    rosbag1, rosbag2, typesys = (needs(f"rosbags.{part}") for part in ("rosbag1", "rosbag2", "typesys"))
+    rosbag1, rosbag2, typesys = (
+        needs(f"rosbags.{part}") for part in ("rosbag1", "rosbag2", "typesys")
+    )
     first = plugin == "ROS1"
-    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(
+        typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE
+    )
     kind = "sensor_msgs/msg/JointState"
-    State, Header, Time = (store.types[n] for n in (kind, "std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+    State, Header, Time = (
+        store.types[n] for n in (kind, "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
     how = {} if first else {"version": 9, "storage_plugin": getattr(rosbag2.StoragePlugin, plugin)}
     path = at / ("x.bag" if first else "x")
     with (rosbag1 if first else rosbag2).Writer(path, **how) as writer:
@@ -304,7 +383,9 @@ def bag(at: Path, m: Motion, plugin: str = "SQLITE3", gripper: bool = False) -> 
         said = [(ns, NAMES, m.q[k], m.tau[k]) for k, ns in enumerate(m.ns.tolist())]
         if gripper:
             said += [
-                (ns + 10**6, ["finger"], m.v[k, :1], m.v[k, 1:]) for k, ns in enumerate(m.ns.tolist()) if k % 3 == 0
+                (ns + 10**6, ["finger"], m.v[k, :1], m.v[k, 1:])
+                for k, ns in enumerate(m.ns.tolist())
+                if k % 3 == 0
             ]
         for ns, names, q, tau in sorted(said, key=lambda each: each[0]):
             head = Header(*((0,) if first else ()), Time(ns // 10**9, ns % 10**9), "")
@@ -330,8 +411,12 @@ def two(*kinds: str, of: Any = range(2)) -> tuple[str, ...]:
 DEG = 180 / np.pi
 STATES = tuple(f"joint_states.{kind}[{n}]" for n in NAMES for kind in ("position", "effort"))
 SHAPES = {
-    "rostopic echo -p": Shape(rostopic_echo, 125, two("field.position", "field.velocity", "field.effort", of=NAMES)),
-    "rostopic echo -p, joints in any order": Shape(shuffled_names, 125, two("field.position", of=NAMES)),
+    "rostopic echo -p": Shape(
+        rostopic_echo, 125, two("field.position", "field.velocity", "field.effort", of=NAMES)
+    ),
+    "rostopic echo -p, joints in any order": Shape(
+        shuffled_names, 125, two("field.position", of=NAMES)
+    ),
     "rosbag 1": Shape(lambda at, m: bag(at, m, "ROS1"), 100, STATES),
     "rosbag 2, SQLite": Shape(bag, 100, STATES),
     "rosbag 2, MCAP": Shape(lambda at, m: bag(at, m, "MCAP"), 100, STATES),
@@ -343,14 +428,22 @@ SHAPES = {
     "UR RTDE": Shape(rtde, 500, two("actual_q", "actual_qd", "actual_current")),
     "KUKA RSI": Shape(kuka_rsi, 1000 / 12, two("AIPos.A", "MACur.A", of=(1, 2)), DEG),
     "KUKA FRI": Shape(kuka_fri, 200, two("measured_position", "external_torque")),
-    "libfranka": Shape(libfranka, 1000, (*two("state.q", "state.dq", "state.tau_J"), "cmd.tau_J_d[0]")),
+    "libfranka": Shape(
+        libfranka, 1000, (*two("state.q", "state.dq", "state.tau_J"), "cmd.tau_J_d[0]")
+    ),
     "ABB EGM": Shape(abb_egm, 250, two("joint", of=(1, 2)), DEG),
-    "PlotJuggler": Shape(plotjuggler, 100, (*(f"/joint_states/{n}/position" for n in NAMES), "/wrench/force/z")),
-    "MATLAB table": Shape(matlab_table, 100, two("q", "tau", of=(1, 2)), 1.0, ROWS, {"clock": "t_ms"}),
+    "PlotJuggler": Shape(
+        plotjuggler, 100, (*(f"/joint_states/{n}/position" for n in NAMES), "/wrench/force/z")
+    ),
+    "MATLAB table": Shape(
+        matlab_table, 100, two("q", "tau", of=(1, 2)), 1.0, ROWS, {"clock": "t_ms"}
+    ),
     "MATLAB file": Shape(matlab, 100, two("data.q", "data.tau")),
     "pandas to_csv": Shape(pandas_with_index, 50, two("q", "v", "tau")),
     "pandas to_csv, dates as index": Shape(pandas_with_times_as_index, 50, two("q", "v", "tau")),
-    "pandas to_csv, seconds as index": Shape(pandas_with_seconds_as_index, 50, two("q", "v", "tau")),
+    "pandas to_csv, seconds as index": Shape(
+        pandas_with_seconds_as_index, 50, two("q", "v", "tau")
+    ),
     "pandas to_parquet": Shape(parquet_with_index, 50, two("q", "v", "tau")),
     "InfluxDB": Shape(influx, 100, two("q", "v", "tau")),
     "a row a joint": Shape(long_table, 100, two("position", "effort", of=NAMES)),
@@ -361,17 +454,23 @@ SHAPES = {
     "units in names": Shape(units_in_names, 100, two("q", "tau"), DEG),
     "milliseconds without a unit": Shape(milliseconds_without_unit, 125, two("q", "v", "tau")),
     "no header": Shape(without_header, 100, two("q"), 1.0, ROWS, {"columns": ["t", "q0", "q1"]}),
-    "a word in the first row": Shape(words_in_the_first_row, 100, ("q",), 1.0, ROWS, {"columns": ["t", "q", "state"]}),
+    "a word in the first row": Shape(
+        words_in_the_first_row, 100, ("q",), 1.0, ROWS, {"columns": ["t", "q", "state"]}
+    ),
     "hexadecimal status": Shape(hexadecimal, 100, two("q")),
     "codes for missing data": Shape(codes_for_missing, 100, two("q")),
     "equal columns of one name": Shape(doubled, 100, two("q")),
     "JSON of ros2 topic echo": Shape(json_of_ros2, 100, two("position", "effort", of=NAMES)),
-    "JSON of two publishers": Shape(json_of_two_publishers, 100, two("position", of=(*NAMES, "finger"))),
+    "JSON of two publishers": Shape(
+        json_of_two_publishers, 100, two("position", of=(*NAMES, "finger"))
+    ),
     "NumPy records": Shape(structured, 100, two("q")),
     "robomimic": Shape(robomimic, 20, two("robot0_joint_pos", "actions")),
     "LeRobot 0.7": Shape(lerobot, 30, two("observation.state", "action", of=NAMES)),
     "LeRobot, nested names": Shape(
-        lambda at, m: lerobot(at, m, [NAMES], "v2.1"), 30, two("observation.state", "action", of=NAMES)
+        lambda at, m: lerobot(at, m, [NAMES], "v2.1"),
+        30,
+        two("observation.state", "action", of=NAMES),
     ),
 }
 

@@ -76,7 +76,12 @@ def test_a_fault_acts_on_time_and_only_then(stack, course, kind):
     again, _ = play(stack, actions)
     np.testing.assert_array_equal(again, healthy)
     inner = stack.unwrapped
-    assert (len(inner.edits), inner.corruptions, inner.deliveries, inner.substep_hooks) == (0, [], [], [])
+    assert (len(inner.edits), inner.corruptions, inner.deliveries, inner.substep_hooks) == (
+        0,
+        [],
+        [],
+        [],
+    )
 
 
 @pytest.mark.parametrize("fault", [Push(onset=4), WeakJoint(onset=4), faults.Payload(onset=4)])
@@ -90,7 +95,9 @@ def test_after_a_hard_reset_the_environment_is_as_new(lift, fault):
         return np.array([env.step(np.full(7, 0.2, np.float32))[4]["stream"] for _ in range(4)])
 
     fresh = gym.make("asm_gym/Lift-v0")
-    np.testing.assert_array_equal(second_episode(FaultInjection(lift, [fault])), second_episode(fresh))
+    np.testing.assert_array_equal(
+        second_episode(FaultInjection(lift, [fault])), second_episode(fresh)
+    )
     fresh.close()
 
 
@@ -110,7 +117,10 @@ def test_every_kind_of_the_suite_is_in_one_group_and_another_kind_moves_none():
 def test_edits_of_one_number_compose_and_end_in_any_order():
     ledger, array = SimulatorEdits(), np.array([0.3, 5.0])
     nominal, first, second = array.copy(), ExitStack(), ExitStack()
-    double, add = first.enter_context(ledger.edit(array, 0)), second.enter_context(ledger.edit(array, 0))
+    double, add = (
+        first.enter_context(ledger.edit(array, 0)),
+        second.enter_context(ledger.edit(array, 0)),
+    )
     double(lambda v: 2 * v)
     add(lambda v: v + 0.1)
     assert array[0] == 2 * 0.3 + 0.1
@@ -197,10 +207,24 @@ def test_a_fault_that_the_robot_cannot_have_is_refused(lift, fault, message):
 @pytest.mark.parametrize(
     ("kind", "bad"),
     [
-        *((Push, bad) for bad in ({"onset": -1}, {"onset": 2.5}, {"duration": 0}, {"newtons": float("nan")})),
-        *((Push, bad) for bad in ({"newtons": "a"}, {"direction": (0, 0, 0)}, {"direction": (float("inf"), 0, 0)})),
+        *(
+            (Push, bad)
+            for bad in ({"onset": -1}, {"onset": 2.5}, {"duration": 0}, {"newtons": float("nan")})
+        ),
+        *(
+            (Push, bad)
+            for bad in (
+                {"newtons": "a"},
+                {"direction": (0, 0, 0)},
+                {"direction": (float("inf"), 0, 0)},
+            )
+        ),
         *((WeakJoint, bad) for bad in ({"joint": 1.5}, {"strength": 1.5})),
-        *[(faults.Payload, {"kilograms": 0}), (faults.Spikes, {"probability": 2}), (faults.Delay, {"steps": 0})],
+        *[
+            (faults.Payload, {"kilograms": 0}),
+            (faults.Spikes, {"probability": 2}),
+            (faults.Delay, {"steps": 0}),
+        ],
     ],
 )
 def test_a_bad_description_is_refused(kind, bad):

@@ -15,7 +15,13 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.data.inspection import inspected
 from asm_gym.data.logs import Log
-from asm_gym.data.selection import normal_episodes, pieces, split_at_random, split_in_time, with_shared_noise
+from asm_gym.data.selection import (
+    normal_episodes,
+    pieces,
+    split_at_random,
+    split_in_time,
+    with_shared_noise,
+)
 from asm_gym.data.text import read_text
 from asm_gym.evaluation.alarms import alarms_of, traces_of
 from asm_gym.guard.live_watch import follow
@@ -42,7 +48,9 @@ def test_normal_episodes_are_cut_into_pieces_and_split_by_the_seed():
         "failed": Episode.from_table(log(1)),
         "with a fault": Episode.from_table(log(2), success=True, faults=np.arange(ROWS) > 9),
     }
-    kept, left_out = normal_episodes([Log("normal", normal), *(Log(why, episode) for why, episode in others.items())])
+    kept, left_out = normal_episodes(
+        [Log("normal", normal), *(Log(why, episode) for why, episode in others.items())]
+    )
     assert kept == [normal]
     assert left_out == dict.fromkeys(others, 1)
     cut = pieces(normal, 0.5)
@@ -67,7 +75,9 @@ def test_the_head_of_a_log_is_learned_from_and_its_tail_calibrated_on():
 def test_noise_is_declared_by_all_logs_and_not_by_the_first():
     def log(noise: float, seed: int) -> Episode:
         rows = np.random.default_rng(seed)
-        return Episode.from_table({"q": np.sin(np.arange(900) / 50) + noise * rows.normal(size=900)}, rate=50.0)
+        return Episode.from_table(
+            {"q": np.sin(np.arange(900) / 50) + noise * rows.normal(size=900)}, rate=50.0
+        )
 
     first = log(0.0, 0)
     others = [Episode.from_stream(log(0.1, n).stream, first.spec) for n in range(1, 5)]
@@ -105,20 +115,33 @@ def test_an_inspection_says_what_is_known_of_a_log():
     ((start, stop),) = found.gaps
     assert stop - start == pytest.approx(2.01, abs=0.02)
     assert {c.name: c.role for c in found.columns} == {
-        **{"Time": "clock", "Num": "counter", "q_1": "sense", "current_1": "sense", "fan": "constant"},
+        **{
+            "Time": "clock",
+            "Num": "counter",
+            "q_1": "sense",
+            "current_1": "sense",
+            "fan": "constant",
+        },
         **{"target_1": "command", "anomaly": "label"},
     }
-    assert (facts["q_1"]["unit"], facts["q_1"]["resolution"]) == ("rad", pytest.approx(0.002, rel=1e-3))
+    assert (facts["q_1"]["unit"], facts["q_1"]["resolution"]) == (
+        "rad",
+        pytest.approx(0.002, rel=1e-3),
+    )
     assert facts["current_1"]["noise"] == pytest.approx(0.05, rel=0.1)
     assert (facts["current_1"]["resolution"], facts["current_1"]["missing"]) == (0.0, 10)
     assert "never moves" in facts["fan"]["what is done"]
     assert any("1 gaps in the clock, the longest 2.0" in line for line in found.remarks())
-    assert any("no clock: say --rate" in line for line in inspected("x", {"q": np.arange(9.0)}).remarks())
+    assert any(
+        "no clock: say --rate" in line for line in inspected("x", {"q": np.arange(9.0)}).remarks()
+    )
 
 
 def test_an_inspection_counts_the_rows_that_fit_loses():
     t = np.delete(np.arange(100), [40, 41, 60]) / 50
-    assert np.diff(inspected("x", {"time": t, "q": t}).gaps, axis=1).ravel() == pytest.approx([0.06, 0.04])
+    assert np.diff(inspected("x", {"time": t, "q": t}).gaps, axis=1).ravel() == pytest.approx(
+        [0.06, 0.04]
+    )
 
 
 def test_the_command_prints_a_table_and_draws_a_picture(tmp_path, capsys, monkeypatch):
@@ -165,8 +188,12 @@ def test_logs_of_different_columns_are_one_line_each(tmp_path, capsys):
     for n, name in enumerate(("q_2", "q_3")):
         rows = np.random.default_rng(n).normal(size=(600, 2)).cumsum(axis=0)
         table = np.column_stack([np.arange(600) / 100, rows])
-        np.savetxt(tmp_path / f"{n}.csv", table, "%.5f", ",", header=f"time,q_1,{name}", comments="")
-    assert main(["inspect", str(tmp_path), "--out", str(tmp_path / "out")]) == 1  # for fit refuses them
+        np.savetxt(
+            tmp_path / f"{n}.csv", table, "%.5f", ",", header=f"time,q_1,{name}", comments=""
+        )
+    assert (
+        main(["inspect", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+    )  # for fit refuses them
     said = capsys.readouterr().out
     assert "1.csv has other columns than 0.csv: q_2, q_3" in said
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "m.asm")]) == 2
@@ -201,12 +228,28 @@ def memory(logs):
 def test_too_few_episodes_are_refused_with_how_many_are_needed(logs, tmp_path, capsys):
     out = tmp_path / "x.asm"
     assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01"]) == 2
-    assert "this false-alarm rate needs 198 normal episodes, 99 of them to calibrate on, got 40" in (
-        capsys.readouterr().err
+    assert (
+        "this false-alarm rate needs 198 normal episodes, 99 of them to calibrate on, got 40"
+        in (capsys.readouterr().err)
     )
     assert not out.exists()
     # 40 logs of 80 rows at 50 Hz: 7 pieces of 0.2 s each.
-    assert main(["fit", str(logs), "--out", str(out), *FIT, "--false-alarm-rate", "0.01", "--split", "0.2"]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(logs),
+                "--out",
+                str(out),
+                *FIT,
+                "--false-alarm-rate",
+                "0.01",
+                "--split",
+                "0.2",
+            ]
+        )
+        == 0
+    )
 
 
 def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsys):
@@ -220,7 +263,9 @@ def test_a_promise_by_the_hour_takes_the_hours_and_says_so(logs, tmp_path, capsy
     assert load_monitor(out).promise.per == "hour"
 
 
-def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(memory, tmp_path, capsys, monkeypatch):
+def test_a_fitted_memory_alarms_for_a_stuck_joint_and_not_for_a_normal_log(
+    memory, tmp_path, capsys, monkeypatch
+):
     monkeypatch.setattr("sys.argv", ["asm-gym", "watch", "a log.csv", "--bridge", "0.1"])
     write_csv(tmp_path / "good.csv", log(100))
     stuck = log(101)
@@ -246,7 +291,9 @@ def streamed(monitor, columns, form=lambda row: json.dumps(row.tolist())):
     """What following these rows prints, and its exit code."""
     rows = Episode.from_table(columns, channels=monitor.spec).stream
     said = io.StringIO()
-    code = int(follow([form(row) for row in rows], monitor, lambda line: print(line, file=said)) > 0)
+    code = int(
+        follow([form(row) for row in rows], monitor, lambda line: print(line, file=said)) > 0
+    )
     return code, said.getvalue()
 
 
@@ -260,19 +307,27 @@ def test_rows_as_they_come_raise_the_alarms_of_the_recording(memory, tmp_path):
     assert code == 1
     *alarms, summary = said.strip().splitlines()
     found = alarms_of(trace)
-    assert [float(line.split()[0]) for line in alarms] == [pytest.approx(alarm.start) for alarm in found]
+    assert [float(line.split()[0]) for line in alarms] == [
+        pytest.approx(alarm.start) for alarm in found
+    ]
     assert summary.startswith(f"{ROWS} rows, {len(found)} alarm")
     assert len(found) < len(trace.alarms)  # close ones are one
     assert streamed(monitor, log(100))[0] == 0
 
     def by_channel(row):
         return json.dumps(
-            {"q": row[:2].tolist(), "torque": float(row[2]), "cmd_0": float(row[3]), "cmd[1]": float(row[4])}
+            {
+                "q": row[:2].tolist(),
+                "torque": float(row[2]),
+                "cmd_0": float(row[3]),
+                "cmd[1]": float(row[4]),
+            }
         )
 
-    assert [line.split("thresholds")[0] for line in streamed(monitor, stuck, by_channel)[1].splitlines()[:-1]] == [
-        line.split("thresholds")[0] for line in alarms
-    ]
+    assert [
+        line.split("thresholds")[0]
+        for line in streamed(monitor, stuck, by_channel)[1].splitlines()[:-1]
+    ] == [line.split("thresholds")[0] for line in alarms]
 
 
 @pytest.mark.parametrize(
@@ -300,11 +355,16 @@ LOST = [40, 41, 42]
 def test_what_lost_rows_is_learned_in_parts_and_a_lost_row_is_an_alarm(tmp_path, capsys):
     (tmp_path / "logs").mkdir()
     for n in range(24):
-        columns = {name: np.delete(values, LOST) if n % 2 else values for name, values in log(n).items()}
+        columns = {
+            name: np.delete(values, LOST) if n % 2 else values for name, values in log(n).items()
+        }
         write_csv(tmp_path / "logs" / f"{n}.csv", columns)
     out = ["--out", str(tmp_path / "x.asm"), *FIT, "--false-alarm-rate", "0.1"]
     assert main(["fit", str(tmp_path / "logs"), *out]) == 0
-    assert "Rows were lost: 12 of 24 episodes were cut there, into 24 parts." in capsys.readouterr().out
+    assert (
+        "Rows were lost: 12 of 24 episodes were cut there, into 24 parts."
+        in capsys.readouterr().out
+    )
     how = ["--monitor", str(tmp_path / "x.asm"), "--out", str(tmp_path / "out")]
     assert main(["watch", str(tmp_path / "logs" / "1.csv"), *how]) == 1
     alarms = read_text(tmp_path / "out" / "alarms.csv")
@@ -312,7 +372,9 @@ def test_what_lost_rows_is_learned_in_parts_and_a_lost_row_is_an_alarm(tmp_path,
     assert np.isinf(alarms["thresholds"][0])
 
 
-def test_one_or_two_lost_rows_are_bridged_and_what_was_sensed_comes_before_what_was_not(tmp_path, capsys):
+def test_one_or_two_lost_rows_are_bridged_and_what_was_sensed_comes_before_what_was_not(
+    tmp_path, capsys
+):
     (tmp_path / "logs").mkdir()
     for n in range(24):
         columns = {name: np.delete(values, [20, 40, 41]) for name, values in log(n).items()}
@@ -335,17 +397,36 @@ def test_one_or_two_lost_rows_are_bridged_and_what_was_sensed_comes_before_what_
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3, 30])
-def test_up_to_two_lost_rows_are_bridged_and_more_are_an_alarm_behind_every_surprise(memory, lost, tmp_path, capsys):
+def test_up_to_two_lost_rows_are_bridged_and_more_are_an_alarm_behind_every_surprise(
+    memory, lost, tmp_path, capsys
+):
     columns = log(100)
     columns["torque"][70:73] += 5.0  # a collision
-    write_csv(tmp_path / "x.csv", {name: np.delete(values, slice(30, 30 + lost)) for name, values in columns.items()})
-    assert main(["watch", str(tmp_path / "x.csv"), "--monitor", str(memory), "--out", str(tmp_path / "out")]) == 1
+    write_csv(
+        tmp_path / "x.csv",
+        {name: np.delete(values, slice(30, 30 + lost)) for name, values in columns.items()},
+    )
+    assert (
+        main(
+            [
+                "watch",
+                str(tmp_path / "x.csv"),
+                "--monitor",
+                str(memory),
+                "--out",
+                str(tmp_path / "out"),
+            ]
+        )
+        == 1
+    )
     first, *others = capsys.readouterr().out.split("log\n", 1)[1].splitlines()[:-1]
     assert "surprise" in first
     assert any("missing data" in line for line in others) == (lost > 2)
 
 
-def test_a_file_that_cannot_be_read_is_named_and_the_others_of_its_folder_are_read(memory, tmp_path, capsys):
+def test_a_file_that_cannot_be_read_is_named_and_the_others_of_its_folder_are_read(
+    memory, tmp_path, capsys
+):
     (tmp_path / "logs").mkdir()
     for n in range(24):
         write_csv(tmp_path / "logs" / f"{n:02}.csv", log(n))
@@ -365,7 +446,10 @@ def test_a_file_that_cannot_be_read_is_named_and_the_others_of_its_folder_are_re
 
 def test_a_bridge_never_makes_fit_refuse_what_it_accepts_without(tmp_path, capsys):
     for n in range(12):
-        write_csv(tmp_path / f"{n:02}.csv", {name: np.delete(values, [40]) for name, values in log(n).items()})
+        write_csv(
+            tmp_path / f"{n:02}.csv",
+            {name: np.delete(values, [40]) for name, values in log(n).items()},
+        )
     out = ["--out", str(tmp_path / "x.asm"), *FIT, "--false-alarm-rate", "0.1"]
     assert main(["fit", str(tmp_path), *out, "--bridge", "0"]) == 0
     assert main(["fit", str(tmp_path), *out, "--bridge", "0.05"]) == 0
@@ -377,7 +461,9 @@ def test_why_no_row_is_whole_reaches_the_error_with_what_mends_it(tmp_path, caps
         write_csv(tmp_path / f"{n:02}.csv", log(n) | {"scale": seldom})
     out = ["--out", str(tmp_path / "x.asm"), *FIT, "--false-alarm-rate", "0.1"]
     assert main(["fit", str(tmp_path), *out]) == 2
-    assert re.search(r"rows that lack a number are scale in \d+% of all; --ignore", capsys.readouterr().err)
+    assert re.search(
+        r"rows that lack a number are scale in \d+% of all; --ignore", capsys.readouterr().err
+    )
     assert main(["fit", str(tmp_path), *out, "--ignore", "scale"]) == 0
 
 
@@ -385,7 +471,10 @@ def test_a_memory_is_fitted_from_a_pipe(tmp_path, monkeypatch, capsys):
     rows = pd.DataFrame(log(0, 3000)).to_json(orient="records", lines=True)
     monkeypatch.setattr("sys.stdin", io.StringIO(rows))
     out = tmp_path / "arm.asm"
-    assert main(["fit", "-", "--out", str(out), *FIT, "--false-alarm-rate", "0.1", "--split", "1"]) == 0
+    assert (
+        main(["fit", "-", "--out", str(out), *FIT, "--false-alarm-rate", "0.1", "--split", "1"])
+        == 0
+    )
     said = capsys.readouterr().out
     assert "the source ended: 3000 rows" in said
     assert "Learned from 30 episodes: 1500 rows" in said
@@ -401,11 +490,22 @@ def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
     rows = (tmp_path / "log.csv").read_text().splitlines()
     marked = [f"{row},{'fault' if n == 0 else int(2500 <= n < 2550)}" for n, row in enumerate(rows)]
     (tmp_path / "log.csv").write_text("\n".join(marked))
-    fit = ["fit", str(tmp_path / "log.csv"), "--out", str(tmp_path / "m.asm"), "--monitor", "kalman"]
+    fit = [
+        "fit",
+        str(tmp_path / "log.csv"),
+        "--out",
+        str(tmp_path / "m.asm"),
+        "--monitor",
+        "kalman",
+    ]
     fit += ["--false-alarm-rate", "0.1"]
     assert main(fit) == 2
-    assert "1 with a fault; --split 5 learns from between" in " ".join(capsys.readouterr().err.split())
+    assert "1 with a fault; --split 5 learns from between" in " ".join(
+        capsys.readouterr().err.split()
+    )
     assert main([*fit, "--split", "1"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "Learned from 54 episodes: 2700 rows" in said  # half of 44 pieces before the mark, 64 after it
+    assert (
+        "Learned from 54 episodes: 2700 rows" in said
+    )  # half of 44 pieces before the mark, 64 after it
     assert "with a fault" not in said

@@ -15,13 +15,42 @@ from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety
 from tests.fakes import CueMonitor, FadingMonitor, FakeEnv
 
-FAULTS = {name: kind for name, kind in vars(faults).items() if isinstance(kind, type) and name != "Fault"}
+FAULTS = {
+    name: kind for name, kind in vars(faults).items() if isinstance(kind, type) and name != "Fault"
+}
 
-quickly = settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+quickly = settings(
+    max_examples=15, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
+)
 
-NUMBERS = (0, 1, -1, 3, 10**9, -(10**9), 10**400, 0.5, 1e-320, 1e300, -1e300, np.nan, np.inf, -np.inf, 1j)
+NUMBERS = (
+    0,
+    1,
+    -1,
+    3,
+    10**9,
+    -(10**9),
+    10**400,
+    0.5,
+    1e-320,
+    1e300,
+    -1e300,
+    np.nan,
+    np.inf,
+    -np.inf,
+    1j,
+)
 TEXTS = ("", "hold", "no such thing", "\x00", "\ud800", "x" * 10_000, b"robot0_link5")
-SEQUENCES = ((), [], (0, 0, 0), (0.0, 1.0, 0.0), (np.nan, 0, 0), (1e300, 1e300, 1e300), ("a", "b", "c"), [[1], [2, 3]])
+SEQUENCES = (
+    (),
+    [],
+    (0, 0, 0),
+    (0.0, 1.0, 0.0),
+    (np.nan, 0, 0),
+    (1e300, 1e300, 1e300),
+    ("a", "b", "c"),
+    [[1], [2, 3]],
+)
 ARRAYS = (
     np.zeros(3),
     np.full(3, np.nan),
@@ -31,7 +60,20 @@ ARRAYS = (
     np.int64(2),
     np.bool_(True),
 )
-NASTY = (None, True, False, *NUMBERS, *TEXTS, *SEQUENCES, *ARRAYS, {}, set(), object(), int, lambda: None)
+NASTY = (
+    None,
+    True,
+    False,
+    *NUMBERS,
+    *TEXTS,
+    *SEQUENCES,
+    *ARRAYS,
+    {},
+    set(),
+    object(),
+    int,
+    lambda: None,
+)
 nasty = st.sampled_from(range(len(NASTY))).map(NASTY.__getitem__)
 
 
@@ -43,7 +85,9 @@ def assert_fine_or_refused(make, arguments):
         said = str(error)
         words = [name.removesuffix("s") for name in arguments]
         shown = [repr(value)[:20] for value in arguments.values()]
-        assert any(w in said or w.replace("_", " ") in said for w in words) or any(s in said for s in shown), said
+        assert any(w in said or w.replace("_", " ") in said for w in words) or any(
+            s in said for s in shown
+        ), said
         return None
 
 

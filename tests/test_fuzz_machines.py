@@ -24,7 +24,9 @@ from asm_gym.wrappers import FaultInjection, NeuralASMSafety
 from tests.fakes import CueMonitor, FakeEnv
 from tests.streams import sine_episodes, sine_spec
 
-FAULTS = {name: kind for name, kind in vars(faults).items() if isinstance(kind, type) and name != "Fault"}
+FAULTS = {
+    name: kind for name, kind in vars(faults).items() if isinstance(kind, type) and name != "Fault"
+}
 
 SOAK = int(os.environ.get("SOAK", "1"))
 
@@ -84,7 +86,11 @@ class Guard(RuleBasedStateMachine):
         self.robot = Playing()
         self.acts = on_alarm != "monitor"
         self.env = NeuralASMSafety(
-            self.robot, CueMonitor(tuple(cue)), on_alarm, release_after=release_after, max_override=max_override
+            self.robot,
+            CueMonitor(tuple(cue)),
+            on_alarm,
+            release_after=release_after,
+            max_override=max_override,
         )
         self.running = False
 
@@ -146,7 +152,9 @@ class Guard(RuleBasedStateMachine):
 
 TestGuard = Guard.TestCase
 TestGuard.settings = runs(40, 30)
-quiet = pytest.mark.filterwarnings("ignore::UserWarning")  # the wrapper says whom it does not believe
+quiet = pytest.mark.filterwarnings(
+    "ignore::UserWarning"
+)  # the wrapper says whom it does not believe
 TestGuard.pytestmark = [quiet]
 
 
@@ -223,7 +231,9 @@ class World(RuleBasedStateMachine):
         if not hasattr(cls, "env"):
             cls.env, cls.first = gym.make("asm_gym/Stack-v0", horizon=6), {}
         self.inner, self.outer, self.running = cls.env.unwrapped, cls.env, None
-        with suppress(ValueError):  # the example before may have left it in the middle of an episode
+        with suppress(
+            ValueError
+        ):  # the example before may have left it in the middle of an episode
             self.inner.reset(options={"noise": 1})
 
     @rule(seed=st.integers(0, 2))
@@ -233,13 +243,19 @@ class World(RuleBasedStateMachine):
             np.testing.assert_array_equal(type(self).first.setdefault(seed, row), row)
         self.running = seed
 
-    @rule(options=st.sampled_from([{"qpos_noise": -1}, {"noise": 1}, {"qpos_noise": None}, 3, [("qpos_noise", 0)]]))
+    @rule(
+        options=st.sampled_from(
+            [{"qpos_noise": -1}, {"noise": 1}, {"qpos_noise": None}, 3, [("qpos_noise", 0)]]
+        )
+    )
     def reset_that_makes_no_sense(self, options):
         with pytest.raises(ValueError, match=r"qpos_noise|option"):
             self.outer.unwrapped.reset(options=options)
         self.running = None
 
-    @rule(action=st.one_of(st.lists(numbers, min_size=7, max_size=7), st.lists(numbers, max_size=3)))
+    @rule(
+        action=st.one_of(st.lists(numbers, min_size=7, max_size=7), st.lists(numbers, max_size=3))
+    )
     def step(self, action):
         action = as_float32(action)
         if action.shape != (7,) or not np.isfinite(action).all():
@@ -257,7 +273,10 @@ class World(RuleBasedStateMachine):
             self.running = None
 
     @precondition(lambda self: self.running is None)
-    @rule(kinds=st.lists(st.sampled_from(sorted(FAULTS)), min_size=1, max_size=2), onset=st.integers(0, 3))
+    @rule(
+        kinds=st.lists(st.sampled_from(sorted(FAULTS)), min_size=1, max_size=2),
+        onset=st.integers(0, 3),
+    )
     def faults(self, kinds, onset):
         self.mended()
         with suppress(ValueError):  # nothing here to act on
@@ -299,7 +318,10 @@ class Archive(RuleBasedStateMachine):
         self.path = self.folder / "x.asm"
         self.held, self.damaged = None, False
 
-    @rule(held=st.dictionaries(st.sampled_from(["W", "b", "deep/er", "x y"]), arrays, max_size=3), number=st.floats())
+    @rule(
+        held=st.dictionaries(st.sampled_from(["W", "b", "deep/er", "x y"]), arrays, max_size=3),
+        number=st.floats(),
+    )
     def write(self, held, number):
         try:
             write_checkpoint(self.path, "test", {"number": number}, held)
@@ -314,15 +336,24 @@ class Archive(RuleBasedStateMachine):
         whole = self.path.read_bytes()
         at = data.draw(st.integers(0, len(whole) - 1))
         how = data.draw(st.sampled_from(["flip", "cut", "repeat", "zeros"]))
-        flipped = whole[:at] + bytes([whole[at] ^ (1 << data.draw(st.integers(0, 7)))]) + whole[at + 1 :]
-        made = {"flip": flipped, "cut": whole[:at], "repeat": whole + whole[at:], "zeros": whole[:at] + b"\0" * 64}
+        flipped = (
+            whole[:at] + bytes([whole[at] ^ (1 << data.draw(st.integers(0, 7)))]) + whole[at + 1 :]
+        )
+        made = {
+            "flip": flipped,
+            "cut": whole[:at],
+            "repeat": whole + whole[at:],
+            "zeros": whole[:at] + b"\0" * 64,
+        }
         self.path.write_bytes(made[how])
         self.damaged = made[how] != whole
 
     @rule(kind=st.sampled_from(["test", "other"]))
     def read(self, kind):
         if self.held is None or kind != "test":
-            with pytest.raises(FileNotFoundError if self.held is None else ValueError, match=r"x\.asm"):
+            with pytest.raises(
+                FileNotFoundError if self.held is None else ValueError, match=r"x\.asm"
+            ):
                 read_checkpoint(self.path, kind)
             return
         try:
@@ -333,7 +364,9 @@ class Archive(RuleBasedStateMachine):
             return
         # Damage may hit what a zip keeps twice, or nobody reads: then nothing else is read than what was written.
         assert found.header["number"] == self.held[""]
-        assert {n: a.tobytes() for n, a in found.arrays.items()} == {n: a.tobytes() for n, a in self.held.items() if n}
+        assert {n: a.tobytes() for n, a in found.arrays.items()} == {
+            n: a.tobytes() for n, a in self.held.items() if n
+        }
 
     @invariant()
     def nothing_is_left_lying_about(self):

@@ -38,7 +38,9 @@ class Finite(Judge):
 
     def observe(self, state, stream):
         state, surprise = super().observe(state, stream)
-        return state, surprise._replace(value=np.where(np.isfinite(stream).all(axis=1), surprise.value, np.inf))
+        return state, surprise._replace(
+            value=np.where(np.isfinite(stream).all(axis=1), surprise.value, np.inf)
+        )
 
 
 def test_a_number_that_is_missing_is_an_alarm_that_says_so_and_the_policy_goes_on():
@@ -68,7 +70,10 @@ class Everywhere(Finite):
 def test_numbers_that_are_lost_in_turn_hide_no_surprise(every):
     """Surprise went to 0 for three rows at each number that was lost, so that one every 150 ms hid everything."""
     for step in range(25, 35):
-        said = infos(NeuralASMSafety(Acting(blinks(every)), Everywhere({step}, "contact"), "graded"), step + 2)
+        said = infos(
+            NeuralASMSafety(Acting(blinks(every)), Everywhere({step}, "contact"), "graded"),
+            step + 2,
+        )
         assert said[step]["reason"] == "surprise"
         assert 3.9 < said[step]["surprise"] <= 10.0  # three of five senses are judged at least
         assert said[step + 1]["intervened"]
@@ -85,7 +90,8 @@ def test_a_reflex_of_another_environment_is_refused_and_a_class_is_bound():
     env = FakeEnv()
     for reflex in (Hold, BackOff):
         with pytest.raises(
-            ValueError, match=f"this {reflex.__name__} was made for another environment.*on_alarm={reflex.__name__}"
+            ValueError,
+            match=f"this {reflex.__name__} was made for another environment.*on_alarm={reflex.__name__}",
         ):
             NeuralASMSafety(env, CueMonitor([1]), on_alarm=reflex(FakeEnv()))
         assert NeuralASMSafety(env, CueMonitor([1]), on_alarm=reflex(env)).reset(seed=0)
@@ -107,7 +113,9 @@ def test_a_policy_that_uses_one_buffer_changes_nothing_that_was_said_or_kept():
         buffer[:] = [0.1 * t, 0.0, 1.0 if t < 4 else -1.0]
         said.append(guarded.step(buffer)[4]["asm"]["executed_action"])
     np.testing.assert_allclose([s[0] for s in said], [0, 0.1, 0.2, 0.3, 0, 0], atol=1e-6)
-    np.testing.assert_allclose([s[2] for s in said], 1.0)  # the grip of before the alarm, whatever came into the buffer
+    np.testing.assert_allclose(
+        [s[2] for s in said], 1.0
+    )  # the grip of before the alarm, whatever came into the buffer
 
 
 # ---------------------------------------------------------------- a monitor that changes
@@ -116,7 +124,9 @@ def test_a_policy_that_uses_one_buffer_changes_nothing_that_was_said_or_kept():
 @pytest.mark.parametrize("many", [False, True])
 def test_a_monitor_that_is_assigned_watches_from_the_next_episode_on(many):
     inner = SyncVectorEnv([FakeEnv, FakeEnv]) if many else FakeEnv()
-    env = (VectorNeuralASMSafety if many else NeuralASMSafety)(inner, FadingMonitor([2]), on_alarm="hold")
+    env = (VectorNeuralASMSafety if many else NeuralASMSafety)(
+        inner, FadingMonitor([2]), on_alarm="hold"
+    )
     act = np.stack([ACT, ACT]) if many else ACT
 
     def alarms():
@@ -147,7 +157,12 @@ def test_a_memory_that_is_fitted_while_it_watches_is_an_alarm_until_it_is_taken_
 
 @pytest.mark.parametrize(
     "action",
-    [np.ones(3) + 1j, np.ma.masked_array(np.ones(3), [0, 1, 0]), np.array(["1", "0", "0"]), ["1", "0", "0"]],
+    [
+        np.ones(3) + 1j,
+        np.ma.masked_array(np.ones(3), [0, 1, 0]),
+        np.array(["1", "0", "0"]),
+        ["1", "0", "0"],
+    ],
 )
 def test_what_would_lose_what_it_is_is_no_action(action):
     env = NeuralASMSafety(FakeEnv(), CueMonitor())
@@ -157,10 +172,14 @@ def test_what_would_lose_what_it_is_is_no_action(action):
 
 
 def test_an_environment_that_cannot_tell_speed_says_so_and_is_held_at_an_alarm():
-    env = NeuralASMSafety(FakeEnv(), CueMonitor([3]), "hold", contact_limits=ContactLimits(hand_speed=0.05))
+    env = NeuralASMSafety(
+        FakeEnv(), CueMonitor([3]), "hold", contact_limits=ContactLimits(hand_speed=0.05)
+    )
     env.reset(seed=0)
     said = [env.step(np.full(3, 0.9, np.float32))[4]["asm"] for _ in range(5)]
-    assert {(s["severity"]["speed"], s["severity"]["predicted_force"], s["slowed"]) for s in said} == {(None, None, 0)}
+    assert {
+        (s["severity"]["speed"], s["severity"]["predicted_force"], s["slowed"]) for s in said
+    } == {(None, None, 0)}
     assert [s["intervened"] for s in said] == [False] * 4 + [True]
     np.testing.assert_array_equal(env.unwrapped.actions[-1][:2], [0, 0])
 
@@ -193,7 +212,9 @@ def strict(env, monitor, **limits):
     return NeuralASMSafety(env, monitor, "hold", contact_limits=ContactLimits(**limits))
 
 
-def test_of_guards_around_one_environment_the_strictest_limits_count_and_an_outer_one_takes_none_away(lift):
+def test_of_guards_around_one_environment_the_strictest_limits_count_and_an_outer_one_takes_none_away(
+    lift,
+):
     robot, memory = lift.unwrapped, NeuralASM.pretrained("panda")
     inner = strict(lift, memory, wrist_force=50.0, hand_speed=0.1)
     NeuralASMSafety(inner, memory, "monitor").reset(seed=0)
@@ -213,7 +234,9 @@ def test_of_guards_around_one_environment_the_strictest_limits_count_and_an_oute
 
 def test_a_guard_inside_a_vector_guard_keeps_its_limits_and_its_costs(lift):
     memory = NeuralASM.pretrained("panda")
-    inner = NeuralASMSafety(lift, CueMonitor([2], memory.spec), "hold", contact_limits=ContactLimits(wrist_force=50.0))
+    inner = NeuralASMSafety(
+        lift, CueMonitor([2], memory.spec), "hold", contact_limits=ContactLimits(wrist_force=50.0)
+    )
     env = VectorNeuralASMSafety(SyncVectorEnv([lambda: inner]), memory, "hold", contact_limits=None)
     env.reset(seed=0)
     assert lift.unwrapped.contact_limits.wrist_force == 50.0

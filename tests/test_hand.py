@@ -18,7 +18,9 @@ def test_a_planar_arm_is_where_trigonometry_says():
     hand = np.array([[long.sum(), 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
     chain = Chain("", np.stack([up, up]), np.array([[0, 0, 0], [long[0], 0, 0]], np.float64), hand)
     for a, b in np.random.default_rng(0).uniform(-3, 3, (20, 2)):
-        place = long[0] * np.array([np.cos(a), np.sin(a)]) + long[1] * np.array([np.cos(a + b), np.sin(a + b)])
+        place = long[0] * np.array([np.cos(a), np.sin(a)]) + long[1] * np.array(
+            [np.cos(a + b), np.sin(a + b)]
+        )
         turned = [np.cos(a + b), np.sin(a + b), 0, -np.sin(a + b), np.cos(a + b), 0]
         np.testing.assert_allclose(chain.at(np.array([a, b])), [*place, 0, *turned], atol=1e-12)
 
@@ -39,8 +41,13 @@ def test_the_chain_of_an_arm_is_the_simulators(lift):
 def rows(arm, count, seed=0):
     """(T, D) of an arm that moves as it likes, with the noise that its sensors have."""
     spec, chain, rng = arm.stream_spec, arm.hand_chains[0], np.random.default_rng(seed)
-    where = [spec.slices[n] for n in ("joint_position", "joint_velocity", "hand_position", "hand_orientation")]
-    angles = np.array([0, 0.2, 0, -2.4, 0, 2.9, 0.8]) + rng.normal(0, 0.004, (count, 7)).cumsum(axis=0)
+    where = [
+        spec.slices[n]
+        for n in ("joint_position", "joint_velocity", "hand_position", "hand_orientation")
+    ]
+    angles = np.array([0, 0.2, 0, -2.4, 0, 2.9, 0.8]) + rng.normal(0, 0.004, (count, 7)).cumsum(
+        axis=0
+    )
     speeds = np.gradient(angles, axis=0) / spec.dt
     found = rng.normal(size=(count, spec.size)) * spec.noise
     for row, q, v in zip(found, angles, speeds, strict=True):
@@ -84,7 +91,9 @@ def test_healthy_senses_contradict_nothing(lift):
 
 
 @pytest.mark.parametrize("joint", range(7))
-def test_an_encoder_that_is_five_thousandths_off_is_named_and_its_angle_found_by_the_hand(lift, joint):
+def test_an_encoder_that_is_five_thousandths_off_is_named_and_its_angle_found_by_the_hand(
+    lift, joint
+):
     spec = lift.unwrapped.stream_spec
     check = Check(lift)
     stream, angles = rows(lift.unwrapped, 60, seed=joint)

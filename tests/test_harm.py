@@ -25,7 +25,14 @@ def test_harm_is_the_impulse_beyond_forty_newtons():
 
 
 def record(guard, seed, value, policy="down", kind="hostile", success=True):
-    case = {"kind": kind, "task": "Lift", "policy": policy, "fault": "nominal", "robot": "Panda", "rate": 20}
+    case = {
+        "kind": kind,
+        "task": "Lift",
+        "policy": policy,
+        "fault": "nominal",
+        "robot": "Panda",
+        "rate": 20,
+    }
     forces = dict.fromkeys(("harm", "peak", "first"), value) | {
         "over_s": value / 100,
         "alarms": 2,
@@ -42,8 +49,16 @@ def test_what_is_kept_away_is_of_the_policy_alone_and_cells_without_harm_do_not_
     records += [record(ALONE, 0, 0.5, "uniform"), record(DEFAULT, 0, 0.5, "uniform")]
     table = harm.by_guard("", pd.DataFrame(records), [ALONE, DEFAULT], ("robot", "rate"), harm.CASE)
     told = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
-    assert (told[1]["harm [N s]"], told[1]["kept away"], told[1]["cells that keep 95 %"]) == ("1.2", "96.8 %", "1 of 2")
-    assert (told[1]["alarms"], told[1]["cost"], told[1]["time over 40 N [s]"]) == ("2.0", "5.0", "0.01")
+    assert (told[1]["harm [N s]"], told[1]["kept away"], told[1]["cells that keep 95 %"]) == (
+        "1.2",
+        "96.8 %",
+        "1 of 2",
+    )
+    assert (told[1]["alarms"], told[1]["cost"], told[1]["time over 40 N [s]"]) == (
+        "2.0",
+        "5.0",
+        "0.01",
+    )
     assert (told[5][""], told[5]["kept away"]) == ("Panda, 20 Hz, Lift, forward", "90.0 %")
 
 
@@ -51,7 +66,10 @@ def test_success_is_paired_by_scene_and_counted_without_a_blow():
     records = []
     for policy, seed, alone, guarded, blow in (
         *(("scripted", 1, True, True, 10.0), ("scripted", 2, True, False, 300.0)),
-        *(("lift_sac", 1, False, True, 10.0), ("lift_sac", 2, True, True, 60.0)),  # the last leans for 0.6 s
+        *(
+            ("lift_sac", 1, False, True, 10.0),
+            ("lift_sac", 2, True, True, 60.0),
+        ),  # the last leans for 0.6 s
     ):
         records.append(record(ALONE, seed, blow, policy, "healthy", alone))
         records.append(record(DEFAULT, seed, 10.0, policy, "healthy", guarded))
@@ -81,7 +99,18 @@ def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypa
         return record(job[1], job[0].trial.seed, 9.0) | job[0].key
 
     monkeypatch.setattr(harm, "episode", episode)
-    asked = ["--quick", "--guards", ALONE, "hold", "--against", "hostile", "--workers", "1", "--out", str(tmp_path)]
+    asked = [
+        "--quick",
+        "--guards",
+        ALONE,
+        "hold",
+        "--against",
+        "hostile",
+        "--workers",
+        "1",
+        "--out",
+        str(tmp_path),
+    ]
     assert main(harm, asked) == 0
     text = (tmp_path / "harm.md").read_text()
     assert "| hold |" in text

@@ -23,7 +23,8 @@ def joints(env):
     inner = env.unwrapped
     data, robots = inner.simulation.data, inner.robosuite_env.robots
     places = [
-        np.concatenate([getattr(robot, f"_ref_joint_{what}_indexes") for robot in robots]) for what in ("pos", "vel")
+        np.concatenate([getattr(robot, f"_ref_joint_{what}_indexes") for robot in robots])
+        for what in ("pos", "vel")
     ]
     return data.qpos[places[0]].copy(), data.qvel[places[1]].copy()
 
@@ -31,7 +32,9 @@ def joints(env):
 def motion(env, held=30):
     """How fast the joints were when they were held, how far they then went, and how fast they are at last."""
     env.reset(seed=1)
-    action = np.sign(np.random.default_rng(1).standard_normal(env.action_space.shape)).astype(np.float32)
+    action = np.sign(np.random.default_rng(1).standard_normal(env.action_space.shape)).astype(
+        np.float32
+    )
     for _ in range(AT):
         env.step(action)
     (start, speed), farthest = joints(env), 0.0
@@ -61,7 +64,9 @@ def assert_stays(speed, farthest, last):
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize("robot", [r if r == "Panda" else pytest.param(r, marks=pytest.mark.slow) for r in ROBOTS])
+@pytest.mark.parametrize(
+    "robot", [r if r == "Panda" else pytest.param(r, marks=pytest.mark.slow) for r in ROBOTS]
+)
 def test_held_at_speed_the_joints_stop_where_they_are(robot, controller):
     if controller == "IK_POSE" and not robot_named(robot).has_inverse_kinematics:
         with pytest.raises(ValueError, match=f"IK_POSE is for Panda, Sawyer, and not for {robot}"):
@@ -120,7 +125,13 @@ def test_held_within_a_step_the_robot_stays_too():
 
 def pushed(controller, newtons, steps=30):
     """How far the joints of an arm that is held are pushed by a force at its hand for half a second, and stay [rad]."""
-    push = Push(body="robot0_right_hand", newtons=newtons, direction=(0.0, 1.0, 0.0), onset=AT + 10, duration=10)
+    push = Push(
+        body="robot0_right_hand",
+        newtons=newtons,
+        direction=(0.0, 1.0, 0.0),
+        onset=AT + 10,
+        duration=10,
+    )
     inner = FaultInjection(made(controller=controller), [push])
     env = guarded(inner)
     env.reset(seed=0)
@@ -135,11 +146,15 @@ def pushed(controller, newtons, steps=30):
 
 
 @pytest.mark.parametrize("controller", ["OSC_POSE", "JOINT_POSITION", "IK_POSE"])
-def test_an_arm_that_is_held_resists_a_push_comes_back_and_yields_to_more_than_it_is_said_to(controller):
+def test_an_arm_that_is_held_resists_a_push_comes_back_and_yields_to_more_than_it_is_said_to(
+    controller,
+):
     farthest, after = pushed(controller, 40.0)
     assert farthest < 0.1
     assert after < 0.005
-    assert pushed(controller, 4 * YIELDS_AT)[1] > 0.1  # it gives way, and stays where it was pushed to
+    assert (
+        pushed(controller, 4 * YIELDS_AT)[1] > 0.1
+    )  # it gives way, and stays where it was pushed to
 
 
 def test_a_flag_left_behind_is_forgotten_by_reset_and_used_up_by_a_step(lift):
@@ -168,11 +183,17 @@ def test_in_many_environments_those_that_are_held_stay_and_the_others_go_on(many
             return state, surprise._replace(value=value)
 
     inner = many([make, make])
-    env = VectorNeuralASMSafety(inner, Second(spec=inner.get_attr("stream_spec")[0]), contact_limits=None)
+    env = VectorNeuralASMSafety(
+        inner, Second(spec=inner.get_attr("stream_spec")[0]), contact_limits=None
+    )
     env.reset(seed=0)
     at = env.monitor.spec.slices["joint_position"]
-    streams = np.stack([env.step(np.ones((2, 7), np.float32))[4]["stream"][:, at] for _ in range(25)])
-    moved = np.abs(streams[-1] - streams[3]).max(axis=1)  # since it was held; motors at their limits overshoot first
+    streams = np.stack(
+        [env.step(np.ones((2, 7), np.float32))[4]["stream"][:, at] for _ in range(25)]
+    )
+    moved = np.abs(streams[-1] - streams[3]).max(
+        axis=1
+    )  # since it was held; motors at their limits overshoot first
     assert moved[1] < 0.05
     assert moved[0] > 0.2
     env.close()

@@ -15,7 +15,17 @@ import asm_gym
 from tests.wheel import LINKS, ROOT
 
 LAYERS = (
-    *("core", "data", "memory", "policies", "detection", "envs", "monitors", "faults", "evaluation"),
+    *(
+        "core",
+        "data",
+        "memory",
+        "policies",
+        "detection",
+        "envs",
+        "monitors",
+        "faults",
+        "evaluation",
+    ),
     *("guard", "wrappers", "rollouts", "scripts"),
 )
 """Rooms in their order: each may import itself and what stands before it, so that nothing enters a room twice."""
@@ -32,17 +42,25 @@ def layer(module: str) -> str:
 
 def modules() -> dict[str, ast.Module]:
     """Every module of the package by its long name, parsed."""
-    files = [f for f in (ROOT / "asm_gym").rglob("*.py") if f.relative_to(ROOT / "asm_gym").parts[0] not in LINKS]
+    files = [
+        f
+        for f in (ROOT / "asm_gym").rglob("*.py")
+        if f.relative_to(ROOT / "asm_gym").parts[0] not in LINKS
+    ]
     named = {".".join(f.relative_to(ROOT).with_suffix("").parts): f for f in files}
     for link in LINKS:
         for f in (ROOT / link).rglob("*.py"):
             named[".".join(("asm_gym", *f.relative_to(ROOT).with_suffix("").parts))] = f
-    return {name: ast.parse(f.read_text(encoding="utf-8"), str(f)) for name, f in sorted(named.items())}
+    return {
+        name: ast.parse(f.read_text(encoding="utf-8"), str(f)) for name, f in sorted(named.items())
+    }
 
 
 def imports(name: str, tree: ast.Module) -> Iterator[str]:
     """Full dotted names that a module imports, wherever the statement stands; ``from a import b`` gives ``a.b``."""
-    package = name.split(".")[:-1]  # ``asm_gym.envs.__init__`` lies in ``asm_gym.envs`` as ``asm_gym.envs.x`` does
+    package = name.split(".")[
+        :-1
+    ]  # ``asm_gym.envs.__init__`` lies in ``asm_gym.envs`` as ``asm_gym.envs.x`` does
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -75,9 +93,17 @@ def test_imports_point_one_way(name: str) -> None:
 
 
 def test_nothing_is_imported_by_its_short_name() -> None:
-    tests = {f"tests.{f.stem}": ast.parse(f.read_text(encoding="utf-8")) for f in (ROOT / "tests").glob("*.py")}
+    tests = {
+        f"tests.{f.stem}": ast.parse(f.read_text(encoding="utf-8"))
+        for f in (ROOT / "tests").glob("*.py")
+    }
     everywhere = IMPORTS | {name: list(imports(name, tree)) for name, tree in tests.items()}
-    short = [f"{name} imports {w}" for name, whats in everywhere.items() for w in whats if w.split(".")[0] in LINKS]
+    short = [
+        f"{name} imports {w}"
+        for name, whats in everywhere.items()
+        for w in whats
+        if w.split(".")[0] in LINKS
+    ]
     assert not short, "write asm_gym.wrappers, asm_gym.policies, asm_gym.scripts"
 
 

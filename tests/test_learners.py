@@ -33,7 +33,9 @@ def test_the_callback_logs_what_learning_met(tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "progress.json").read_text().splitlines()]
     assert (rows[-1]["safety/cost"], rows[-1]["safety/surprise"]) == (3.0, 10.0)
     with pytest.raises(KeyError, match="wrap the environment in NeuralASMSafety"):
-        sb3.PPO("MlpPolicy", guarded.env, n_steps=16, batch_size=16).learn(16, callback=SafetyCallback())
+        sb3.PPO("MlpPolicy", guarded.env, n_steps=16, batch_size=16).learn(
+            16, callback=SafetyCallback()
+        )
 
 
 def with_cost():
@@ -56,7 +58,11 @@ def test_stable_baselines_learns_and_meets_every_cost(kind: str):
     sb3 = needs("stable_baselines3")
     from asm_gym.rollouts.safety_callback import SafetyCallback
 
-    how = {"n_steps": 64, "batch_size": 32} if kind == "PPO" else {"learning_starts": 32, "batch_size": 32}
+    how = (
+        {"n_steps": 64, "batch_size": 32}
+        if kind == "PPO"
+        else {"learning_starts": 32, "batch_size": 32}
+    )
     callback = SafetyCallback()
     agent = getattr(sb3, kind)("MlpPolicy", watched(), seed=0, **how)
     before = [p.detach().clone() for p in agent.policy.parameters()]
@@ -67,7 +73,9 @@ def test_stable_baselines_learns_and_meets_every_cost(kind: str):
 
 def test_torchrl_collects_and_meets_every_cost():
     collectors = needs("torchrl.collectors")
-    kind = getattr(collectors, "Collector", None) or collectors.SyncDataCollector  # the name of before
+    kind = (
+        getattr(collectors, "Collector", None) or collectors.SyncDataCollector
+    )  # the name of before
     collector = kind(with_cost, None, frames_per_batch=64, total_frames=STEPS)
     assert sum(float(batch["next", "cost"].sum()) for batch in collector) == COST
     collector.shutdown()

@@ -10,7 +10,14 @@ from asm_gym.monitors import make_monitor
 from asm_gym.wrappers.lerobot import LeRobotGuard
 from tests.needs import needs
 
-MOTORS = ["shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "wrist_roll.pos", "gripper.pos"]
+MOTORS = [
+    "shoulder_pan.pos",
+    "shoulder_lift.pos",
+    "elbow_flex.pos",
+    "wrist_flex.pos",
+    "wrist_roll.pos",
+    "gripper.pos",
+]
 RATE = 30.0
 
 
@@ -88,7 +95,9 @@ def test_a_jammed_joint_is_an_alarm_and_the_arm_stays_where_it_stood(monitor):
     assert np.abs(held[0][:5] - arm.q[:5]).max() < 1.0
 
 
-@pytest.mark.parametrize(("hot", "fault"), [(25.0, "stalled"), (71.0, "overheated"), (None, "stalled")])
+@pytest.mark.parametrize(
+    ("hot", "fault"), [(25.0, "stalled"), (71.0, "overheated"), (None, "stalled")]
+)
 def test_a_servo_that_stalls_or_overheats_is_named(monitor, hot, fault):
     guard, arm = LeRobotGuard(monitor, "monitor"), Arm(201)
 
@@ -109,10 +118,14 @@ def test_a_hold_ends_when_it_is_quiet_and_a_stop_when_it_is_reset(monitor):
         arm.jammed[:] = False
         still = dict(zip(MOTORS, arm.sent[-1], strict=True))
         for _ in range(120):
-            arm.send_action(guard({"observation": arm.get_observation(), "action": dict(still)})["action"])
+            arm.send_action(
+                guard({"observation": arm.get_observation(), "action": dict(still)})["action"]
+            )
         assert guard.intervened is not over
         guard.reset()
-        arm.send_action(guard({"observation": arm.get_observation(), "action": dict(still)})["action"])
+        arm.send_action(
+            guard({"observation": arm.get_observation(), "action": dict(still)})["action"]
+        )
         assert not guard.intervened
 
 
@@ -153,7 +166,9 @@ def test_what_is_missing_or_not_finite_is_held_at_once_at_finite_numbers(monitor
 @pytest.mark.parametrize("rows", [1, 60])
 @pytest.mark.parametrize("what", ["observation", "action"])
 @pytest.mark.parametrize("value", [None, "?", float("nan"), float("inf"), "missing"])
-def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hold(monitor, on_alarm, rows, what, value):
+def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hold(
+    monitor, on_alarm, rows, what, value
+):
     guard, arm = LeRobotGuard(monitor, on_alarm), Arm(208)
     for k in range(60):
         given = {"observation": arm.get_observation(), "action": arm.policy(k)}
@@ -173,7 +188,11 @@ def test_only_finite_numbers_are_sent_and_nothing_before_there_is_a_place_to_hol
 
 @pytest.mark.filterwarnings("ignore:policy. the action must be finite")
 def test_a_velocity_is_held_by_zero_and_what_no_name_tells_must_be_told(monitor):
-    names = [f"{what}[{m.replace('.pos', '.vel')}]" for what in ("observation.state", "action") for m in MOTORS]
+    names = [
+        f"{what}[{m.replace('.pos', '.vel')}]"
+        for what in ("observation.state", "action")
+        for m in MOTORS
+    ]
     other = recorded(0)
     named = Episode.from_table(
         dict(zip(names, other.stream.T.astype(float), strict=True)), rate=RATE, action=["action*"]
@@ -181,9 +200,13 @@ def test_a_velocity_is_held_by_zero_and_what_no_name_tells_must_be_told(monitor)
     rolls = make_monitor("kalman+evidence", named.spec)
     rolls = rolls.with_learned(monitor.learned_)
     rolls.threshold_ = monitor.threshold
-    observation = dict(zip((m.replace(".pos", ".vel") for m in MOTORS), np.arange(6.0), strict=True))
+    observation = dict(
+        zip((m.replace(".pos", ".vel") for m in MOTORS), np.arange(6.0), strict=True)
+    )
     guard = LeRobotGuard(rolls)
-    sent = guard({"observation": observation, "action": dict.fromkeys(observation, float("nan"))})["action"]
+    sent = guard({"observation": observation, "action": dict.fromkeys(observation, float("nan"))})[
+        "action"
+    ]
     assert list(sent.values())[:5] == [0.0] * 5
     guard = LeRobotGuard(monitor, action_means="torque")
     with pytest.raises(ValueError, match="action_means"):

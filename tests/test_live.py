@@ -21,13 +21,18 @@ from asm_gym.data.rows import NEWEST, Pace, Publishers, RowReader
 from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
-SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
+SPEC = StreamSpec(
+    (Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02
+)
 ROWS = np.arange(40.0).reshape(10, 4)
 
 
 def csv_lines(times=None, rows=ROWS, header="time [s],cmd,q_0 [rad],q_1 [rad],note,torque"):
     times = 0.02 * np.arange(len(rows)) if times is None else times
-    return [header, *(f"{t:.3f},{r[3]},{r[0]},{r[1]},fine,{r[2]}" for t, r in zip(times, rows, strict=True))]
+    return [
+        header,
+        *(f"{t:.3f},{r[3]},{r[0]},{r[1]},fine,{r[2]}" for t, r in zip(times, rows, strict=True)),
+    ]
 
 
 def read(lines):
@@ -45,7 +50,13 @@ def test_csv_is_read_by_its_header_in_whatever_order():
 
 def test_rows_that_are_missing_by_their_time_are_counted():
     kept = [0, 1, 2, 5, 6]
-    assert [lost for _, lost in read(csv_lines(0.02 * np.array(kept), ROWS[kept]))] == [0, 0, 0, 2, 0]
+    assert [lost for _, lost in read(csv_lines(0.02 * np.array(kept), ROWS[kept]))] == [
+        0,
+        0,
+        0,
+        2,
+        0,
+    ]
     named = [{"t": 0.02 * k, "q": [1, 2], "torque": 3, "cmd": 4} for k in (0, 4)]
     assert [lost for _, lost in read(map(json.dumps, named))] == [0, 3]
 
@@ -83,14 +94,26 @@ def test_text_of_any_encoding_is_read_as_from_a_file(encoding, tmp_path):
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost_lacks_its_numbers(as_json):
+def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost_lacks_its_numbers(
+    as_json,
+):
     spec = StreamSpec((Channel("position", 2, "rad", elements=("elbow", "lift")),), dt=0.02)
-    rows = [(k, joint, k + 10 * (joint == "lift")) for k in range(5) for joint in ("elbow", "lift")[:: (-1) ** k]]
+    rows = [
+        (k, joint, k + 10 * (joint == "lift"))
+        for k in range(5)
+        for joint in ("elbow", "lift")[:: (-1) ** k]
+    ]
     del rows[5]  # the lift's of the third moment
     lines = [json.dumps({"time": 0.02 * k, "joint": j, "position [rad]": x}) for k, j, x in rows]
-    lines = lines if as_json else ["time,joint,position [rad]", *(f"{0.02 * k},{j},{x}" for k, j, x in rows)]
+    lines = (
+        lines
+        if as_json
+        else ["time,joint,position [rad]", *(f"{0.02 * k},{j},{x}" for k, j, x in rows)]
+    )
     read = [row for row, _ in RowReader(spec).rows(lines)]
-    np.testing.assert_array_equal([r.numbers for r in read], [[0, 10], [1, 11], [2, np.nan], [3, 13], [4, 14]])
+    np.testing.assert_array_equal(
+        [r.numbers for r in read], [[0, 10], [1, 11], [2, np.nan], [3, 13], [4, 14]]
+    )
     assert not any(row.lost or row.problem for row in read)
 
 
@@ -102,20 +125,30 @@ def test_equal_columns_of_one_name_are_read_as_one_as_in_a_file():
 
 @pytest.mark.parametrize("finger_first", [True, False])
 def test_publishers_of_other_joints_make_one_row_and_one_that_lacks_a_number_lacks_it(finger_first):
-    spec = StreamSpec((Channel("position", 3, "rad", elements=("elbow", "lift", "finger")),), dt=0.01)
+    spec = StreamSpec(
+        (Channel("position", 3, "rad", elements=("elbow", "lift", "finger")),), dt=0.01
+    )
 
     def said(k, **joints):
-        return json.dumps({"time": 0.01 * k, "name": list(joints), "position": list(joints.values())})
+        return json.dumps(
+            {"time": 0.01 * k, "name": list(joints), "position": list(joints.values())}
+        )
 
     lines = [said(0, finger=-1)] if finger_first else []
     for k in range(20):
         lines.append(said(k, lift=k + 100, elbow=k))
-        lines += [said(k + 0.5, finger=k), json.dumps({"time": 0.01 * k, "battery": 12.0})] if k % 4 == 0 else []
+        lines += (
+            [said(k + 0.5, finger=k), json.dumps({"time": 0.01 * k, "battery": 12.0})]
+            if k % 4 == 0
+            else []
+        )
     lines.insert(-1, said(18.5, elbow=18))  # without its lift
     read = [row for row, _ in RowReader(spec).rows(lines)]
     first = 0 if finger_first else 1
     wanted = [[k, k + 100, (k - 1) // 4 * 4 if k else -1] for k in range(first, 19)]
-    np.testing.assert_array_equal([r.numbers for r in read], [*wanted, [18, np.nan, 16], [19, 119, 16]])
+    np.testing.assert_array_equal(
+        [r.numbers for r in read], [*wanted, [18, np.nan, 16], [19, 119, 16]]
+    )
     assert not any(row.problem for row in read)
 
 
@@ -136,12 +169,24 @@ def test_a_publisher_that_falls_silent_leaves_its_numbers_missing_and_another_on
             ["time,q_0,q_1,torque", "1,2,3,4"],
             "line 1 is no row of numbers, and no header: the memory reads channels that are not there: cmd",
         ),
-        (["q_0,q_0,q_1,torque,cmd", "1,1,3,4,5", "1,2,3,4,5"], "line 3 .* columns of the same name differ: 'q_0'"),
-        (["[1, 2]"], r"line 1 is no row of numbers.*: it must hold 4 numbers, got the shape \(2,\)"),
+        (
+            ["q_0,q_0,q_1,torque,cmd", "1,1,3,4,5", "1,2,3,4,5"],
+            "line 3 .* columns of the same name differ: 'q_0'",
+        ),
+        (
+            ["[1, 2]"],
+            r"line 1 is no row of numbers.*: it must hold 4 numbers, got the shape \(2,\)",
+        ),
         (["{"], "line 1 is no row of numbers"),
-        (['{"q": [1, 2]}'], "line 1 is no row of numbers.*: the memory reads channels that are not there: torque, cmd"),
+        (
+            ['{"q": [1, 2]}'],
+            "line 1 is no row of numbers.*: the memory reads channels that are not there: torque, cmd",
+        ),
         (['{"q": [1, 2, 3], "torque": 1, "cmd": 1}'], "q must hold 2 numbers, got 3"),
-        ([*csv_lines()[:2], "0.1,1,2"], "line 3 is no row of numbers: it has 3 cells, its header 6"),
+        (
+            [*csv_lines()[:2], "0.1,1,2"],
+            "line 3 is no row of numbers: it has 3 cells, its header 6",
+        ),
         ([*csv_lines()[:2], "0.1,1,2,x,fine,3"], "line 3 is no row of numbers"),
         ([*csv_lines()[:3], csv_lines()[1]], r"time must increase, got 0 s after 0\.02"),
     ],
@@ -174,7 +219,12 @@ def test_whatever_a_line_holds_reading_goes_on():
         "\ufffd\x00",
         "a line of more than 5 bytes",
     ]
-    rows = [row for row, _ in RowReader(SPEC).rows([bad[0], good, *(line for b in bad for line in (b, good))])]
+    rows = [
+        row
+        for row, _ in RowReader(SPEC).rows(
+            [bad[0], good, *(line for b in bad for line in (b, good))]
+        )
+    ]
     assert [bool(row.problem) for row in rows] == [True, False] + len(bad) * [True, False]
     assert all(row.numbers.tolist() == ROWS[0].tolist() for row in rows if not row.problem)
 

@@ -32,7 +32,9 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 from tests.needs import needs
 from tests.streams import swing
 
-SPEC = StreamSpec((Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02)
+SPEC = StreamSpec(
+    (Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02
+)
 DT = SPEC.dt
 
 episode = partial(swing, SPEC)
@@ -47,7 +49,12 @@ def monitor():
 def lines(rows, stamps=None, dies=False):
     """Rows as JSON lines, at these times, of a source that may die."""
     for t, row in zip(DT * np.arange(len(rows)) if stamps is None else stamps, rows, strict=False):
-        line = {"time": float(t), "q": row[:2].tolist(), "torque": float(row[2]), "cmd": float(row[3])}
+        line = {
+            "time": float(t),
+            "q": row[:2].tolist(),
+            "torque": float(row[2]),
+            "cmd": float(row[3]),
+        }
         yield json.dumps(line).replace("NaN", "null")
     if dies:
         raise SourceDied("nothing came for 2 s")
@@ -56,7 +63,9 @@ def lines(rows, stamps=None, dies=False):
 def watched(source, monitor, **settings):
     """The number of alarms, and what was said."""
     events = []
-    return follow(source, monitor, events.append, WatchSettings(**settings)), "\n".join(map(str, events))
+    return follow(source, monitor, events.append, WatchSettings(**settings)), "\n".join(
+        map(str, events)
+    )
 
 
 def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
@@ -76,7 +85,9 @@ def test_a_source_that_dies_and_rows_that_are_lost_are_alarms(monitor):
 @pytest.mark.parametrize("lost", [1, 2, 3, 30])
 def test_up_to_two_lost_rows_are_bridged_and_more_are_one_alarm(lost, monitor):
     kept = np.delete(np.arange(80), np.arange(20, 20 + lost))
-    count, said = watched(lines(episode(500).stream[kept], DT * kept), monitor, bridge_s=bridge_of(None, DT))
+    count, said = watched(
+        lines(episode(500).stream[kept], DT * kept), monitor, bridge_s=bridge_of(None, DT)
+    )
     assert count == (lost > 2)
     assert said.count("(late)") == (lost > 2)
 
@@ -156,7 +167,9 @@ def test_a_knock_that_excuses_surprise_is_said_once_and_is_no_alarm(monitor, mon
     assert not count
     assert said.count("knock") == 1
     assert "0.120 s  knock: no alarm" in said
-    trace = ScoredEpisode("log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])})
+    trace = ScoredEpisode(
+        "log", 0, 0.1, 1.0, np.zeros(6), excused={KNOCK: np.array([0, 2, 2, 0, 2, 0.5])}
+    )
     assert excused_in(trace) == {KNOCK: 2}
 
 
@@ -167,13 +180,23 @@ def test_a_pipe_and_a_file_are_watched_as_a_command(monitor, tmp_path, monkeypat
     assert main(["watch", "-", "--monitor", str(tmp_path / "x.asm")]) == 0
     assert "80 rows, 0 alarms; a row took" in capsys.readouterr().out
     (tmp_path / "log.jsonl").write_text(text)
-    live = ["watch", f"tail:{tmp_path / 'log.jsonl'}", "--monitor", str(tmp_path / "x.asm"), "--silence", "0.1"]
+    live = [
+        "watch",
+        f"tail:{tmp_path / 'log.jsonl'}",
+        "--monitor",
+        str(tmp_path / "x.asm"),
+        "--silence",
+        "0.1",
+    ]
     assert main(live) == 1
     assert "the source has died" in capsys.readouterr().out
 
 
 def recording(folder, stream, names=("q[0]", "q[1]", "torque", "cmd"), name="log.csv"):
-    rows = [",".join(("time", *names)), *(",".join(map(str, (DT * k, *row))) for k, row in enumerate(stream))]
+    rows = [
+        ",".join(("time", *names)),
+        *(",".join(map(str, (DT * k, *row))) for k, row in enumerate(stream)),
+    ]
     (folder / name).write_text("\n".join(rows) + "\n")
     return str(folder / name)
 
@@ -186,14 +209,25 @@ def test_a_channel_that_is_never_finite_is_reported(value, columns, monitor, tmp
     stream = episode(500).stream.astype(object)
     stream[:, columns] = value
     out = tmp_path / "out"
-    code = main(["watch", recording(tmp_path, stream), "--monitor", str(tmp_path / "x.asm"), "--out", str(out)])
+    code = main(
+        [
+            "watch",
+            recording(tmp_path, stream),
+            "--monitor",
+            str(tmp_path / "x.asm"),
+            "--out",
+            str(out),
+        ]
+    )
     assert "Axis limits" not in capsys.readouterr().err
     if code != 2:  # a column that says nothing may be refused, in a line of its own
         assert code == 1
         assert (out / "report.html").stat().st_size > 10_000
 
 
-def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, tmp_path, monkeypatch):
+def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(
+    monitor, tmp_path, monkeypatch
+):
     needs("matplotlib")
     monitor.save(tmp_path / "x.asm")
     stream = episode(500).stream.copy()
@@ -205,7 +239,16 @@ def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(monitor, t
         (tmp_path / f"own {name}").write_text("precious")
         (out / name).symlink_to(tmp_path / f"own {name}")
     source = recording(tmp_path, stream, name="@SUM(1).csv")
-    command = ["watch", source, "--monitor", str(tmp_path / "x.asm"), "--out", str(out), "--figures", "2"]
+    command = [
+        "watch",
+        source,
+        "--monitor",
+        str(tmp_path / "x.asm"),
+        "--out",
+        str(out),
+        "--figures",
+        "2",
+    ]
     monkeypatch.setattr("sys.argv", ["asm-gym", *command])
     assert main(command) == 1
     assert {(tmp_path / f"own {name}").read_text() for name in names} == {"precious"}
@@ -242,7 +285,9 @@ def test_alarms_leave_a_watch_as_json_and_by_a_command(monitor, tmp_path, monkey
 
 
 def test_an_infinite_surprise_is_json_too():
-    event = LiveEvent("alarm", 1.0, "q[0]  inf thresholds", "missing data", "q[0]", float("inf"), 0.1)
+    event = LiveEvent(
+        "alarm", 1.0, "q[0]  inf thresholds", "missing data", "q[0]", float("inf"), 0.1
+    )
     assert json.loads(event.to_json())["thresholds"] == "inf"
 
 
@@ -265,9 +310,14 @@ def test_alarms_of_one_cause_are_one(monitor):
 
 @pytest.mark.parametrize("rate", [20, 100])
 def test_another_rate_is_said_once_and_is_an_alarm(rate, monitor):
-    count, said = watched(lines(np.resize(episode(500).stream, (200, 4)), np.arange(200) / rate), monitor)
+    count, said = watched(
+        lines(np.resize(episode(500).stream, (200, 4)), np.arange(200) / rate), monitor
+    )
     assert count
-    assert said.count(f"rows come at {rate} a second, and the memory reads 50: they are not judged") == 1
+    assert (
+        said.count(f"rows come at {rate} a second, and the memory reads 50: they are not judged")
+        == 1
+    )
 
 
 def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(monitor):

@@ -35,7 +35,9 @@ class Point(gym.Env[Any, Any]):
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.gripper_actions = (2,)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.at, self.steps = self.np_random.uniform(-1.0, 1.0, 2), 0
         return self.at.astype(np.float32), {}
@@ -55,9 +57,13 @@ def taught(env: Point, episodes: int = 30) -> list[Episode]:
         action, rows, actions = np.zeros(3, np.float32), [], []
         for _ in range(40):
             rows.append(np.concatenate([observation, action]))
-            intended = np.append(np.clip(-2 * observation, -1, 1), 1.0 if np.linalg.norm(observation) < 0.1 else -1.0)
+            intended = np.append(
+                np.clip(-2 * observation, -1, 1), 1.0 if np.linalg.norm(observation) < 0.1 else -1.0
+            )
             actions.append(intended)
-            action = np.clip(intended + 0.5 * np.append(rng.normal(size=2), 0.0), -1, 1).astype(np.float32)
+            action = np.clip(intended + 0.5 * np.append(rng.normal(size=2), 0.0), -1, 1).astype(
+                np.float32
+            )
             observation, *_ = env.step(action)
         shifted = np.concatenate([np.zeros((1, 3)), actions[:-1]]).astype(np.float32)
         made.append(Episode.from_stream(np.stack(rows), spec, actions=shifted))
@@ -164,7 +170,9 @@ def memory_of(spec: StreamSpec) -> NeuralASM:
 
 def test_a_memory_that_does_not_fit_is_refused_with_what_differs(lift, pilot):
     own = lift.unwrapped.measured_spec
-    common = replace(own, channels=tuple(c for c in own.channels if c.group in ("hand", "object", "action")))
+    common = replace(
+        own, channels=tuple(c for c in own.channels if c.group in ("hand", "object", "action"))
+    )
     strange = Channel("whisker", 2, "m", group="hand")
     ball = Channel("ball_pos", 3, group="object")
     hand, action = [c for c in common.channels if c.group == "hand"], common.channels[-1]
@@ -175,7 +183,9 @@ def test_a_memory_that_does_not_fit_is_refused_with_what_differs(lift, pilot):
         ),
         r"whisker: missing": replace(common, channels=(*hand, strange, action)),
         r"robot: Sawyer against Panda": replace(common, source="Sawyer"),
-        r"objects: ball_pos are known, none of which is here": replace(common, channels=(*hand, ball, action)),
+        r"objects: ball_pos are known, none of which is here": replace(
+            common, channels=(*hand, ball, action)
+        ),
         r"a row every 0.1 s, and is asked to act every 0.05 s": replace(common, dt=0.1),
     }
     for message, spec in bad.items():

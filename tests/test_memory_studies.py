@@ -36,7 +36,9 @@ def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
     episode = written(letter, np.random.default_rng(1))
     noise = episode.stream[:, :2] - np.cumsum(episode.stream[:, 2:], axis=0) * DT
     assert noise.std() == pytest.approx(NOISE, rel=0.2)
-    slow, fast = (written(letter, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0))
+    slow, fast = (
+        written(letter, np.random.default_rng(1), speed, wobble=0.0) for speed in (1.0, 2.0)
+    )
     assert len(fast) == len(slow) / 2
     np.testing.assert_allclose(fast.stream[:, :2], slow.stream[1::2, :2], atol=6 * NOISE)
 
@@ -81,7 +83,10 @@ def test_the_network_as_published_memorises_what_it_reads_side_by_side(monkeypat
     train = copybook(repertoire(2, np.random.default_rng(0)), 1, np.random.default_rng(1))
     means, errors = mean_demonstrations(train), {}
     for epochs in (1, 120):
-        models = [memorise_and_recall.as_published(train, epochs, np.random.default_rng(seed)) for seed in (2, 3, 4)]
+        models = [
+            memorise_and_recall.as_published(train, epochs, np.random.default_rng(seed))
+            for seed in (2, 3, 4)
+        ]
         assert models[0].network.hidden_size == 32
         errors[epochs] = np.median([recalled(model, train, means, STEPS)[0] for model in models])
     assert errors[120] < 0.5 * errors[1]
@@ -90,7 +95,10 @@ def test_the_network_as_published_memorises_what_it_reads_side_by_side(monkeypat
 def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finite_differences():
     weights, batch = small_batch(14)
     read, alone = (local(weights, batch, 8, alone, pi_z=1.0) for alone in (False, True))
-    gradient = {target: exact(weights, batch, 8, target, pi_z=1.0) for target in ("energy", "error", "alone")}
+    gradient = {
+        target: exact(weights, batch, 8, target, pi_z=1.0)
+        for target in ("energy", "error", "alone")
+    }
     assert gradient["energy"].energy == pytest.approx(read.energy, rel=1e-4)
     assert gradient["error"].error == pytest.approx(read.error, rel=1e-4)
     assert gradient["alone"].error == pytest.approx(alone.error, rel=1e-4)
@@ -100,7 +108,9 @@ def test_the_differentiated_network_is_the_memory_and_its_gradient_that_of_finit
             for step in (0.01, -0.01):
                 moved = getattr(weights, name).copy()
                 moved[index] += step
-                ends.append(local(weights._replace(**{name: moved}), batch, 8, target == "alone", 1.0).error)
+                ends.append(
+                    local(weights._replace(**{name: moved}), batch, 8, target == "alone", 1.0).error
+                )
             slope = (ends[0] - ends[1]) / 0.02
             assert -gradient[target].arrays[name][index] == pytest.approx(slope, rel=0.05, abs=0.02)
 
@@ -113,8 +123,13 @@ def test_the_local_change_is_the_gradient_of_the_energy_and_of_the_error_for_a_f
     weights, batch = small_batch(20)
     angles = []
     for pi_z in (1.0, 100.0):
-        angles.append(cosine(local(weights, batch, 50, pi_z=pi_z), exact(weights, batch, 50, "error", pi_z)))
-        alone = local(weights, batch, 50, alone=True, pi_z=pi_z), exact(weights, batch, 50, "alone", pi_z)
+        angles.append(
+            cosine(local(weights, batch, 50, pi_z=pi_z), exact(weights, batch, 50, "error", pi_z))
+        )
+        alone = (
+            local(weights, batch, 50, alone=True, pi_z=pi_z),
+            exact(weights, batch, 50, "alone", pi_z),
+        )
         assert 0.2 < cosine(*alone) < 0.999  # the way back through time is left out
     assert 0.5 < angles[0] < angles[1]
     assert angles[1] > 0.999
@@ -124,15 +139,23 @@ def test_the_rival_learns_from_episodes_of_different_lengths():
     train, _ = letters_of(2)
     reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
     taught = trajectories(reader, train)
-    cut = [Trajectory(t.senses[:n], t.commands[:n], t.inputs) for t, n in zip(taught, (40, 60) * 6, strict=True)]
+    cut = [
+        Trajectory(t.senses[:n], t.commands[:n], t.inputs)
+        for t, n in zip(taught, (40, 60) * 6, strict=True)
+    ]
     batch = side_by_side(cut)
     assert batch.senses.shape[0] == 60
     assert np.isnan(batch.senses[40:, 0]).all()
     assert np.isfinite(batch.senses[:, 1]).all()
     for cell in ("GRU", "LSTM"):
-        few, many = (train_recurrent(cut, 16, n, np.random.default_rng(0), cell=cell) for n in (1, 60))
+        few, many = (
+            train_recurrent(cut, 16, n, np.random.default_rng(0), cell=cell) for n in (1, 60)
+        )
         errors = [
-            np.mean((expected(network, *side_by_side(taught), STEPS)[0] - side_by_side(taught).senses) ** 2)
+            np.mean(
+                (expected(network, *side_by_side(taught), STEPS)[0] - side_by_side(taught).senses)
+                ** 2
+            )
             for network in (few, many)
         ]
         assert errors[1] < 0.7 * errors[0]
@@ -141,7 +164,9 @@ def test_the_rival_learns_from_episodes_of_different_lengths():
 def wandering(seed: int, rows: int = 80) -> Episode:
     """A stream of the Panda's senses in which each wanders on its own way round."""
     rng = np.random.default_rng(seed)
-    angle = rng.uniform(0, 2 * np.pi) + 0.1 * np.arange(rows)[:, None] + np.arange(workspace.SPEC.size)
+    angle = (
+        rng.uniform(0, 2 * np.pi) + 0.1 * np.arange(rows)[:, None] + np.arange(workspace.SPEC.size)
+    )
     return Episode.from_stream(np.sin(angle) + 0.01 * rng.normal(size=angle.shape), workspace.SPEC)
 
 
@@ -153,7 +178,9 @@ def test_a_sense_that_sticks_is_alone_over_its_ceiling_and_counts_no_more_once_l
     trained = learn_settling(trajectories(reader, train), 64, schedule, rng, lambda: None)
     model = workspace.Settling(reader, trained.network, train)
     assert np.mean([model.felt(e.stream)[1] ** 2 for e in train]) == pytest.approx(1.0, abs=0.1)
-    model.ceilings = 1.5 * np.max([model.felt(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0)
+    model.ceilings = 1.5 * np.max(
+        [model.felt(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0
+    )
     stuck = wandering(30).stream.astype(np.float64)
     stuck[40:, workspace.JOINTS] = stuck[40, workspace.JOINTS]
     energies = model.felt(stuck)[2][42:48].max(axis=0)

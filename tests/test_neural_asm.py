@@ -38,7 +38,10 @@ def test_movements_far_from_all_that_was_learned_are_an_alarm_though_the_body_ca
     """Twice as fast, and about another place: the channels go together as they always do."""
     mixing = np.random.default_rng(12345).normal(size=(6, 12))  # that of the sines
     faster = [replace(e, stream=e.stream[::2]) for e in sine_episodes(20, seed=7, steps=(80, 100))]
-    elsewhere = [replace(e, stream=e.stream + np.r_[3.0 * mixing[0], 0, 0]) for e in sine_episodes(20, seed=8)]
+    elsewhere = [
+        replace(e, stream=e.stream + np.r_[3.0 * mixing[0], 0, 0])
+        for e in sine_episodes(20, seed=8)
+    ]
     for far in (faster, elsewhere):
         assert np.mean([s.value.max() > asm.threshold for s in asm.score_episodes(far)]) >= 0.95
 
@@ -103,7 +106,9 @@ def test_a_huge_number_is_a_finite_alarm_on_its_channel(asm, huge):
 @pytest.mark.parametrize("value", [1e3, 1e6, 1e30])
 @pytest.mark.parametrize("sense", [slice(None), 3, 10], ids=["all", "one", "another"])
 @pytest.mark.parametrize("rows", [1, 2, 25])
-def test_an_episode_that_begins_with_absurd_numbers_alarms_within_five_rows(asm, value, sense, rows):
+def test_an_episode_that_begins_with_absurd_numbers_alarms_within_five_rows(
+    asm, value, sense, rows
+):
     """Nothing came before the first row, so that no change in it can be judged.
 
     Where all are so absurd that they are read as the same, it is rest that alarms: of fifty episodes, in the fifth row.
@@ -139,7 +144,11 @@ def test_constant_and_copied_channels_are_no_trouble():
 
 
 def test_an_interrupted_fit_leaves_the_memory_as_it_was():
-    asm = NeuralASM(sine_spec(), **SMALL).fit(sine_episodes(8)).calibrate(sine_episodes(19, seed=1), 0.05)
+    asm = (
+        NeuralASM(sine_spec(), **SMALL)
+        .fit(sine_episodes(8))
+        .calibrate(sine_episodes(19, seed=1), 0.05)
+    )
     episode, threshold = sine_episodes(1, seed=13)[0], asm.threshold
     before, weights = asm.score(episode).value.tobytes(), learned_bytes(asm)
 
@@ -172,20 +181,31 @@ def test_a_bad_hyperparameter_is_named_with_what_was_given(name, value):
 
 def test_bad_episodes_are_refused_by_fit_and_calibrate(asm):
     good = sine_episodes(3)
-    other = StreamSpec((Channel("joint_position", 11, "rad", group="joint"), Channel("wrench", 3, "N")), dt=0.05)
+    other = StreamSpec(
+        (Channel("joint_position", 11, "rad", group="joint"), Channel("wrench", 3, "N")), dt=0.05
+    )
     nan = good[1].stream.copy()
     nan[7, 4] = np.nan
     wild = good[1].stream.copy()
     wild[7, 4] = 1e25
     cases = [
         ([], "at least one episode"),
-        ([good[0], replace(good[1], stream=good[1].stream[:1])], "episode 1 must be at least 2 steps long, got 1"),
-        ([good[0], replace(good[1], stream=nan)], r"episode 1, step 7, joint_position\[4\] must be finite, got nan"),
+        (
+            [good[0], replace(good[1], stream=good[1].stream[:1])],
+            "episode 1 must be at least 2 steps long, got 1",
+        ),
+        (
+            [good[0], replace(good[1], stream=nan)],
+            r"episode 1, step 7, joint_position\[4\] must be finite, got nan",
+        ),
         (
             [good[0], replace(good[1], stream=wild)],
             r"episode 1, step 7, joint_position\[4\] is 1e\+25, where 98 % of all",
         ),
-        ([*good, Episode.from_stream(np.zeros((5, 14)), other)], "(?s)episode 3 does not fit.*command.*wrench"),
+        (
+            [*good, Episode.from_stream(np.zeros((5, 14)), other)],
+            "(?s)episode 3 does not fit.*command.*wrench",
+        ),
     ]
     for episodes, message in cases:
         with pytest.raises(ValueError, match=message):

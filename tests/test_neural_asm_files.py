@@ -24,11 +24,18 @@ def test_save_and_load_keep_every_bit(asm, tmp_path):
     asm.save(tmp_path / "memory.asm")
     back = NeuralASM.load(tmp_path / "memory.asm")
     assert learned_bytes(back) == learned_bytes(asm)
-    assert (back.spec, back.threshold, back.get_params()) == (asm.spec, asm.threshold, asm.get_params())
+    assert (back.spec, back.threshold, back.get_params()) == (
+        asm.spec,
+        asm.threshold,
+        asm.get_params(),
+    )
     episode = sine_episodes(1, seed=13)[0]
     assert back.score(episode).attribution.tobytes() == asm.score(episode).attribution.tobytes()
     back.save(tmp_path / "again.asm")
-    with zipfile.ZipFile(tmp_path / "memory.asm") as a, zipfile.ZipFile(tmp_path / "again.asm") as b:
+    with (
+        zipfile.ZipFile(tmp_path / "memory.asm") as a,
+        zipfile.ZipFile(tmp_path / "again.asm") as b,
+    ):
         assert {n: a.read(n) for n in a.namelist()} == {n: b.read(n) for n in b.namelist()}
 
 
@@ -107,11 +114,15 @@ def test_a_checkpoint_with_a_missing_or_misshapen_array_is_refused(asm, tmp_path
     rewritten(tmp_path / "m.asm", tmp_path / "missing.asm", lambda m: m.pop(member))
     with pytest.raises(ValueError, match="damaged"):
         NeuralASM.load(tmp_path / "missing.asm")
-    rewritten(tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy.npy"]}))
+    rewritten(
+        tmp_path / "m.asm", tmp_path / "shape.asm", lambda m: m.update({member: m["energy.npy"]})
+    )
     with pytest.raises(ValueError, match="damaged"):
         NeuralASM.load(tmp_path / "shape.asm")
 
 
 def test_a_file_of_an_older_version_is_refused_with_what_makes_it_anew(asm, tmp_path):
     with pytest.raises(ValueError, match=r"older version: make it anew with asm-gym fit"):
-        NeuralASM.load(tampered(asm, tmp_path / "m.asm", {"W_C.planesf4": np.zeros((4, 8), np.uint8)}))
+        NeuralASM.load(
+            tampered(asm, tmp_path / "m.asm", {"W_C.planesf4": np.zeros((4, 8), np.uint8)})
+        )

@@ -21,7 +21,9 @@ def test_rounding_moves_a_weight_by_half_a_step_at_most_and_packing_by_nothing(s
     after = rounded(before)
     step = np.abs(before["V"]).max(axis=1, keepdims=True) / 127 * 1.002
     assert (np.abs(after["V"] - before["V"]) <= np.where(after["V"] == before["V"], 0, step)).all()
-    assert np.mean(np.abs(after["V"] - before["V"]) <= step / 2) > 0.98  # but the faintest, which must stay
+    assert (
+        np.mean(np.abs(after["V"] - before["V"]) <= step / 2) > 0.98
+    )  # but the faintest, which must stay
     np.testing.assert_array_equal(after["V"] == 0, before["V"] == 0)
     np.testing.assert_array_equal(after["D"], before["D"])
     kept = packed(after)
@@ -45,14 +47,18 @@ def test_weights_that_no_integer_stands_for_are_refused_by_name_and_kept_as_they
 
 
 def test_parts_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="V of 8 bits should have a scale for each of its rows, got"):
+    with pytest.raises(
+        ValueError, match="V of 8 bits should have a scale for each of its rows, got"
+    ):
         unpacked({"V.bits": np.zeros((2, 2), np.int8)})
     with pytest.raises(ValueError, match="the root of moments"):
         unpacked({"moments.root": np.zeros(4, np.int16), "moments.scale": np.array(1.0)})
 
 
 def test_a_rounded_memory_is_the_same_when_it_is_read_and_smaller(tmp_path):
-    memory = NeuralASM(sine_spec(), hidden_size=64, association_size=64, epochs=1).fit(sine_episodes(40))
+    memory = NeuralASM(sine_spec(), hidden_size=64, association_size=64, epochs=1).fit(
+        sine_episodes(40)
+    )
     small = memory.rounded()
     assert small.threshold_ is None
     small.calibrate(sine_episodes(40, seed=1), 0.05)

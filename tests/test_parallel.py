@@ -55,7 +55,9 @@ def start(tmp_path):
 
     def started(where: str) -> tuple[subprocess.Popen, list[int]]:
         command = [sys.executable, "-c", PARENT, str(tmp_path), where]
-        parents.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True))
+        parents.append(
+            subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+        )
         assert until(lambda: len(list(tmp_path.iterdir())) == 2, 300), "no workers"
         return parents[-1], [int(p.name) for p in tmp_path.iterdir()]
 
@@ -66,7 +68,9 @@ def start(tmp_path):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
-@pytest.mark.parametrize("where", ["main", "thread"])  # from a thread, workers have no signal and look for themselves
+@pytest.mark.parametrize(
+    "where", ["main", "thread"]
+)  # from a thread, workers have no signal and look for themselves
 def test_workers_end_within_seconds_of_their_killed_parent(start, where):
     parent, workers = start(where)
     assert all(map(is_alive, workers))
@@ -77,7 +81,11 @@ def test_workers_end_within_seconds_of_their_killed_parent(start, where):
 
 def test_results_are_in_order_and_progress_is_told():
     seen = []
-    assert parallel_map(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [3, 1, 2]
+    assert parallel_map(abs, [-3, 1, -2], 2, lambda done, total: seen.append((done, total))) == [
+        3,
+        1,
+        2,
+    ]
     assert seen == [(1, 3), (2, 3), (3, 3)]
 
 

@@ -47,7 +47,9 @@ class Solid(gym.Env):
         blocked = self.t >= 60
         swing *= [self.others if blocked else 1.0, self.turns if blocked else 1.0]
         external = 0.1 * self.np_random.standard_normal(2) + np.array([0.0, self.torque * blocked])
-        return np.concatenate([swing + 0.001 * self.np_random.standard_normal(2), external, action]).astype(np.float32)
+        return np.concatenate(
+            [swing + 0.001 * self.np_random.standard_normal(2), external, action]
+        ).astype(np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -81,17 +83,24 @@ def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeyp
     monitor = Judge(range(60, 130, 5), family)
     streams = [healthy(seed) for seed in range(8)]
     monitor.spec = SOLID
-    monitor.diagnosis_ = Diagnosis(Completion.fit(StreamScaler.fit(SOLID, streams), streams), Named(family))
+    monitor.diagnosis_ = Diagnosis(
+        Completion.fit(StreamScaler.fit(SOLID, streams), streams), Named(family)
+    )
     joint = next(h for h in monitor.diagnosis_.hypotheses if h.part == "joint[1]")
     diagnosed = Diagnosis.__call__
-    monkeypatch.setattr(Diagnosis, "__call__", lambda *given: diagnosed(*given)._replace(part=joint.part))
+    monkeypatch.setattr(
+        Diagnosis, "__call__", lambda *given: diagnosed(*given)._replace(part=joint.part)
+    )
     env = NeuralASMSafety(Solid(*fault), monitor, "graded", release_after=2)
     env.reset(seed=99)
     said = []
     while len(said) < 125 and not (said and said[-1]["gave_up"]):
         said.append(env.step(ACT)[4]["asm"])
     first = next((t for t, s in enumerate(said) if s["case"] == case), None)
-    assert {s["case"] for s in said[60:80]} == {"", "actuator" if family == "joint" else family}  # not at once
+    assert {s["case"] for s in said[60:80]} == {
+        "",
+        "actuator" if family == "joint" else family,
+    }  # not at once
     assert first is not None
     assert (first >= 60 + 25) == case.startswith("lasting")
     assert any(s["intervened"] for s in said) or not case.startswith("lasting")
@@ -107,8 +116,14 @@ def test_what_presses_decides_whatever_the_cause_is_taken_for(family):
 
     env = NeuralASMSafety(Pressing(), Judge({9}, family), release_after=2)
     said = infos(env, 12)
-    assert (said[9]["case"], said[9]["response"], said[9]["reason"]) == ("pressing", DEFAULT["pressing"], "contact")
-    assert said[9]["cause"]["family"] == {"joint": "actuator", "command": "action"}.get(family, family)
+    assert (said[9]["case"], said[9]["response"], said[9]["reason"]) == (
+        "pressing",
+        DEFAULT["pressing"],
+        "contact",
+    )
+    assert said[9]["cause"]["family"] == {"joint": "actuator", "command": "action"}.get(
+        family, family
+    )
     assert said[9]["severity"]["presses"]
     assert [s["intervened"] for s in said[8:12]] == [False, False, True, True]
 
@@ -145,14 +160,17 @@ def test_who_presses_for_the_third_time_is_ended_and_who_presses_for_long_is_too
 
 
 @pytest.mark.parametrize(
-    ("felt", "probability", "goes_on"), [(0.1, 0.9, True), (None, 0.9, False), (0.1, 0.45, False), (1.1, 0.9, False)]
+    ("felt", "probability", "goes_on"),
+    [(0.1, 0.9, True), (None, 0.9, False), (0.1, 0.45, False), (1.1, 0.9, False)],
 )
-def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure(felt, probability, goes_on):
+def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure(
+    felt, probability, goes_on
+):
     monitor = Judge({10}, "object")
     named = monitor.diagnosis_.readout
-    named.p = probability * (named.p == named.p.max()) + (1 - probability) * (named.p != named.p.max()) / (
-        len(named.p) - 1
-    )
+    named.p = probability * (named.p == named.p.max()) + (1 - probability) * (
+        named.p != named.p.max()
+    ) / (len(named.p) - 1)
     inner = Acting()
     inner.felt = felt
     said = infos(NeuralASMSafety(inner, monitor, "graded"), 13)
@@ -161,7 +179,9 @@ def test_the_policy_goes_on_only_where_somebody_would_feel_and_the_cause_is_sure
 
 
 @pytest.mark.parametrize(("force", "goes_on"), [(39.0, True), (41.0, False)])
-def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_motion(force, goes_on):
+def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_motion(
+    force, goes_on
+):
     monitor = Judge({10}, "object")
     diagnosis, spec = monitor.diagnosis_, monitor.spec
     diagnostician = Diagnostician(spec, diagnosis, DEFAULT, asked=True)
@@ -196,7 +216,9 @@ def test_the_policy_goes_on_for_a_bounded_time_and_is_held_then():
 @pytest.mark.parametrize("response", ["go on", "complete"])
 @pytest.mark.parametrize("cause", ["pressing", "lasting pressing"])
 def test_a_table_that_lets_a_pressing_arm_go_on_is_refused(cause, response):
-    with pytest.raises(ValueError, match=f"'{response}' would let a pressing arm go on: {cause} takes hold"):
+    with pytest.raises(
+        ValueError, match=f"'{response}' would let a pressing arm go on: {cause} takes hold"
+    ):
         NeuralASMSafety(Acting(), Judge(()), responses={cause: response})
 
 
@@ -227,7 +249,9 @@ def test_who_leans_again_and_again_presses_though_he_lets_go_for_a_moment():
 
 
 def test_who_leans_hard_with_a_slow_hand_presses_sooner_than_one_whose_own_inertia_that_may_be():
-    slow, fast, gentle = (weighed([0.0] * 20 + [force] * 12, v)[20:, 2] for force, v in ((76, 0), (76, 0.3), (42, 0)))
+    slow, fast, gentle = (
+        weighed([0.0] * 20 + [force] * 12, v)[20:, 2] for force, v in ((76, 0), (76, 0.3), (42, 0))
+    )
     assert (np.argmax(slow), np.argmax(fast), np.argmax(gentle)) == (2, 10, 8)
 
 

@@ -18,7 +18,11 @@ SIZES = {"hidden_size": 4, "association_size": 4, "epochs": 1}
 @pytest.fixture
 def shelf(tmp_path, monkeypatch):
     """A room with one memory, of a body called sines under the controller SWING."""
-    memory = NeuralASM(sine_spec(), **SIZES).fit(sine_episodes(4)).calibrate(sine_episodes(4, seed=1), 0.5)
+    memory = (
+        NeuralASM(sine_spec(), **SIZES)
+        .fit(sine_episodes(4))
+        .calibrate(sine_episodes(4, seed=1), 0.5)
+    )
     memory.about = {"name": "sines", "controller": "SWING"}
     memory.save(tmp_path / "sines.asm")
     monkeypatch.setattr("asm_gym.monitors.shipped.SHIPPED", tmp_path)
@@ -31,7 +35,10 @@ def test_a_shipped_memory_is_loaded_by_name_with_its_threshold_and_what_is_known
     assert memory.threshold == shelf.threshold
     assert memory.about == {"name": "sines", "controller": "SWING"}
     assert repr(memory) == f"<NeuralASM 'sines', sines at 20 Hz, threshold {shelf.threshold:.4g}>"
-    with pytest.raises(ValueError, match=r"unknown pretrained memory 'cosines'; known: sines; did you mean 'sines'\?"):
+    with pytest.raises(
+        ValueError,
+        match=r"unknown pretrained memory 'cosines'; known: sines; did you mean 'sines'\?",
+    ):
         NeuralASM.pretrained("cosines")
 
 
@@ -41,19 +48,27 @@ def test_a_shipped_memory_is_loaded_by_name_with_its_threshold_and_what_is_known
         (replace(sine_spec(), source="cosines"), "SWING", "robot: sines against cosines"),
         (sine_spec(), "SLIDE", "controller: SWING against SLIDE"),
         (replace(sine_spec(), dt=0.01), "SWING", "dt: 0.05 s against 0.01 s"),
-        (replace(sine_spec(sensory=11), source="sines"), "SWING", "joint_position: size 12 against 11"),
+        (
+            replace(sine_spec(sensory=11), source="sines"),
+            "SWING",
+            "joint_position: size 12 against 11",
+        ),
     ],
 )
 def test_another_body_is_refused_with_what_there_is_and_what_to_do(shelf, spec, controller, why):
     with pytest.raises(ValueError, match="no shipped memory fits") as refused:
         pretrained_for(spec, controller)
     assert f"sines: {why}" in str(refused.value)
-    made = f"asm-gym babble --robot {spec.source}" + (" --stream-freq 100 for" if spec.dt == 0.01 else " for")
+    made = f"asm-gym babble --robot {spec.source}" + (
+        " --stream-freq 100 for" if spec.dt == 0.01 else " for"
+    )
     assert made in str(refused.value)
 
 
 def test_the_wrapper_without_a_monitor_says_what_there_is_where_none_fits(shelf):
-    with pytest.raises(ValueError, match=r"no shipped memory fits this stream of an unnamed body at 20 Hz"):
+    with pytest.raises(
+        ValueError, match=r"no shipped memory fits this stream of an unnamed body at 20 Hz"
+    ):
         NeuralASMSafety(FakeEnv())
 
 
@@ -78,8 +93,12 @@ def test_an_environment_of_the_panda_is_watched_by_the_memory_of_its_body():
 @pytest.mark.floats
 @pytest.mark.parametrize("robot", ["Panda", "Sawyer", "IIWA"])
 @pytest.mark.parametrize("stream_freq", [None, 100])
-def test_each_arm_and_rate_has_a_memory_of_its_own_and_a_healthy_episode_is_quiet(robot, stream_freq):
-    env = NeuralASMSafety(gym.make("asm_gym/Lift-v0", robot=robot, stream_freq=stream_freq), on_alarm="monitor")
+def test_each_arm_and_rate_has_a_memory_of_its_own_and_a_healthy_episode_is_quiet(
+    robot, stream_freq
+):
+    env = NeuralASMSafety(
+        gym.make("asm_gym/Lift-v0", robot=robot, stream_freq=stream_freq), on_alarm="monitor"
+    )
     name = robot.lower() + ("_100hz" if stream_freq else "")
     assert env.monitor.about["name"] == name
     assert env.threshold == NeuralASM.pretrained(name).threshold

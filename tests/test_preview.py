@@ -17,7 +17,12 @@ from tests.fakes import CueMonitor, FakeEnv
 from tests.test_lerobot import MOTORS, LeRobotGuard, recorded
 
 HAND = StreamSpec(
-    (Channel("hand_position", 3, "m"), Channel("hand_velocity", 3, "m/s"), Channel("action", 2, group=MOTOR)), dt=0.05
+    (
+        Channel("hand_position", 3, "m"),
+        Channel("hand_velocity", 3, "m/s"),
+        Channel("action", 2, group=MOTOR),
+    ),
+    dt=0.05,
 )
 UP = np.tile([0, 0, 0.5, 0, 0, 0, 0], (16, 1))
 DOWN = -UP
@@ -32,7 +37,9 @@ def path(speed, commands=(0.0, 0.5)):
 
 
 def test_what_healthy_policies_commanded_is_their_range_and_their_greatest_step():
-    found = healthy_commands([path(0.2, (0.0, 0.5)), np.vstack([path(0.2, (1.0, 0.5)), path(0.2, (0.4, 0.5))])], HAND)
+    found = healthy_commands(
+        [path(0.2, (0.0, 0.5)), np.vstack([path(0.2, (1.0, 0.5)), path(0.2, (0.4, 0.5))])], HAND
+    )
     np.testing.assert_allclose(found, [[0.0, 0.5], [1.0, 0.5], [0.6, 0.0]], atol=1e-6)
 
 
@@ -56,9 +63,13 @@ def memory(lift):
 
 
 def test_a_hand_that_would_go_faster_than_any_was_there_is_the_end_of_a_chunk():
-    spec = StreamSpec((*HAND.channels[:2], Channel("hand_angular_velocity", 3), HAND.channels[2]), HAND.dt)
+    spec = StreamSpec(
+        (*HAND.channels[:2], Channel("hand_angular_velocity", 3), HAND.channels[2]), HAND.dt
+    )
     rows = np.insert(path(0.2, (0.2, 0.0)), 6, np.zeros((3, 1)), axis=1)
-    known = SimpleNamespace(spec=spec, pace_={"": HandSpeedMap.learned([rows], spec)}, motion_=np.zeros((5, 3)))
+    known = SimpleNamespace(
+        spec=spec, pace_={"": HandSpeedMap.learned([rows], spec)}, motion_=np.zeros((5, 3))
+    )
     known.motion_[3, 0] = 1.0  # the hand has the velocity that is commanded
     row, last = rows[10], rows[10, 9:]
 
@@ -71,7 +82,9 @@ def test_a_hand_that_would_go_faster_than_any_was_there_is_the_end_of_a_chunk():
 
 
 @pytest.mark.parametrize("on_alarm", ["graded", "monitor"])
-def test_a_chunk_is_kept_up_to_the_action_that_leads_where_no_healthy_hand_was(on_alarm, memory, lift):
+def test_a_chunk_is_kept_up_to_the_action_that_leads_where_no_healthy_hand_was(
+    on_alarm, memory, lift
+):
     env = NeuralASMSafety(lift, memory, on_alarm)
     env.reset(seed=0)
     assert env.preview(UP).at is None
@@ -98,7 +111,9 @@ def test_the_limit_of_speed_counts_in_a_preview(memory, lift):
     assert slow.preview(DOWN).at > early
 
 
-@pytest.mark.parametrize("chunk", [np.zeros((0, 7)), np.zeros((4, 6)), np.zeros(7), np.zeros((2, 3, 7)), "down"])
+@pytest.mark.parametrize(
+    "chunk", [np.zeros((0, 7)), np.zeros((4, 6)), np.zeros(7), np.zeros((2, 3, 7)), "down"]
+)
 def test_what_is_no_chunk_is_refused(chunk, memory, lift):
     env = NeuralASMSafety(lift, memory)
     env.reset(seed=0)
@@ -131,7 +146,9 @@ def test_a_monitor_that_knows_no_places_says_so_and_an_episode_must_run(lift):
 
 def test_motion_and_commands_are_learned_by_calibrate_and_kept_in_files(tmp_path):
     rng = np.random.default_rng(0)
-    noisy = [Episode.from_stream(path(0.2) + 0.01 * rng.normal(size=(40, 8)), HAND) for _ in range(12)]
+    noisy = [
+        Episode.from_stream(path(0.2) + 0.01 * rng.normal(size=(40, 8)), HAND) for _ in range(12)
+    ]
     monitor = make_monitor("kalman", HAND).fit(noisy[:6])
     assert monitor.motion_ is None
     monitor.calibrate(noisy[6:], 0.5).save(tmp_path / "hand.asm")

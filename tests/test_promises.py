@@ -11,7 +11,9 @@ from asm_gym.policies.hold import Hold
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from tests.fakes import SPEC, CueMonitor, FadingMonitor, FakeEnv
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*which counts as an alarm", "ignore:.*is done instead")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*which counts as an alarm", "ignore:.*is done instead"
+)
 
 ACT = np.array([0.3, -0.2, 1.0], np.float32)
 HELD = np.array([0, 0, 1.0], np.float32)

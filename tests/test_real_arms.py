@@ -48,7 +48,11 @@ TWO_LINKS = BodyModel.of(PENDULUMS, ["position[0]", "position[1]"])
 
 def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     episode = Episode.from_table(pendulum_columns(200))
-    piece, rng, slices = Piece(episode, 100, np.array([5.0, 5.0]), None), np.random.default_rng(0), episode.spec.slices
+    piece, rng, slices = (
+        Piece(episode, 100, np.array([5.0, 5.0]), None),
+        np.random.default_rng(0),
+        episode.spec.slices,
+    )
     for kind in ("frozen", "slipped", "late", "step"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
@@ -64,17 +68,25 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
 
 def test_a_push_does_the_work_of_its_force_at_the_outermost_link():
     a, b = 0.3, 0.9
-    moved = jacobian(TWO_LINKS, np.array([a, b]))  # about y: x and z of the end of the first link, where the second is
-    np.testing.assert_allclose(moved[:, 0], 0.4 * np.array([-np.sin(a), 0.0, -np.cos(a)]), atol=1e-12)
+    moved = jacobian(
+        TWO_LINKS, np.array([a, b])
+    )  # about y: x and z of the end of the first link, where the second is
+    np.testing.assert_allclose(
+        moved[:, 0], 0.4 * np.array([-np.sin(a), 0.0, -np.cos(a)]), atol=1e-12
+    )
     np.testing.assert_allclose(moved[:, 1], 0.0, atol=1e-12)
     episode = Episode.from_table(pendulum_columns(200))
     found = with_fault("push", Piece(episode, 100, np.ones(2), TWO_LINKS), np.random.default_rng(0))
     torque = (found.stream - episode.stream)[-1, episode.spec.slices["effort"]].astype(float)
-    along = jacobian(TWO_LINKS, episode.stream[-1, episode.spec.slices["position"]].astype(float))[0, 0]
+    along = jacobian(TWO_LINKS, episode.stream[-1, episode.spec.slices["position"]].astype(float))[
+        0, 0
+    ]
     assert 0.0 < abs(torque[0] / along) <= NEWTONS
 
 
-def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folder, tmp_path, capsys):
+def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(
+    folder, tmp_path, capsys
+):
     out = [
         "--out",
         str(tmp_path / "out"),
@@ -84,7 +96,9 @@ def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folde
         "association_values",
         "friction_rule",
     ]
-    assert main(["reproduce", "real_arms", str(folder), *out, "--experiments", "ur10", "panda"]) == 0
+    assert (
+        main(["reproduce", "real_arms", str(folder), *out, "--experiments", "ur10", "panda"]) == 0
+    )
     text = (tmp_path / "out" / "real_arms.md").read_text()
     assert "UR10" in text
     assert "panda_exciting_trajectory.db3 is missing: it is unisa-acg" in text
@@ -94,7 +108,14 @@ def test_the_study_runs_on_files_of_the_same_shape_and_names_a_missing_one(folde
 
 def test_the_study_gives_monitors_a_body_model_or_names_the_missing_file(folder, tmp_path, capsys):
     out = ["--out", str(tmp_path / "out"), "--experiments", "ur10", "--workers", "1"]
-    command = ["reproduce", "real_arms", str(folder), *out, "--monitors", "association_values, body"]
+    command = [
+        "reproduce",
+        "real_arms",
+        str(folder),
+        *out,
+        "--monitors",
+        "association_values, body",
+    ]
     assert main(command) == 0
     assert "| association_values, body |" in (tmp_path / "out" / "real_arms.md").read_text()
     (folder / "urdf" / "ur10_robot.urdf").unlink()
@@ -103,6 +124,9 @@ def test_the_study_gives_monitors_a_body_model_or_names_the_missing_file(folder,
 
 
 def test_every_monitor_meets_the_same_faults(folder):
-    one, other = ([r["kind"] for r in examined(Job("ur10", m, 0, 1), folder)] for m in ("kalman", "friction_rule"))
+    one, other = (
+        [r["kind"] for r in examined(Job("ur10", m, 0, 1), folder)]
+        for m in ("kalman", "friction_rule")
+    )
     assert one == other
     assert set(one) == {*FAULTS, ""}

@@ -47,7 +47,9 @@ def test_what_is_registered_is_known_in_worker_processes_and_what_is_forgotten_i
     assert before == [[False] * 4] * 2
     assert not any("mine" in rows for rows in added().values())
     register_task("mine", SyntheticArm, horizon=20)
-    register_fault("mine", lambda drawn, severity: Push(newtons=(5.0, 10.0, 20.0)[severity], onset=drawn.onset))
+    register_fault(
+        "mine", lambda drawn, severity: Push(newtons=(5.0, 10.0, 20.0)[severity], onset=drawn.onset)
+    )
     register_policy("mine", Still)
     MONITORS["mine"] = MONITORS["kalman"]
     assert parallel_map(known, ["mine"] * 2, 2) == [[True] * 4] * 2

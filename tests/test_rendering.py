@@ -25,7 +25,9 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
-with_opengl = pytest.mark.skipif(rendering_backend() is None, reason="this machine has no OpenGL to render with")
+with_opengl = pytest.mark.skipif(
+    rendering_backend() is None, reason="this machine has no OpenGL to render with"
+)
 
 
 def scene(colour: str = "0.9 0.1 0.1") -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -47,7 +49,9 @@ def test_a_picture_shows_the_scene_without_its_collision_shapes(renderer: Offscr
     picture = renderer.render(*scene())
     assert picture.shape == (48, 64, 3)
     assert picture.dtype == np.uint8
-    assert picture[24, 32, 0] > picture[24, 32, 2], "the box, red; the shape above it is for collisions alone"
+    assert picture[24, 32, 0] > picture[24, 32, 2], (
+        "the box, red; the shape above it is for collisions alone"
+    )
     assert picture[2, 2, 2] > picture[2, 2, 0], "the floor, blue"
 
 

@@ -34,7 +34,9 @@ def a_trace(condition: str, seed: int, acting: str = "policy alone") -> ScoredEp
     channels = tuple(f"joint_position[{i}]" for i in range(20))
     onset, outcome = 20 if fault.any() else None, InterventionOutcome(True, 10 * rng.random())
     kept = {"attribution": attribution, "channels": channels, "fault": fault}
-    made = ScoredEpisode(condition, seed, 0.05, 20.0, surprise, onset, acting=acting, outcome=outcome, **kept)
+    made = ScoredEpisode(
+        condition, seed, 0.05, 20.0, surprise, onset, acting=acting, outcome=outcome, **kept
+    )
     return made.attributed(attribution, channels)
 
 
@@ -51,9 +53,16 @@ def figures_of(traces: list[ScoredEpisode]) -> dict[str, Figure]:
     }
 
 
-def test_figures_are_the_same_bytes_whatever_the_users_style_and_leave_it_alone(traces, tmp_path: Path):
-    before = {name: figures.save(f, tmp_path / f"{name}.png").read_bytes() for name, f in figures_of(traces).items()}
-    with mpl.rc_context({"axes.facecolor": "red", "font.size": 30, "axes.labelsize": 30, "ytick.direction": "in"}):
+def test_figures_are_the_same_bytes_whatever_the_users_style_and_leave_it_alone(
+    traces, tmp_path: Path
+):
+    before = {
+        name: figures.save(f, tmp_path / f"{name}.png").read_bytes()
+        for name, f in figures_of(traces).items()
+    }
+    with mpl.rc_context(
+        {"axes.facecolor": "red", "font.size": 30, "axes.labelsize": 30, "ytick.direction": "in"}
+    ):
         again = figures_of(traces)
         assert mpl.rcParams["font.size"] == 30.0
     for name, figure in again.items():
@@ -66,7 +75,9 @@ def test_infinite_and_zero_surprise_can_be_drawn(traces, tmp_path: Path):
     surprise = good.surprise.copy()
     surprise[:5], surprise[30:] = 0.0, np.inf
     broken = dataclasses.replace(good, surprise=surprise)
-    for name, figure in figures_of([broken, *(t for t in traces if t.condition == "nominal")]).items():
+    for name, figure in figures_of(
+        [broken, *(t for t in traces if t.condition == "nominal")]
+    ).items():
         assert figures.save(figure, tmp_path / f"{name}.png").stat().st_size > 5000
 
 
@@ -114,11 +125,19 @@ class _Page(HTMLParser):
 def test_a_report_holds_everything_and_fetches_nothing(traces, tmp_path: Path):
     table = tabulate("Detection", CONDITION_COLUMNS, by_condition(traces, 1.0))
     drawn = {"A figure": figures_of(traces)["surprise"]}
-    out = write_report(tmp_path / "report.html", "Lift", "First.\n\nSecond.", [table], drawn, {"seed": 0})
+    out = write_report(
+        tmp_path / "report.html", "Lift", "First.\n\nSecond.", [table], drawn, {"seed": 0}
+    )
     source = out.read_text(encoding="utf-8")
     page = _Page(source)
     assert [s["aria-label"] for s in page.all("svg")] == ["A figure"]
-    assert [len(page.all(tag)) for tag in ("table", "caption", "p", "script", "link")] == [1, 1, 2, 0, 0]
+    assert [len(page.all(tag)) for tag in ("table", "caption", "p", "script", "link")] == [
+        1,
+        1,
+        2,
+        0,
+        0,
+    ]
     assert not re.search(r"https?://|@import|url\((?!#)", source)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html"]  # nothing unfinished
 
@@ -138,7 +157,13 @@ def test_a_table_of_conditions_has_the_numbers_of_the_summary(traces):
     rows = by_condition(traces, 0.5)
     table = tabulate("", CONDITION_COLUMNS, rows)
     nominal, push, _ = (dict(zip(table.headings, row, strict=True)) for row in table.rows)
-    assert (push[""], push["\ndetected"], nominal["\ndetected"]) == ("push", str(rows[1].detected.k), "")
+    assert (push[""], push["\ndetected"], nominal["\ndetected"]) == (
+        "push",
+        str(rows[1].detected.k),
+        "",
+    )
     assert push["delay [ms]\nmedian, 95 %"].endswith(">500")  # there are misses
     found = sum(r.detected.k for r in rows)
-    assert headline(rows).startswith(f"{found} of 16 faults detected; {false_alarms(rows[0].watched).k} of 8 nominal")
+    assert headline(rows).startswith(
+        f"{found} of 16 faults detected; {false_alarms(rows[0].watched).k} of 8 nominal"
+    )

@@ -20,7 +20,9 @@ from asm_gym.scripts.reproduce import STUDIES, hours, kit, memorise_and_recall
 
 
 def test_spread_is_over_seeds_and_not_over_measurements():
-    records = [{"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs]
+    records = [
+        {"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs
+    ]
     assert kit.over_seeds(records, "x", kind="a") == pytest.approx((4.0, math.sqrt(8)))
     assert kit.shown(records, "x", 1, kind="a") == "4.0 ± 2.8"
     assert kit.shown(records, "x", kind="b") == ""
@@ -51,16 +53,26 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_study(tmp_path, caps
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("study", [study for study in STUDIES if study not in ("hours", "real_arms")])
+@pytest.mark.parametrize(
+    "study", [study for study in STUDIES if study not in ("hours", "real_arms")]
+)
 def test_every_study_runs_from_end_to_end(study, tmp_path, capsys):
-    assert cli(["reproduce", study, "--quick", "--workers", "1", "--seed", "3", "--out", str(tmp_path)]) == 0
+    assert (
+        cli(
+            ["reproduce", study, "--quick", "--workers", "1", "--seed", "3", "--out", str(tmp_path)]
+        )
+        == 0
+    )
     kept = json.loads((tmp_path / f"{study}.json").read_text())
     assert kept["seed"] == 3
     assert kept["versions"].keys() >= {"asm_gym", "numpy", "torch"}
     with (tmp_path / f"{study}.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     table = (tmp_path / f"{study}.md").read_text()
-    if study in ("harm", "chunks"):  # which count episodes; the others have means over seeds and a figure
+    if study in (
+        "harm",
+        "chunks",
+    ):  # which count episodes; the others have means over seeds and a figure
         assert rows
         assert "|" in table
     else:
@@ -78,28 +90,45 @@ def ten_minutes(seed, peak, onset=None, severity=""):
     surprise = np.zeros(600)
     surprise[300 if onset is None else onset] = peak
     kind = "nominal" if onset is None else "push"
-    return ScoredEpisode(kind, seed, 1.0, 0.0, surprise, onset=onset, task="Lift", severity=severity)
+    return ScoredEpisode(
+        kind, seed, 1.0, 0.0, surprise, onset=onset, task="Lift", severity=severity
+    )
 
 
 def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_met():
     solved = [ten_minutes(n, peak) for n, peak in enumerate([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])]
     severities = [(2.5, "strong"), (9.0, "medium"), (2.0, "mild")]
     faults = [ten_minutes(n, peak, 200, severity) for n, (peak, severity) in enumerate(severities)]
-    marks = [Marks("lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0))]
+    marks = [
+        Marks("lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0))
+    ]
     table = promises_table(marks, {1.0: 4.5, 5.0: 1.5}, 1.0)
     assert "1.00 healthy hours" in table.caption
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
-    assert [row[2].split()[0] for row in table.rows] == ["2.0", "5.0"]  # peaks 5 and 6; peaks 2 to 6
-    assert [row[-2:] for row in table.rows] == [("50 % of 2", "0 % of 1"), ("100 % of 2", "100 % of 1")]
+    assert [row[2].split()[0] for row in table.rows] == [
+        "2.0",
+        "5.0",
+    ]  # peaks 5 and 6; peaks 2 to 6
+    assert [row[-2:] for row in table.rows] == [
+        ("50 % of 2", "0 % of 1"),
+        ("100 % of 2", "100 % of 1"),
+    ]
     severe = [marks[0]._replace(metrics=DetectionMetrics("", faults[:2], solved, 1.0))]
-    assert [row[-1] for row in promises_table(severe, {1.0: 4.5, 5.0: 1.5}, 1.0).rows] == ["50 % of 2", "100 % of 2"]
+    assert [row[-1] for row in promises_table(severe, {1.0: 4.5, 5.0: 1.5}, 1.0).rows] == [
+        "50 % of 2",
+        "100 % of 2",
+    ]
 
 
 def test_promises_over_halves_come_true_where_all_hours_are_alike():
     rng = np.random.default_rng(0)
-    solved = [replace(ten_minutes(n, 0.0), surprise=rng.exponential(size=600)) for n in range(240)]  # 40 hours
+    solved = [
+        replace(ten_minutes(n, 0.0), surprise=rng.exponential(size=600)) for n in range(240)
+    ]  # 40 hours
     faults = [ten_minutes(0, 99.0, 200, "strong"), ten_minutes(1, 0.5, 200, "strong")]
-    table = hours.splits_table([Marks("scripted", solved, [], DetectionMetrics("", faults, solved, 1.0))])
+    table = hours.splits_table(
+        [Marks("scripted", solved, [], DetectionMetrics("", faults, solved, 1.0))]
+    )
     assert "40.0 healthy hours" in table.caption
     came = [float(cell.split()[0]) for cell in table.rows[0]]
     np.testing.assert_allclose(came, hours.PROMISES, rtol=0.25)
@@ -121,4 +150,6 @@ def test_an_e_detector_alarms_no_more_often_than_promised_and_lets_weak_evidence
         fresh.follow(5.0)  # such as one block in 150 reaches
     assert np.diff(thresholds)[: int(np.argmax(np.array(thresholds) < 5.0))].max() < 0
     assert min(thresholds) < 5.0  # the alarm comes, though no episode alone would raise it
-    assert thresholds[0] > np.quantile(peaks, 1 - 1 / 50)  # what the hourly threshold of this promise is
+    assert thresholds[0] > np.quantile(
+        peaks, 1 - 1 / 50
+    )  # what the hourly threshold of this promise is

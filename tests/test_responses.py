@@ -34,7 +34,9 @@ def test_unknown_names_in_a_table_are_refused_with_the_known_ones(table, message
         NeuralASMSafety(FakeEnv(), CueMonitor(), on_alarm="graded", responses=table)
 
 
-@pytest.mark.parametrize(("family", "response"), [("contact", "hold"), ("object", "go on"), ("command", "hold")])
+@pytest.mark.parametrize(
+    ("family", "response"), [("contact", "hold"), ("object", "go on"), ("command", "hold")]
+)
 def test_what_is_done_follows_from_the_cause(family, response):
     env = NeuralASMSafety(Acting(), Judge({10}, family), on_alarm="graded", release_after=2)
     said = infos(env, 20)
@@ -49,7 +51,10 @@ def test_what_is_done_follows_from_the_cause(family, response):
 
 
 def test_by_default_the_cause_decides_where_the_monitor_names_one_and_the_robot_holds_where_it_does_not():
-    for monitor, actions in ((Judge({10}, "object"), [ACT] * 12), (CueMonitor({10}), [ACT] * 11 + [0 * ACT])):
+    for monitor, actions in (
+        (Judge({10}, "object"), [ACT] * 12),
+        (CueMonitor({10}), [ACT] * 11 + [0 * ACT]),
+    ):
         inner = Acting()
         monitor.spec = Judge({10}).spec
         infos(NeuralASMSafety(inner, monitor), 12)
@@ -57,14 +62,18 @@ def test_by_default_the_cause_decides_where_the_monitor_names_one_and_the_robot_
 
 
 def test_a_table_of_ones_own_is_followed():
-    env = NeuralASMSafety(Acting(), Judge({10}, "contact"), on_alarm="graded", responses={"contact": "go on"})
+    env = NeuralASMSafety(
+        Acting(), Judge({10}, "contact"), on_alarm="graded", responses={"contact": "go on"}
+    )
     said = infos(env, 20)
     assert said[10]["transition"] == "go on"
     assert not any(s["intervened"] for s in said)
 
 
 def test_stopping_holds_for_half_a_second_and_ends_the_episode():
-    env = NeuralASMSafety(Acting(), Judge(range(10, 99), "joint"), on_alarm="graded", responses={"actuator": "stop"})
+    env = NeuralASMSafety(
+        Acting(), Judge(range(10, 99), "joint"), on_alarm="graded", responses={"actuator": "stop"}
+    )
     env.reset(seed=0)
     outs = []
     while not outs or not (outs[-1][2] or outs[-1][3]):
@@ -76,7 +85,9 @@ def test_stopping_holds_for_half_a_second_and_ends_the_episode():
 
 def test_a_contact_that_lasts_is_answered_as_one():
     table = {"contact": "go on", "lasting contact": "hold"}
-    env = NeuralASMSafety(Acting(), Judge(range(10, 99), "contact"), on_alarm="graded", responses=table)
+    env = NeuralASMSafety(
+        Acting(), Judge(range(10, 99), "contact"), on_alarm="graded", responses=table
+    )
     said = infos(env, 35)
     assert [s["response"] for s in said[10:30]] == ["go on"] * 20
     assert said[30]["response"] == "hold"
@@ -146,8 +157,14 @@ def test_a_sensor_that_the_policy_cannot_read_stops_nobody_and_is_said(caplog):
         said = infos(env, 80)
     assert "complete: surprise" in caplog.text
     assert "(sensor lone, 0.9" in caplog.text
-    assert (said[21]["cause"]["part"], said[21]["case"], said[21]["response"]) == ("lone", "sensor", "complete")
-    assert [s["completed"] for s in said] == [()] * 21 + [("lone",)] * 59  # it is never well again: nothing tells of it
+    assert (said[21]["cause"]["part"], said[21]["case"], said[21]["response"]) == (
+        "lone",
+        "sensor",
+        "complete",
+    )
+    assert [s["completed"] for s in said] == [()] * 21 + [
+        ("lone",)
+    ] * 59  # it is never well again: nothing tells of it
     assert not any(s["intervened"] or s["failure"] for s in said)
     np.testing.assert_array_equal(env.unwrapped.actions, [ACT] * 80)
 
@@ -161,7 +178,9 @@ def test_readings_that_are_lost_and_were_never_read_stop_nobody(caplog):
 
 
 def test_where_it_is_not_known_what_a_policy_reads_the_robot_holds():
-    changed = gym.wrappers.TransformObservation(Partial(lone_offset), lambda o: o[:3], gym.spaces.Box(-50, 50, (3,)))
+    changed = gym.wrappers.TransformObservation(
+        Partial(lone_offset), lambda o: o[:3], gym.spaces.Box(-50, 50, (3,))
+    )
     with pytest.warns(UserWarning, match="so the robot holds"):
         env = NeuralASMSafety(changed, of_stream(Judge({21})), on_alarm="graded", release_after=2)
     assert [s["intervened"] for s in infos(env, 30)[21:25]] == [False, True, True, False]
@@ -186,7 +205,9 @@ def test_all_senses_lost_is_held():
     class Careful(Judge):
         def observe(self, state, stream):
             state, surprise = super().observe(state, stream)
-            return state, surprise._replace(value=np.where(np.isfinite(stream).all(axis=1), 0.1, np.inf))
+            return state, surprise._replace(
+                value=np.where(np.isfinite(stream).all(axis=1), 0.1, np.inf)
+            )
 
     said = infos(NeuralASMSafety(Acting(blind), Careful(()), on_alarm="graded"), 20)
     assert all(s["intervened"] for s in said[10:])
@@ -203,8 +224,13 @@ def test_a_stream_that_stops_for_a_second_is_held_for_as_long_without_a_trial_an
     with pytest.warns(UserWarning, match="stream: ValueError"):
         said = infos(env, 60)
     assert [t for t, s in enumerate(said) if s["intervened"]] == list(range(21, 45))
-    assert [t for t, s in enumerate(said) if s["failure"].startswith("stream: ")] == list(range(20, 40))
-    assert [(t, s["transition"]) for t, s in enumerate(said) if s["transition"]] == [(20, "override"), (44, "release")]
+    assert [t for t, s in enumerate(said) if s["failure"].startswith("stream: ")] == list(
+        range(20, 40)
+    )
+    assert [(t, s["transition"]) for t, s in enumerate(said) if s["transition"]] == [
+        (20, "override"),
+        (44, "release"),
+    ]
 
 
 def test_a_diagnosis_that_raises_is_answered_as_the_unknown_is():

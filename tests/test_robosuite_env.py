@@ -16,7 +16,9 @@ from asm_gym.tasks import ROBOTS, TASKS
 
 
 def test_an_environment_runs_where_opencv_cannot_be_imported(tmp_path):
-    (tmp_path / "cv2.py").write_text("raise ImportError('libGL.so.1: cannot open shared object file')")
+    (tmp_path / "cv2.py").write_text(
+        "raise ImportError('libGL.so.1: cannot open shared object file')"
+    )
     code = """
 import sys, gymnasium, asm_gym
 env = gymnasium.make("asm_gym/Lift-v0")
@@ -25,7 +27,9 @@ assert "cv2" not in sys.modules, "the stand-in must not be left to others"
 print(len(env.step(env.action_space.sample())))
 """
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    out = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    out = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
     assert out.stdout.strip() == "5"
 
 
@@ -57,9 +61,18 @@ def test_the_stream_is_named_number_by_number(lift):
     assert info["stream"].dtype == np.float32
     assert info["success"] is False
     assert spec.dt == pytest.approx(0.05)
-    assert {c.group for c in spec.channels} == {"joint", "torque", "hand", "wrench", "gripper", MOTOR}
+    assert {c.group for c in spec.channels} == {
+        "joint",
+        "torque",
+        "hand",
+        "wrench",
+        "gripper",
+        MOTOR,
+    }
     action = np.array([0.5, -0.25, 3.0, 0, 0, 0, -1], np.float32)
-    np.testing.assert_array_equal(lift.step(action)[4]["stream"][spec.motor], np.clip(action, -1, 1))
+    np.testing.assert_array_equal(
+        lift.step(action)[4]["stream"][spec.motor], np.clip(action, -1, 1)
+    )
 
 
 def test_without_noise_the_stream_reads_the_simulators_own_state():
@@ -70,7 +83,9 @@ def test_without_noise_the_stream_reads_the_simulators_own_state():
     robot = env.unwrapped.robosuite_env.robots[0]
     np.testing.assert_allclose(stream[slices["joint_position"]], data.qpos[:7], rtol=1e-6)
     np.testing.assert_allclose(stream[slices["commanded_torque"]], data.ctrl[:7], rtol=1e-6)
-    np.testing.assert_allclose(stream[slices["hand_position"]], data.site_xpos[robot.eef_site_id["right"]], rtol=1e-6)
+    np.testing.assert_allclose(
+        stream[slices["hand_position"]], data.site_xpos[robot.eef_site_id["right"]], rtol=1e-6
+    )
     env.close()
 
 
@@ -80,7 +95,9 @@ def test_noise_has_the_standard_deviation_that_the_spec_names():
     rest = np.zeros(7, np.float32)
     env.reset(seed=0)
     exact.reset(seed=0)
-    errors = np.array([env.step(rest)[4]["stream"] - exact.step(rest)[4]["stream"] for _ in range(150)])
+    errors = np.array(
+        [env.step(rest)[4]["stream"] - exact.step(rest)[4]["stream"] for _ in range(150)]
+    )
     noise = env.unwrapped.stream_spec.noise
     ratio = errors.std(axis=0)[noise > 0] / noise[noise > 0]
     # The standard deviation of a standard deviation of 150 draws is 6 %; 75 channels stay within 4 of those.
@@ -113,12 +130,18 @@ def test_external_torque_is_the_force_on_a_body_seen_from_the_joints():
     for _ in range(20):
         env.step(np.zeros(7, np.float32))
     model, data = env.unwrapped.simulation.model, env.unwrapped.simulation.data
-    body, force, jacobian = model.body("robot0_link5").id, np.array([3.0, 10.0, -5.0]), np.zeros((3, model.nv))
+    body, force, jacobian = (
+        model.body("robot0_link5").id,
+        np.array([3.0, 10.0, -5.0]),
+        np.zeros((3, model.nv)),
+    )
     data.xfrc_applied[body, :3] = force
     stream = env.step(np.zeros(7, np.float32))[4]["stream"]
     mujoco.mj_jac(model, data, jacobian, None, data.xipos[body], body)
     torque = stream[env.unwrapped.stream_spec.slices["external_torque"]]
-    np.testing.assert_allclose(torque, (jacobian.T @ force)[:7], atol=0.15)  # joint friction is external too, 0.1 N m
+    np.testing.assert_allclose(
+        torque, (jacobian.T @ force)[:7], atol=0.15
+    )  # joint friction is external too, 0.1 N m
     env.close()
 
 
@@ -144,7 +167,9 @@ def test_an_unstable_simulation_ends_the_episode_and_says_so(lift):
     assert not lift.reset(seed=0)[1]["unstable"]
 
 
-@pytest.mark.parametrize("action", [np.zeros(6), np.zeros((1, 7)), np.full(7, np.nan)], ids=["short", "batch", "nan"])
+@pytest.mark.parametrize(
+    "action", [np.zeros(6), np.zeros((1, 7)), np.full(7, np.nan)], ids=["short", "batch", "nan"]
+)
 def test_a_bad_action_is_refused(lift, action):
     lift.reset(seed=0)
     with pytest.raises(ValueError, match="action"):
@@ -204,7 +229,10 @@ def test_vectors_of_environments_agree_with_single_ones(lift, mode):
 @pytest.mark.slow
 def test_every_robot_that_tasks_list_has_a_file():
     assert tuple(robots.ROBOTS) == ROBOTS
-    assert [name for name in ROBOTS if robots.robot_named(name).has_inverse_kinematics] == ["Panda", "Sawyer"]
+    assert [name for name in ROBOTS if robots.robot_named(name).has_inverse_kinematics] == [
+        "Panda",
+        "Sawyer",
+    ]
     with pytest.raises(ValueError, match="Panda"):
         robots.robot_named("Baxter")
 

@@ -41,7 +41,10 @@ def streams(**how):
 
 def test_an_object_and_a_factory_give_the_same_episodes_with_any_number_of_workers():
     expected = streams(policy=Damp(), workers=1)
-    assert expected[0].shape == (200, 3 + 1)  # where info has no stream, observation and action are it
+    assert expected[0].shape == (
+        200,
+        3 + 1,
+    )  # where info has no stream, observation and action are it
     for policy in (Damp(), Damp, lambda env: Damp()):
         for workers in (1, 2):
             for a, b in zip(expected, streams(policy=policy, workers=workers), strict=True):
@@ -112,14 +115,18 @@ with claimed(Path(sys.argv[1]), "run.json", {}):
 @pytest.fixture
 def holder(tmp_path):
     """Another process that works in the folder."""
-    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout.readline() == "held\n"
     yield process
     process.kill()
     process.wait()
 
 
-def test_a_second_command_is_refused_until_the_first_ends_even_if_it_is_killed(holder, tmp_path, capsys):
+def test_a_second_command_is_refused_until_the_first_ends_even_if_it_is_killed(
+    holder, tmp_path, capsys
+):
     with pytest.raises(BlockingIOError, match="in use"), claimed(tmp_path, "run.json", {}):
         pass
     assert main(["collect", PENDULUM, "--policy", "sway", "--out", str(tmp_path)]) == 2
@@ -137,7 +144,10 @@ def test_a_run_continues_with_its_settings_and_is_refused_with_others(tmp_path):
     for _ in range(2):
         with claimed(tmp_path, "run.json", {"seed": 1, "task": "Lift"}):
             pass
-    with pytest.raises(ValueError, match="seed: 1 there, 2 here"), claimed(tmp_path, "run.json", {"seed": 2}):
+    with (
+        pytest.raises(ValueError, match="seed: 1 there, 2 here"),
+        claimed(tmp_path, "run.json", {"seed": 2}),
+    ):
         pass
 
 
@@ -148,7 +158,13 @@ def test_only_what_is_missing_is_made(tmp_path):
 
     (tmp_path / "1").write_text("old")
     seen = []
-    made = make_missing(make, [0, 1, 2], lambda n: tmp_path / str(n), 1, lambda done, total: seen.append((done, total)))
+    made = make_missing(
+        make,
+        [0, 1, 2],
+        lambda n: tmp_path / str(n),
+        1,
+        lambda done, total: seen.append((done, total)),
+    )
     assert [p.read_text() for p in made] == ["new", "old", "new"]
     assert seen == [(1, 3), (2, 3), (3, 3)]
 
@@ -157,11 +173,19 @@ def recording(role: str, seed: int, force: float, success: bool = True) -> Episo
     made = sine_episodes(1)[0]
     kind = {"kind": "push", "severity": "mild", "onset": 5} if role == "faulty" else {}
     forces = np.full(len(made), force, np.float32)
-    return replace(made, success=success, label=EpisodeLabel("Lift", role, seed=seed, **kind), contact_force=forces)
+    return replace(
+        made,
+        success=success,
+        label=EpisodeLabel("Lift", role, seed=seed, **kind),
+        contact_force=forces,
+    )
 
 
 def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
-    nominal = [recording(role, seed, 10.0) for seed, role in enumerate(["fit", "fit", "calibration", "nominal"])]
+    nominal = [
+        recording(role, seed, 10.0)
+        for seed, role in enumerate(["fit", "fit", "calibration", "nominal"])
+    ]
     crash, failure = recording("nominal", 7, 21.0), recording("fit", 8, 90.0, success=False)
     faulty = [recording("faulty", seed, 300.0) for seed in (3, 7)]
     found = Recordings.of([*nominal, crash, failure, *faulty])
@@ -169,7 +193,10 @@ def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
     assert [e.labelled.seed for e in found.roles["faulty"]] == [3]
     assert [e.labelled.seed for role in NOMINAL_ROLES for e in found.roles[role]] == [0, 1, 2, 3]
     assert [e.labelled.seed for e in found.twins] == [3, 7]
-    unfelt = [replace(recording(role, 0, 1.0), contact_force=np.zeros(0, np.float32)) for role in NOMINAL_ROLES]
+    unfelt = [
+        replace(recording(role, 0, 1.0), contact_force=np.zeros(0, np.float32))
+        for role in NOMINAL_ROLES
+    ]
     assert Recordings.of(unfelt).left_out == (0, 0)
 
 

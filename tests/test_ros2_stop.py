@@ -13,10 +13,14 @@ from asm_gym.guard.live_events import LiveEvent
 from tests.wheel import ROOT
 
 NOTE = LiveEvent("note", 0.5, "knock: no alarm").to_json()
-ALARM = LiveEvent("alarm", 1.0, "q[0]  inf thresholds", "missing data", "q[0]", float("inf"), 0.1).to_json()
+ALARM = LiveEvent(
+    "alarm", 1.0, "q[0]  inf thresholds", "missing data", "q[0]", float("inf"), 0.1
+).to_json()
 
 
-@pytest.mark.parametrize(("lines", "left"), [([NOTE, ALARM, NOTE], [NOTE]), (["no json", NOTE], [NOTE]), ([NOTE], [])])
+@pytest.mark.parametrize(
+    ("lines", "left"), [([NOTE, ALARM, NOTE], [NOTE]), (["no json", NOTE], [NOTE]), ([NOTE], [])]
+)
 def test_an_alarm_or_the_end_of_the_watch_deactivates_the_controllers(lines, left, monkeypatch):
     ros, services = MagicMock(), MagicMock()
     for name, module in {

@@ -61,7 +61,9 @@ def leverages(R, inputs, senses):
     for g in np.unique(senses.groups):
         others = np.setdiff1d(np.arange(len(C)), places[senses.groups == g])
         b = inputs[:, others].astype(np.float64)
-        found[:, senses.groups == g] = np.sum(b * np.linalg.solve(C[np.ix_(others, others)], b.T).T, axis=1)[:, None]
+        found[:, senses.groups == g] = np.sum(
+            b * np.linalg.solve(C[np.ix_(others, others)], b.T).T, axis=1
+        )[:, None]
     return found
 
 
@@ -71,11 +73,18 @@ def observed_by(asm, state, rows):
     d, senses, (was, before) = asm.detection.detector_, asm.spec.sensory, state.detection
     white = bounded(errors, d.bound) @ d.whitening
     vector = was.vector + d.gains[:, None] * (white[:, None] - was.vector)
-    evidence = Evidence(vector, was.context + CONTEXT_GAIN * (memory.expected - was.context), was.steps + 1)
+    evidence = Evidence(
+        vector, was.context + CONTEXT_GAIN * (memory.expected - was.context), was.steps + 1
+    )
     ratios = (strength(evidence, d.gains) / d.ceiling) ** d.tail
     _, parts = pool(ratios.reshape(len(rows), -1))
-    drive = np.hstack([memory.expected, evidence.context]) @ d.context_quantile[:-1] + d.context_quantile[-1]
-    parts = parts.reshape(ratios.shape).sum(axis=1) / np.exp(np.clip(drive, *d.context_range))[:, None]
+    drive = (
+        np.hstack([memory.expected, evidence.context]) @ d.context_quantile[:-1]
+        + d.context_quantile[-1]
+    )
+    parts = (
+        parts.reshape(ratios.shape).sum(axis=1) / np.exp(np.clip(drive, *d.context_range))[:, None]
+    )
 
     counted = asm.learned_["repetition"]
     now = rows[:, senses]
@@ -102,7 +111,9 @@ def memory(dt=0.05, **settings):
     """A fitted memory, and rows (T, B, D) with which much is wrong."""
     spec = replace(sine_spec(), dt=dt)
     episodes = sine_episodes(12, spec=spec, steps=(60, 60))
-    asm = NeuralASM(spec, hidden_size=16, association_size=30, epochs=1, **settings).fit(episodes[:8])
+    asm = NeuralASM(spec, hidden_size=16, association_size=30, epochs=1, **settings).fit(
+        episodes[:8]
+    )
     rows = np.stack([e.stream.astype(np.float64) for e in episodes[-4:] + episodes[:1]], axis=1)
     rows[20, 1, 3] = np.nan
     rows[30:32, 2] = -np.inf
@@ -112,7 +123,11 @@ def memory(dt=0.05, **settings):
 
 
 def leaves(state):
-    return [state] if isinstance(state, np.ndarray) else [leaf for part in state for leaf in leaves(part)]
+    return (
+        [state]
+        if isinstance(state, np.ndarray)
+        else [leaf for part in state for leaf in leaves(part)]
+    )
 
 
 def both(asm, rows, start):
@@ -141,7 +156,13 @@ def test_one_call_gives_what_the_equations_give(dt, batch):
 @pytest.mark.parametrize("dynamics", ["traces", "settling"])
 def test_streams_that_began_at_different_times_and_named_skills_make_no_difference(dynamics):
     asm, rows, episodes = memory(0.01, dynamics=dynamics)
-    name_skills(asm, [e.__class__(**{**vars(e), "info": {"skill": str(n % 2)}}) for n, e in enumerate(episodes[:8])])
+    name_skills(
+        asm,
+        [
+            e.__class__(**{**vars(e), "info": {"skill": str(n % 2)}})
+            for n, e in enumerate(episodes[:8])
+        ],
+    )
     state = asm.initial_state(5)
     history = state.model.history._replace(steps=np.array([0, 1, 2, 5, 11]))
     both(asm, rows, state._replace(model=state.model._replace(history=history)))
@@ -185,7 +206,9 @@ def test_many_streams_leave_the_threads_of_blas_as_they_were():
     with ONE_THREAD, ONE_THREAD:
         inside = [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
     assert set(inside) == {1}
-    assert [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"] == before
+    assert [
+        pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"
+    ] == before
 
 
 LAG = 3
@@ -194,7 +217,9 @@ FAST = replace(sine_spec(), dt=0.05 / LAG)
 
 @pytest.fixture(scope="module")
 def fast() -> NeuralASM:
-    return NeuralASM(FAST, hidden_size=24, association_size=60, epochs=2).fit(sine_episodes(12, spec=FAST))
+    return NeuralASM(FAST, hidden_size=24, association_size=60, epochs=2).fit(
+        sine_episodes(12, spec=FAST)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +242,9 @@ def test_every_third_row_feels_as_if_there_were_no_others(fast, slow):
     stream = sine_episodes(1, seed=3)[0].stream
     errors = told(fast.model, stream)
     for first in range(LAG):
-        np.testing.assert_allclose(errors[first::LAG], told(slow, stream[first::LAG]), rtol=2e-5, atol=2e-6)
+        np.testing.assert_allclose(
+            errors[first::LAG], told(slow, stream[first::LAG]), rtol=2e-5, atol=2e-6
+        )
     assert np.abs(errors[2 * LAG :]).max() > 0.1
 
 
@@ -226,7 +253,9 @@ def test_recall_goes_on_with_every_third_row(fast, slow):
     rows = recall(fast, cue, 7)
     for turn in range(LAG):  # the cue's first row belongs to none of them
         expected = continued(slow.network, slow.senses_, cue[1 + turn :: LAG], 3)
-        np.testing.assert_allclose(rows[turn::LAG], expected[: len(rows[turn::LAG])], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(
+            rows[turn::LAG], expected[: len(rows[turn::LAG])], rtol=1e-4, atol=1e-5
+        )
     with pytest.raises(ValueError, match="at least 6 rows"):
         recall(fast, cue[:5], 1)
 

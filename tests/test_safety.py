@@ -47,7 +47,9 @@ def test_hold_acts_from_the_next_step_keeps_the_grip_and_hands_back_after_quiet(
 
 
 def test_an_alarm_during_the_override_starts_the_quiet_time_again():
-    infos = run(NeuralASMSafety(FakeEnv(), CueMonitor([2, 4]), on_alarm="hold", release_after=3), 10)
+    infos = run(
+        NeuralASMSafety(FakeEnv(), CueMonitor([2, 4]), on_alarm="hold", release_after=3), 10
+    )
     assert [i["asm"]["intervened"] for i in infos[1:]] == [False] * 3 + [True] * 5 + [False] * 2
 
 
@@ -81,7 +83,9 @@ def test_a_policy_of_the_users_takes_over_with_a_fresh_state():
 
     env = NeuralASMSafety(FakeEnv(), CueMonitor([0]), on_alarm=Counter(), release_after=3)
     run(env, 6)
-    np.testing.assert_allclose([a[0] for a in env.unwrapped.actions], [0.3, 0.0, 0.1, 0.2, 0.3, 0.3], atol=1e-6)
+    np.testing.assert_allclose(
+        [a[0] for a in env.unwrapped.actions], [0.3, 0.0, 0.1, 0.2, 0.3, 0.3], atol=1e-6
+    )
 
 
 def test_attribution_names_every_number_and_adds_up_to_the_surprise():
@@ -101,7 +105,9 @@ def test_reset_forgets_everything_whatever_happened(cue, release):
         assert a["asm"]["intervened"] == b["asm"]["intervened"]
 
 
-OTHER = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05)
+OTHER = StreamSpec(
+    (Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05
+)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +145,9 @@ def test_discrete_actions_are_refused_and_so_is_a_step_before_reset():
 def test_a_monitor_needs_no_base_class_and_must_answer_a_surprise(answer, got):
     class Foreign:
         threshold, spec = 1.0, SPEC
-        observe = staticmethod(lambda state, rows: (state, Surprise(np.zeros(len(rows)), np.zeros(rows.shape))))
+        observe = staticmethod(
+            lambda state, rows: (state, Surprise(np.zeros(len(rows)), np.zeros(rows.shape)))
+        )
 
         def initial_state(self, batch=1):
             return None
@@ -158,7 +166,10 @@ def test_a_reflex_that_acts_too_long_gives_up_and_ends_the_episode():
     assert [o[2] for o in outs] == [False] * 6 + [True]
     with pytest.raises(gym.error.ResetNeeded):
         env.step(ACT)
-    outs = [env.reset(seed=0), *(env.step(ACT) for _ in range(4))]  # a new episode has its own patience
+    outs = [
+        env.reset(seed=0),
+        *(env.step(ACT) for _ in range(4)),
+    ]  # a new episode has its own patience
     assert not outs[-1][2]
 
 
@@ -212,7 +223,9 @@ def test_where_a_backup_policy_fails_the_robot_holds_and_says_so(how):
 def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fails(caplog):
     """Surprise stays over the threshold whatever is done: holds of 2, 4 and 8 steps, and then it gives up."""
     caplog.set_level("INFO", logger="asm_gym.safety")
-    env = NeuralASMSafety(FakeEnv(length=60), CueMonitor(range(3, 60)), try_after=2, max_override=14)
+    env = NeuralASMSafety(
+        FakeEnv(length=60), CueMonitor(range(3, 60)), try_after=2, max_override=14
+    )
     env.reset(seed=0)
     infos = []
     while not infos or not infos[-1]["asm"]["gave_up"]:
@@ -226,13 +239,19 @@ def test_control_is_handed_back_on_trial_and_withheld_longer_after_each_that_fai
 
 def test_an_alarm_that_is_back_at_once_has_not_gone_and_ends_the_episode():
     """Quiet whenever the robot holds, and surprising again two steps after the policy goes on: a fault that lasts."""
-    env = NeuralASMSafety(FakeEnv(length=60), CueMonitor([3, 7, 11, 15, 19]), release_after=2, max_override=6)
+    env = NeuralASMSafety(
+        FakeEnv(length=60), CueMonitor([3, 7, 11, 15, 19]), release_after=2, max_override=6
+    )
     env.reset(seed=0)
     infos = []
     while not infos or not infos[-1]["asm"]["gave_up"]:
         infos.append(env.step(ACT)[4])
-    assert "".join("h" if i["asm"]["intervened"] else "p" for i in infos) == "pppp" + "hhpp" * 3 + "h"
-    later = NeuralASMSafety(FakeEnv(length=60), CueMonitor([3, 9, 15, 21, 27]), release_after=2, max_override=6)
+    assert (
+        "".join("h" if i["asm"]["intervened"] else "p" for i in infos) == "pppp" + "hhpp" * 3 + "h"
+    )
+    later = NeuralASMSafety(
+        FakeEnv(length=60), CueMonitor([3, 9, 15, 21, 27]), release_after=2, max_override=6
+    )
     assert not any(i["asm"]["gave_up"] for i in run(later, 40))
 
 
@@ -243,7 +262,9 @@ def test_recall_does_what_the_memory_expects_and_needs_one_that_expects():
 
     env = NeuralASMSafety(FakeEnv(), Expecting([2]), on_alarm="recall", release_after=2)
     run(env, 6)
-    np.testing.assert_allclose(env.unwrapped.actions[3], 0.3, rtol=1e-6)  # as expected after the row that alarmed
+    np.testing.assert_allclose(
+        env.unwrapped.actions[3], 0.3, rtol=1e-6
+    )  # as expected after the row that alarmed
     np.testing.assert_allclose(env.unwrapped.actions[4], 0.4, rtol=1e-6)
     np.testing.assert_array_equal(env.unwrapped.actions[5], ACT)
     with pytest.raises(ValueError, match="CueMonitor does not"):
@@ -280,7 +301,11 @@ def test_a_reflex_takes_over_within_a_control_step():
     np.testing.assert_array_equal(second["asm"]["executed_action"], [0, 0, 0, 0, 0, 0, 1])
     assert np.argmax(second["asm"]["surprises"]) == 2
     rows = [env.step(action)[4] for _ in range(3)]
-    assert [r["asm"]["intervened"] for r in rows] == [True, True, False]  # two control steps of quiet
+    assert [r["asm"]["intervened"] for r in rows] == [
+        True,
+        True,
+        False,
+    ]  # two control steps of quiet
     assert not env.unwrapped.row_hooks
     env.close()
 
@@ -290,7 +315,9 @@ def test_rates_that_do_not_fit_are_refused(lift):
     with pytest.raises(ValueError, match=r"dt: 0\.05 s against 0\.01 s"):
         NeuralASMSafety(fast, CueMonitor(spec=lift.unwrapped.stream_spec))
     with pytest.raises(ValueError, match="RescaleAction changes actions"):
-        NeuralASMSafety(gym.wrappers.RescaleAction(fast, -2.0, 2.0), CueMonitor(spec=fast.unwrapped.stream_spec))
+        NeuralASMSafety(
+            gym.wrappers.RescaleAction(fast, -2.0, 2.0), CueMonitor(spec=fast.unwrapped.stream_spec)
+        )
     fast.close()
 
 
@@ -303,7 +330,9 @@ class Foreseeing(CueMonitor):
 
 @pytest.mark.parametrize("name", [*REFLEXES, GRADED])
 def test_every_reflex_acts_in_the_step_after_an_alarm_by_an_action_of_its_own(name, lift):
-    env = NeuralASMSafety(lift, Foreseeing([3], lift.unwrapped.stream_spec), on_alarm=name, contact_limits=None)
+    env = NeuralASMSafety(
+        lift, Foreseeing([3], lift.unwrapped.stream_spec), on_alarm=name, contact_limits=None
+    )
     env.reset(seed=0)
     wanted = np.full(7, 0.75, np.float32)
     said = [env.step(wanted)[4]["asm"] for _ in range(5)]
@@ -340,7 +369,9 @@ def episode(env, steps=20):
 
 
 def test_a_false_alarm_raises_the_threshold_of_the_next_episode_and_not_of_its_own():
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
+    env = NeuralASMSafety(
+        FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW
+    )
     first, second = episode(env), episode(env)
     assert first["threshold"] == 1.0
     assert np.isnan(first["level"])
@@ -359,24 +390,34 @@ def test_without_adapt_nothing_moves_and_nothing_is_added():
 def test_what_goes_on_while_the_reflex_acts_is_no_drift():
     passing, lasting = {5: 2.0}, dict.fromkeys(range(5, 20), 2.0)
     for values, moved in ((passing, True), (lasting, False)):
-        env = NeuralASMSafety(FakeEnv(), ScriptedMonitor(values), release_after=3, adaptive_threshold=HOW)
+        env = NeuralASMSafety(
+            FakeEnv(), ScriptedMonitor(values), release_after=3, adaptive_threshold=HOW
+        )
         episode(env)
         assert (episode(env)["threshold"] > 1.0) is moved
 
 
 def test_surprise_of_the_reflex_itself_is_not_the_policys():
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0, 6: 1000.0}), release_after=3, adaptive_threshold=HOW)
+    env = NeuralASMSafety(
+        FakeEnv(), ScriptedMonitor({5: 2.0, 6: 1000.0}), release_after=3, adaptive_threshold=HOW
+    )
     episode(env)
-    assert episode(env)["threshold"] == pytest.approx(np.exp(0.45))  # by the 2; 1000 is above the ceiling
+    assert episode(env)["threshold"] == pytest.approx(
+        np.exp(0.45)
+    )  # by the 2; 1000 is above the ceiling
 
 
 def test_a_confirmed_alarm_and_one_above_the_ceiling_teach_nothing():
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
+    env = NeuralASMSafety(
+        FakeEnv(), ScriptedMonitor({5: 2.0}), on_alarm="monitor", adaptive_threshold=HOW
+    )
     episode(env)
     env.confirm_alarm()
     assert episode(env)["threshold"] == 1.0
     assert episode(env)["threshold"] > 1.0  # the confirmation was of one episode
-    env = NeuralASMSafety(FakeEnv(), ScriptedMonitor({5: 20.5}), on_alarm="monitor", adaptive_threshold=HOW)
+    env = NeuralASMSafety(
+        FakeEnv(), ScriptedMonitor({5: 20.5}), on_alarm="monitor", adaptive_threshold=HOW
+    )
     for _ in range(5):
         last = episode(env)
     assert last["threshold"] == 1.0
@@ -392,7 +433,9 @@ def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_epi
             return state + 1, Surprise(value, np.zeros((len(stream), self.spec.size)))
 
     lengths = (6, 10)
-    made = SyncVectorEnv([lambda n=n: FakeEnv(n) for n in lengths], autoreset_mode=AutoresetMode.NEXT_STEP)
+    made = SyncVectorEnv(
+        [lambda n=n: FakeEnv(n) for n in lengths], autoreset_mode=AutoresetMode.NEXT_STEP
+    )
     env = VectorNeuralASMSafety(made, Monitor({3: 2.0}), on_alarm="monitor", adaptive_threshold=HOW)
     env.reset()
     thresholds = []
@@ -402,7 +445,9 @@ def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_epi
     thresholds = np.array(thresholds)
     np.testing.assert_allclose(thresholds[0], [1.0, 1.0])
     once = np.exp(0.45)
-    np.testing.assert_allclose(thresholds[7], [once, 1.0])  # the first has begun anew, the second is under way
+    np.testing.assert_allclose(
+        thresholds[7], [once, 1.0]
+    )  # the first has begun anew, the second is under way
     np.testing.assert_allclose(thresholds[12], [once, once**2])
     assert infos["asm"]["level"].shape == infos["asm"]["ceiling"].shape == (2,)
     np.testing.assert_allclose(env.threshold, thresholds[-1])
@@ -410,9 +455,13 @@ def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_epi
 
 @pytest.mark.parametrize("on_alarm", ["monitor", "hold"])
 def test_a_policy_so_strange_that_most_of_its_steps_alarm_is_named_once_with_what_to_do(on_alarm):
-    strange = ScriptedMonitor(dict.fromkeys(range(0, 4000, 2), 2.0) | dict.fromkeys(range(0, 4000, 3), 2.0))
+    strange = ScriptedMonitor(
+        dict.fromkeys(range(0, 4000, 2), 2.0) | dict.fromkeys(range(0, 4000, 3), 2.0)
+    )
     env = NeuralASMSafety(FakeEnv(8000), strange, on_alarm=on_alarm, release_after=1)
-    with pytest.warns(UserWarning, match=r"of the first 200 rows under this policy alarm: .* warm_start=True") as said:
+    with pytest.warns(
+        UserWarning, match=r"of the first 200 rows under this policy alarm: .* warm_start=True"
+    ) as said:
         episode(env, 4000)
     assert len(said) == 1
 

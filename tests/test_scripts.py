@@ -16,7 +16,13 @@ from asm_gym.scripts.cli import main
 from asm_gym.version import __version__
 
 LIFT = "asm_gym/Lift-v0"
-TINY = {"fit_episodes": 6, "calibration_episodes": 19, "nominal_episodes": 2, "faulty_episodes": 1, "epochs": 3}
+TINY = {
+    "fit_episodes": 6,
+    "calibration_episodes": 19,
+    "nominal_episodes": 2,
+    "faulty_episodes": 1,
+    "epochs": 3,
+}
 
 
 def tiny(out: Path) -> None:
@@ -61,7 +67,11 @@ def test_the_demo_writes_everything_it_promises(folder):
 
 def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(folder):
     push = Push(newtons=100.0, onset=10, duration=10)
-    trace = watch(Trial(LIFT, 4, "push", faults=(push,), acting="terminate"), RolloutConfig(), folder / "lift.asm")
+    trace = watch(
+        Trial(LIFT, 4, "push", faults=(push,), acting="terminate"),
+        RolloutConfig(),
+        folder / "lift.asm",
+    )
     assert trace.detected_after is not None
     assert trace.detected_after <= 4
 

@@ -6,7 +6,9 @@ import pytest
 from asm_gym.scaling import FARTHEST, StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
-SPEC = StreamSpec((Channel("slow", 1), Channel("fast", 2), Channel("action", 1, group=MOTOR)), dt=0.05)
+SPEC = StreamSpec(
+    (Channel("slow", 1), Channel("fast", 2), Channel("action", 1, group=MOTOR)), dt=0.05
+)
 
 
 @pytest.fixture
@@ -21,15 +23,22 @@ def streams():
 
 def test_values_and_changes_are_standardised_by_hand(streams):
     senses = StreamScaler.fit(SPEC, streams)
-    row, before, earlier = np.array([[1.0, 2.0, 3.0, 0.5], [0.9, 0.0, 0.0, 0.0], [0.7, 9.0, 9.0, 9.0]])[:, None]
+    row, before, earlier = np.array(
+        [[1.0, 2.0, 3.0, 0.5], [0.9, 0.0, 0.0, 0.0], [0.7, 9.0, 9.0, 9.0]]
+    )[:, None]
     reading = senses.read(row, before, earlier)
     rows = np.concatenate(streams).astype(np.float64)
     steps = np.concatenate([np.diff(s.astype(np.float64), axis=0) for s in streams])
     expected = [*((row[0, :3] - rows.mean(0)[:3]) / rows.std(0)[:3]), 0.1 / steps[:, 0].std()]
     np.testing.assert_allclose(reading.senses[0], expected, rtol=1e-5)
-    np.testing.assert_allclose(reading.commands[0], [(0.5 - rows.mean(0)[3]) / rows.std(0)[3], 1.0], rtol=1e-5)
+    np.testing.assert_allclose(
+        reading.commands[0], [(0.5 - rows.mean(0)[3]) / rows.std(0)[3], 1.0], rtol=1e-5
+    )
     assert reading.seen.all()
-    last = [*((before[0] - rows.mean(0)) / rows.std(0)), *((row[0, :3] - before[0, :3]) / steps.std(0)[:3])]
+    last = [
+        *((before[0] - rows.mean(0)) / rows.std(0)),
+        *((row[0, :3] - before[0, :3]) / steps.std(0)[:3]),
+    ]
     lately = 0.2 / steps[:, 0].std()
     np.testing.assert_allclose(reading.inputs[0], [*last, lately, *reading.commands[0]], rtol=1e-4)
     assert senses.inputs == reading.inputs.shape[1]

@@ -29,7 +29,11 @@ SCHEDULE = Schedule(8, 4, 3e-3, 20, 1.0, 1.0, 0.0)
 
 def network(iterations: int = 20) -> SettlingNetwork:
     return SettlingNetwork(
-        initial_settling_weights(H, S, A, np.random.default_rng(0)), unassociated(), iterations, 1, 1
+        initial_settling_weights(H, S, A, np.random.default_rng(0)),
+        unassociated(),
+        iterations,
+        1,
+        1,
     )
 
 
@@ -42,31 +46,48 @@ def total_energy(w: SettlingWeights, before, u, x, z, pi_z, pi_x) -> float:
     carried = np.tanh(before) @ w.W_H.T
     state, senses = z - carried - u @ w.W_U.T, x - np.tanh(z) @ w.W_F.T - w.b_F
     action = u[:, :-1] - np.tanh(carried + w.W_U[:, -1]) @ w.W_A.T
-    return 0.5 * float(pi_z * np.sum(state**2) + pi_x * np.sum(senses**2) + np.sum(action**2)) / len(z)
+    return (
+        0.5 * float(pi_z * np.sum(state**2) + pi_x * np.sum(senses**2) + np.sum(action**2)) / len(z)
+    )
 
 
 def problem(settled: bool):
     """Weights, what a step reads, and z: anywhere, or where inference settles; of double precision."""
     rng = np.random.default_rng(3)
-    w = SettlingWeights(*(np.asarray(W, np.float64) for W in initial_settling_weights(H, S, A, rng)))
+    w = SettlingWeights(
+        *(np.asarray(W, np.float64) for W in initial_settling_weights(H, S, A, rng))
+    )
     w.b_F[:] = rng.normal(size=S)
     before, u, x = (
         rng.normal(size=(3, H)),
         np.hstack([rng.normal(size=(3, A)), np.ones((3, 1))]),
         rng.normal(size=(3, S)),
     )
-    return w, before, u, x, settle_in_double(w, before, u, x) if settled else rng.normal(size=(3, H))
+    return (
+        w,
+        before,
+        u,
+        x,
+        settle_in_double(w, before, u, x) if settled else rng.normal(size=(3, H)),
+    )
 
 
 def settle_in_double(w: SettlingWeights, before, u, x, pi_z=2.0, pi_x=1.5):
-    mu, curvature = np.tanh(before) @ w.W_H.T + u @ w.W_U.T, pi_z + pi_x * np.linalg.norm(w.W_F, 2) ** 2
+    mu, curvature = (
+        np.tanh(before) @ w.W_H.T + u @ w.W_U.T,
+        pi_z + pi_x * np.linalg.norm(w.W_F, 2) ** 2,
+    )
     return infer(mu, x - w.b_F, w.W_F, pi_z, np.full_like(x, pi_x), curvature, 3000)
 
 
 def changes(w: SettlingWeights, before, u, x, z, pi_z=2.0, pi_x=1.5) -> SettlingWeights:
     carried = np.tanh(before) @ w.W_H.T
     mu, h = carried + u @ w.W_U.T, carried + w.W_U[:, -1]
-    errors = pi_z * (z - mu), pi_x * (x - w.b_F - np.tanh(z) @ w.W_F.T), u[:, :-1] - np.tanh(h) @ w.W_A.T
+    errors = (
+        pi_z * (z - mu),
+        pi_x * (x - w.b_F - np.tanh(z) @ w.W_F.T),
+        u[:, :-1] - np.tanh(h) @ w.W_A.T,
+    )
     return settling_change(before, u, h, errors, z, w.W_A)
 
 
@@ -99,7 +120,9 @@ def test_where_it_is_linear_it_is_the_observer_of_a_constant_gain():
     for _ in range(30):
         x = small * rng.normal(size=(1, 3))
         u = np.append(small * rng.normal(size=1), 0.0)[None]
-        z = net.follow(z, u.astype(np.float32), x.astype(np.float32), np.ones((1, 3), np.float32)).traces
+        z = net.follow(
+            z, u.astype(np.float32), x.astype(np.float32), np.ones((1, 3), np.float32)
+        ).traces
         mu = state @ w.W_H.T + u @ w.W_U.T
         state = mu + (x - mu @ C.T) @ K.T
         np.testing.assert_allclose(z, state, atol=1e-3 * small)
@@ -136,7 +159,9 @@ class Published:
         return mu, z
 
     def energy(self, before, u, x, z):
-        return 0.5 * np.sum((z - self.prediction(before, u)) ** 2) + 0.5 * np.sum((x - self.senses(z)) ** 2)
+        return 0.5 * np.sum((z - self.prediction(before, u)) ** 2) + 0.5 * np.sum(
+            (x - self.senses(z)) ** 2
+        )
 
     def learn(self, before, u, x, rate):
         """Take a step of Adam along the Hebbian changes, and return the state."""
@@ -164,9 +189,15 @@ class Published:
 def exact_problem(seed: int, steps: int = 6):
     """Random weights, and random rows (T, B, ...), of double precision, in which kernels then compute too."""
     rng = np.random.default_rng(seed)
-    w = SettlingWeights(*(np.asarray(W, np.float64) for W in initial_settling_weights(H, S, A, rng)))
+    w = SettlingWeights(
+        *(np.asarray(W, np.float64) for W in initial_settling_weights(H, S, A, rng))
+    )
     w.b_F[:] = rng.normal(size=S)
-    return w, rng.normal(size=(steps, 3, S)), np.dstack([rng.normal(size=(steps, 3, A)), np.ones((steps, 3, 1))])
+    return (
+        w,
+        rng.normal(size=(steps, 3, S)),
+        np.dstack([rng.normal(size=(steps, 3, A)), np.ones((steps, 3, 1))]),
+    )
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -219,7 +250,9 @@ def test_few_of_our_steps_of_inference_go_at_least_as_far_as_a_hundred_published
 
 @pytest.fixture(scope="module")
 def asm() -> NeuralASM:
-    memory = NeuralASM(sine_spec(), 32, 48, epochs=30, free_running_probability=0.6, dynamics="settling")
+    memory = NeuralASM(
+        sine_spec(), 32, 48, epochs=30, free_running_probability=0.6, dynamics="settling"
+    )
     return memory.fit(sine_episodes(40)).calibrate(sine_episodes(60, 1), 0.05)
 
 
@@ -228,15 +261,25 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
     loaded, episode = load_monitor(tmp_path / "settling.asm"), sine_episodes(1, 5)[0]
     assert isinstance(loaded, NeuralASM)
     assert loaded.get_params() == asm.get_params()
-    assert (loaded.dynamics, loaded.config.iterations, loaded.config.prior_precision) == ("settling", 20, 1.0)
+    assert (loaded.dynamics, loaded.config.iterations, loaded.config.prior_precision) == (
+        "settling",
+        20,
+        1.0,
+    )
     assert loaded.score(episode).value.tobytes() == asm.score(episode).value.tobytes()
     cue, after = episode.stream[:20].astype(float), episode.stream[20:30]
     np.testing.assert_array_equal(recall(loaded, cue, 10), recall(asm, cue, 10))
-    apart = np.abs(recall(asm, cue, 10) - after)[:, :12].mean(), np.abs(cue[-1] - after)[:, :12].mean()
+    apart = (
+        np.abs(recall(asm, cue, 10) - after)[:, :12].mean(),
+        np.abs(cue[-1] - after)[:, :12].mean(),
+    )
     assert apart[0] < 0.9 * apart[1]  # 0.5 to 0.8, by the rounding of what it learned
     alarms = [asm.score(frozen(e, 3, 15)).value.max() > asm.threshold for e in sine_episodes(20, 7)]
     assert np.mean(alarms) > 0.9
-    named = [Episode.from_stream(e.stream, e.spec, info={"skill": str(n % 2)}) for n, e in enumerate(sine_episodes(8))]
+    named = [
+        Episode.from_stream(e.stream, e.spec, info={"skill": str(n % 2)})
+        for n, e in enumerate(sine_episodes(8))
+    ]
     copy = load_monitor(tmp_path / "settling.asm")
     assert set(name_skills(copy, named).score(episode).skill) <= {"0", "1"}
     state = asm.initial_state()
@@ -246,15 +289,27 @@ def test_a_memory_that_settles_is_used_by_the_same_names(asm, tmp_path):
 
 
 def test_what_cannot_be_is_refused_in_a_line(asm, tmp_path):
-    with pytest.raises(ValueError, match=r"^unknown dynamics 'setling'; known: traces, settling; did you mean"):
+    with pytest.raises(
+        ValueError, match=r"^unknown dynamics 'setling'; known: traces, settling; did you mean"
+    ):
         NeuralASM(sine_spec(), dynamics="setling")
-    with pytest.raises(ValueError, match=r"^iterations must be a whole number in \[1, 1000\], got 0$"):
+    with pytest.raises(
+        ValueError, match=r"^iterations must be a whole number in \[1, 1000\], got 0$"
+    ):
         NeuralASM(sine_spec(), dynamics="settling", config=MemoryConfig(iterations=0))
     asm.save(tmp_path / "settling.asm")
     saved = read_checkpoint(tmp_path / "settling.asm", NeuralASM.kind)
-    with pytest.raises(ValueError, match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'traces'$"):
+    with pytest.raises(
+        ValueError,
+        match=r"^this is a memory of dynamics='settling', .* cannot be loaded as 'traces'$",
+    ):
         NeuralASM(sine_spec(), 32, 48).restore(saved)
     traces = NeuralASM(sine_spec(), 8, 8, epochs=1).fit(sine_episodes(5))
     traces.save(tmp_path / "traces.asm")
-    with pytest.raises(ValueError, match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$"):
-        NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(read_checkpoint(tmp_path / "traces.asm", traces.kind))
+    with pytest.raises(
+        ValueError,
+        match=r"^this is a memory of dynamics='traces', .* cannot be loaded as 'settling'$",
+    ):
+        NeuralASM(sine_spec(), 8, 8, dynamics="settling").restore(
+            read_checkpoint(tmp_path / "traces.asm", traces.kind)
+        )

@@ -20,8 +20,15 @@ def episode(env, seed, steps=8):
     """The numbers of the model at the beginning, then all that an episode of random actions shows."""
     observation, info = env.reset(seed=seed)
     env = env.unwrapped
-    shown, data = [numbers(env.simulation.model), observation.tobytes(), info["stream"].tobytes()], env.simulation.data
-    for action in np.random.default_rng(seed).uniform(-1, 1, (steps, *env.action_space.shape)).astype(np.float32):
+    shown, data = (
+        [numbers(env.simulation.model), observation.tobytes(), info["stream"].tobytes()],
+        env.simulation.data,
+    )
+    for action in (
+        np.random.default_rng(seed)
+        .uniform(-1, 1, (steps, *env.action_space.shape))
+        .astype(np.float32)
+    ):
         observation, reward, _, _, info = env.step(action)
         state = data.qpos, data.qvel, data.qacc_warmstart, observation, info["stream"]
         shown.append((reward, info["contact_force"], *(a.tobytes() for a in state)))

@@ -14,7 +14,9 @@ from asm_gym.tasks import task
 
 def pair(name, controller="OSC_POSE"):
     """Our environment and robosuite's own, at the start of the same episode."""
-    ours = gym.make(f"asm_gym/{name}-v0", controller=controller, sensor_noise=0.0, horizon=10_000).unwrapped
+    ours = gym.make(
+        f"asm_gym/{name}-v0", controller=controller, sensor_noise=0.0, horizon=10_000
+    ).unwrapped
     theirs = backend.make(task(name), ours.robots, controller, 20, reward_shaping=True)
     ours.reset(seed=4)
     for env in (theirs, ours.robosuite_env):
@@ -29,14 +31,18 @@ def gentle(size, steps, seed=0):
     """Smooth movements about where the arm starts, the gripper opening and closing."""
     t = np.arange(steps)[:, None] / 20.0
     rng = np.random.default_rng(seed)
-    return 0.25 * np.sin(2 * np.pi * rng.uniform(0.1, 0.5, size) * t + rng.uniform(0, 2 * np.pi, size))
+    return 0.25 * np.sin(
+        2 * np.pi * rng.uniform(0.1, 0.5, size) * t + rng.uniform(0, 2 * np.pi, size)
+    )
 
 
 def hands(env):
     return np.array([env.sim.data.site_xpos[r.eef_site_id[a]] for r in env.robots for a in r.arms])
 
 
-@pytest.mark.parametrize("name", ["Lift", "Stack", "Door", "NutAssemblySquare", "Wipe", "TwoArmLift"])
+@pytest.mark.parametrize(
+    "name", ["Lift", "Stack", "Door", "NutAssemblySquare", "Wipe", "TwoArmLift"]
+)
 def test_the_hand_moves_as_under_robosuites_own_step(name):
     ours, theirs = pair(name)
     assert ours.simulation.compiled
@@ -55,7 +61,12 @@ def test_the_hand_moves_as_under_robosuites_own_step(name):
 
 @pytest.mark.parametrize(
     ("controller", "compiled"),
-    [("JOINT_POSITION", True), ("OSC_POSITION", False), ("JOINT_TORQUE", False), ("IK_POSE", False)],
+    [
+        ("JOINT_POSITION", True),
+        ("OSC_POSITION", False),
+        ("JOINT_TORQUE", False),
+        ("IK_POSE", False),
+    ],
 )
 def test_other_controllers_move_as_under_robosuites_own_step(controller, compiled):
     ours, theirs = pair("Lift", controller)
@@ -85,7 +96,13 @@ def test_contacts_and_grasps_are_robosuites_own(name):
     theirs, model = env.robosuite_env, env.simulation.model
     rng, names = np.random.default_rng(0), [n for n in theirs.sim.model.geom_names if n]
     robot = theirs.robots[0]
-    groups = [robot.robot_model, robot.gripper["right"], *theirs.model.mujoco_objects[:3], names[0], names[:20]]
+    groups = [
+        robot.robot_model,
+        robot.gripper["right"],
+        *theirs.model.mujoco_objects[:3],
+        names[0],
+        names[:20],
+    ]
     touched = 0
     for _ in range(20):
         env.step(env.action_space.sample())
@@ -96,7 +113,9 @@ def test_contacts_and_grasps_are_robosuites_own(name):
             assert theirs.check_contact(one, other) == expected
             touched += expected
         grippers, thing = robot.gripper, theirs.model.mujoco_objects[0]
-        assert theirs._check_grasp(grippers, thing) == type(theirs)._check_grasp(theirs, grippers, thing)
+        assert theirs._check_grasp(grippers, thing) == type(theirs)._check_grasp(
+            theirs, grippers, thing
+        )
     assert touched
     env.close()
 
@@ -150,7 +169,11 @@ def test_nobody_tells_the_robot_of_a_payload():
     env.reset(seed=0)
     rest, data, model = np.zeros(7, np.float32), env.simulation.data, env.simulation.model
     hand = model.body("robot0_right_hand").id
-    felt, jacobian, velocities = env.stream_spec.slices["external_torque"], np.zeros((3, model.nv)), [np.zeros(3)]
+    felt, jacobian, velocities = (
+        env.stream_spec.slices["external_torque"],
+        np.zeros((3, model.nv)),
+        [np.zeros(3)],
+    )
     before = [env.step(rest)[4]["stream"][felt] for _ in range(21)][-1]
     height = hands(env.robosuite_env)[0, 2]
 
@@ -182,7 +205,10 @@ def test_two_arms_give_two_sets_of_channels_and_move_alone():
     rest, second = np.zeros(14, np.float32), 0.5 * np.eye(14, dtype=np.float32)[7 + 2]  # upwards
     before = env.step(rest)[4]["stream"]
     stream = [env.step(second)[4]["stream"] for _ in range(8)][-1]
-    moved = {n: np.abs(stream - before)[spec.slices[f"{n}_hand_position"]].max() for n in ("robot0", "robot1")}
+    moved = {
+        n: np.abs(stream - before)[spec.slices[f"{n}_hand_position"]].max()
+        for n in ("robot0", "robot1")
+    }
     assert moved["robot1"] > 0.03 > 5 * moved["robot0"]
     env.close()
 
@@ -213,9 +239,13 @@ def test_a_faster_stream_is_the_same_world_looked_at_more_often():
         np.testing.assert_array_equal(rows[-1], b["stream"])
         for name in ("external_torque", "wrist_force"):  # a step's mean is that of its rows
             of = spec.slices[name]
-            np.testing.assert_allclose(rows[:, of].mean(axis=0), a["stream"][of], rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(
+                rows[:, of].mean(axis=0), a["stream"][of], rtol=1e-4, atol=1e-3
+            )
         of = spec.slices["wrist_force_peak"]
-        np.testing.assert_allclose(np.abs(rows[:, of]).max(axis=0), np.abs(a["stream"][of]), rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(
+            np.abs(rows[:, of]).max(axis=0), np.abs(a["stream"][of]), rtol=1e-4, atol=1e-3
+        )
         assert a["contact_force"] == pytest.approx(b["contact_force"], rel=1e-6, abs=1e-9)
 
 

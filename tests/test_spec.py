@@ -28,8 +28,18 @@ SPEC = StreamSpec(
 
 def test_every_number_has_a_name_and_a_place():
     assert SPEC.size == 5
-    assert SPEC.labels == ("joint_position[0]", "joint_position[1]", "force", "action[0]", "action[1]")
-    assert SPEC.slices == {"joint_position": slice(0, 2), "force": slice(2, 3), "action": slice(3, 5)}
+    assert SPEC.labels == (
+        "joint_position[0]",
+        "joint_position[1]",
+        "force",
+        "action[0]",
+        "action[1]",
+    )
+    assert SPEC.slices == {
+        "joint_position": slice(0, 2),
+        "force": slice(2, 3),
+        "action": slice(3, 5),
+    }
     assert SPEC.sensory.tolist() == [0, 1, 2]
     assert SPEC.motor.tolist() == [3, 4]
     assert SPEC.noise.tolist() == [0.1, 0.1, 0.5, 0, 0]
@@ -58,8 +68,14 @@ def test_a_spec_survives_json(chosen, dt):
     [
         ((SPEC.channels[0], SPEC.channels[2]), "force: missing"),
         ((*SPEC.channels, Channel("smell", 1)), "smell: new"),
-        ((Channel("joint_position", 3, "rad", group="joint"), *SPEC.channels[1:]), "size 2 against 3"),
-        ((Channel("joint_position", 2, "deg", group="joint"), *SPEC.channels[1:]), "unit rad against deg"),
+        (
+            (Channel("joint_position", 3, "rad", group="joint"), *SPEC.channels[1:]),
+            "size 2 against 3",
+        ),
+        (
+            (Channel("joint_position", 2, "deg", group="joint"), *SPEC.channels[1:]),
+            "unit rad against deg",
+        ),
         ((SPEC.channels[1], SPEC.channels[0], SPEC.channels[2]), "order"),
     ],
 )
@@ -109,7 +125,9 @@ def test_an_episode_from_a_recorded_stream_is_float32_and_as_long():
     assert episode.success
 
 
-@pytest.mark.parametrize("stops", [1, np.inf, ((0.0,),), ((1.0, 0.0),), ((0.0, np.nan),), [(0.0, 1.0)], "ab"])
+@pytest.mark.parametrize(
+    "stops", [1, np.inf, ((0.0,),), ((1.0, 0.0),), ((0.0, np.nan),), [(0.0, 1.0)], "ab"]
+)
 def test_what_is_no_pair_of_stops_is_refused(stops):
     with pytest.raises(TypeError, match="channel 'q': stops must be a tuple of pairs"):
         Channel("q", 1, "rad", stops=stops)
@@ -126,7 +144,9 @@ EPISODE = Episode(
     rewards=np.ones(6, np.float32),
     faults=np.arange(6) >= 2,
     contact_force=np.arange(6, dtype=np.float32),
-    label=EpisodeLabel("Lift", "faulty", "push", "mild", 7, onset=2, affected_channels=frozenset({"force"})),
+    label=EpisodeLabel(
+        "Lift", "faulty", "push", "mild", 7, onset=2, affected_channels=frozenset({"force"})
+    ),
     info={"terminated": False},
 )
 
@@ -151,7 +171,11 @@ def test_a_label_names_a_file_and_an_episode_without_one_says_so():
 def test_a_damaged_file_is_named(tmp_path):
     whole = save_episode(tmp_path / "new.npz", EPISODE).read_bytes()
     path = tmp_path / "one.npz"
-    for damaged in (whole[: len(whole) // 2], b"", whole[:200] + bytes(b ^ 255 for b in whole[200:250]) + whole[250:]):
+    for damaged in (
+        whole[: len(whole) // 2],
+        b"",
+        whole[:200] + bytes(b ^ 255 for b in whole[200:250]) + whole[250:],
+    ):
         path.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"one\.npz is damaged"):
             load_episode(path)
@@ -179,7 +203,12 @@ def test_the_control_period_is_what_an_environment_says_of_time_and_never_silent
         self.time += 0.2
         return 0.0, 0.0, False, False, {}
 
-    own = {"time": 3.0, "step": step, "reset": lambda self: None, "action_space": gym.spaces.Discrete(2)}
+    own = {
+        "time": 3.0,
+        "step": step,
+        "reset": lambda self: None,
+        "action_space": gym.spaces.Discrete(2),
+    }
     clocked = env(**own)
     assert control_period(clocked) == pytest.approx(0.2)  # by its own clock, in a copy
     assert clocked.unwrapped.time == 3.0
@@ -192,8 +221,13 @@ def test_an_environment_whose_step_returns_six_values_is_refused_with_the_wrappe
     space = gym.spaces.Box(-1, 1, (2,), np.float32)
     zeros = np.zeros(2, np.float32)
     said = {"observation_space": space, "action_space": space, "dt": 0.1}
-    said |= {"reset": lambda self, **_: (zeros, {}), "step": lambda self, a: (zeros, 0.0, 1.0, False, False, {})}
+    said |= {
+        "reset": lambda self, **_: (zeros, {}),
+        "step": lambda self, a: (zeros, 0.0, 1.0, False, False, {}),
+    }
     recorder = StreamRecorder(type("Six", (gym.Env,), said)())
     recorder.reset()
-    with pytest.raises(TypeError, match=r"step of Six returns 6 values.*SafetyGymnasium2Gymnasium\(env\)"):
+    with pytest.raises(
+        TypeError, match=r"step of Six returns 6 values.*SafetyGymnasium2Gymnasium\(env\)"
+    ):
         recorder.step(zeros)

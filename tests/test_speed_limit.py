@@ -38,7 +38,9 @@ def asked_twist(env, arm, action):
     velocity = change * (controller.kp / controller.kd)[: len(change)]
     if controller.name == "JOINT_POSITION":
         return joint_twist(simulation, arm, velocity)
-    frame = simulation.data.site(f"{controller.naming_prefix}{controller.part_name}_center").xmat.reshape(3, 3)
+    frame = simulation.data.site(
+        f"{controller.naming_prefix}{controller.part_name}_center"
+    ).xmat.reshape(3, 3)
     twist = np.zeros(6)
     twist[: len(velocity)] = velocity
     return np.concatenate([frame @ twist[:3], frame @ twist[3:]])
@@ -48,7 +50,9 @@ def slowed(env, action, limits):
     """Return the action, and the speed from which on each arm is braked."""
     simulation = env.simulation
     action, brakes = action.astype(float), []
-    for arm, (controller, part) in enumerate(zip(simulation.controllers, simulation.moves, strict=True)):
+    for arm, (controller, part) in enumerate(
+        zip(simulation.controllers, simulation.moves, strict=True)
+    ):
         place = simulation.data.site_xpos[simulation.arms.site[arm]]
         base = simulation.data.xpos[simulation.arms.root[arm]]
         own = limits
@@ -59,7 +63,9 @@ def slowed(env, action, limits):
             continue
         asked, present = asked_twist(env, arm, action), present_twist(simulation, arm)
         shares = [
-            share_of(own, arm, place, twist, hand_speed(twist), hand_momentum(simulation, arm, twist))
+            share_of(
+                own, arm, place, twist, hand_speed(twist), hand_momentum(simulation, arm, twist)
+            )
             for twist in (asked, present)
         ]
         most = hand_speed(asked) * shares[0]
@@ -93,16 +99,22 @@ CASES = [
 
 @pytest.mark.parametrize(("task", "controller", "robot"), CASES)
 def test_actions_are_slowed_as_the_equation_says(task, controller, robot, maps):
-    env = gym.make(f"asm_gym/{task}-v0", controller=controller, robot=robot, disable_env_checker=True)
+    env = gym.make(
+        f"asm_gym/{task}-v0", controller=controller, robot=robot, disable_env_checker=True
+    )
     env.reset(seed=0)
     arm, rng = env.unwrapped, np.random.default_rng(0)
     towards_base = np.zeros(env.action_space.shape, np.float32)
     towards_base[arm.simulation.moves[0].start] = -1.0
     slower = 0
     for step in range(40):
-        action = (rng.uniform(-1, 1, env.action_space.shape) * rng.choice([0.0, 0.2, 1.0])).astype(np.float32)
+        action = (rng.uniform(-1, 1, env.action_space.shape) * rng.choice([0.0, 0.2, 1.0])).astype(
+            np.float32
+        )
         for speed_map in maps:
-            arm.contact_limits = ContactLimits(1e6, 1e6, rng.choice([0.02, 0.1, 0.3]), pace=speed_map)
+            arm.contact_limits = ContactLimits(
+                1e6, 1e6, rng.choice([0.02, 0.1, 0.3]), pace=speed_map
+            )
             expected, brakes = slowed(arm, action, arm.contact_limits)
             np.testing.assert_allclose(arm._slowed(action), expected, atol=2e-6)
             np.testing.assert_allclose(arm.simulation.speed_limits, brakes, rtol=1e-6)
@@ -121,7 +133,9 @@ def test_without_a_limit_of_speed_an_action_stays_and_no_arm_is_braked(lift):
     assert np.isinf(arm.simulation.speed_limits).all()
 
 
-@pytest.mark.parametrize("place", [np.full(3, np.nan), np.full(3, np.inf), np.full(3, 1e30), np.full(3, -9.0)])
+@pytest.mark.parametrize(
+    "place", [np.full(3, np.nan), np.full(3, np.inf), np.full(3, 1e30), np.full(3, -9.0)]
+)
 def test_nothing_is_known_of_a_place_outside_the_map(place):
     speed_map = HandSpeedMap(np.array([[1, 0, 0, 0, *[0.1] * 12]]))
     assert cell_near(speed_map.grid, speed_map.low, 1, np.array([0.01, 0.01, 0.01])) >= 0

@@ -49,7 +49,9 @@ def test_products_along_synapses_and_back_are_matrix_products(batch, senses):
     a, W = rng.normal(size=(batch, 6)), rng.normal(size=(senses, 6))
     np.testing.assert_allclose(outward(a, W), a @ W.T, rtol=1e-12)
     x, pi = rng.normal(size=(batch, senses)), rng.uniform(size=(batch, senses))
-    np.testing.assert_allclose(called(feedback)(a, x, W, pi), (pi * (x - a @ W.T)) @ W, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        called(feedback)(a, x, W, pi), (pi * (x - a @ W.T)) @ W, rtol=1e-12, atol=1e-12
+    )
 
 
 def test_energy_gradient_is_that_of_finite_differences():
@@ -68,7 +70,10 @@ def test_energy_never_rises_during_inference(seed, weight, reach):
     _, mu, x, W_F, pi_z, pi_x = problem(seed, dtype=np.float64)
     W_F, x = W_F * weight, x * reach
     curvature = pi_z + pi_x.max() * np.linalg.norm(W_F, 2) ** 2
-    energies = [energy(infer(mu, x, W_F, pi_z, pi_x, curvature, k), mu, x, W_F, pi_z, pi_x) for k in range(15)]
+    energies = [
+        energy(infer(mu, x, W_F, pi_z, pi_x, curvature, k), mu, x, W_F, pi_z, pi_x)
+        for k in range(15)
+    ]
     assert (np.diff(energies, axis=0) / (1.0 + energies[0])).max() <= 1e-6
 
 
@@ -125,7 +130,8 @@ def sines(count: int, motor: int = 2) -> list[Trajectory]:
 def test_learning_lowers_the_energy_and_is_reproducible():
     episodes = sines(12)
     first, again = (
-        learn_traces(episodes, 32, schedule(epochs=15), np.random.default_rng(7), lambda: None) for _ in range(2)
+        learn_traces(episodes, 32, schedule(epochs=15), np.random.default_rng(7), lambda: None)
+        for _ in range(2)
     )
     assert first.energy[-1] < 0.6 * first.energy[0]  # two of seven numbers are noise
     pairs = zip(first.network.weights, again.network.weights, strict=True)
@@ -142,7 +148,12 @@ def test_a_bit_that_was_seen_long_ago_is_recalled():
     how = schedule(epochs=100, batch_size=8, learning_rate=5e-3, prior_precision=30.0)
     network, right = learn_traces(episodes, 32, how, rng, lambda: None).network, []
     for episode in episodes:
-        cued = follow(network, network.at_rest(1), episode.senses[:delay, None], episode.commands[:delay, None])
+        cued = follow(
+            network,
+            network.at_rest(1),
+            episode.senses[:delay, None],
+            episode.commands[:delay, None],
+        )
         right.append(run_on(network, cued.traces, 1).senses[0, 0, 1] * episode.senses[0, 0])
     assert min(right) > 0
     assert np.mean(right) > 0.4
@@ -171,15 +182,24 @@ def test_a_missing_sense_is_inferred_from_the_others():
     rng = np.random.default_rng(0)
     rows = rng.choice([-1.0, 1.0], size=(40, 30, 1)).repeat(2, axis=2).astype(np.float32)
     episodes = [Trajectory(r, np.ones((30, 1), np.float32), r) for r in rows]
-    net = learn_traces(episodes, 16, schedule(epochs=40, batch_size=8), rng, lambda: None).network.with_iterations(50)
+    net = learn_traces(
+        episodes, 16, schedule(epochs=40, batch_size=8), rng, lambda: None
+    ).network.with_iterations(50)
     for r in rows[:20]:
-        step = net.follow(net.at_rest(1), np.ones((1, 1), np.float32), r[:1], np.array([[1.0, 0.0]], np.float32))
-        assert step.traces.reshape(len(DECAYS), 3)[0, 1] * r[0, 1] > 0  # the fastest trace is the row itself
+        step = net.follow(
+            net.at_rest(1), np.ones((1, 1), np.float32), r[:1], np.array([[1.0, 0.0]], np.float32)
+        )
+        assert (
+            step.traces.reshape(len(DECAYS), 3)[0, 1] * r[0, 1] > 0
+        )  # the fastest trace is the row itself
 
 
 def phases(count: int) -> list[Trajectory]:
     senses, commands = some_rows(40, count, S, A)
-    return [Trajectory(senses[: 30 + n, n], commands[: 30 + n, n], senses[: 30 + n, n]) for n in range(count)]
+    return [
+        Trajectory(senses[: 30 + n, n], commands[: 30 + n, n], senses[: 30 + n, n])
+        for n in range(count)
+    ]
 
 
 @pytest.mark.parametrize("free", [0.0, 1.0])
@@ -209,12 +229,16 @@ def test_recall_is_in_the_units_of_the_stream_and_better_than_standing_still(asm
     for episode in sine_episodes(10, seed=9, steps=(60, 60)):
         true = episode.stream[20:35, asm.spec.sensory]
         recalled = recall(asm, episode.stream[:20], 15)[:, asm.spec.sensory]
-        errors.append([np.mean(((x - true) / spread) ** 2) for x in (recalled, true[:1] + 0 * true)])
+        errors.append(
+            [np.mean(((x - true) / spread) ** 2) for x in (recalled, true[:1] + 0 * true)]
+        )
     recalled, held = np.mean(errors, axis=0)
     assert recalled < 0.6 * held
     asm.save(tmp_path / "a.asm")
     cue = sine_episodes(1, seed=3)[0].stream[:10]
-    np.testing.assert_array_equal(recall(NeuralASM.load(tmp_path / "a.asm"), cue, 6), recall(asm, cue, 6))
+    np.testing.assert_array_equal(
+        recall(NeuralASM.load(tmp_path / "a.asm"), cue, 6), recall(asm, cue, 6)
+    )
 
 
 @pytest.mark.parametrize(

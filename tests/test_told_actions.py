@@ -22,7 +22,9 @@ STEPS = 30
 
 def lift(limits=LIMITS, **more):
     env = gym.make("asm_gym/Lift-v0")
-    return NeuralASMSafety(env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=limits, **more)
+    return NeuralASMSafety(
+        env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=limits, **more
+    )
 
 
 def joints(env):
@@ -59,7 +61,9 @@ def test_under_every_controller_that_scales_actions_the_one_that_is_told_moves_t
 ):
     how = {"controller": controller, "stream_freq": stream_freq}
     env, bare = gym.make("asm_gym/Lift-v0", **how), gym.make("asm_gym/Lift-v0", **how)
-    guarded = NeuralASMSafety(env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=LIMITS)
+    guarded = NeuralASMSafety(
+        env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=LIMITS
+    )
     guarded.reset(seed=0)
     bare.reset(seed=0)
     acted, braked = set(), []
@@ -84,7 +88,9 @@ def test_steps_in_which_the_brake_slowed_the_arm_are_told_and_no_others_differ_f
     controller, quiet
 ):
     env, bare = (gym.make("asm_gym/Lift-v0", controller=controller) for _ in range(2))
-    guarded = NeuralASMSafety(env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=LIMITS)
+    guarded = NeuralASMSafety(
+        env, CueMonitor(spec=env.unwrapped.stream_spec), "hold", contact_limits=LIMITS
+    )
     guarded.reset(seed=0)
     bare.reset(seed=0)
     braked = []
@@ -102,7 +108,10 @@ def test_steps_in_which_the_brake_slowed_the_arm_are_told_and_no_others_differ_f
 
 def test_where_a_wrapper_inside_changes_actions_what_was_slowed_is_unknown_and_no_zero():
     env = gym.make("asm_gym/Lift-v0")
-    spec, inside = env.unwrapped.stream_spec, gym.wrappers.RescaleAction(env, np.float32(-2), np.float32(2))
+    spec, inside = (
+        env.unwrapped.stream_spec,
+        gym.wrappers.RescaleAction(env, np.float32(-2), np.float32(2)),
+    )
     guarded = NeuralASMSafety(inside, CueMonitor(spec=spec), "hold", contact_limits=LIMITS)
     guarded.reset(seed=0)
     assert np.isnan(guarded.step(guarded.action_space.high)[4]["asm"]["slowed"])
@@ -129,7 +138,9 @@ def test_many_environments_tell_it_as_one_does():
 
 
 def watched(wrapper=lambda env: env, cue=(2,), **more):
-    return NeuralASMSafety(wrapper(FakeEnv(6)), CueMonitor(cue), **{"on_alarm": "terminate", **more})
+    return NeuralASMSafety(
+        wrapper(FakeEnv(6)), CueMonitor(cue), **{"on_alarm": "terminate", **more}
+    )
 
 
 def test_stable_baselines_counts_every_episode_that_the_guard_ends_and_what_it_reports():
@@ -137,17 +148,30 @@ def test_stable_baselines_counts_every_episode_that_the_guard_ends_and_what_it_r
     counted = {"info_keywords": ("cost", "cost_sum", "is_success")}
     envs = util.make_vec_env(watched, monitor_kwargs=counted)
     envs.reset()
-    ended = [info["episode"] for _ in range(24) for info in envs.step(np.zeros((1, 3)))[3] if "episode" in info]
+    ended = [
+        info["episode"]
+        for _ in range(24)
+        for info in envs.step(np.zeros((1, 3)))[3]
+        if "episode" in info
+    ]
     assert [(e["l"], e["r"], e["cost"], e["cost_sum"], e["is_success"]) for e in ended] == [
         (3, 3.0, 1.0, 1.0, False)
     ] * 8
-    with pytest.raises(ValueError, match=r"Monitor\(NeuralASMSafety.*make_vec_env\(lambda: NeuralASMSafety"):
-        util.make_vec_env(lambda: FakeEnv(6), wrapper_class=NeuralASMSafety, wrapper_kwargs={"monitor": CueMonitor()})
+    with pytest.raises(
+        ValueError, match=r"Monitor\(NeuralASMSafety.*make_vec_env\(lambda: NeuralASMSafety"
+    ):
+        util.make_vec_env(
+            lambda: FakeEnv(6),
+            wrapper_class=NeuralASMSafety,
+            wrapper_kwargs={"monitor": CueMonitor()},
+        )
 
 
 def test_a_counting_wrapper_that_would_not_see_ends_is_refused():
     for on_alarm in ("terminate", "hold", "graded", None):
-        with pytest.raises(ValueError, match=r"RecordEpisodeStatistics\(NeuralASMSafety\(env, monitor\)\)"):
+        with pytest.raises(
+            ValueError, match=r"RecordEpisodeStatistics\(NeuralASMSafety\(env, monitor\)\)"
+        ):
             watched(lambda env: ClipAction(RecordEpisodeStatistics(env)), on_alarm=on_alarm)
         with pytest.raises(ValueError, match=r"RecordEpisodeStatistics\(NeuralASMSafety"):
             watched(RecordEpisodeStatistics, on_alarm=on_alarm)
@@ -164,11 +188,16 @@ def test_what_counts_inside_a_guard_of_many_is_refused_and_outside_it_sees_every
         return RecordEpisodeStatistics(FakeEnv(6))
 
     for kind in (gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv):
-        for on_alarm, made in (("terminate", kind([counted] * 2)), ("hold", CountMany(kind([FakeEnv] * 2)))):
+        for on_alarm, made in (
+            ("terminate", kind([counted] * 2)),
+            ("hold", CountMany(kind([FakeEnv] * 2))),
+        ):
             with pytest.raises(ValueError, match=r"RecordEpisodeStatistics\(VectorNeuralASMSafety"):
                 VectorNeuralASMSafety(made, Cued(), on_alarm)
             VectorNeuralASMSafety(made, Cued(), "monitor").close()
-    many = CountMany(VectorNeuralASMSafety(gym.vector.SyncVectorEnv([FakeEnv] * 2), Cued(), "terminate"))
+    many = CountMany(
+        VectorNeuralASMSafety(gym.vector.SyncVectorEnv([FakeEnv] * 2), Cued(), "terminate")
+    )
     many.reset(seed=0)
     steps = [many.step(np.zeros((2, 3), np.float32)) for _ in range(16)]
     lengths = [found[4]["episode"]["l"].tolist() for found in steps if "episode" in found[4]]
@@ -182,16 +211,22 @@ def test_a_guard_of_many_tells_whose_action_was_overridden():
             state, surprise = super().observe(state, stream)
             return state, surprise._replace(value=np.array([0.0, 10.0]) * (state.steps == 3))
 
-    many = VectorNeuralASMSafety(gym.vector.SyncVectorEnv([FakeEnv] * 2), Cued(), "hold", release_after=2)
+    many = VectorNeuralASMSafety(
+        gym.vector.SyncVectorEnv([FakeEnv] * 2), Cued(), "hold", release_after=2
+    )
     many.reset(seed=0)
-    told = np.array([many.step(np.full((2, 3), 0.5, np.float32))[4]["overridden"] for _ in range(7)])
+    told = np.array(
+        [many.step(np.full((2, 3), 0.5, np.float32))[4]["overridden"] for _ in range(7)]
+    )
     np.testing.assert_array_equal(told, np.array([[False, 3 <= t < 5] for t in range(7)]))
 
 
 SPACES = {
     "whole numbers": gym.spaces.Box(-5, 5, (2,), np.int64),
     "bytes": gym.spaces.Box(0, 255, (2,), np.uint8),
-    "a dict": gym.spaces.Dict(arm=gym.spaces.Box(-1, 1, (2,), np.float32), grip=gym.spaces.Discrete(2)),
+    "a dict": gym.spaces.Dict(
+        arm=gym.spaces.Box(-1, 1, (2,), np.float32), grip=gym.spaces.Discrete(2)
+    ),
     "a tuple": gym.spaces.Tuple((gym.spaces.Discrete(3), gym.spaces.Box(-1, 1, (1,), np.float32))),
     "several choices": gym.spaces.MultiDiscrete([3, 2]),
 }
@@ -203,7 +238,9 @@ def parts(action):
 
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("on_alarm", ["monitor", "terminate"])
-def test_actions_of_any_space_are_recorded_watched_and_reach_the_environment_in_their_type(space, on_alarm):
+def test_actions_of_any_space_are_recorded_watched_and_reach_the_environment_in_their_type(
+    space, on_alarm
+):
     class Strict(FakeEnv):
         def __init__(self):
             super().__init__(8, own_stream=False)
@@ -220,7 +257,8 @@ def test_actions_of_any_space_are_recorded_watched_and_reach_the_environment_in_
         recorder.step(action)
     (episode,) = recorder.episodes
     np.testing.assert_array_equal(
-        episode.stream[:, 2:], [flat(SPACES[space], action).astype(np.float32) for action in actions]
+        episode.stream[:, 2:],
+        [flat(SPACES[space], action).astype(np.float32) for action in actions],
     )
     env = NeuralASMSafety(Strict(), CueMonitor((3,), recorder.stream_spec), on_alarm)
     env.reset(seed=0)
@@ -278,7 +316,9 @@ def test_senses_that_repeat_bit_for_bit_are_missing_and_the_arm_is_held(share):
             assert not info["cost"]
         elif share == 1.0:
             assert info["asm"]["intervened"] == (t > 11)
-        assert t != 11 or not share or info["asm"]["reason"] in ("failure", "missing")  # half of all is too much
+        assert (
+            t != 11 or not share or info["asm"]["reason"] in ("failure", "missing")
+        )  # half of all is too much
     assert bool(info["asm"]["state"] == "policy") == (not share)
     env.close()
 
@@ -328,7 +368,12 @@ def test_an_action_at_the_limit_exactly_is_not_slowed_and_one_beyond_is_and_none
     at = np.float32([0, 0, kept * (1 - 1e-6), 0, 0, 0, 0])
     assert env.step(at)[4]["asm"]["slowed"] == 0.0
     assert env.step(1.01 * at)[4]["asm"]["slowed"] > 0.0
-    for wild in (np.full(7, 1e30), np.array([0, 0, 0, 0, 0, 0, np.inf]), [0, "up", 0, 0, 0, 0, 0], None):
+    for wild in (
+        np.full(7, 1e30),
+        np.array([0, 0, 0, 0, 0, 0, np.inf]),
+        [0, "up", 0, 0, 0, 0, 0],
+        None,
+    ):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

@@ -36,7 +36,9 @@ def linear_expert(count=4, steps=60, seed=0):
         actions = 0.4 * observations[:-1, :1] - 0.3 * observations[:-1, 1:2]
         stream = np.concatenate([observations[1:], actions], axis=1)
         rewards = rng.normal(size=steps).astype(np.float32)
-        episodes.append(Episode(stream, spec, actions=actions, observations=observations, rewards=rewards))
+        episodes.append(
+            Episode(stream, spec, actions=actions, observations=observations, rewards=rewards)
+        )
     return episodes
 
 
@@ -56,9 +58,15 @@ def test_the_buffer_holds_the_demonstrations_and_which_of_them_were_cut_short(en
     mean, scale = np.full(3, 0.5, np.float32), np.full(3, 2.0, np.float32)
     fill_buffer(learner, [episode], Standardised(env, mean, scale))
     buffer = learner.replay_buffer
-    np.testing.assert_allclose(buffer.observations[:5, 0], (episode.observations[:-1] - mean) / scale, rtol=1e-5)
-    np.testing.assert_allclose(buffer.next_observations[:5, 0], (episode.observations[1:] - mean) / scale, rtol=1e-5)
-    np.testing.assert_allclose(buffer.actions[:5, 0], episode.actions / 2, rtol=1e-5)  # of the pendulum's ±2 N m
+    np.testing.assert_allclose(
+        buffer.observations[:5, 0], (episode.observations[:-1] - mean) / scale, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        buffer.next_observations[:5, 0], (episode.observations[1:] - mean) / scale, rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        buffer.actions[:5, 0], episode.actions / 2, rtol=1e-5
+    )  # of the pendulum's ±2 N m
     assert buffer.timeouts[:5, 0].tolist() == [0, 0, 0, 0, 1]
     assert not buffer.sample(64).dones.any()
 
@@ -75,7 +83,13 @@ def test_the_buffer_holds_the_action_that_was_executed():
 
 
 def test_an_agent_is_cloned_improved_and_judged(tmp_path):
-    counts = {"steps": 30, "cloning_updates": 10, "evaluate_every": 15, "evaluation_episodes": 1, "seed": 3}
+    counts = {
+        "steps": 30,
+        "cloning_updates": 10,
+        "evaluate_every": 15,
+        "evaluation_episodes": 1,
+        "seed": 3,
+    }
     how, make = counts | {"progress": lambda done, total: None}, partial(gym.make, "Pendulum-v1")
     agent = train(make, tmp_path, linear_expert(), **how)
     assert np.load(tmp_path / "log" / "evaluations.npz")["timesteps"].tolist() == [15, 30]
@@ -83,7 +97,9 @@ def test_an_agent_is_cloned_improved_and_judged(tmp_path):
     again = train(make, tmp_path / "again", linear_expert(), **how)
     seen = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
     np.testing.assert_array_equal(agent.predict(seen)[0], again.predict(seen)[0])
-    with pytest.raises(ValueError, match="demonstration 0 has observations of 3 numbers, the environment 2"):
+    with pytest.raises(
+        ValueError, match="demonstration 0 has observations of 3 numbers, the environment 2"
+    ):
         train(partial(gym.make, "MountainCarContinuous-v0"), tmp_path, linear_expert(), **how)
 
 
@@ -92,7 +108,9 @@ def test_what_was_cloned_is_not_lost_while_it_is_improved(tmp_path):
     few = ["--demonstrations", "60", "--cloning-updates", "4000", "--final-episodes", "20"]
     judged = ["--steps", "400", "--evaluate-every", "200", "--evaluation-episodes", "4"]
     assert main(["train", "Lift", *few, *judged, "--out", str(tmp_path)]) == 0
-    assert json.loads((tmp_path / "result.json").read_text())["success"] >= 0.5  # 0 where SAC destroys the clone
+    assert (
+        json.loads((tmp_path / "result.json").read_text())["success"] >= 0.5
+    )  # 0 where SAC destroys the clone
 
 
 def test_the_command_clones_an_expert(tmp_path):
@@ -101,8 +119,12 @@ def test_the_command_clones_an_expert(tmp_path):
     assert NetworkPolicy.load(tmp_path / "agent.npz").trained_in["robots"] == ["Panda"]
 
 
-@pytest.mark.parametrize(("made_in", "message"), [("asm_gym/Door-v0", "Door-v0"), ("asm_gym/Lift-v0", "damaged")])
-def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(made_in, message, env, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("made_in", "message"), [("asm_gym/Door-v0", "Door-v0"), ("asm_gym/Lift-v0", "damaged")]
+)
+def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(
+    made_in, message, env, tmp_path, capsys
+):
     episodes = [replace(e, faults=np.zeros(len(e), bool)) for e in linear_expert(2)]
     write_dataset(tmp_path / "data", "asm_gym/pendulum-v0", episodes, env, {})
     (data,) = (tmp_path / "data").rglob("metadata.json")
@@ -112,7 +134,10 @@ def test_a_dataset_that_does_not_fit_is_refused_before_anything_is_learned(made_
     if message == "damaged":
         (recorded,) = (tmp_path / "data").rglob("main_data.hdf5")
         recorded.write_bytes(recorded.read_bytes()[:1000])
-    assert main(["train", "Lift", "--dataset", str(tmp_path / "data"), "--out", str(tmp_path / "out")]) == 2
+    assert (
+        main(["train", "Lift", "--dataset", str(tmp_path / "data"), "--out", str(tmp_path / "out")])
+        == 2
+    )
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 

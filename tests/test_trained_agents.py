@@ -25,7 +25,9 @@ class Uneven(FakeEnv):
 
     def __init__(self):
         super().__init__()
-        self.action_space = spaces.Box(np.array([-1, 0, -3], np.float32), np.array([1, 5, -1], np.float32))
+        self.action_space = spaces.Box(
+            np.array([-1, 0, -3], np.float32), np.array([1, 5, -1], np.float32)
+        )
 
 
 @pytest.mark.parametrize("algorithm", [SAC, PPO])
@@ -40,8 +42,19 @@ def test_an_archive_of_stable_baselines3_acts_as_the_agent_that_was_saved(algori
 
 
 def test_an_agent_with_more_than_its_layers_is_refused(tmp_path):
-    arrays = {"W0": np.zeros((3, 2)), "b0": np.zeros(3), "mean": np.zeros(2), "scale": np.ones(2), "more": np.zeros(1)}
-    write_checkpoint(tmp_path / "a.npz", "agent", {"activation": "relu", "squash": "tanh", "trained_in": {}}, arrays)
+    arrays = {
+        "W0": np.zeros((3, 2)),
+        "b0": np.zeros(3),
+        "mean": np.zeros(2),
+        "scale": np.ones(2),
+        "more": np.zeros(1),
+    }
+    write_checkpoint(
+        tmp_path / "a.npz",
+        "agent",
+        {"activation": "relu", "squash": "tanh", "trained_in": {}},
+        arrays,
+    )
     with pytest.raises(ValueError, match=r"a\.npz is damaged: an agent has no more"):
         NetworkPolicy.load(tmp_path / "a.npz")
 
@@ -121,5 +134,9 @@ def test_shipped_agents_say_where_they_are_from_and_do_their_task(name):
     env = gym.make(header["trained_in"]["env"])
     agent = make_policy(name, env)
     share = about["success"] - CHANCE
-    assert not failures(lambda s: "" if rollout(env, agent, s) else "not solved", episode_seeds(0, 10, stage=3), share)
+    assert not failures(
+        lambda s: "" if rollout(env, agent, s) else "not solved",
+        episode_seeds(0, 10, stage=3),
+        share,
+    )
     env.close()

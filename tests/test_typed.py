@@ -30,7 +30,14 @@ def call(
     "arguments",
     [
         {"path": Path("a"), "count": np.int64(3), "share": np.float32(0.5), "names": ["a", "b"]},
-        {"path": "a", "share": 1, "names": np.array(["a"]), "on": np.True_, "then": list, "more": "what it likes"},
+        {
+            "path": "a",
+            "share": 1,
+            "names": np.array(["a"]),
+            "on": np.True_,
+            "then": list,
+            "more": "what it likes",
+        },
         {"path": "a", "anything": object(), "array": [1, 2]},
     ],
 )
@@ -42,7 +49,10 @@ def test_what_an_annotation_says_is_taken(arguments):
     ("name", "value"),
     [
         *(("path", bad) for bad in (None, 3, b"a", np.zeros(3), ["a"])),
-        *(("names", bad) for bad in ("ab", None, [1], ("a", None), {"a"}, np.array("a"), iter("ab"))),
+        *(
+            ("names", bad)
+            for bad in ("ab", None, [1], ("a", None), {"a"}, np.array("a"), iter("ab"))
+        ),
         ("then", 3),
     ],
 )

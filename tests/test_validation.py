@@ -9,13 +9,17 @@ import pytest
 from asm_gym.validation import as_float32, check_flag, check_number, check_numbers, check_text
 
 
-@pytest.mark.parametrize("value", [True, np.True_, None, "1", 1j, [1.0], np.zeros(1), np.array(1.0), math.nan, np.nan])
+@pytest.mark.parametrize(
+    "value", [True, np.True_, None, "1", 1j, [1.0], np.zeros(1), np.array(1.0), math.nan, np.nan]
+)
 def test_what_is_no_number_is_refused_by_name(value):
     with pytest.raises(ValueError, match=r"^gain must be a number, got "):
         check_number("gain", value)
 
 
-@pytest.mark.parametrize(("value", "kind"), [(3, int), (np.int16(3), int), (3.0, float), (np.float32(3), float)])
+@pytest.mark.parametrize(
+    ("value", "kind"), [(3, int), (np.int16(3), int), (3.0, float), (np.float32(3), float)]
+)
 def test_numbers_of_numpy_come_back_as_those_of_python(value, kind):
     number = check_number("gain", value, low=3, high=3)
     assert number == 3
@@ -55,8 +59,19 @@ def test_infinity_passes_only_where_it_is_asked_for():
 
 def test_arrays_are_refused_by_shape_kind_and_by_any_one_number():
     np.testing.assert_array_equal(check_numbers("offset", (1, 2, 3), 3), [1.0, 2.0, 3.0])
-    for values in ((1, 2), ((1, 2, 3),), "abc", None, (1, None, 2), ((1,), (1, 2)), (True, False, True), 1.0):
-        with pytest.raises(ValueError, match=r"offset must be finite numbers in the shape \(3,\), got"):
+    for values in (
+        (1, 2),
+        ((1, 2, 3),),
+        "abc",
+        None,
+        (1, None, 2),
+        ((1,), (1, 2)),
+        (True, False, True),
+        1.0,
+    ):
+        with pytest.raises(
+            ValueError, match=r"offset must be finite numbers in the shape \(3,\), got"
+        ):
             check_numbers("offset", values, 3)
     for bad in (math.nan, math.inf, -1):
         with pytest.raises(ValueError, match="among them"):
@@ -75,7 +90,9 @@ def test_names_and_flags_are_what_they_say():
 
 
 def test_what_is_too_large_for_a_stream_is_infinite_without_a_warning(recwarn):
-    np.testing.assert_array_equal(as_float32([1e39, -1e300, 0.5]), np.float32([np.inf, -np.inf, 0.5]))
+    np.testing.assert_array_equal(
+        as_float32([1e39, -1e300, 0.5]), np.float32([np.inf, -np.inf, 0.5])
+    )
     assert not recwarn.list
 
 

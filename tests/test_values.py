@@ -53,7 +53,9 @@ def pushed(piece: Episode, size: float) -> Episode:
 
 def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_in_unseen_rows():
     cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
-    model = ValueAssociation(cut[0].spec).fit(cut[:20], np.random.default_rng(0), lambda done, total: None)
+    model = ValueAssociation(cut[0].spec).fit(
+        cut[:20], np.random.default_rng(0), lambda done, total: None
+    )
     state, found, left = model.start(1), [], []
     for row in cut[25].stream.astype(np.float64):
         state, output = model.predict(state, row[None])
@@ -62,9 +64,13 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
     padded = np.vstack([np.zeros((9, 2)), left])
     expected = [padded[t : t + 10].sum(axis=0) / 10 / model.learned_["largest"] for t in range(100)]
     np.testing.assert_allclose(found, expected, atol=1e-12)
-    np.testing.assert_allclose(averaged(np.array(left), 10), np.array(expected) * model.learned_["largest"], atol=1e-12)
+    np.testing.assert_allclose(
+        averaged(np.array(left), 10), np.array(expected) * model.learned_["largest"], atol=1e-12
+    )
     most = [np.abs(o.errors).max(axis=0) for o in model_outputs(model, cut[:20])]
-    assert (np.max(most, axis=0) < 1.0).all()  # rows that it has learned from: cross-fitted ones err more
+    assert (
+        np.max(most, axis=0) < 1.0
+    ).all()  # rows that it has learned from: cross-fitted ones err more
 
 
 @given(
@@ -74,7 +80,9 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
 )
 def test_values_pass_the_threshold_as_often_as_changes_do(centre, spread, seed):
     rng = np.random.default_rng(seed)
-    changes, values = (np.exp(c + s * rng.normal(size=400)) for c, s in zip(centre, spread, strict=True))
+    changes, values = (
+        np.exp(c + s * rng.normal(size=400)) for c, s in zip(centre, spread, strict=True)
+    )
     spec = Episode.from_table({"q": np.zeros((9, 2))}, rate=10.0).spec
 
     class Told:
@@ -96,7 +104,9 @@ def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_i
     columns = pendulum_columns(3000)
     columns["effort"][:, 1] = 0.05 * np.random.default_rng(1).normal(size=3000)  # nothing tells it
     cut = pieces(Episode.from_table(columns), 1.0)
-    model = ValueAssociation(cut[0].spec).fit(cut, np.random.default_rng(0), lambda done, total: None)
+    model = ValueAssociation(cut[0].spec).fit(
+        cut, np.random.default_rng(0), lambda done, total: None
+    )
     assert forces(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
     assert motion(cut[0].spec).tolist() == [0, 1, 2, 3]
     assert model.learned_["R2_values"][5] < 0.5
@@ -109,7 +119,9 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
     for values in (False, True):
         asm = NeuralASM(cut[0].spec, hidden_size=16, association_size=32, epochs=2, values=values)
         asm.fit(cut[:30]).calibrate(cut[30:45], 0.07)
-        found[values] = np.mean([(s.value[90:] > asm.threshold).any() for s in asm.score_episodes(faulty)])
+        found[values] = np.mean(
+            [(s.value[90:] > asm.threshold).any() for s in asm.score_episodes(faulty)]
+        )
         asm.save(tmp_path / "x.asm")
         again = load_monitor(tmp_path / "x.asm")
         np.testing.assert_array_equal(again.score(faulty[0]).value, asm.score(faulty[0]).value)
@@ -128,11 +140,16 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     values = Values.learned(cut[:20], seed=0)
     assert values is not None
     senses = values.monitor.model.senses_
-    z = [np.hstack([senses.read_episode(e.stream).inputs, np.ones((len(e), 1))]) for e in (*cut[:20], cut[25])]
+    z = [
+        np.hstack([senses.read_episode(e.stream).inputs, np.ones((len(e), 1))])
+        for e in (*cut[:20], cut[25])
+    ]
     shown, asked = np.concatenate(z[:-1]).astype(np.float64), z[-1].astype(np.float64)
     inverse = np.linalg.inv(shown.T @ shown + 1e-3 * len(shown) * np.eye(shown.shape[1]))
     h, usual = (np.einsum("ni,ij,nj->n", rows, inverse, rows) for rows in (asked, shown))
-    root = np.sqrt(np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual))))  # a tenth of a second is 10 rows
+    root = np.sqrt(
+        np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual)))
+    )  # a tenth of a second is 10 rows
     one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))
     state, found = values.monitor.initial_state(1), []
     for row in cut[25].stream.astype(np.float64):
@@ -161,13 +178,17 @@ def test_the_rule_takes_friction_from_torque_and_needs_a_speed():
     score = monitor.score(Episode.from_stream(stream, whole.spec))
     assert score.value[:50].max() <= quiet < score.value[70:].min()
     assert np.argmax(score.attribution[-1]) == 4
-    with pytest.raises(ValueError, match="a rule of friction needs a torque and a speed of each joint"):
+    with pytest.raises(
+        ValueError, match="a rule of friction needs a torque and a speed of each joint"
+    ):
         FrictionRule(Episode.from_table({"q": np.zeros((9, 2))}, rate=10).spec)
 
 
 def test_values_are_judged_where_torques_are_measured_and_nothing_feels_contact():
     arm = SyntheticArm.stream_spec
     assert judged_by_values(arm)
-    felt = replace(arm, channels=(*arm.channels, Channel("external_torque", 7, "N m", group="torque")))
+    felt = replace(
+        arm, channels=(*arm.channels, Channel("external_torque", 7, "N m", group="torque"))
+    )
     assert not judged_by_values(felt)
     assert not judged_by_values(Episode.from_table({"position": np.eye(9)}, rate=10.0).spec)

@@ -74,7 +74,12 @@ def test_what_was_handed_out_stays_as_it_was():
     envs = ThreadedVectorEnv(members(), threads=2)
     observation = envs.reset(seed=0)[0]
     *outcome, info = envs.step(np.zeros((5, 3), np.float32))
-    kept = [observation.copy(), *(part.copy() for part in outcome), info["stream"].copy(), info["_stream"].copy()]
+    kept = [
+        observation.copy(),
+        *(part.copy() for part in outcome),
+        info["stream"].copy(),
+        info["_stream"].copy(),
+    ]
     envs.step(np.ones((5, 3), np.float32) * 0.5)
     assert data_equivalence(kept, [observation, *outcome, info["stream"], info["_stream"]])
     envs.close()
@@ -88,7 +93,10 @@ def test_a_member_lives_on_one_thread_which_ends_with_the_vector():
         envs.step(np.zeros((6, 3), np.float32))
         envs.render()
     main = threading.get_ident()
-    lived = [threads - {main} if i > 1 else threads for i, threads in enumerate(envs.get_attr("lived_on"))]
+    lived = [
+        threads - {main} if i > 1 else threads
+        for i, threads in enumerate(envs.get_attr("lived_on"))
+    ]
     assert all(len(threads) == 1 for threads in lived)
     assert len(set.union(*lived)) == 3
     envs.close()
@@ -123,7 +131,9 @@ def test_a_reset_that_does_not_fit_is_refused(options, error):
 def test_robots_on_threads_move_as_each_alone():
     def wrapped():
         env = gym.make("asm_gym/Lift-v0", horizon=8, stream_freq=100)
-        return StreamRecorder(FaultInjection(env, [Push(body="robot0_link5", newtons=20.0, onset=2)]))
+        return StreamRecorder(
+            FaultInjection(env, [Push(body="robot0_link5", newtons=20.0, onset=2)])
+        )
 
     envs = {n: ThreadedVectorEnv([wrapped] * 3, threads=n) for n in (1, 3)}
     actions = np.random.default_rng(0).uniform(-1, 1, (12, 3, 7)).astype(np.float32)
@@ -141,7 +151,9 @@ def test_members_are_filmed_each_on_its_thread(tmp_path):
     pytest.importorskip("moviepy")  # which wants another Pillow than everything else
 
     def filmed(i):
-        return RecordVideo(gym.make("asm_gym/Lift-v0", horizon=2, render_mode="rgb_array"), str(tmp_path / str(i)))
+        return RecordVideo(
+            gym.make("asm_gym/Lift-v0", horizon=2, render_mode="rgb_array"), str(tmp_path / str(i))
+        )
 
     envs = ThreadedVectorEnv([lambda i=i: filmed(i) for i in range(2)], threads=2)
     envs.reset(seed=0)

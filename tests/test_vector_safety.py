@@ -55,7 +55,11 @@ def fakes(wrap, own_stream=True):
 
 def monitor(own_stream=True):
     env = FakeEnv()
-    spec = SPEC if own_stream else StreamSpec.from_spaces(env.observation_space, env.action_space, dt=0.05)
+    spec = (
+        SPEC
+        if own_stream
+        else StreamSpec.from_spaces(env.observation_space, env.action_space, dt=0.05)
+    )
     return FadingMonitor(CUE, spec=spec)
 
 
@@ -67,14 +71,28 @@ def both(options, own_stream=True, many=SyncVectorEnv):
 
 
 def assert_same_report(ours, theirs, present, stepped):
-    for name in ("surprise", "threshold", "alarm", "intervened", "gave_up", "transition", "failure"):
-        np.testing.assert_array_equal(ours["asm"][name][present], theirs["asm"][name][present], name)
+    for name in (
+        "surprise",
+        "threshold",
+        "alarm",
+        "intervened",
+        "gave_up",
+        "transition",
+        "failure",
+    ):
+        np.testing.assert_array_equal(
+            ours["asm"][name][present], theirs["asm"][name][present], name
+        )
     for label, shares in theirs["asm"]["attribution"].items():
         if not label.startswith("_"):
-            np.testing.assert_array_equal(ours["asm"]["attribution"][label][present], shares[present])
+            np.testing.assert_array_equal(
+                ours["asm"]["attribution"][label][present], shares[present]
+            )
     np.testing.assert_array_equal(ours["cost"][present], theirs["cost"][present])
     executed = np.array([list(a) for a in theirs["asm"]["executed_action"][stepped]], np.float32)
-    np.testing.assert_array_equal(ours["asm"]["executed_action"][stepped].reshape(executed.shape), executed)
+    np.testing.assert_array_equal(
+        ours["asm"]["executed_action"][stepped].reshape(executed.shape), executed
+    )
 
 
 def assert_equal_step_by_step(ours, theirs, steps):
@@ -96,7 +114,9 @@ def assert_equal_step_by_step(ours, theirs, steps):
     return np.array(seen).any(axis=0)
 
 
-@pytest.mark.parametrize("options", [*OPTIONS, {"on_alarm": Counter()}], ids=lambda o: "-".join(map(str, o.values())))
+@pytest.mark.parametrize(
+    "options", [*OPTIONS, {"on_alarm": Counter()}], ids=lambda o: "-".join(map(str, o.values()))
+)
 def test_one_wrapper_around_many_equals_many_wrappers(options):
     acted, ended = assert_equal_step_by_step(*both(options), steps=40)
     assert ended
@@ -111,11 +131,15 @@ def test_where_a_reflex_fails_only_that_environment_holds():
     for _ in range(4):
         asm = ours.step(np.full((3, 3), 0.2, np.float32))[4]["asm"]
     assert asm["failure"].tolist() == ["reflex: RuntimeError('out of order')", "", ""]
-    np.testing.assert_allclose(asm["executed_action"], [[0, 0, 0.2], [0.5] * 3, [0.2] * 3], rtol=1e-6)
+    np.testing.assert_allclose(
+        asm["executed_action"], [[0, 0, 0.2], [0.5] * 3, [0.2] * 3], rtol=1e-6
+    )
 
 
 def test_environments_without_a_stream_are_watched_through_their_spaces():
-    assert_equal_step_by_step(*both({"on_alarm": "hold", "release_after": 2}, own_stream=False), steps=30)
+    assert_equal_step_by_step(
+        *both({"on_alarm": "hold", "release_after": 2}, own_stream=False), steps=30
+    )
 
 
 @pytest.mark.parametrize("many", [AsyncVectorEnv, ThreadedVectorEnv])
@@ -126,7 +150,9 @@ def test_members_in_processes_and_on_threads_are_watched_alike(many):
 
 
 def test_only_the_masked_environments_begin_anew():
-    env = VectorNeuralASMSafety(SyncVectorEnv(fakes(lambda e: e), autoreset_mode=AutoresetMode.DISABLED), monitor())
+    env = VectorNeuralASMSafety(
+        SyncVectorEnv(fakes(lambda e: e), autoreset_mode=AutoresetMode.DISABLED), monitor()
+    )
     env.reset(seed=0)
     for _ in range(4):
         infos = env.step(np.zeros((3, 3), np.float32))[4]
@@ -172,18 +198,24 @@ def test_actions_of_a_wrong_shape_are_refused_and_end_no_episode():
 
 def test_what_makes_no_sense_is_refused(lift):
     many = SyncVectorEnv(fakes(lambda e: e))
-    other = StreamSpec((Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05)
+    other = StreamSpec(
+        (Channel("position", 2, "m"), Channel("weight", 1), Channel("action", 3, group=MOTOR)), 0.05
+    )
     with pytest.raises(ValueError, match="weight"):
         VectorNeuralASMSafety(many, FadingMonitor(spec=other))
     with pytest.raises(ValueError, match=r"freeze.*hold"):
         VectorNeuralASMSafety(many, monitor(), on_alarm="freeze")
     with pytest.raises(ValueError, match="give its name"):
         VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(lift))
-    VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5)))  # has no memory
+    VectorNeuralASMSafety(
+        many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5))
+    )  # has no memory
     with pytest.raises(ValueError, match="release_after"):
         VectorNeuralASMSafety(many, monitor(), release_after=0)
     with pytest.raises(ValueError, match="DISABLED, got SAME_STEP"):
-        VectorNeuralASMSafety(SyncVectorEnv(fakes(lambda e: e), autoreset_mode=AutoresetMode.SAME_STEP), monitor())
+        VectorNeuralASMSafety(
+            SyncVectorEnv(fakes(lambda e: e), autoreset_mode=AutoresetMode.SAME_STEP), monitor()
+        )
     with pytest.raises(TypeError, match="VectorEnv"):
         VectorNeuralASMSafety(FakeEnv(), monitor())
     with pytest.raises(gym.error.ResetNeeded):
@@ -197,11 +229,16 @@ def test_what_makes_no_sense_is_refused(lift):
 def test_robots_side_by_side_are_watched_as_each_alone():
     settings, on_alarm = {"horizon": 15}, "comply"
     episodes = collect("asm_gym/Lift-v0", episodes=4, seed=3, workers=1, **settings)
-    asm = NeuralASM(episodes[0].spec, hidden_size=16, association_size=40, epochs=2).fit(episodes[:3])
+    asm = NeuralASM(episodes[0].spec, hidden_size=16, association_size=40, epochs=2).fit(
+        episodes[:3]
+    )
     asm = asm.with_threshold(0.5 * asm.score(episodes[3]).value.max())
     many = gym.make_vec("asm_gym/Lift-v0", num_envs=2, threads=2, **settings)
     many = VectorNeuralASMSafety(many, asm, on_alarm=on_alarm, release_after=2)
-    alone = [NeuralASMSafety(gym.make("asm_gym/Lift-v0", **settings), asm, on_alarm, release_after=2) for _ in range(2)]
+    alone = [
+        NeuralASMSafety(gym.make("asm_gym/Lift-v0", **settings), asm, on_alarm, release_after=2)
+        for _ in range(2)
+    ]
     rng = np.random.default_rng(0)
     many.reset(seed=5)
     for i, env in enumerate(alone):
@@ -218,7 +255,9 @@ def test_robots_side_by_side_are_watched_as_each_alone():
             info = env.step(actions[i])[4]["asm"]
             assert infos["surprise"][i] == pytest.approx(info["surprise"], rel=1e-4)
             assert infos["intervened"][i] == info["intervened"]
-            np.testing.assert_allclose(infos["executed_action"][i], info["executed_action"], atol=1e-5)
+            np.testing.assert_allclose(
+                infos["executed_action"][i], info["executed_action"], atol=1e-5
+            )
             intervened += info["intervened"]
     assert intervened
     many.close()

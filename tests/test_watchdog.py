@@ -36,9 +36,14 @@ def sine(t: int) -> dict[str, float]:
 
 def recorded(seed: int) -> Episode:
     rng = np.random.default_rng(seed)
-    rows = [[*(np.array(list(sine(t).values())) + 0.1 * rng.normal(size=2)), *sine(t).values()] for t in range(120)]
+    rows = [
+        [*(np.array(list(sine(t).values())) + 0.1 * rng.normal(size=2)), *sine(t).values()]
+        for t in range(120)
+    ]
     names = [f"{what}[{m}]" for what in ("observation.state", "action") for m in MOTORS]
-    return Episode.from_table(dict(zip(names, np.array(rows).T, strict=True)), rate=RATE, action=["action*"])
+    return Episode.from_table(
+        dict(zip(names, np.array(rows).T, strict=True)), rate=RATE, action=["action*"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +71,11 @@ def drive(memory: Path, port: int, processes: Any) -> None:
     """The loop of a guarded arm: a stream and a policy in processes of their own."""
     stream = subprocess.Popen([sys.executable, "-c", TICKS], stdout=subprocess.PIPE, text=True)
     policy = subprocess.Popen(
-        [sys.executable, "-c", ECHO], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        [sys.executable, "-c", ECHO],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
     )
     assert stream.stdout
     assert policy.stdin
@@ -78,9 +87,13 @@ def drive(memory: Path, port: int, processes: Any) -> None:
         policy.stdin.write(json.dumps(sine(t)) + "\n")
         action = json.loads(policy.stdout.readline())
         sent = guard.guarded(sine(t), action)
-        sender.sendto(("hold" if guard.intervened else json.dumps(sent)).encode(), ("127.0.0.1", port))
+        sender.sendto(
+            ("hold" if guard.intervened else json.dumps(sent)).encode(), ("127.0.0.1", port)
+        )
         if t == 10:
-            processes.send({"stream": stream.pid, "policy": policy.pid, "watchdog": watchdog.process.pid})
+            processes.send(
+                {"stream": stream.pid, "policy": policy.pid, "watchdog": watchdog.process.pid}
+            )
     time.sleep(60)  # the stream has ended, and nobody notices
 
 
@@ -111,15 +124,29 @@ def test_whoever_is_killed_the_arm_is_told_to_hold(victim: str, memory: Path) ->
 
 def test_a_watch_that_is_killed_runs_its_hook_all_the_same(memory: Path, tmp_path: Path) -> None:
     told = tmp_path / "told"
-    command = [sys.executable, "-m", "asm_gym", "watch", "-", "--monitor", str(memory), "--watchdog", "0.5"]
-    watch = subprocess.Popen([*command, "--hook", f"cat >> {told}"], stdin=subprocess.PIPE, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "asm_gym",
+        "watch",
+        "-",
+        "--monitor",
+        str(memory),
+        "--watchdog",
+        "0.5",
+    ]
+    watch = subprocess.Popen(
+        [*command, "--hook", f"cat >> {told}"], stdin=subprocess.PIPE, text=True
+    )
     assert watch.stdin
     row = json.dumps([*sine(0).values(), *sine(0).values()])
     for _ in range(5):
         watch.stdin.write(f"{row}\n")
         watch.stdin.flush()
         time.sleep(0.02)
-    wait_for(lambda: told.exists() and bool(told.read_text()))  # silence is told of once rows were judged
+    wait_for(
+        lambda: told.exists() and bool(told.read_text())
+    )  # silence is told of once rows were judged
     watch.kill()
     watch.wait()
     wait_for(lambda: told.read_text().count("\n") == 2)

@@ -16,7 +16,13 @@ from asm_gym.data.action_meaning import ACTIONS, ActionMeaning, ActionMeans
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.contact_state import no_load
-from asm_gym.guard.fitted_monitor import LOG, FittedMonitor, check_answer, check_monitor, diagnosis_of
+from asm_gym.guard.fitted_monitor import (
+    LOG,
+    FittedMonitor,
+    check_answer,
+    check_monitor,
+    diagnosis_of,
+)
 from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.robot_facts import RobotFacts
@@ -91,7 +97,9 @@ class Guarding:
         recorded = getattr(monitor, "about", {}).get(ACTIONS)
         if recorded is not None:
             recorded = ActionMeaning.from_json(recorded)
-        self._facts, self._observation_map = robots_of(self.env, monitor.spec, recorded, options.action_means)
+        self._facts, self._observation_map = robots_of(
+            self.env, monitor.spec, recorded, options.action_means
+        )
 
         policies: list[Policy] = []
         reaction = options.reaction(diagnosis_of(monitor) is not None)
@@ -118,7 +126,9 @@ class Guarding:
     def _watch_with_next(self) -> None:
         """Take over the monitor that was assigned, or was fitted or calibrated since."""
         if FittedMonitor.of(self._next_monitor, self._spec).differs(self.guard.fitted):
-            LOG.info("the monitor was changed, fitted or calibrated since: it is taken over as it is now")
+            LOG.info(
+                "the monitor was changed, fitted or calibrated since: it is taken over as it is now"
+            )
             self._watch_with(self._next_monitor)
 
     @property

@@ -92,13 +92,19 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     def _wrap(self, env: gym.Env[Any, Any], monitor: Monitor | None) -> None:
         recorded = {"monitor": monitor, **vars(self._options)}
-        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)  # reflexes and memories are large
+        RecordConstructorArgs.__init__(
+            self, _disable_deepcopy=True, **recorded
+        )  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
         self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
         on_alarm = self._options.on_alarm
-        if self._box is None and not (isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")):
+        if self._box is None and not (
+            isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")
+        ):
             needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
-            raise TypeError(f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"')
+            raise TypeError(
+                f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"'
+            )
 
         self._source = StreamSource(env)
         self._spec = self._source.spec
@@ -120,7 +126,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Confirm that the alarms of this episode were real, for ``adaptive_threshold``."""
         self.guard.confirm(np.ones(1, bool))
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         self._ended = True  # until it has worked
         observation, info = self.env.reset(seed=seed, options=options)
         info = dict(info)
@@ -190,7 +198,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     def sense_rows(self, given: tuple[Any, dict[str, Any]]) -> SensedRows:
         """Return the row that was sensed at the end of a step, by its observation and ``info``."""
         observation, info = given
-        row, failure = sensed_row(lambda: self._source.row(observation, self._executed, info), self._spec.size)
+        row, failure = sensed_row(
+            lambda: self._source.row(observation, self._executed, info), self._spec.size
+        )
         return SensedRows(
             rows=row[None],
             load=load_felt(self._facts, info),
@@ -208,8 +218,12 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
         """Write the report of a step to its ``info``."""
         robots = [report.robots[0] for report in reports]
-        alarm = any([bool(robot["alarm"]) for robot in robots]) or bool(target.get("asm_alarm"))  # of a guard inside
-        intervened = any([bool(robot["overridden"]) for robot in robots]) or bool(target.get("asm_intervened"))
+        alarm = any([bool(robot["alarm"]) for robot in robots]) or bool(
+            target.get("asm_alarm")
+        )  # of a guard inside
+        intervened = any([bool(robot["overridden"]) for robot in robots]) or bool(
+            target.get("asm_intervened")
+        )
         self._alarms += alarm
         target["asm"] = LazyInfo(self._describe(reports))
         target["asm_surprise"] = np.float64(max([robot["surprise"] for robot in robots]))
@@ -293,7 +307,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
         facts = self._facts
         spec = self._spec
-        commanded = None if self._row is None else self._executed  # nothing was done before the first step
+        commanded = (
+            None if self._row is None else self._executed
+        )  # nothing was done before the first step
         rows = self.guard.table.rows
         step: dict[str, Any] = {"alarms": self._alarms, "preview": self._count_down()}
         if self.guard.running is not None:
@@ -304,7 +320,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             executed = commanded
             slowed = 0.0
             if commanded is not None and self._box is not None:
-                executed = facts.executed_in(rows, commanded.reshape(1, -1))[0].reshape(commanded.shape)
+                executed = facts.executed_in(rows, commanded.reshape(1, -1))[0].reshape(
+                    commanded.shape
+                )
                 slowed = facts.slowed(commanded.ravel(), executed.ravel())
             return asm_info(reports, 0, spec, executed, slowed=slowed, **step)
 

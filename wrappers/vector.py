@@ -59,7 +59,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     def _wrap(self, env: VectorEnv[Any, Any, Any], monitor: Monitor | None) -> None:
         VectorWrapper.__init__(self, env)
         if not isinstance(env.single_action_space, gym.spaces.Box):
-            raise TypeError(f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}")
+            raise TypeError(
+                f"VectorNeuralASMSafety needs a Box action space, got {env.single_action_space}"
+            )
         refuse_running_statistics(env, "VectorNeuralASMSafety")
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:
@@ -78,7 +80,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             self._members.set_attr("keeps_holding", [True] * env.num_envs)
         self._alarms = np.zeros(env.num_envs, np.int64)
         self._ended: Mask | None = None  # (n,) None before the first reset, and where a step failed
-        self._forced = np.zeros(env.num_envs, bool)  # ended by this wrapper, which the environment does not know yet
+        self._forced = np.zeros(
+            env.num_envs, bool
+        )  # ended by this wrapper, which the environment does not know yet
 
     def _stream_spec(self) -> StreamSpec:
         """Return the spec of the members' own streams."""
@@ -86,7 +90,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         for other in others:
             first.require(other, "the first environment")
         if round(EnvAttributes(self.env).first("dt", first.dt) / first.dt) > 1:
-            raise ValueError("a vector is watched at its control rate: make the environments without stream_freq")
+            raise ValueError(
+                "a vector is watched at its control rate: make the environments without stream_freq"
+            )
         return first
 
     def _spec_of_spaces(self) -> StreamSpec:
@@ -109,12 +115,16 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         """Confirm the alarms of the environments ``which`` (n,), by default of all; see ``NeuralASMSafety``."""
         self.guard.confirm(np.ones(self.num_envs, bool) if which is None else which)
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         begun = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         ended = self._ended
         self._ended = None  # until it has worked
         # A copy: vector environments take the mask out of the options they are given.
-        self._observations, infos = self.env.reset(seed=seed, options=dict(options) if options else options)
+        self._observations, infos = self.env.reset(
+            seed=seed, options=dict(options) if options else options
+        )
         if ended is None and not begun.all():
             raise gym.error.ResetNeeded("the first reset() must reset all environments")
         self._ended = np.zeros(self.num_envs, bool) if ended is None else ended
@@ -129,11 +139,17 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
 
     def step(self, actions: Any) -> tuple[Any, NDArray[Any], Mask, Mask, dict[str, Any]]:
         if self._ended is None or (not self._resets_itself and self._ended.any()):
-            raise gym.error.ResetNeeded("call reset() before step(): an environment's episode is not running")
+            raise gym.error.ResetNeeded(
+                "call reset() before step(): an environment's episode is not running"
+            )
         proposed = as_float32(actions, "actions").copy()
         if proposed.shape != self.env.action_space.shape:
-            raise ValueError(f"actions have the shape {self.env.action_space.shape}, got {proposed.shape}")
-        begun = self._ended.copy()  # their members begin an episode in this step, and take no action
+            raise ValueError(
+                f"actions have the shape {self.env.action_space.shape}, got {proposed.shape}"
+            )
+        begun = (
+            self._ended.copy()
+        )  # their members begin an episode in this step, and take no action
         running = ~begun
         self._ended = None  # where anything raises, nobody knows what was done
 
@@ -145,7 +161,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         infos["_overridden"] = np.ones_like(begun)
         if self._forced.any():
             observations, infos = self._reset_forced(infos)
-            rewards, terminated, truncated = (np.where(self._forced, 0, x) for x in (rewards, terminated, truncated))
+            rewards, terminated, truncated = (
+                np.where(self._forced, 0, x) for x in (rewards, terminated, truncated)
+            )
 
         sensed = self.sense_rows((observations, infos))
         report = self.guard.judge(sensed, self._commanded, active=running)
@@ -183,7 +201,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                 raise KeyError('info has no "stream"')
             return stream[member]
 
-        rows, failures = zip(*(sensed_row(partial(read, i), self._spec.size) for i in range(shape[0])), strict=True)
+        rows, failures = zip(
+            *(sensed_row(partial(read, i), self._spec.size) for i in range(shape[0])), strict=True
+        )
         failed = {member: failure for member, failure in enumerate(failures) if failure}
         return SensedRows(np.stack(rows), load, failed, infos)
 
@@ -201,12 +221,15 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         """Write the report of a step to its infos, with Gymnasium's masks of the members that are present."""
         report = reports[-1]
         robots = report.robots
-        alarm = robots["alarm"] | np.asarray(target.get("asm_alarm", False), bool)  # of guards inside
+        alarm = robots["alarm"] | np.asarray(
+            target.get("asm_alarm", False), bool
+        )  # of guards inside
         self._alarms += alarm
         fields: dict[str, Any] = {
             "asm_surprise": robots["surprise"].copy(),
             "asm_alarm": alarm,
-            "asm_intervened": robots["overridden"] | np.asarray(target.get("asm_intervened", False), bool),
+            "asm_intervened": robots["overridden"]
+            | np.asarray(target.get("asm_intervened", False), bool),
             "cost": alarm.astype(np.float64),
             "cost_sum": self._alarms.astype(np.float64),
             "asm": LazyInfo(self._describe(report)),
@@ -269,7 +292,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         def describe() -> dict[str, Any]:
             slowed = [facts.slowed(*pair) for pair in zip(commanded, executed, strict=True)]
             actions = executed.reshape(self.env.action_space.shape or ())
-            return side_by_side(report, spec, executed_action=actions, slowed=np.array(slowed), **step)
+            return side_by_side(
+                report, spec, executed_action=actions, slowed=np.array(slowed), **step
+            )
 
         return describe
 

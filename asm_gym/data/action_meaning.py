@@ -33,12 +33,19 @@ LATEST = 3  # rows after which a command may be seen to act, at most
 ENOUGH, FEWEST = 20_000, 50  # rows that are looked at; that can tell
 CERTAIN = 5.0  # standard errors that a coefficient must differ from 0 by
 TELLS = 0.05  # share of what else is not known of a change that the action must explain
-TOWARDS, BY = 0.3, 0.1  # share -c sd(x)/(b sd(u)) from which the state moves towards an action, and below which by it
+TOWARDS, BY = (
+    0.3,
+    0.1,
+)  # share -c sd(x)/(b sd(u)) from which the state moves towards an action, and below which by it
 FOLLOWS = 0.8  # correlation of a state with its target
 COASTS = 0.95  # a, from which a state moves on by itself
 ALIKE = 0.9  # senses that an action explains nearly as well as the best; of these its own is taken
 RATE = 0.9  # correlation of a sense with the change of another whose rate it is
-OWN = (1.0, np.pi / 180, 180 / np.pi)  # slopes of targets in the unit of the sense, in radians, and in degrees
+OWN = (
+    1.0,
+    np.pi / 180,
+    180 / np.pi,
+)  # slopes of targets in the unit of the sense, in radians, and in degrees
 NEAR = 0.05  # a slope or an offset this close to its own, by share, is that
 
 Floats = NDArray[np.float64]
@@ -49,7 +56,9 @@ class ActionMeaning:
     """What the A numbers of an action mean, and for which a robot stays: slope x[sense] + offset."""
 
     means: tuple[str, ...]  # each of ``MEANINGS``, or ``KEPT``, or ``UNKNOWN``
-    senses: tuple[int, ...]  # the column of the stream that a target is told by; -1 where none is known
+    senses: tuple[
+        int, ...
+    ]  # the column of the stream that a target is told by; -1 where none is known
     slopes: tuple[float, ...]
     offsets: tuple[float, ...]
 
@@ -80,7 +89,9 @@ class ActionMeaning:
         if isinstance(means, str):
             means = (means,) * size
         if len(means) != size:
-            raise ValueError(f"action_means must be one name, or {size} of them, got {short_repr(means)}")
+            raise ValueError(
+                f"action_means must be one name, or {size} of them, got {short_repr(means)}"
+            )
         for name in means:
             check_choice("action_means", name, MEANINGS)
         known = recorded or cls.unknown((size,))
@@ -155,7 +166,9 @@ def _windows(episodes: Sequence[Episode]) -> Floats:
     found, count = [np.zeros((0, episodes[0].spec.size, LATEST + 1))], 0
     for episode in episodes:
         if count < ENOUGH and len(episode.stream) > LATEST:
-            windows = sliding_window_view(np.asarray(episode.stream, np.float64), LATEST + 1, axis=0)
+            windows = sliding_window_view(
+                np.asarray(episode.stream, np.float64), LATEST + 1, axis=0
+            )
             found.append(windows[np.isfinite(windows).all(axis=(1, 2))])
             count += len(windows)
     return np.concatenate(found)
@@ -163,13 +176,19 @@ def _windows(episodes: Sequence[Episode]) -> Floats:
 
 def _rates(spec: StreamSpec, windows: Floats) -> set[int]:
     """Return which senses are rates: their units or names say so, or another sense changes by them."""
-    named = {i for i in spec.sensory if spec.units[i] in ("rad/s", "m/s", "deg/s") or "vel" in spec.labels[i].lower()}
+    named = {
+        i
+        for i in spec.sensory
+        if spec.units[i] in ("rad/s", "m/s", "deg/s") or "vel" in spec.labels[i].lower()
+    }
     now = windows[:, spec.sensory, -1]
     both = np.hstack([now - windows[:, spec.sensory, -2], now])
     both = both - both.mean(axis=0) if len(both) else both
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(both.T @ both) / np.sqrt(np.outer(*[(both**2).sum(axis=0)] * 2))
-    alike = np.nan_to_num(alike[: now.shape[1], now.shape[1] :])  # (S, S) of the change of each, and of each
+    alike = np.nan_to_num(
+        alike[: now.shape[1], now.shape[1] :]
+    )  # (S, S) of the change of each, and of each
     np.fill_diagonal(alike, 0.0)
     return named | set(spec.sensory[alike.max(axis=0, initial=0.0) > RATE])
 
@@ -186,14 +205,18 @@ class _Fit(NamedTuple):
     offset: float
 
 
-def _meaning(spec: StreamSpec, windows: Floats, rates: set[int], column: int) -> tuple[str, int, float, float]:
+def _meaning(
+    spec: StreamSpec, windows: Floats, rates: set[int], column: int
+) -> tuple[str, int, float, float]:
     """Return what a number of the action means, its sense, and slope and offset of where it stays."""
     if len(windows) < FEWEST:
         return UNKNOWN, -1, 0.0, 0.0
     if np.ptp(windows[:, column]) == 0:
         return KEPT, -1, 0.0, 0.0
     asked = [
-        (windows[:, sense], windows[:, column, -1 - lag], sense) for sense in spec.sensory for lag in range(LATEST + 1)
+        (windows[:, sense], windows[:, column, -1 - lag], sense)
+        for sense in spec.sensory
+        for lag in range(LATEST + 1)
     ]
     fits = [fit for x, u, sense in asked if (fit := _fit(x, u, int(sense)))]
     place = _likeliest(spec, column, [fit for fit in fits if fit.sense not in rates])
@@ -209,10 +232,17 @@ def _meaning(spec: StreamSpec, windows: Floats, rates: set[int], column: int) ->
 
 def _likeliest(spec: StreamSpec, column: int, fits: Sequence[_Fit]) -> _Fit | None:
     """Return the fit of the sense that a number of the action moves; None where it moves none."""
-    best, name = max((fit.tells for fit in fits), default=0.0), spec.labels[column].partition("[")[2]
+    best, name = (
+        max((fit.tells for fit in fits), default=0.0),
+        spec.labels[column].partition("[")[2],
+    )
     alike = [fit for fit in fits if fit.tells >= ALIKE * best]
     own = [fit for fit in alike if name and spec.labels[fit.sense].endswith(f"[{name}")]
-    return max(own or alike, key=lambda fit: (fit.slope in OWN and fit.offset == 0.0, fit.tells), default=None)
+    return max(
+        own or alike,
+        key=lambda fit: (fit.slope in OWN and fit.offset == 0.0, fit.tells),
+        default=None,
+    )
 
 
 def _fit(x: Floats, u: Floats, sense: int) -> _Fit | None:

@@ -28,7 +28,9 @@ def read_parquet(path: Path) -> Columns:
 def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
     """Return the array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the column ``value``."""
     try:
-        array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # a file shorter than it declares is refused
+        array = np.array(
+            np.load(path, mmap_mode="r", allow_pickle=False)
+        )  # a file shorter than it declares is refused
     except ValueError as error:  # whose remedy is unsafe
         raise ValueError("it is damaged, or no array of numbers") from error
     if array.dtype.names and array.ndim == 1:
@@ -67,7 +69,9 @@ def _along_time(arrays: Columns) -> Columns:
     """Arrays with their rows along time: those of the length that most have, turned where that stands second."""
     lengths = [size for array in arrays.values() for size in array.shape if size > 1]
     rows = max(set(lengths), key=lambda size: (lengths.count(size), size), default=0)
-    turned = {n: a.T if a.ndim == 2 and a.shape[0] != rows == a.shape[1] else a for n, a in arrays.items()}
+    turned = {
+        n: a.T if a.ndim == 2 and a.shape[0] != rows == a.shape[1] else a for n, a in arrays.items()
+    }
     return {name: array for name, array in turned.items() if len(array) == rows}
 
 
@@ -81,7 +85,11 @@ def read_hdf5(path: Path) -> dict[str, tuple[Columns, float | None]]:
     with h5py.File(path, "r") as file:
         if not hasattr(file.get("data"), "items"):
             return {"": (_along_time(_numbers_in(file)), None)}
-        rate = json.loads(file["data"].attrs.get("env_args", "{}")).get("env_kwargs", {}).get("control_freq")
+        rate = (
+            json.loads(file["data"].attrs.get("env_args", "{}"))
+            .get("env_kwargs", {})
+            .get("control_freq")
+        )
         made = {}
         for name in sorted(file["data"], key=lambda name: (len(name), name)):
             group = file["data"][name]
@@ -106,7 +114,9 @@ def check_hdf5(path: Path) -> None:
                 if node.external or node.is_virtual:
                     raise ValueError(f"{node.name} is kept in another file, which is not read")
                 if node.nbytes and not node.id.get_storage_size():
-                    raise ValueError(f"{node.name} declares {node.nbytes} bytes that were never written")
+                    raise ValueError(
+                        f"{node.name} declares {node.nbytes} bytes that were never written"
+                    )
 
     with h5py.File(path, "r") as file:
         check(file)

@@ -27,20 +27,28 @@ def _joints(message: Any) -> Numbers:
     for kind in ("position", "velocity", "effort"):
         values = getattr(message, kind)
         if len(values) == len(message.name):  # others are missing: nothing tells whose they are
-            found |= {f"{kind}[{name}]": float(v) for name, v in zip(message.name, values, strict=True)}
+            found |= {
+                f"{kind}[{name}]": float(v) for name, v in zip(message.name, values, strict=True)
+            }
     return found
 
 
 def _wrench(message: Any) -> Numbers:
     parts = {"force": message.wrench.force, "torque": message.wrench.torque}
-    return {f"{name}[{axis}]": float(getattr(part, axis)) for name, part in parts.items() for axis in "xyz"}
+    return {
+        f"{name}[{axis}]": float(getattr(part, axis))
+        for name, part in parts.items()
+        for axis in "xyz"
+    }
 
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MESSAGES: dict[str, Callable[[Any], Numbers]] = {
     JOINT_STATE: _joints,
     "geometry_msgs/msg/WrenchStamped": _wrench,
-    "std_msgs/msg/Float64MultiArray": lambda message: {f"data[{k}]": float(v) for k, v in enumerate(message.data)},
+    "std_msgs/msg/Float64MultiArray": lambda message: {
+        f"data[{k}]": float(v) for k, v in enumerate(message.data)
+    },
 }
 """The numbers of a message, by its type."""
 
@@ -50,7 +58,9 @@ MENDS = {".mcap": "mcap recover", ".bag": "rosbag reindex"}
 
 def read_bag(path: Path) -> Columns:
     """Return the columns of a bag, ``time`` [s] among them. Raises ValueError if it is damaged or has no JointState."""
-    highlevel, typesys = (require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys"))
+    highlevel, typesys = (
+        require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys")
+    )
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
         with highlevel.AnyReader([path], default_typestore=store) as bag:
@@ -58,7 +68,11 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = f"; where its recorder was killed, {MENDS[path.suffix]} mends it" if path.suffix in MENDS else ""
+        mend = (
+            f"; where its recorder was killed, {MENDS[path.suffix]} mends it"
+            if path.suffix in MENDS
+            else ""
+        )
         raise ValueError(f"it is damaged: {error}{mend}") from error
 
 
@@ -79,9 +93,13 @@ def _columns(bag: Any) -> Columns:
         came = 1e-9 * written
         said.setdefault(key, []).append({"came": came, "time": stamp_of(message) or came} | named)
     of_states = {c.topic for c in states}
-    clock = max((key for key in said if key[0] in of_states), key=lambda key: (len(key), len(said[key])))
+    clock = max(
+        (key for key in said if key[0] in of_states), key=lambda key: (len(key), len(said[key]))
+    )
     if len(said) > 1:
-        note(f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values")
+        note(
+            f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values"
+        )
     tables = {key: pd.DataFrame(messages) for key, messages in said.items()}
     rows = tables[clock]
     for other in (table for key, table in tables.items() if key != clock):

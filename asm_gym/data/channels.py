@@ -29,9 +29,13 @@ from asm_gym.validation import check_number
 
 # Words of a label that say that nothing is wrong.
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
-RESAMPLED = 1.5  # A log with a clock is read at another rate, up to so many times its own or as much slower
+RESAMPLED = (
+    1.5  # A log with a clock is read at another rate, up to so many times its own or as much slower
+)
 SLOWEST = 1e-6  # the least rate of a log [Hz]: a row in eleven days
-RATE_TOLERANCE = 0.01  # how far a log's rate may be off that of the memory which reads it, as a share
+RATE_TOLERANCE = (
+    0.01  # how far a log's rate may be off that of the memory which reads it, as a share
+)
 
 
 class Recorded(NamedTuple):
@@ -39,7 +43,9 @@ class Recorded(NamedTuple):
 
     stream: NDArray[np.float32]  # (T, D)
     spec: StreamSpec
-    faults: NDArray[np.bool_]  # (T,) where a label says that something is wrong; (0,) where the table has no label
+    faults: NDArray[
+        np.bool_
+    ]  # (T,) where a label says that something is wrong; (0,) where the table has no label
 
 
 class ColumnPlan:
@@ -52,7 +58,9 @@ class ColumnPlan:
     def __init__(self, names: Iterable[str], spec: StreamSpec, whole: bool = True) -> None:
         bare = {name: split_unit(name)[0] for name in names}
         # joint_0 is joint[0] too, though it may be the only one here.
-        places = {label_of(short): name for name, short in bare.items()} | {short: name for name, short in bare.items()}
+        places = {label_of(short): name for name, short in bare.items()} | {
+            short: name for name, short in bare.items()
+        }
         self.codes = np.array(spec.missing)
         self.columns, self._scale, self._turned = list[str](), list[float](), list[int]()
         missing = []
@@ -78,11 +86,15 @@ class ColumnPlan:
     def row(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
         """Return the numbers (D,) of a row by the names of its columns; NaN of those that it lacks."""
         found = (values.get(name) for name in self.columns)
-        return self._made(np.array([math.nan if value is None else value for value in found], np.float64))
+        return self._made(
+            np.array([math.nan if value is None else value for value in found], np.float64)
+        )
 
     def rows(self, table: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
         """Return the rows (T, D) of a table."""
-        return self._made(np.column_stack([table[name] for name in self.columns]).astype(np.float64))
+        return self._made(
+            np.column_stack([table[name] for name in self.columns]).astype(np.float64)
+        )
 
     def _made(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
         """The numbers (..., D) of a stream of those of the columns."""
@@ -106,8 +118,14 @@ def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ())
     spec = layout.spec or described(columns, layout)
     plan = ColumnPlan(table, spec)
     rows = plan.rows(table)
-    labels = [v for n, v in table.items() if n not in plan.columns and layout.marks(split_unit(n)[0], v)]
-    faults = np.logical_or.reduce([_marked(values) for values in labels]) if labels else np.zeros(0, np.bool_)
+    labels = [
+        v for n, v in table.items() if n not in plan.columns and layout.marks(split_unit(n)[0], v)
+    ]
+    faults = (
+        np.logical_or.reduce([_marked(values) for values in labels])
+        if labels
+        else np.zeros(0, np.bool_)
+    )
     timing = None
     with suppress(ValueError) if layout.rate is not None else nullcontext():
         timing = None if clock is None else timing_of(table, clock)
@@ -118,7 +136,9 @@ def read_recorded(frame: Any, layout: LogLayout, others: Sequence[Columns] = ())
         if labels:
             rows, faults = rows[:, :-1], np.nan_to_num(rows[:, -1]) > 0
     if layout.spec is not None and abs(dt / spec.dt - 1) > RATE_TOLERANCE:
-        raise ValueError(f"the memory reads {1 / spec.dt:.4g} rows a second, these come at {1 / dt:.4g}")
+        raise ValueError(
+            f"the memory reads {1 / spec.dt:.4g} rows a second, these come at {1 / dt:.4g}"
+        )
     if layout.spec is None:
         spec = with_noise(replace(spec, dt=dt), np.array([noise_of(x) for x in rows.T]))
         _note_columns(columns)
@@ -152,11 +172,15 @@ def _period(timing: Timing | None, layout: LogLayout) -> tuple[float, bool]:
     dt = said or (layout.spec.dt if layout.spec is not None else own)
     if 1 / RESAMPLED <= own / dt <= RESAMPLED:
         if abs(dt / own - 1) > RATE_TOLERANCE:
-            note(f"rows that come at {1 / own:.4g} a second are read at {1 / dt:.4g}, by their clock")
+            note(
+                f"rows that come at {1 / own:.4g} a second are read at {1 / dt:.4g}, by their clock"
+            )
         return dt, True
     if said is not None:
         clock = timing.clock.name
-        note(f"the clock {clock!r} says {1 / own:.4g} rows a second: by --rate {layout.rate:g} it is not read")
+        note(
+            f"the clock {clock!r} says {1 / own:.4g} rows a second: by --rate {layout.rate:g} it is not read"
+        )
         return said, False
     return own, True
 
@@ -190,7 +214,9 @@ def described(columns: Sequence[Column], layout: LogLayout) -> StreamSpec:
     for column in sorted(used, key=lambda c: c.name in commanded):  # the action stands last
         parts.setdefault(column.name if column.turn else column.channel, []).append(column)
     channels = tuple(_channel(name, part, commanded) for name, part in parts.items())
-    return StreamSpec(channels, 1.0, "table", tuple(sorted({c.code for c in used if not math.isnan(c.code)})))
+    return StreamSpec(
+        channels, 1.0, "table", tuple(sorted({c.code for c in used if not math.isnan(c.code)}))
+    )
 
 
 def _chosen(columns: Sequence[Column], pattern: str) -> list[Column]:
@@ -212,13 +238,17 @@ def _channel(name: str, columns: Sequence[Column], commanded: set[str]) -> Chann
     if columns[0].turn:
         return Channel(name, 2, "rad" if columns[0].turn < 7 else "deg", 0.0, group, TURNED)
     elements = tuple(c.element for c in columns)
-    return Channel(name, len(columns), next(iter(units), "1"), 0.0, group, elements if any(elements) else ())
+    return Channel(
+        name, len(columns), next(iter(units), "1"), 0.0, group, elements if any(elements) else ()
+    )
 
 
 def with_noise(spec: StreamSpec, noise: NDArray[np.float64]) -> StreamSpec:
     """Return a spec whose sensed channels have the median of the white noise (..., D) of their numbers."""
     channels = [
-        channel if channel.group == MOTOR else replace(channel, noise=float(np.median(noise[..., place])))
+        channel
+        if channel.group == MOTOR
+        else replace(channel, noise=float(np.median(noise[..., place])))
         for channel, place in zip(spec.channels, spec.slices.values(), strict=True)
     ]
     return replace(spec, channels=tuple(channels))
@@ -226,9 +256,13 @@ def with_noise(spec: StreamSpec, noise: NDArray[np.float64]) -> StreamSpec:
 
 def _note_columns(columns: Sequence[Column]) -> None:
     """Say what is left out, and why."""
-    for role in dict.fromkeys(c.role for c in columns if not c.read and c.role not in ("clock", "ignored")):
+    for role in dict.fromkeys(
+        c.role for c in columns if not c.read and c.role not in ("clock", "ignored")
+    ):
         same = [c for c in columns if c.role == role]
-        names = ", ".join(c.name for c in same[:6]) + (f" and {len(same) - 6} others" if len(same) > 6 else "")
+        names = ", ".join(c.name for c in same[:6]) + (
+            f" and {len(same) - 6} others" if len(same) > 6 else ""
+        )
         note(f"left out: {names}: {same[0].why}")
     for column in columns:
         if column.read and column.why:

@@ -23,21 +23,42 @@ from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
 
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))  # least number since 1970, and its unit [s]
-SLOWEST_WITHOUT_UNIT = 2.0  # step from which on a clock without a unit is not believed to count seconds
+EPOCHS = (
+    (1e17, 1e-9),
+    (1e14, 1e-6),
+    (1e11, 1e-3),
+    (1e8, 1.0),
+)  # least number since 1970, and its unit [s]
+SLOWEST_WITHOUT_UNIT = (
+    2.0  # step from which on a clock without a unit is not believed to count seconds
+)
 UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
-DAY, LEAST_DATE, BRIEF = 86400.0, 3e4, 1e-4  # [s]; Excel and MATLAB count days, from 1982 on so many, in steps so short
-MOST_DOUBLED = 0.02  # share of rows that may have the stamp of the one before: they were written twice
+DAY, LEAST_DATE, BRIEF = (
+    86400.0,
+    3e4,
+    1e-4,
+)  # [s]; Excel and MATLAB count days, from 1982 on so many, in steps so short
+MOST_DOUBLED = (
+    0.02  # share of rows that may have the stamp of the one before: they were written twice
+)
 DISAGREE = 0.01  # how far two clocks may be off each other, as a share, before that is said
 ALIKE = 0.2  # how far two clocks, or a clock and a memory, may be off, as a share, and tell each other's unit
 
-FEWEST, ALIKE_MOTION = 8, 0.9  # rows from which on velocities tell the unit, and how well they must explain positions
+FEWEST, ALIKE_MOTION = (
+    8,
+    0.9,
+)  # rows from which on velocities tell the unit, and how well they must explain positions
 
-_PAIR = re.compile(r"(?P<of>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nsecs?|ns|usecs?|us|micros)\]?", re.I)
-_SECONDS = ("secs", "sec", "seconds", "s")
-_PLACES = {"velocity": "position", "velocities": "positions", "vel": "pos", "qvel": "qpos"} | dict.fromkeys(
-    ("qd", "dq", "v"), "q"
+_PAIR = re.compile(
+    r"(?P<of>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nsecs?|ns|usecs?|us|micros)\]?", re.I
 )
+_SECONDS = ("secs", "sec", "seconds", "s")
+_PLACES = {
+    "velocity": "position",
+    "velocities": "positions",
+    "vel": "pos",
+    "qvel": "qpos",
+} | dict.fromkeys(("qd", "dq", "v"), "q")
 """What a position is called, by what its velocity is called."""
 
 
@@ -54,7 +75,10 @@ class Clock(NamedTuple):
 
     def seconds(self, table: Mapping[str, NDArray[Any]]) -> Floats:
         """Return (T,) seconds, from the first row where the clock counts from 1970, which would cost digits."""
-        parts = [_seconds(c, u, table[c], len(self.columns) > 1) for c, u in zip(self.columns, self.units, strict=True)]
+        parts = [
+            _seconds(c, u, table[c], len(self.columns) > 1)
+            for c, u in zip(self.columns, self.units, strict=True)
+        ]
         if len(parts) == 1 or np.nanmax(parts[1], initial=0.0) >= 1.0:  # both count all the time
             return parts[0]
         return parts[0] + parts[1]
@@ -64,20 +88,27 @@ class Clock(NamedTuple):
         cells = [row.get(column) for column in self.columns]
         if any(cell is None for cell in cells):
             return None
-        found = [_moment(c, u, str(cell)) for c, u, cell in zip(self.columns, self.units, cells, strict=True)]
+        found = [
+            _moment(c, u, str(cell))
+            for c, u, cell in zip(self.columns, self.units, cells, strict=True)
+        ]
         return found[0] if len(found) == 1 or found[1] >= 1.0 else found[0] + found[1]
 
 
 def _seconds(column: str, unit: float | None, values: NDArray[Any], paired: bool) -> Floats:
     values, unit = _numbers(column, unit, values)
     if values.ndim != 1 or not len(values):
-        raise ValueError(f"the clock {column!r} must hold a number a row, got the shape {values.shape}")
+        raise ValueError(
+            f"the clock {column!r} must hold a number a row, got the shape {values.shape}"
+        )
     known = values[np.isfinite(values)]
     first = float(known[0]) if len(known) else 0.0
     unit = _epoch(first) if unit is None else unit
     if first < EPOCHS[-1][0] or (paired and unit < 1.0):
         return values.astype(np.float64) * unit
-    since = values.astype(np.int64) - int(known[0]) if values.dtype.kind in "biu" else values - first
+    since = (
+        values.astype(np.int64) - int(known[0]) if values.dtype.kind in "biu" else values - first
+    )
     return np.asarray(since, np.float64) * unit
 
 
@@ -86,7 +117,9 @@ def _epoch(number: float) -> float:
     return next((unit for least, unit in EPOCHS if number >= least), 1.0)
 
 
-def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDArray[Any], float | None]:
+def _numbers(
+    column: str, unit: float | None, values: NDArray[Any]
+) -> tuple[NDArray[Any], float | None]:
     """The numbers (T,) of a column of times, and their unit: nanoseconds since 1970 of dates, seconds of a day."""
     import pandas as pd
 
@@ -109,9 +142,13 @@ def _numbers(column: str, unit: float | None, values: NDArray[Any]) -> tuple[NDA
         with suppress(ValueError, TypeError):
             moments = pd.to_datetime(text, utc=True, **how).dt.as_unit("ns")
             since = moments.astype(np.int64)
-            return (since if moments.notna().all() else since.where(moments.notna())).to_numpy(), 1e-9
+            return (
+                since if moments.notna().all() else since.where(moments.notna())
+            ).to_numpy(), 1e-9
     odd = next(str(cell) for cell in text[numbers.isna() & text.notna()])
-    raise ValueError(f"the clock {column!r} must hold a time, got {odd[:40]!r}: --rate HZ reads the rows without it")
+    raise ValueError(
+        f"the clock {column!r} must hold a time, got {odd[:40]!r}: --rate HZ reads the rows without it"
+    )
 
 
 def _span(ends: Any, day_first: bool) -> float:
@@ -144,11 +181,19 @@ def clocks_among(names: Iterable[str]) -> list[Clock]:
     for name, found in ((name, _PAIR.fullmatch(name)) for name in names):
         for end in _SECONDS if found else ():
             assert found is not None
-            coarse = lower.get(name[: found.start("unit")].lower() + end + name[found.end("unit") :].lower(), name)
+            coarse = lower.get(
+                name[: found.start("unit")].lower() + end + name[found.end("unit") :].lower(), name
+            )
             if coarse != name and coarse not in pairs:
-                pairs[coarse] = Clock((coarse, name), (1.0, 1e-9 if found["unit"].lower().startswith("n") else 1e-6))
+                pairs[coarse] = Clock(
+                    (coarse, name), (1.0, 1e-9 if found["unit"].lower().startswith("n") else 1e-6)
+                )
     fine = {pair.columns[1] for pair in pairs.values()}
-    single = {name: Clock((name,), (_named_unit(name),)) for name in names if is_clock(name) and name not in fine}
+    single = {
+        name: Clock((name,), (_named_unit(name),))
+        for name in names
+        if is_clock(name) and name not in fine
+    }
     return [clock for name in names if (clock := pairs.get(name) or single.get(name))]
 
 
@@ -161,7 +206,9 @@ def _named_unit(name: str) -> float | None:
     return LONGER.get(split_unit(name)[1].lower()) or SECONDS.get(name.lower().rpartition("_")[2])
 
 
-def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | None = None) -> Clock | None:
+def find_clock(
+    table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | None = None
+) -> Clock | None:
     """Return the steadiest clock of a table, or the one that is ``wanted``; None where there is none.
 
     ``dt`` [s] is how far apart a memory reads rows: it tells the unit of a clock that says none. Raises ValueError
@@ -184,7 +231,9 @@ def find_clock(table: Mapping[str, NDArray[Any]], wanted: str = "", dt: float | 
     best = usable[0][1] if usable else None
     rising = _rising(table, [clock for _, clock in usable])
     if rising is not None and best is not None:
-        note(f"the stamps of {best.name!r} repeat themselves: the clock is {rising.name!r}, which rises with them")
+        note(
+            f"the stamps of {best.name!r} repeat themselves: the clock is {rising.name!r}, which rises with them"
+        )
     if rising is None and trouble:
         raise ValueError(trouble)
     return rising or best
@@ -197,7 +246,14 @@ def clock_called(wanted: str, columns: Collection[str]) -> Clock:
     name = names.get(wanted) or names.get(bare)
     if name is None:
         raise ValueError(f"no column is called {wanted!r}; there are: {', '.join(columns)[:300]}")
-    pair = next((clock for clock in clocks_among(columns) if clock.columns[0] == name and clock.columns[1:]), None)
+    pair = next(
+        (
+            clock
+            for clock in clocks_among(columns)
+            if clock.columns[0] == name and clock.columns[1:]
+        ),
+        None,
+    )
     if pair is not None and not unit:
         return pair
     if unit and wanted not in columns and unit.lower() not in LONGER:
@@ -217,10 +273,15 @@ def _unsteadiness(times: Floats) -> tuple[float, float]:
 
 def _note_others(table: Mapping[str, NDArray[Any]], best: Clock, *others: Clock) -> None:
     for other in others if len(table[best.columns[0]]) > 2 else ():
-        own, step = (float(np.ptp(clock.seconds(table))) / (len(table[best.columns[0]]) - 1) for clock in (best, other))
+        own, step = (
+            float(np.ptp(clock.seconds(table))) / (len(table[best.columns[0]]) - 1)
+            for clock in (best, other)
+        )
         if own > 0 and step > 0 and abs(step / own - 1) > DISAGREE:
             rates = f"{1 / own:.4g} and {1 / step:.4g} rows a second"
-            note(f"{best.name!r} and {other.name!r} disagree, {rates}: the former is read; --clock NAME chooses")
+            note(
+                f"{best.name!r} and {other.name!r} disagree, {rates}: the former is read; --clock NAME chooses"
+            )
 
 
 def _with_unit(clock: Clock, table: Mapping[str, NDArray[Any]], dt: float | None) -> Clock:
@@ -232,7 +293,11 @@ def _with_unit(clock: Clock, table: Mapping[str, NDArray[Any]], dt: float | None
     step = float(np.median(np.diff(known))) if len(known) > 2 else 0.0
     if not step > 0 or known[0] >= EPOCHS[-1][0]:
         return clock
-    plausible = [u for u in UNITS if 1.0 <= 1 / (step * u) <= 1000.0] if step >= SLOWEST_WITHOUT_UNIT else []
+    plausible = (
+        [u for u in UNITS if 1.0 <= 1 / (step * u) <= 1000.0]
+        if step >= SLOWEST_WITHOUT_UNIT
+        else []
+    )
     moved = _seconds_a_row(table) or dt
     alike = [u for u in UNITS if moved is not None and abs(step * u / moved - 1) < ALIKE]
     unit = DAY if known[0] > LEAST_DATE and step < BRIEF else next(iter([*alike, *plausible]), 1.0)
@@ -252,15 +317,29 @@ def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock
             with suppress(ValueError):
                 if (np.diff(Clock((name,)).seconds(table)) > 0).all():
                     return Clock((name,))
-        if values.dtype.kind not in "biuf" or values.ndim != 1 or len(values) < 3 or not np.isfinite(values).all():
+        if (
+            values.dtype.kind not in "biuf"
+            or values.ndim != 1
+            or len(values) < 3
+            or not np.isfinite(values).all()
+        ):
             continue
-        if any(name in clock.columns for clock in coarse) or not np.mean(np.diff(values) > 0) > 1 - MOST_DOUBLED:
+        if (
+            any(name in clock.columns for clock in coarse)
+            or not np.mean(np.diff(values) > 0) > 1 - MOST_DOUBLED
+        ):
             continue
-        unit = _named_unit(name) or (_epoch(float(values[0])) if values[0] >= EPOCHS[1][0] else None)
-        unit = 1.0 if unit is None and unnamed and (values != np.rint(values)).any() else unit  # an index of seconds
+        unit = _named_unit(name) or (
+            _epoch(float(values[0])) if values[0] >= EPOCHS[1][0] else None
+        )
+        unit = (
+            1.0 if unit is None and unnamed and (values != np.rint(values)).any() else unit
+        )  # an index of seconds
         for whole in (float(np.ptp(clock.seconds(table))) for clock in coarse):
             span = float(values[-1]) - float(values[0])
-            unit = unit or next((u for u in UNITS if whole > 0 and abs(span * u / whole - 1) < ALIKE), None)
+            unit = unit or next(
+                (u for u in UNITS if whole > 0 and abs(span * u / whole - 1) < ALIKE), None
+            )
         if unit is not None:
             return Clock((name,), (unit,))
     return None
@@ -273,7 +352,9 @@ def _seconds_a_row(table: Mapping[str, NDArray[Any]]) -> float | None:
         for speed, place in _PLACES.items():
             other = re.sub(rf"(?<![A-Za-z]){speed}(?![A-Za-z])", place, name, count=1, flags=re.I)
             pair = names.get(other, speeds), speeds
-            if other == name or any(x.dtype.kind not in "biuf" or x.ndim != 1 or len(x) < FEWEST for x in pair):
+            if other == name or any(
+                x.dtype.kind not in "biuf" or x.ndim != 1 or len(x) < FEWEST for x in pair
+            ):
                 continue
             moved = np.gradient(pair[0].astype(np.float64))
             if np.ptp(speeds) > 0 and np.corrcoef(moved, speeds)[0, 1] > ALIKE_MOTION:

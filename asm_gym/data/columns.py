@@ -29,7 +29,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.clock import Clock, clocks_among
-from asm_gym.data.names import COUNTERS, SENSE, TAU, TURN, UNITS, element_of, is_command, is_label, split_unit
+from asm_gym.data.names import (
+    COUNTERS,
+    SENSE,
+    TAU,
+    TURN,
+    UNITS,
+    element_of,
+    is_command,
+    is_label,
+    split_unit,
+)
 from asm_gym.data.tables import is_numeric
 from asm_gym.data.text import DOUBLED, numbers_in
 from asm_gym.spec import StreamSpec
@@ -37,7 +47,10 @@ from asm_gym.spec import StreamSpec
 Floats = NDArray[np.float64]
 
 READ = ("sense", "command")
-KEPT_TOGETHER = ("constant", "counter")  # roles by behaviour that the elements of a channel do not get alone
+KEPT_TOGETHER = (
+    "constant",
+    "counter",
+)  # roles by behaviour that the elements of a channel do not get alone
 BACK = "; name it among --channels to read it"
 MIXED = 0.5  # share of numbers from which on a column with words is one of numbers
 
@@ -58,20 +71,28 @@ class LogLayout:
     rate: float | None = None  # rows a second [Hz], whatever the clock says
     action: Sequence[str] = ()  # patterns of the columns that were commanded
     channels: Sequence[str] = ()  # patterns of the columns that are read; all where empty
-    labels: Sequence[str] = ()  # patterns of the columns that say what is wrong, beside those that are called so
+    labels: Sequence[
+        str
+    ] = ()  # patterns of the columns that say what is wrong, beside those that are called so
     columns: Sequence[str] = ()  # names of the columns of files without a header
     by_name: bool = False  # without an ``action``, columns that are called so were commanded
     ignore: Sequence[str] = ()  # patterns of the columns that are left out
     clock: str = ""  # the column of times, perhaps with a unit behind it; by default the steadiest
-    like: Path | None = None  # of a folder only logs with the columns and the rate of this one are read
-    nominal: float | None = None  # rows a second that somebody meant them to have, where no clock says it [Hz]
+    like: Path | None = (
+        None  # of a folder only logs with the columns and the rate of this one are read
+    )
+    nominal: float | None = (
+        None  # rows a second that somebody meant them to have, where no clock says it [Hz]
+    )
 
     def marks(self, name: str, values: NDArray[Any]) -> bool:
         """Tell whether a column says which rows are faulty; one of fractions measures something."""
         if any(fnmatchcase(name, pattern) for pattern in self.ignore):
             return False
         whole = not is_numeric(values) or bool((known(values) == np.rint(known(values))).all())
-        return (is_label(name) and whole) or any(fnmatchcase(name, pattern) for pattern in self.labels)
+        return (is_label(name) and whole) or any(
+            fnmatchcase(name, pattern) for pattern in self.labels
+        )
 
 
 class Column(NamedTuple):
@@ -94,10 +115,14 @@ class Column(NamedTuple):
 
     def matches(self, pattern: str) -> bool:
         """Tell whether it or its channel is called so."""
-        return any(name == pattern or fnmatchcase(name, pattern) for name in (self.name, self.channel))
+        return any(
+            name == pattern or fnmatchcase(name, pattern) for name in (self.name, self.channel)
+        )
 
 
-def decide(tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, clock: Clock | None) -> list[Column]:
+def decide(
+    tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, clock: Clock | None
+) -> list[Column]:
     """Return what is done with each column of the first of some tables, by all of them; ``clock`` is that of all."""
     table = tables[0]
     times = [_times(each, clock) for each in tables]
@@ -112,7 +137,11 @@ def decide(tables: Sequence[Mapping[str, NDArray[Any]]], layout: LogLayout, cloc
             role, why = _by_behaviour(column, every, times)
             cells = tuple(hash(np.ascontiguousarray(v, np.float64).tobytes()) for v in every)
             same = seen.setdefault(cells, column.name)
-            if role == "sense" and same != column.name and is_command(same) == is_command(column.name):
+            if (
+                role == "sense"
+                and same != column.name
+                and is_command(same) == is_command(column.name)
+            ):
                 role, why = "copy", f"equals {same}{BACK}"
         if role == "sense":
             role = "command" if is_command(column.name) else "sense"
@@ -136,19 +165,27 @@ def _times(table: Mapping[str, NDArray[Any]], clock: Clock | None) -> NDArray[np
 def _named(table: Mapping[str, NDArray[Any]]) -> dict[str, Column]:
     """The columns by their headers, with unit, channel and element."""
     bare = {header: split_unit(header) for header in table}
-    found = {header: element_of(name) for header, (name, _) in bare.items() if is_numeric(table[header])}
+    found = {
+        header: element_of(name) for header, (name, _) in bare.items() if is_numeric(table[header])
+    }
     stems = Counter(element.channel for element in found.values() if element)
     whole = {name for name, _ in bare.values()}
     made = {}
     for header, (name, unit) in bare.items():
         element = found.get(header)
-        grouped = element and (element.named or stems[element.channel] > 1) and element.channel not in whole
+        grouped = (
+            element
+            and (element.named or stems[element.channel] > 1)
+            and element.channel not in whole
+        )
         channel, part = (element.channel, element.name) if element and grouped else (name, "")
         made[header] = Column(name, unit, "sense", channel, part, table[header])
     return made
 
 
-def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None, is_stamp: bool) -> tuple[str, str]:
+def _by_name(
+    header: str, column: Column, layout: LogLayout, clock: Clock | None, is_stamp: bool
+) -> tuple[str, str]:
     """The role of a column by its name, by the options, and by the kind of its cells; else a sense."""
     asked_for = any(column.matches(pattern) for pattern in layout.channels)
     left_out = any(column.matches(pattern) or header == pattern for pattern in layout.ignore)
@@ -168,7 +205,11 @@ def _by_name(header: str, column: Column, layout: LogLayout, clock: Clock | None
             "double",
             f"differs from another column of the name {other!r}; --ignore '{header}' leaves it out",
         ),
-        (is_numeric(column.values) and not np.isfinite(column.values).any(), "empty", "holds no number"),
+        (
+            is_numeric(column.values) and not np.isfinite(column.values).any(),
+            "empty",
+            "holds no number",
+        ),
     )
     role, why = next(((role, why) for holds, role, why in rules if holds), ("sense", ""))
     return _words(column) if role == "sense" and not is_numeric(column.values) else (role, why)
@@ -201,7 +242,10 @@ def _by_behaviour(
     fewest = 2 if column.name.lower() in COUNTERS else FEWEST
     for way, sign in (("rises", 1.0), ("falls", -1.0)):
         going = [sign * values for values in moving]
-        if all(counts(v, fewest) or any(len(v) == len(t) and follows(v, t) for t in times) for v in going):
+        if all(
+            counts(v, fewest) or any(len(v) == len(t) and follows(v, t) for t in times)
+            for v in going
+        ):
             return "counter", f"{way} by a constant{BACK}"
     return "sense", ""
 
@@ -238,14 +282,22 @@ def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
     if len(found) < fewest or len(found) < len(values) or (found != np.rint(found)).any():
         return False
     steps = np.diff(found)
-    if len(rises := steps[steps != 0]) > 1 and len(rises) < len(steps) and (rises == rises[0]).all() and rises[0] > 0:
+    if (
+        len(rises := steps[steps != 0]) > 1
+        and len(rises) < len(steps)
+        and (rises == rises[0]).all()
+        and rises[0] > 0
+    ):
         return len(np.unique(found)) > 2  # an index, of episodes or of cycles
     usual = float(np.median(steps))
     if usual <= 0 or np.mean(steps == usual) < STEADY:
         return False
     forward = steps[steps > 0]
     anew = np.flatnonzero(steps < 0)  # it wraps, or begins again: near its least number
-    return bool((forward % usual == 0).all() and (found[anew + 1] <= found.min() + usual * (FEWEST + 1)).all())
+    return bool(
+        (forward % usual == 0).all()
+        and (found[anew + 1] <= found.min() + usual * (FEWEST + 1)).all()
+    )
 
 
 def follows(values: NDArray[Any], times: Floats) -> bool:
@@ -271,7 +323,12 @@ def turn_of(values: NDArray[Any], unit: str) -> float:
         ends = (-turn / 2, turn / 2) if found.min() < -0.05 * turn else (0.0, turn)
         reached = found.min() - ends[0] < 0.1 * turn and ends[1] - found.max() < 0.1 * turn
         smooth = np.abs(steps - turn * np.rint(steps / turn))
-        if jumps.any() and reached and len(np.unique(found)) > FEWEST and (smooth < 0.25 * turn).all():
+        if (
+            jumps.any()
+            and reached
+            and len(np.unique(found)) > FEWEST
+            and (smooth < 0.25 * turn).all()
+        ):
             return turn
     return 0.0
 

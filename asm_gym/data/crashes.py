@@ -24,12 +24,17 @@ def peak_force(episode: Episode) -> float:
 def peak_torques(episode: Episode) -> NDArray[np.float64]:
     """Return (T,) the largest external torque on a joint in each row [N m], within it where sensed; 0 without any."""
     slices = episode.spec.slices
-    sensed = [[s for name, s in slices.items() if name.endswith(f"external_torque{end}")] for end in ("_peak", "")]
+    sensed = [
+        [s for name, s in slices.items() if name.endswith(f"external_torque{end}")]
+        for end in ("_peak", "")
+    ]
     torques = [np.abs(episode.stream[:, s]).max(axis=1) for s in sensed[0] or sensed[1]]
     return np.max([np.zeros(len(episode)), *torques], axis=0)
 
 
-def crashes(episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = ()) -> dict[int, float]:
+def crashes(
+    episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = ()
+) -> dict[int, float]:
     """Return the numbers of the episodes that crash, and how many times as hard as is usual in their tasks they press.
 
     ``reference`` says which episodes tell what is usual: by default, and where none does, all.

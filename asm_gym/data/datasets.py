@@ -34,11 +34,18 @@ from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 
 METADATA, ARRAYS = "metadata.json", "main_data.hdf5"  # files of a dataset's folder ``data``
-OWN_FILES = (ARRAYS, METADATA, "SHA256SUMS")  # files that this package has written there, the last one until 1.0
+OWN_FILES = (
+    ARRAYS,
+    METADATA,
+    "SHA256SUMS",
+)  # files that this package has written there, the last one until 1.0
 SPARE_BYTES = 10_000_000  # beside the arrays of a data set, that a disk must have
 INFO = Path("meta") / "info.json"
 
-SENSED, COMMANDED = "observation.", "action"  # features that are read begin so; pictures are left out
+SENSED, COMMANDED = (
+    "observation.",
+    "action",
+)  # features that are read begin so; pictures are left out
 
 
 def require_minari() -> None:
@@ -49,7 +56,11 @@ def require_minari() -> None:
 
 @typed
 def write_dataset(
-    root: Path, dataset_id: str, episodes: Sequence[Episode], env: gym.Env[Any, Any], details: dict[str, Any]
+    root: Path,
+    dataset_id: str,
+    episodes: Sequence[Episode],
+    env: gym.Env[Any, Any],
+    details: dict[str, Any],
 ) -> Path:
     """Write episodes of one spec as a Minari dataset to ``root/<dataset_id>``, in place of the one that is there.
 
@@ -68,24 +79,43 @@ def write_dataset(
         spec.require(episode.spec, f"episode {n}")
         steps = len(episode.actions)
         if not steps or len(episode.observations) != steps + 1 or len(episode.rewards) != steps:
-            raise ValueError(f"episode {n} needs an action, a reward and a flat observation of every step")
+            raise ValueError(
+                f"episode {n} needs an action, a reward and a flat observation of every step"
+            )
         check_recorded(episode)
     folder = _folder(root, dataset_id)
-    unfinished, replaced = (folder.with_name(f".{folder.name}.{what}") for what in ("unfinished", "replaced"))
+    unfinished, replaced = (
+        folder.with_name(f".{folder.name}.{what}") for what in ("unfinished", "replaced")
+    )
     for before in (folder, unfinished, replaced):
         _refuse_foreign(before)
     for before in (unfinished, replaced):
         shutil.rmtree(before, ignore_errors=True)
     data = unfinished / "data"
     data.mkdir(parents=True)
-    size = sum(array.nbytes for e in episodes for array in (e.observations, e.actions, e.rewards, e.stream, e.faults))
-    if shutil.disk_usage(data).free < size + SPARE_BYTES:  # HDF5 may end the process where a disk is full
+    size = sum(
+        array.nbytes
+        for e in episodes
+        for array in (e.observations, e.actions, e.rewards, e.stream, e.faults)
+    )
+    if (
+        shutil.disk_usage(data).free < size + SPARE_BYTES
+    ):  # HDF5 may end the process where a disk is full
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / ARRAYS))
-    spaces = {"observation_space": flatten_space(env.observation_space), "action_space": env.action_space}
+    spaces = {
+        "observation_space": flatten_space(env.observation_space),
+        "action_space": env.action_space,
+    }
     storage = MinariStorage.new(data, **spaces, env_spec=env.spec)
     storage.update_episodes([_buffer(n, episode) for n, episode in enumerate(episodes)])
-    storage.update_episode_metadata({"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes)
-    about = {"stream_spec": spec.to_json(), "dataset_id": dataset_id, "minari_version": minari.__version__}
+    storage.update_episode_metadata(
+        {"success": bool(e.success), "info": json.dumps(e.info)} for e in episodes
+    )
+    about = {
+        "stream_spec": spec.to_json(),
+        "dataset_id": dataset_id,
+        "minari_version": minari.__version__,
+    }
     storage.update_metadata(details | about)
     if folder.exists():
         folder.rename(replaced)
@@ -96,7 +126,9 @@ def write_dataset(
 
 def _folder(root: Path, dataset_id: str) -> Path:
     """The folder of a dataset, which lies below ``root``."""
-    if not all(re.fullmatch(r"\w[\w.-]*", part) for part in check_text("dataset_id", dataset_id).split("/")):
+    if not all(
+        re.fullmatch(r"\w[\w.-]*", part) for part in check_text("dataset_id", dataset_id).split("/")
+    ):
         raise ValueError(f"dataset_id must be a name such as asm_gym/lift-v0, got {dataset_id!r}")
     folder = root.resolve() / dataset_id  # Minari doubles a relative path
     if folder.resolve() != folder:
@@ -106,7 +138,11 @@ def _folder(root: Path, dataset_id: str) -> Path:
 
 def _refuse_foreign(folder: Path) -> None:
     """Raise ValueError where a folder that is to be replaced holds what ``write_dataset`` does not write."""
-    found = {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()} if folder.is_dir() else {folder}
+    found = (
+        {f for f in folder.rglob("*") if f.is_symlink() or not f.is_dir()}
+        if folder.is_dir()
+        else {folder}
+    )
     foreign = found - {folder / "data" / name for name in OWN_FILES}
     if folder.exists() and foreign:
         raise ValueError(f"asm-gym did not write {min(foreign)}, so {folder} is not replaced")
@@ -157,7 +193,10 @@ def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
     spec = _spec(folder, metadata, dataset, found)
     if not recorded:
         raise ValueError(f"{folder} holds no episode")
-    return [_episode(folder, data, note, spec, spaces) for data, note in zip(recorded, notes, strict=True)]
+    return [
+        _episode(folder, data, note, spec, spaces)
+        for data, note in zip(recorded, notes, strict=True)
+    ]
 
 
 def _find_dataset(path: Path) -> Path:
@@ -165,7 +204,9 @@ def _find_dataset(path: Path) -> Path:
     if (path / METADATA).is_file():
         return path
     found = [f for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
-    below = [f.parent for f in found if not any(p.startswith(".") for p in f.relative_to(path).parts)]  # left by a kill
+    below = [
+        f.parent for f in found if not any(p.startswith(".") for p in f.relative_to(path).parts)
+    ]  # left by a kill
     if not below:
         raise FileNotFoundError(f"no Minari dataset at or below {path}")
     if len(below) > 1:
@@ -178,9 +219,13 @@ def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | No
         try:
             return StreamSpec.from_json(metadata["stream_spec"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{folder} names its channels in a way that cannot be read: {error}") from error
+            raise ValueError(
+                f"{folder} names its channels in a way that cannot be read: {error}"
+            ) from error
     if env_id in {task.id for task in TASKS.values()}:
-        raise ValueError(f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`")
+        raise ValueError(
+            f"{folder} was recorded in {env_id} and holds no streams: record it with `asm-gym collect`"
+        )
     dt = 1.0
     if env_id in gym.registry:  # how the file itself says to make it is not followed
         with suppress(gym.error.Error, ImportError), closing(gym.make(env_id)) as env:
@@ -188,29 +233,43 @@ def _spec(folder: Path, metadata: dict[str, Any], dataset: Any, env_id: str | No
     return StreamSpec.from_spaces(dataset.observation_space, dataset.action_space, dt)
 
 
-def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, spaces: tuple[Any, Any]) -> Episode:
+def _episode(
+    folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, spaces: tuple[Any, Any]
+) -> Episode:
     T = len(data.rewards)
     infos = data.infos or {}
     seed = note.get("seed")
     try:
-        for name, length in {"actions": T, "observations": T + 1, "terminations": T, "truncations": T}.items():
+        for name, length in {
+            "actions": T,
+            "observations": T + 1,
+            "terminations": T,
+            "truncations": T,
+        }.items():
             if found := {len(part) for part in _leaves(getattr(data, name))} - {length}:
                 raise ValueError(f"{T} rewards need {length} {name}, got {found.pop()}")
         observations = flat_rows(spaces[0], data.observations, T + 1)
         if spec.source == "spaces" and "stream" not in infos:
-            stream = np.concatenate([observations[1:], flat_rows(spaces[1], data.actions, T)], axis=1)
+            stream = np.concatenate(
+                [observations[1:], flat_rows(spaces[1], data.actions, T)], axis=1
+            )
         else:
             stream = _without_reset(np.asarray(infos["stream"], np.float32), T)
         episode = Episode(
             stream=stream,
             spec=spec,
-            success=bool(note["success"] if "success" in note else np.any(infos.get("success", False))),
+            success=bool(
+                note["success"] if "success" in note else np.any(infos.get("success", False))
+            ),
             seed=None if seed is None else int(seed),
             actions=np.asarray(data.actions, np.float32).reshape(T, -1),
             observations=observations,
             rewards=np.asarray(data.rewards, np.float32),
-            faults=_without_reset(np.asarray(infos.get("fault", np.zeros(len(stream))), np.bool_), T),
-            info=json.loads(note.get("info", "{}")) | {"terminated": bool(np.any(data.terminations))},
+            faults=_without_reset(
+                np.asarray(infos.get("fault", np.zeros(len(stream))), np.bool_), T
+            ),
+            info=json.loads(note.get("info", "{}"))
+            | {"terminated": bool(np.any(data.terminations))},
         )
         check_recorded(episode)
         return episode
@@ -220,7 +279,11 @@ def _episode(folder: Path, data: Any, note: dict[str, Any], spec: StreamSpec, sp
 
 def _leaves(values: Any) -> list[Any]:
     """The arrays of a dict, at any depth."""
-    return [leaf for value in values.values() for leaf in _leaves(value)] if isinstance(values, dict) else [values]
+    return (
+        [leaf for value in values.values() for leaf in _leaves(value)]
+        if isinstance(values, dict)
+        else [values]
+    )
 
 
 def _without_reset(rows: NDArray[Any], T: int) -> NDArray[Any]:
@@ -235,7 +298,11 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
     """Yield the columns of each episode, its rate [Hz], and whether it succeeded (by default it did)."""
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
-        version, rate, features = info["codebase_version"], float(info["fps"]), dict(info["features"])
+        version, rate, features = (
+            info["codebase_version"],
+            float(info["fps"]),
+            dict(info["features"]),
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{folder / INFO} is no LeRobot dataset's: {error!r}") from error
     if not str(version).startswith(("v2", "v3")):
@@ -243,10 +310,13 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
     read = {
         name: _names(feature)
         for name, feature in features.items()
-        if name.startswith((SENSED, COMMANDED)) and str(feature.get("dtype", "")).startswith(("float", "int"))
+        if name.startswith((SENSED, COMMANDED))
+        and str(feature.get("dtype", "")).startswith(("float", "int"))
     }
     if not any(name.startswith(SENSED) for name in read):
-        raise ValueError(f"{folder} has no feature that is sensed, observation.… of numbers: {', '.join(features)}")
+        raise ValueError(
+            f"{folder} has no feature that is sensed, observation.… of numbers: {', '.join(features)}"
+        )
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
         raise ValueError(f"{folder} holds no data/**/*.parquet")
@@ -258,11 +328,17 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
         index = columns["episode_index"]
         for episode in dict.fromkeys(index.tolist()):
             rows = index == episode
-            success = bool(columns["next.success"][rows].any()) if "next.success" in columns else True
+            success = (
+                bool(columns["next.success"][rows].any()) if "next.success" in columns else True
+            )
             found = {name: as_array(columns[name][rows]) for name in read}
             made = {k: v for name in read for k, v in _split(name, found[name], read[name])}
             stamps = {"timestamp": columns["timestamp"][rows]} if "timestamp" in columns else {}
-            yield stamps | made, rate, success  # frames that were lost are known by the stamps alone
+            yield (
+                stamps | made,
+                rate,
+                success,
+            )  # frames that were lost are known by the stamps alone
 
 
 def _names(feature: dict[str, Any]) -> list[str]:
@@ -273,7 +349,9 @@ def _names(feature: dict[str, Any]) -> list[str]:
     return found if len(set(found)) == len(found) else []
 
 
-def _split(name: str, values: NDArray[Any], names: Sequence[str]) -> Iterator[tuple[str, NDArray[Any]]]:
+def _split(
+    name: str, values: NDArray[Any], names: Sequence[str]
+) -> Iterator[tuple[str, NDArray[Any]]]:
     """A feature's columns, each by its name where there are names."""
     if values.ndim == 2 and len(names) == values.shape[1]:
         yield from ((f"{name}[{element}]", values[:, k]) for k, element in enumerate(names))

@@ -21,7 +21,14 @@ from asm_gym.validation import as_float32, typed
 
 KIND = "episode"
 CONTROLLER = "controller"  # where an episode, or a monitor, says under which one it was recorded
-ARRAYS = {"stream": "f", "actions": "f", "observations": "fiub", "rewards": "f", "faults": "b", "contact_force": "f"}
+ARRAYS = {
+    "stream": "f",
+    "actions": "f",
+    "observations": "fiub",
+    "rewards": "f",
+    "faults": "b",
+    "contact_force": "f",
+}
 """Arrays of a file, and the kinds of numbers that each may have."""
 
 
@@ -35,7 +42,9 @@ class EpisodeLabel:
     severity: str = ""
     seed: int = 0  # of the environment and of the policy. Episodes that share it are twins
     onset: int | None = None  # the first step with the fault or variation
-    affected_channels: frozenset[str] = field(default=frozenset(), compare=False)  # where it shows first, as measured
+    affected_channels: frozenset[str] = field(
+        default=frozenset(), compare=False
+    )  # where it shows first, as measured
 
     @property
     def path(self) -> Path:
@@ -84,7 +93,9 @@ class Episode:
 
     def __post_init__(self) -> None:
         if self.stream.ndim != 2:
-            raise ValueError(f"an episode's stream must have the shape (T, D), got {self.stream.shape}")
+            raise ValueError(
+                f"an episode's stream must have the shape (T, D), got {self.stream.shape}"
+            )
         self.spec.check_row(self.stream)
 
     def __len__(self) -> int:
@@ -102,7 +113,9 @@ class Episode:
     def labelled(self) -> EpisodeLabel:
         """The label. Raises ValueError without one."""
         if self.label is None:
-            raise ValueError("this episode has no label, which holds the task and the role that it was recorded for")
+            raise ValueError(
+                "this episode has no label, which holds the task and the role that it was recorded for"
+            )
         return self.label
 
     @classmethod
@@ -113,7 +126,9 @@ class Episode:
 
     @classmethod
     @typed
-    def from_table(cls, frame: Any, channels: StreamSpec | Sequence[str] | None = None, **how: Any) -> Episode:
+    def from_table(
+        cls, frame: Any, channels: StreamSpec | Sequence[str] | None = None, **how: Any
+    ) -> Episode:
         """Make an episode from one log; the arguments are those of ``from_tables``."""
         return cls.from_tables([frame], channels, **how)[0]
 
@@ -150,7 +165,9 @@ class Episode:
         layout = LogLayout(spec, rate, action, chosen, labels, ignore=ignore, clock=clock)
         tables, made = [laid_out(frame) for frame in frames], list[Episode]()
         for n, table in enumerate(tables):
-            found = read_recorded(table, layout, tables[:n] + tables[n + 1 :] if layout.spec is None else ())
+            found = read_recorded(
+                table, layout, tables[:n] + tables[n + 1 :] if layout.spec is None else ()
+            )
             layout = replace(layout, spec=found.spec)
             made.append(cls(found.stream, found.spec, **{"faults": found.faults} | fields))
         return made
@@ -161,17 +178,23 @@ def check_recorded(episode: Episode) -> None:
     rows, steps = len(episode), len(episode.actions)
     for name, length in (("observations", steps + 1), ("rewards", steps), ("contact_force", steps)):
         if steps and len(getattr(episode, name)) not in (0, length):
-            raise ValueError(f"{steps} actions need {length} {name}, got {len(getattr(episode, name))}")
+            raise ValueError(
+                f"{steps} actions need {length} {name}, got {len(getattr(episode, name))}"
+            )
     for name in ("rewards", "faults", "contact_force"):
         if getattr(episode, name).ndim != 1:
-            raise ValueError(f"{name} must have one dimension, got the shape {getattr(episode, name).shape}")
+            raise ValueError(
+                f"{name} must have one dimension, got the shape {getattr(episode, name).shape}"
+            )
     if len(episode.faults) not in (0, rows):
         raise ValueError(f"{rows} rows of a stream need {rows} faults, got {len(episode.faults)}")
     if steps and rows % steps:
         raise ValueError(f"{steps} actions cannot have {rows} rows of a stream")
     bad = np.flatnonzero(~np.isfinite(episode.rewards))
     if len(bad):
-        raise ValueError(f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}")
+        raise ValueError(
+            f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}"
+        )
 
 
 @typed
@@ -200,8 +223,14 @@ def load_episode(path: str | Path) -> Episode:
         saved = read_checkpoint(Path(path), KIND)
         header, label = saved.header, saved.header["label"]
         if label is not None:
-            label = EpisodeLabel(**{**label, "affected_channels": frozenset(label["affected_channels"])})
-        kept: dict[str, Any] = {**saved.arrays, "label": label, "spec": StreamSpec.from_json(header["spec"])}
+            label = EpisodeLabel(
+                **{**label, "affected_channels": frozenset(label["affected_channels"])}
+            )
+        kept: dict[str, Any] = {
+            **saved.arrays,
+            "label": label,
+            "spec": StreamSpec.from_json(header["spec"]),
+        }
         kept |= {name: header[name] for name in ("success", "seed", "info")}
         for name, kinds in ARRAYS.items():
             if name in kept and kept[name].dtype.kind not in kinds:

@@ -36,8 +36,12 @@ class Inspection(NamedTuple):
         """Say in a line how long it is, and at which rate it comes."""
         seconds = float(np.ptp(self.times)) if self.rate and len(self.times) else 0.0
         by = f" by {self.by!r}" if self.by else ""
-        rate = f"{self.rate:.6g} Hz{by}, jitter {100 * self.jitter:.1f} %" if self.rate else "no rate"
-        return f"{self.name}: {len(self.times)} rows, {seconds:.5g} s, {rate}, {len(self.gaps)} gaps"
+        rate = (
+            f"{self.rate:.6g} Hz{by}, jitter {100 * self.jitter:.1f} %" if self.rate else "no rate"
+        )
+        return (
+            f"{self.name}: {len(self.times)} rows, {seconds:.5g} s, {rate}, {len(self.gaps)} gaps"
+        )
 
     def remarks(self) -> list[str]:
         """List what a user should know of the whole, a line each."""
@@ -47,7 +51,8 @@ class Inspection(NamedTuple):
             "no clock: say --rate, rows a second, or name the column of times with --clock": not (
                 self.trouble or self.rate
             ),
-            f"the clock jitters by {self.jitter:.0%} of a step": self.jitter > JITTERS and not self.trouble,
+            f"the clock jitters by {self.jitter:.0%} of a step": self.jitter > JITTERS
+            and not self.trouble,
             f"{len(self.gaps)} gaps in the clock, the longest {longest:.3g} s: up to {BRIDGED_ROWS} lost rows, or "
             "--bridge, are filled, the log is cut at others": len(self.gaps) > 0,
             "no command by name: the memory learns without the arm's commands, unless fit --action says": all(
@@ -58,7 +63,10 @@ class Inspection(NamedTuple):
 
 
 def inspected(
-    name: str, table: Mapping[str, NDArray[Any]], layout: LogLayout | None = None, others: Sequence[Columns] = ()
+    name: str,
+    table: Mapping[str, NDArray[Any]],
+    layout: LogLayout | None = None,
+    others: Sequence[Columns] = (),
 ) -> Inspection:
     """Describe a table of columns (T,) or (T, k), as ``asm-gym fit`` reads it; ``others`` are of the same folder."""
     table, layout = laid_out(table), layout or LogLayout()
@@ -72,7 +80,11 @@ def inspected(
     refused = [f"{c.name} {c.why}" for c in columns if c.role in ("mixed", "double")]
     refused += [] if any(c.read for c in columns) or refused else ["no column of numbers is left"]
     rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
-    unread: dict[str, Any] = {"times": rows / (rate or 1.0), "rate": rate, "trouble": trouble or "; ".join(refused)}
+    unread: dict[str, Any] = {
+        "times": rows / (rate or 1.0),
+        "rate": rate,
+        "trouble": trouble or "; ".join(refused),
+    }
     return Inspection(name, columns, [_facts(c) for c in columns], **unread | found)
 
 
@@ -82,11 +94,21 @@ def _by_clock(table: Columns, clock: Clock) -> dict[str, Any]:
     times, dt = timing.times, timing.dt
     if dt is None:
         raise ValueError("one row")
-    lost = spans(np.isnan(evenly(np.ones((len(times), 1)), times, dt)[:, 0]))  # as fit and watch read them
-    gaps = times[0] + dt * np.array([(start - 1, stop) for start, stop in lost], np.float64).reshape(-1, 2)
+    lost = spans(
+        np.isnan(evenly(np.ones((len(times), 1)), times, dt)[:, 0])
+    )  # as fit and watch read them
+    gaps = times[0] + dt * np.array(
+        [(start - 1, stop) for start, stop in lost], np.float64
+    ).reshape(-1, 2)
     steps = np.diff(times) / dt
     jitter = float(steps[steps <= FAR * max(1.0, float(np.quantile(steps, 0.9)))].std())
-    return {"times": clock.seconds(table), "rate": 1 / dt, "by": clock.name, "jitter": jitter, "gaps": gaps}
+    return {
+        "times": clock.seconds(table),
+        "rate": 1 / dt,
+        "by": clock.name,
+        "jitter": jitter,
+        "gaps": gaps,
+    }
 
 
 def _facts(column: Column) -> dict[str, Any]:
@@ -111,5 +133,6 @@ def _facts(column: Column) -> dict[str, Any]:
         "resolution": resolution(values),
         "repeats": float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0,
         "missing": missing,
-        "what is done": "; ".join(line for line, holds in remarks.items() if holds) or "read as it is",
+        "what is done": "; ".join(line for line, holds in remarks.items() if holds)
+        or "read as it is",
     }

@@ -37,7 +37,9 @@ LARGEST = 65_535  # bytes of a datagram
 LONGEST = 100 * LARGEST  # bytes of a line: more than a row of any robot
 CONNECT_S = 5.0  # how long a topic may take to be found [s]
 WAIT_S = 0.05  # how often the end of a topic is looked for while nothing comes [s]
-AT_ONCE = 2048  # messages of a topic taken, and kept for the reader, at once: four seconds of 500 Hz
+AT_ONCE = (
+    2048  # messages of a topic taken, and kept for the reader, at once: four seconds of 500 Hz
+)
 
 FIELDS: dict[str, dict[str, str]] = {
     "builtin_interfaces/msg/Time": {"sec": "int32", "nanosec": "uint32"},
@@ -46,11 +48,20 @@ FIELDS: dict[str, dict[str, str]] = {
     | dict.fromkeys(("position", "velocity", "effort"), "[float64]"),
     "geometry_msgs/msg/Vector3": dict.fromkeys("xyz", "float64"),
     "geometry_msgs/msg/Wrench": dict.fromkeys(("force", "torque"), "geometry_msgs/msg/Vector3"),
-    "geometry_msgs/msg/WrenchStamped": {"header": "std_msgs/msg/Header", "wrench": "geometry_msgs/msg/Wrench"},
+    "geometry_msgs/msg/WrenchStamped": {
+        "header": "std_msgs/msg/Header",
+        "wrench": "geometry_msgs/msg/Wrench",
+    },
     "std_msgs/msg/String": {"data": "str"},
     "std_msgs/msg/MultiArrayDimension": {"label": "str", "size": "uint32", "stride": "uint32"},
-    "std_msgs/msg/MultiArrayLayout": {"dim": "[std_msgs/msg/MultiArrayDimension]", "data_offset": "uint32"},
-    "std_msgs/msg/Float64MultiArray": {"layout": "std_msgs/msg/MultiArrayLayout", "data": "[float64]"},
+    "std_msgs/msg/MultiArrayLayout": {
+        "dim": "[std_msgs/msg/MultiArrayDimension]",
+        "data_offset": "uint32",
+    },
+    "std_msgs/msg/Float64MultiArray": {
+        "layout": "std_msgs/msg/MultiArrayLayout",
+        "data": "[float64]",
+    },
 }
 """Fields of the messages, from their .msg files."""
 
@@ -69,7 +80,9 @@ def live_source(source: str) -> LiveSource | None:
     return LIVE.get(source if source == "-" else f"{source.partition(':')[0]}:")
 
 
-def lines_from(source: str, stdin: TextIO, silence: float, first: float = math.inf) -> Iterator[str]:
+def lines_from(
+    source: str, stdin: TextIO, silence: float, first: float = math.inf
+) -> Iterator[str]:
     """Return the lines of a live source, as they come.
 
     Sources are ``-`` for standard input, ``tail:FILE`` for a file that grows, ``udp:PORT`` for datagrams of this
@@ -78,7 +91,9 @@ def lines_from(source: str, stdin: TextIO, silence: float, first: float = math.i
     """
     found = live_source(source)
     if found is None:
-        raise ValueError(f"unknown source {source!r}; known: {', '.join(s.example for s in LIVE.values())}")
+        raise ValueError(
+            f"unknown source {source!r}; known: {', '.join(s.example for s in LIVE.values())}"
+        )
     return found.open(source.partition(":")[2], stdin, silence, first)
 
 
@@ -117,7 +132,9 @@ def _follow_datagrams(place: str, stdin: TextIO, silence: float, first: float) -
     number, at, sender = place.partition("@")
     host, colon, own = sender.partition(":")
     if not number.isdigit() or (at and not host) or (colon and not own.isdigit()):
-        raise ValueError(f"udp takes a port of this machine, as in udp:9870, or udp:9870@127.0.0.1:5005, got {place!r}")
+        raise ValueError(
+            f"udp takes a port of this machine, as in udp:9870, or udp:9870@127.0.0.1:5005, got {place!r}"
+        )
     port = int(check_number("port", int(number), low=1, high=65_535, whole=True))
     believed = IPv4Address(host or "127.0.0.1")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
@@ -150,7 +167,9 @@ def message(name: str) -> Any:
     if name not in FIELDS:
         return getattr(_dds("idl.types"), name)
     fields = {field: message(kind) for field, kind in FIELDS[name].items()}
-    return _dds("idl").make_idl_struct(name.rpartition("/")[2], _type_name(name).replace("::", "."), fields)
+    return _dds("idl").make_idl_struct(
+        name.rpartition("/")[2], _type_name(name).replace("::", "."), fields
+    )
 
 
 def _type_name(name: str) -> str:
@@ -173,7 +192,11 @@ def publisher(topic: str) -> Callable[[str], None]:
     Raises ValueError where ROS_DOMAIN_ID is no number.
     """
     policy, kind, participant = _dds("core").Policy, message("std_msgs/msg/String"), _participant()
-    lasting = policy.Reliability.Reliable(0), policy.Durability.TransientLocal, policy.History.KeepLast(1)
+    lasting = (
+        policy.Reliability.Reliable(0),
+        policy.Durability.TransientLocal,
+        policy.History.KeepLast(1),
+    )
     there = _dds("topic").Topic(participant, f"rt/{topic.strip('/')}", kind)
     writer = _dds("pub").DataWriter(participant, there, qos=_dds("core").Qos(*lasting))
     return lambda text: writer.write(kind(text))
@@ -201,7 +224,9 @@ def _follow_topics(topics: str, silence: float) -> Iterator[str]:
     clock, *others = names
     waiting = core.WaitSet(participant)
     waiting.attach(
-        core.ReadCondition(readers[clock], core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead)
+        core.ReadCondition(
+            readers[clock], core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
+        )
     )
     publishers, rows, last = Publishers(silence), 0, time.monotonic()
     while time.monotonic() - last <= silence:
@@ -211,7 +236,9 @@ def _follow_topics(topics: str, silence: float) -> Iterator[str]:
                 if not getattr(getattr(sample, "sample_info", None), "valid_data", False):
                     continue  # it only says that a writer went
                 joints = [f"{name}.{joint}" for joint in getattr(sample, "name", ())] or [name]
-                numbers = {f"{name}.{number}": v for number, v in MESSAGES[kinds[name]](sample).items()}
+                numbers = {
+                    f"{name}.{number}": v for number, v in MESSAGES[kinds[name]](sample).items()
+                }
                 row = publishers.row(numbers, joints, now := time.monotonic(), leads=name == clock)
                 last = now if name == clock else last
                 if row is not None:
@@ -231,7 +258,9 @@ def _kind(participant: Any, name: str) -> str:
     until, there = time.monotonic() + CONNECT_S, dict[str, str]()
     while f"rt/{name}" not in there and time.monotonic() < until:
         time.sleep(WAIT_S)
-        there |= {p.topic_name: p.type_name for p in found.take(N=AT_ONCE) if hasattr(p, "topic_name")}
+        there |= {
+            p.topic_name: p.type_name for p in found.take(N=AT_ONCE) if hasattr(p, "topic_name")
+        }
     kind = there.get(f"rt/{name}")
     if kind is None:
         others = ", ".join(sorted(topic[2:] for topic in there if topic.startswith("rt/")))
@@ -245,7 +274,11 @@ LIVE = {
     "-": LiveSource("-", _follow_pipe),
     "tail:": LiveSource("tail:FILE", _follow_file),
     "udp:": LiveSource("udp:PORT", _follow_datagrams, returns=True),
-    "dds:": LiveSource("dds:/TOPIC", lambda place, stdin, silence, first: _follow_topics(place, silence), returns=True),
+    "dds:": LiveSource(
+        "dds:/TOPIC",
+        lambda place, stdin, silence, first: _follow_topics(place, silence),
+        returns=True,
+    ),
 }
 """Live sources by prefix."""
 
@@ -262,7 +295,9 @@ def _lines(more: Callable[[], bytes | None], silence: float, first: float) -> It
         *whole, rest = (rest + found).split(b"\n")
         rest = rest[: LONGEST + 1]  # what is longer is no row, and costs no memory
         for line in whole:
-            yield f"a line of more than {LONGEST} bytes" if len(line) > LONGEST else decoded(line)[0]
+            yield (
+                f"a line of more than {LONGEST} bytes" if len(line) > LONGEST else decoded(line)[0]
+            )
     if rest.strip():
         yield decoded(rest)[0]
 

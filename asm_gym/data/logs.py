@@ -35,15 +35,23 @@ FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
     ".parquet": lambda path, layout: read_parquet(path),
     ".mat": lambda path, layout: read_mat(path),
     **dict.fromkeys(
-        (".csv", ".tsv", ".txt", ".dat", ".data", ".log"), lambda path, layout: read_text(path, layout.columns)
+        (".csv", ".tsv", ".txt", ".dat", ".data", ".log"),
+        lambda path, layout: read_text(path, layout.columns),
     ),
-    **dict.fromkeys((".jsonl", ".ndjson"), lambda path, layout: read_json_lines(path, layout.columns)),
+    **dict.fromkeys(
+        (".jsonl", ".ndjson"), lambda path, layout: read_json_lines(path, layout.columns)
+    ),
     **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, layout: read_bag(path)),
 }
 """Reader of a file's columns, by its suffix."""
 
 HDF5 = (".hdf5", ".h5")  # files of several demonstrations, as robomimic writes them
-ASKED_FOR = (".txt", ".dat", ".data", ".log")  # read where they are named, and not in a folder: most are no logs
+ASKED_FOR = (
+    ".txt",
+    ".dat",
+    ".data",
+    ".log",
+)  # read where they are named, and not in a folder: most are no logs
 POINTER = b"version https://git-lfs.github.com"
 FIRST_TABLES = 20  # by how many of a folder's tables it is decided what columns are,
 FIRST_NUMBERS = 20_000_000  # or by how many numbers of these
@@ -84,15 +92,24 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
         episode = source.episode
         if episode is None:
             try:
-                others = [] if layout.spec else [other for other in first if other is not source.columns]
+                others = (
+                    [] if layout.spec else [other for other in first if other is not source.columns]
+                )
                 found = read_recorded(source.columns, replace(layout, nominal=source.rate), others)
             except ValueError as error:
-                hint = f"; {LIKE}, such as {one} or {source.file}" if layout.spec is not robot else ""
+                hint = (
+                    f"; {LIKE}, such as {one} or {source.file}" if layout.spec is not robot else ""
+                )
                 raise ValueError(f"{source.file or source.name}: {error}{hint}") from error
-            if robot is None and (more := [name for name in source.columns if not (name in known or is_label(name))]):
+            if robot is None and (
+                more := [name for name in source.columns if not (name in known or is_label(name))]
+            ):
                 note(f"not read, as the first log lacks it: {', '.join(more)[:120]}; {LIKE}")
             episode = Episode(found.stream, found.spec, success=source.success, faults=found.faults)
-        layout, one = replace(layout, spec=layout.spec or episode.spec), one or source.file  # others are read as it
+        layout, one = (
+            replace(layout, spec=layout.spec or episode.spec),
+            one or source.file,
+        )  # others are read as it
         yield Log(source.name, episode)
 
 
@@ -126,17 +143,25 @@ def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
     if not files:
         if next(path.rglob(METADATA), None) is None:
             known = ", ".join((*FILES, *HDF5))
-            raise FileNotFoundError(f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset")
-        yield from (Source(f"episode {n}", {}, episode) for n, episode in enumerate(read_dataset(path)))
+            raise FileNotFoundError(
+                f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset"
+            )
+        yield from (
+            Source(f"episode {n}", {}, episode) for n, episode in enumerate(read_dataset(path))
+        )
     troubles = []
     for name, file in files.items():
         try:
-            parts = [part for source in _read(name, file, layout) for part in _parts(source, layout)]
+            parts = [
+                part for source in _read(name, file, layout) for part in _parts(source, layout)
+            ]
         except (ImportError, MemoryError):
             raise
         except Exception as error:  # each format's reader raises whatever the damage leads to
             damaged = "" if isinstance(error, ValueError) else "it is damaged: "
-            troubles.append(f"{file}: {damaged}{' '.join(str(error).split()) or type(error).__name__}")
+            troubles.append(
+                f"{file}: {damaged}{' '.join(str(error).split()) or type(error).__name__}"
+            )
             if len(troubles) == len(files):
                 raise ValueError(troubles[0]) from error
             note(UNREAD + troubles[-1])
@@ -188,7 +213,9 @@ def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
     if len(parts) < 2:
         yield source._replace(columns=table)
         return
-    note(f"{source.name}: time begins anew or leaps {len(parts) - 1} times, and the log is cut there")
+    note(
+        f"{source.name}: time begins anew or leaps {len(parts) - 1} times, and the log is cut there"
+    )
     for n, (start, stop) in enumerate(parts, 1):
         part = {name: values[start:stop] for name, values in table.items()}
         yield source._replace(name=f"{source.name} part {n}", columns=part)
@@ -204,5 +231,13 @@ def _files_at(path: Path) -> dict[str, Path]:
             raise ValueError(f"{path}: files that can be read end in {', '.join(known)}")
         return {path.name: path}
     root = path / "episodes" if (path / "episodes").is_dir() else path
-    found = {f.relative_to(root): f for f in sorted(root.rglob("*")) if f.suffix in known and f.suffix not in ASKED_FOR}
-    return {str(name): f for name, f in found.items() if not any(part.startswith(".") for part in name.parts)}
+    found = {
+        f.relative_to(root): f
+        for f in sorted(root.rglob("*"))
+        if f.suffix in known and f.suffix not in ASKED_FOR
+    }
+    return {
+        str(name): f
+        for name, f in found.items()
+        if not any(part.startswith(".") for part in name.parts)
+    }

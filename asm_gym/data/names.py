@@ -33,14 +33,33 @@ SECONDS = {
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), 1e-9),
 }
 """Seconds in one, by the unit behind the name of a clock."""
-LONGER = SECONDS | dict.fromkeys(("min", "minutes"), 60.0) | dict.fromkeys(("h", "hours"), 3600.0) | {"d": 86400.0}
+LONGER = (
+    SECONDS
+    | dict.fromkeys(("min", "minutes"), 60.0)
+    | dict.fromkeys(("h", "hours"), 3600.0)
+    | {"d": 86400.0}
+)
 """Those that stand in brackets: an ``angle_min`` holds no minutes."""
 
 # Names of columns that count rows.
-COUNTERS = {"", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index", "unnamed: 0"}
+COUNTERS = {
+    "",
+    "index",
+    "idx",
+    "num",
+    "no",
+    "no.",
+    "row",
+    "seq",
+    "frame",
+    "frame_index",
+    "unnamed: 0",
+}
 COUNTERS |= {"__index_level_0__"}  # of pandas in Parquet
 
-TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fromkeys(("rad", "radian", "radians"), TAU)
+TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fromkeys(
+    ("rad", "radian", "radians"), TAU
+)
 """A whole turn, by the unit of an angle."""
 TURNED = ("sin", "cos")  # elements of a channel that stands for an angle which turns over
 
@@ -69,9 +88,13 @@ _SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
 _PLACES = "pos|position|positions|angles?|q|qpos|joint_pos"
 SPEED, POSITION = _word(_SPEEDS), _word(_PLACES)
 
-SENSE = _word(f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|temperatures?|voltages?|pressures?")
+SENSE = _word(
+    f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|temperatures?|voltages?|pressures?"
+)
 
-_ELEMENT = re.compile(r"(?P<of>.+)\[(?P<named>[\w./ -]+)\]|(?P<stem>.*[^\W\d_])[_.]?(?P<number>\d+)")
+_ELEMENT = re.compile(
+    r"(?P<of>.+)\[(?P<named>[\w./ -]+)\]|(?P<stem>.*[^\W\d_])[_.]?(?P<number>\d+)"
+)
 
 _WITH_UNIT = re.compile(r"(?P<name>.*\S)\s+[\[(](?P<unit>[^\[\]()]+)[\])]")
 _UNIT_AT_ONCE = re.compile(r"(?P<name>.*\S)[\[(](?P<unit>[^\[\]()]+)[\])]")  # q1(deg)
@@ -93,7 +116,9 @@ def element_of(name: str) -> Element | None:
     if found is None:
         return None
     named = found["named"] is not None
-    return Element(found["of"] if named else found["stem"], found["named"] if named else found["number"], named)
+    return Element(
+        found["of"] if named else found["stem"], found["named"] if named else found["number"], named
+    )
 
 
 @cache
@@ -104,7 +129,9 @@ def split_unit(column: str) -> tuple[str, str]:
     """
     if found := _WITH_UNIT.fullmatch(column):
         return found["name"], found["unit"]
-    if (found := _UNIT_AT_ONCE.fullmatch(column)) and (found["unit"] in UNITS or found["unit"] in SECONDS):
+    if (found := _UNIT_AT_ONCE.fullmatch(column)) and (
+        found["unit"] in UNITS or found["unit"] in SECONDS
+    ):
         return found["name"], found["unit"]
     if found := _UNIT_BEHIND.fullmatch(column):
         return found["name"] if element_of(found["name"]) else column, found["unit"]

@@ -29,4 +29,6 @@ def noted() -> Iterator[list[str]]:
         if issubclass(warning.category, LogWarning):
             notes += [str(warning.message)] if str(warning.message) not in notes else []
         else:
-            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+            warnings.warn_explicit(
+                warning.message, warning.category, warning.filename, warning.lineno
+            )

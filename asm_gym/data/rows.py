@@ -22,7 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.channels import RESAMPLED, ColumnPlan
-from asm_gym.data.clock import EPOCHS, SLOWEST_WITHOUT_UNIT, UNITS, Clock, clock_called, clocks_among
+from asm_gym.data.clock import (
+    EPOCHS,
+    SLOWEST_WITHOUT_UNIT,
+    UNITS,
+    Clock,
+    clock_called,
+    clocks_among,
+)
 from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.tables import Named, is_key, named_columns, named_row
 from asm_gym.data.text import DOUBLED, Dialect, check_cells, flat_row, header_of
@@ -80,9 +87,13 @@ class Publishers:
 
     def __init__(self, silence: float) -> None:
         self.silence = silence  # after which the numbers of a publisher are missing [s]
-        self._newest = dict[frozenset[str], tuple[float, bool, Mapping[str, Any]]]()  # messages by their numbers
+        self._newest = dict[
+            frozenset[str], tuple[float, bool, Mapping[str, Any]]
+        ]()  # messages by their numbers
 
-    def row(self, message: Mapping[str, Any], numbers: Iterable[str], now: float, leads: bool = True) -> Any:
+    def row(
+        self, message: Mapping[str, Any], numbers: Iterable[str], now: float, leads: bool = True
+    ) -> Any:
         """Return the row that a message makes at the time ``now`` [s], or None; only one that ``leads`` may make one.
 
         A message with some of the numbers of another one is of the same publisher, and lacks the others.
@@ -94,7 +105,9 @@ class Publishers:
         self._newest = {of: said for of, said in kept.items() if now - said[0] <= self.silence}
         if own != max((of for of, said in self._newest.items() if said[1]), key=len, default=None):
             return None
-        return {name: value for _, _, other in self._newest.values() for name, value in other.items()} | dict(message)
+        return {
+            name: value for _, _, other in self._newest.values() for name, value in other.items()
+        } | dict(message)
 
 
 class Row(NamedTuple):
@@ -116,20 +129,32 @@ class RowReader:
     def __init__(self, spec: StreamSpec, clock: str = "", silence: float = 2.0) -> None:
         self.spec, self.line, self._wanted = spec, 0, clock
         self._dialect = Dialect(",", comma=False)
-        self._header: list[str] | None = None  # of CSV, as a file's: a name that comes again has a number
-        self._header_line, self._doubled = "", list[tuple[str, str]]()  # names with a number, and without
+        self._header: list[str] | None = (
+            None  # of CSV, as a file's: a name that comes again has a number
+        )
+        self._header_line, self._doubled = (
+            "",
+            list[tuple[str, str]](),
+        )  # names with a number, and without
         self._plan: ColumnPlan | None = None  # of rows by name
         self._named: Named = {}  # columns that name others
         self._joint = ""  # column that says whose numbers a row holds
-        self._gathered: dict[str, Any] = {}  # of the joints that came, where a row is one of a joint
+        self._gathered: dict[
+            str, Any
+        ] = {}  # of the joints that came, where a row is one of a joint
         self._publishers = Publishers(silence)
-        self._now, self._since = 0.0, math.inf  # when the newest line came, and the first that lacks columns
+        self._now, self._since = (
+            0.0,
+            math.inf,
+        )  # when the newest line came, and the first that lacks columns
         self._lacking: ValueError | None = None  # what all publishers lack up to now
         self._clock: Clock | None = None
         self._first: float | None = None  # number of a clock whose unit is not known yet
         self._pace = Pace(spec.dt)
         self._known = False  # a row was read
-        self._aside: float | None = None  # time of the last row, where that is no successor of the one before [s]
+        self._aside: float | None = (
+            None  # time of the last row, where that is no successor of the one before [s]
+        )
 
     def begin(self) -> None:
         """Begin anew with the clock; columns stay."""
@@ -147,15 +172,23 @@ class RowReader:
                 if found is None:
                     continue
                 row = found
-            except Exception as error:  # anybody may have sent it: deep, huge or broken, it must not end a watch
+            except (
+                Exception
+            ) as error:  # anybody may have sent it: deep, huge or broken, it must not end a watch
                 row = self._problem(error)
             yield row, arrived
         if self._lacking is not None and not self._known:
             yield self._problem(self._lacking), self._now
 
     def _problem(self, error: Exception) -> Row:
-        kind = "no row of numbers" + (", and no header" if self._header is None and not self._known else "")
-        return Row(np.full(self.spec.size, np.nan), read=False, problem=f"line {self.line} is {kind}: {error}")
+        kind = "no row of numbers" + (
+            ", and no header" if self._header is None and not self._known else ""
+        )
+        return Row(
+            np.full(self.spec.size, np.nan),
+            read=False,
+            problem=f"line {self.line} is {kind}: {error}",
+        )
 
     def _begins_with(self, line: str) -> bool:
         """Tell whether a line is the header of CSV, for the first time or once more, and take it up."""
@@ -167,7 +200,9 @@ class RowReader:
         header, self._header_line = list[str](), line.strip()
         for k, name in enumerate(given := header_of(self._dialect.cells(line))):
             header.append(f"{name}{DOUBLED}{given[:k].count(name) + 1}" if name in header else name)
-        self._doubled = [(own, name) for own, name in zip(header, given, strict=True) if own != name]
+        self._doubled = [
+            (own, name) for own, name in zip(header, given, strict=True) if own != name
+        ]
         self._named = named_columns(header)
         if not self._named and not any(map(is_key, header)):
             self._match(header)
@@ -181,7 +216,9 @@ class RowReader:
             return None
         numbers, stamp = found
         if numbers.shape != (self.spec.size,):
-            raise ValueError(f"it must hold {self.spec.size} numbers, got the shape {numbers.shape}")
+            raise ValueError(
+                f"it must hold {self.spec.size} numbers, got the shape {numbers.shape}"
+            )
         self._known = True
         if stamp is None:
             return Row(numbers)
@@ -189,9 +226,15 @@ class RowReader:
         try:
             lost = self._pace.lost(stamp)
         except ClockWentBack as error:
-            if aside is None or not 0 < stamp - aside <= LEAP_S:  # one row that came late is left out
+            if (
+                aside is None or not 0 < stamp - aside <= LEAP_S
+            ):  # one row that came late is left out
                 self._aside = stamp
-                return Row(numbers, read=False, problem=f"{error}: the row is left out (--clock NAME chooses)")
+                return Row(
+                    numbers,
+                    read=False,
+                    problem=f"{error}: the row is left out (--clock NAME chooses)",
+                )
             self.begin()
             self._pace.lost(stamp)
             return Row(numbers, problem=str(error))
@@ -214,7 +257,11 @@ class RowReader:
             check_cells(cells, len(self._header), "it has")
             given = dict(zip(self._header, map(self._dialect.plain, cells), strict=False))
             for name, first in self._doubled:
-                if given[name] != given[first] and self._plan is not None and name not in self._plan.columns:
+                if (
+                    given[name] != given[first]
+                    and self._plan is not None
+                    and name not in self._plan.columns
+                ):
                     raise ValueError(f"its columns of the same name differ: {first!r}")
             return self._by_name(given, self._dialect.number)
         row: Any = json.loads(line)
@@ -223,8 +270,14 @@ class RowReader:
         flat = flat_row(row)
         for channel in self.spec.channels:
             part = row.get(channel.name)
-            if isinstance(part, list) and len(part) != channel.size and f"{channel.name}[0]" in flat:
-                raise ValueError(f"{channel.name} must hold {channel.size} numbers, got {len(part)}")
+            if (
+                isinstance(part, list)
+                and len(part) != channel.size
+                and f"{channel.name}[0]" in flat
+            ):
+                raise ValueError(
+                    f"{channel.name} must hold {channel.size} numbers, got {len(part)}"
+                )
         return self._by_name(flat, lambda value: float("nan" if value is None else value))
 
     def _by_name(
@@ -233,17 +286,27 @@ class RowReader:
         """The numbers and the time of a row by name; a number that the row lacks is NaN."""
         row = named_row(row, self._named) if self._named else row
         if self._plan is None:
-            joints = {label.rpartition("[")[2].rstrip("]") for label in self.spec.labels if "[" in label}
+            joints = {
+                label.rpartition("[")[2].rstrip("]") for label in self.spec.labels if "[" in label
+            }
             self._joint = next((n for n in row if is_key(n) and str(row[n]).strip() in joints), "")
         message = self._gather(row) if self._joint else row
         if message is None:
             return None
-        numbers = ColumnPlan(message, self.spec, whole=False).columns if self._plan is None else self._plan.columns
-        whole = self._publishers.row(message, (name for name in numbers if name in message), self._now)
+        numbers = (
+            ColumnPlan(message, self.spec, whole=False).columns
+            if self._plan is None
+            else self._plan.columns
+        )
+        whole = self._publishers.row(
+            message, (name for name in numbers if name in message), self._now
+        )
         plan = self._plan if whole is None else self._plan or self._whole_plan(whole, bool(numbers))
         if whole is None or plan is None:
             return None
-        return plan.row({name: number(whole[name]) for name in plan.columns if name in whole}), self._moment(whole)
+        return plan.row(
+            {name: number(whole[name]) for name in plan.columns if name in whole}
+        ), self._moment(whole)
 
     def _whole_plan(self, row: Mapping[str, Any], some: bool) -> ColumnPlan | None:
         """Return the plan of a row with all columns; None while another publisher may add some, ValueError later."""
@@ -259,7 +322,11 @@ class RowReader:
     def _gather(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
         """The row of all joints, once it is complete, or one of a later moment comes; None before."""
         joint, before = str(row[self._joint]).strip(), self._gathered
-        own = {n if is_clock(n) else element_name(n, joint): v for n, v in row.items() if n != self._joint}
+        own = {
+            n if is_clock(n) else element_name(n, joint): v
+            for n, v in row.items()
+            if n != self._joint
+        }
         stamps = [clock.moment(each) for clock in clocks_among(row)[:1] for each in (before, row)]
         later = bool(stamps) and None not in stamps and stamps[1] - stamps[0] > 0.5 * self.spec.dt  # type: ignore[operator]
         if later or any(n in before and not is_clock(n) for n in own):

@@ -20,7 +20,9 @@ AROUND_S = 5.0  # how near to marked rows nothing is learned from [s]: what led 
 
 
 def normal_episodes(
-    logs: Iterable[Log], between_marks: bool = False, progress: Callable[[int, int], object] = lambda *_: None
+    logs: Iterable[Log],
+    between_marks: bool = False,
+    progress: Callable[[int, int], object] = lambda *_: None,
 ) -> tuple[list[Episode], Counter[str]]:
     """Return the normal episodes among logs, and how many others were left out, by why.
 
@@ -54,7 +56,10 @@ def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
     """The stretches of rows that are wanted (T,), but for short ones."""
     least = max(2, round(SHORTEST_S / episode.spec.dt))
     stretches = [(start, stop) for start, stop in spans(wanted) if stop - start >= least]
-    return [Episode.from_stream(episode.stream[start:stop], episode.spec, success=True) for start, stop in stretches]
+    return [
+        Episode.from_stream(episode.stream[start:stop], episode.spec, success=True)
+        for start, stop in stretches
+    ]
 
 
 def with_shared_noise(episodes: list[Episode]) -> list[Episode]:
@@ -71,10 +76,14 @@ def pieces(episode: Episode, seconds: float) -> list[Episode]:
     """Cut an episode into pieces of one length; a rest that is shorter is left out."""
     rows = max(1, round(seconds / episode.spec.dt))
     ends = range(rows, len(episode) + 1, rows)
-    return [Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends]
+    return [
+        Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends
+    ]
 
 
-def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[list[Episode], list[Episode]]:
+def split_in_time(
+    logs: list[list[Episode]], calibration_share: float
+) -> tuple[list[Episode], list[Episode]]:
     """Split the pieces of long logs into heads to learn from and tails to calibrate on, a piece between left out.
 
     Shuffled, pieces that follow each other would promise too much. Raises ValueError where no log is long enough.
@@ -85,7 +94,9 @@ def split_in_time(logs: list[list[Episode]], calibration_share: float) -> tuple[
         fitting += parts[:head]
         calibration += parts[head + 1 :] if len(logs) > 1 or len(parts) > 2 else parts[head:]
     if not fitting or not calibration:
-        raise ValueError(f"{len(fitting) + len(calibration)} pieces are too few to learn from and to calibrate on")
+        raise ValueError(
+            f"{len(fitting) + len(calibration)} pieces are too few to learn from and to calibrate on"
+        )
     return fitting, calibration
 
 

@@ -37,9 +37,15 @@ HELD = 3.0  # for so many of its own periods a slower column keeps its newest va
 
 def table_of(frame: Any) -> Columns:
     """Return the columns (T,) of a dictionary, a frame of pandas or Polars, or an Arrow table by name."""
-    names = frame if isinstance(frame, Mapping) else getattr(frame, "column_names", getattr(frame, "columns", None))
+    names = (
+        frame
+        if isinstance(frame, Mapping)
+        else getattr(frame, "column_names", getattr(frame, "columns", None))
+    )
     if names is None or callable(names):
-        raise TypeError(f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}")
+        raise TypeError(
+            f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}"
+        )
     if len({str(name) for name in names}) < len(list(names)):
         raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
     made: Columns = {}
@@ -65,7 +71,11 @@ def as_array(column: Any) -> NDArray[Any]:
     array = np.asarray(column)
     if array.dtype == object and all(cell is None or isinstance(cell, Real) for cell in array):
         return np.array([np.nan if cell is None else cell for cell in array], np.float64)
-    if array.dtype == object and len(array) and all(isinstance(row, list | tuple | np.ndarray) for row in array):
+    if (
+        array.dtype == object
+        and len(array)
+        and all(isinstance(row, list | tuple | np.ndarray) for row in array)
+    ):
         return np.array(array.tolist()) if len({len(row) for row in array}) == 1 else array
     return array
 
@@ -82,7 +92,11 @@ def named_columns(names: Iterable[str]) -> Named:
     for name in names:
         if match := _NAMES.fullmatch(name):
             kind = re.compile(rf"({re.escape(match['of'])}.*?[^\W\d])[_.]?\[?{match['place']}\]?")
-            others = {other: kind.fullmatch(other) for other in names if other != name and not _NAMES.fullmatch(other)}
+            others = {
+                other: kind.fullmatch(other)
+                for other in names
+                if other != name and not _NAMES.fullmatch(other)
+            }
             found[name] = {hit[1].rstrip("_.["): other for other, hit in others.items() if hit}
     return {name: kinds for name, kinds in found.items() if kinds}
 
@@ -99,8 +113,14 @@ def named_row(row: Mapping[str, Any], named: Named) -> dict[str, Any]:
 
 def _with_names(table: Columns) -> Columns:
     """The table with the columns that cells name: a message may name other joints, or the same in another order."""
-    named = {name: kinds for name, kinds in named_columns(table).items() if not is_numeric(table[name])}
-    made = {name: values for name, values in table.items() if all(name not in k.values() for k in named.values())}
+    named = {
+        name: kinds for name, kinds in named_columns(table).items() if not is_numeric(table[name])
+    }
+    made = {
+        name: values
+        for name, values in table.items()
+        if all(name not in k.values() for k in named.values())
+    }
     for name, kinds in named.items():
         words = np.array([str(cell).strip() for cell in made.pop(name)])
         for word in dict.fromkeys(words.tolist()):
@@ -116,7 +136,9 @@ def _pivoted(table: Columns) -> Columns:
     import pandas as pd
 
     key = next((name for name in table if is_key(name) and _goes_round(table[name])), None)
-    values = [name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)]
+    values = [
+        name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)
+    ]
     if key is None or not values:
         return table
     clock = next(filter(is_clock, table), None)
@@ -124,10 +146,18 @@ def _pivoted(table: Columns) -> Columns:
     round_of = frame.groupby(key, sort=False).cumcount()
     if clock is not None and frame[clock].duplicated().any():  # joints of a moment share a stamp
         round_of = (frame[clock] != frame[clock].shift()).cumsum()
-    wide = frame.assign(_round=round_of).pivot_table(values, "_round", key, aggfunc="last", sort=False)
-    made: Columns = {} if clock is None else {clock: frame.groupby(round_of.to_numpy())[clock].first().to_numpy()}
+    wide = frame.assign(_round=round_of).pivot_table(
+        values, "_round", key, aggfunc="last", sort=False
+    )
+    made: Columns = (
+        {}
+        if clock is None
+        else {clock: frame.groupby(round_of.to_numpy())[clock].first().to_numpy()}
+    )
     made |= {element_name(name, word): wide[name, word].to_numpy() for name, word in wide.columns}
-    note(f"a row a joint: put side by side by {key!r}, as {next(reversed(made))} and {len(made) - 1} others")
+    note(
+        f"a row a joint: put side by side by {key!r}, as {next(reversed(made))} and {len(made) - 1} others"
+    )
     return made
 
 
@@ -154,19 +184,41 @@ def _joined(table: Columns) -> Columns:
     """A table whose columns come at several rates, at the rate of the fastest ones."""
     import pandas as pd
 
-    filled = {n: np.isfinite(v) for n, v in table.items() if is_numeric(v) and v.dtype.kind == "f" and not is_clock(n)}
+    filled = {
+        n: np.isfinite(v)
+        for n, v in table.items()
+        if is_numeric(v) and v.dtype.kind == "f" and not is_clock(n)
+    }
     masks = {mask.tobytes(): mask for mask in filled.values() if mask.any()}
     rows, most = np.ones(len(next(iter(table.values()), ())), np.bool_), SPARSE
-    if len(masks) > 1 and np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY:  # a row has one of them
-        columns = Counter(mask.tobytes() for mask in filled.values())  # as live: rows are those of the most numbers
-        rows, most = max(masks.values(), key=lambda mask: (columns[mask.tobytes()], np.count_nonzero(mask))), 1.0
-    slower = {n: m for n, m in filled.items() if not np.array_equal(m, rows) and m.mean() <= most and _regular(m)}
+    if (
+        len(masks) > 1 and np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY
+    ):  # a row has one of them
+        columns = Counter(
+            mask.tobytes() for mask in filled.values()
+        )  # as live: rows are those of the most numbers
+        rows, most = (
+            max(masks.values(), key=lambda mask: (columns[mask.tobytes()], np.count_nonzero(mask))),
+            1.0,
+        )
+    slower = {
+        n: m
+        for n, m in filled.items()
+        if not np.array_equal(m, rows) and m.mean() <= most and _regular(m)
+    }
     if not slower:
         return table
     note(f"columns come at several rates: {', '.join(slower)[:120]} keep their newest value")
-    held = pd.DataFrame({n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()})[rows]
-    start = int(held.notna().to_numpy().argmax(axis=0).max())  # before that the slower ones said nothing
-    return {n: (held[n].to_numpy() if n in slower else values[rows])[start:] for n, values in table.items()}
+    held = pd.DataFrame(
+        {n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()}
+    )[rows]
+    start = int(
+        held.notna().to_numpy().argmax(axis=0).max()
+    )  # before that the slower ones said nothing
+    return {
+        n: (held[n].to_numpy() if n in slower else values[rows])[start:]
+        for n, values in table.items()
+    }
 
 
 def _regular(mask: NDArray[np.bool_]) -> bool:
@@ -187,7 +239,11 @@ def laid_out(frame: Any) -> Columns:
     check_width(len(table))
     lengths = {name: len(values) for name, values in table.items()}
     if not any(lengths.values()):
-        raise ValueError(f"a table must hold a row of numbers, got none of {', '.join(table)[:200] or 'any column'}")
+        raise ValueError(
+            f"a table must hold a row of numbers, got none of {', '.join(table)[:200] or 'any column'}"
+        )
     if len(set(lengths.values())) > 1:
-        raise ValueError(f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}")
+        raise ValueError(
+            f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}"
+        )
     return _joined(_pivoted(_with_names(table)))

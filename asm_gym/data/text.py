@@ -103,7 +103,11 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
     names, has_header = _header(dialect, first, columns)
     if not has_header:
         rows = lines
-    elif len(rows) > 1 and rows.iloc[0].strip() != first.strip() and _are_units(dialect, *rows.iloc[:2]):
+    elif (
+        len(rows) > 1
+        and rows.iloc[0].strip() != first.strip()
+        and _are_units(dialect, *rows.iloc[:2])
+    ):
         units = [cell.strip().strip("[]()") for cell in dialect.cells(rows.iloc[0])]
         names = [f"{n} [{u}]" if u and n else n for n, u in zip(names, units, strict=False)]
         rows = rows.iloc[1:]
@@ -115,13 +119,22 @@ def read_text(path: Path, columns: Sequence[str] = ()) -> Columns:
             note(f"{path}: {left_out.sum()} lines are left out, {what}")
             rows = rows[~left_out]
     cells = rows.map(dialect.cells)
-    if not complete and len(rows) > 1 and _cut_off(dialect, cells.iloc[-2], cells.iloc[-1], len(names)):
+    if (
+        not complete
+        and len(rows) > 1
+        and _cut_off(dialect, cells.iloc[-2], cells.iloc[-1], len(names))
+    ):
         note(f"{path}: its last line was cut off, and is left out")
         rows, cells = rows.iloc[:-1], cells.iloc[:-1]
     if rows.empty:
         raise ValueError(f"it needs a header and at least one row, got {len(lines)} lines")
     for n, found in cells.items():
-        if has_header and found and found[0].strip() in names and {cell.strip() for cell in found} <= set(names):
+        if (
+            has_header
+            and found
+            and found[0].strip() in names
+            and {cell.strip() for cell in found} <= set(names)
+        ):
             raise ValueError(f"line {n} is another header: cut the file there")
         check_cells(found, len(names), f"line {n} has")
     try:
@@ -146,8 +159,14 @@ def _header_at(lines: Sequence[str]) -> int:
         dialect = Dialect.of(line)
         with suppress(ValueError):
             size = len(dialect.cells(line.lstrip(BEFORE)))
-            below = [dialect.cells(other) for other in lines[at + 1 :] if not other.lstrip().startswith("#")][:AGREE]
-            agree = all(len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below)
+            below = [
+                dialect.cells(other)
+                for other in lines[at + 1 :]
+                if not other.lstrip().startswith("#")
+            ][:AGREE]
+            agree = all(
+                len(cells) >= size and not any(c.strip() for c in cells[size:]) for cells in below
+            )
             numbers = [sum(dialect.numbers_among(cells[:size])) for cells in below]
             if below and agree and max(numbers) > 0 and numbers[-1] > 0:
                 if not at or not any(dialect.numbers_among(dialect.cells(line))):
@@ -171,7 +190,10 @@ def _merged(names: Sequence[str], columns: Sequence[NDArray[Any]]) -> Columns:
             continue
         others = [other for other in made if other.partition(DOUBLED)[0] == name]
         if any(
-            np.array_equal(made[o], values, equal_nan=made[o].dtype.kind == values.dtype.kind == "f") for o in others
+            np.array_equal(
+                made[o], values, equal_nan=made[o].dtype.kind == values.dtype.kind == "f"
+            )
+            for o in others
         ):
             note(f"columns of the same name are equal, and read as one: {name}")
         else:
@@ -199,7 +221,9 @@ def _lines(path: Path) -> tuple[pd.Series[str], bool]:
     sizes = lines.str.len()
     if sizes.max() > LONGEST_LINE:
         n, size = sizes.idxmax(), sizes.max()
-        raise ValueError(f"line {n} has {size} characters: at most {MOST_COLUMNS} columns can be watched")
+        raise ValueError(
+            f"line {n} has {size} characters: at most {MOST_COLUMNS} columns can be watched"
+        )
     return lines, raw.endswith((b"\n", b"\r"))
 
 
@@ -213,13 +237,17 @@ def decoded(line: bytes) -> tuple[str, bool]:
 def check_cells(cells: Sequence[str], size: int, where: str) -> None:
     """Raise ValueError where a row has fewer cells than its header, or more that hold something."""
     if len(cells) < size or any(cell.strip() for cell in cells[size:]):
-        raise ValueError(f"{where} {len(cells)} cells, its header {size}: mend it, or cut the file there")
+        raise ValueError(
+            f"{where} {len(cells)} cells, its header {size}: mend it, or cut the file there"
+        )
 
 
 def _cut_off(dialect: Dialect, before: Sequence[str], last: Sequence[str], size: int) -> bool:
     """Whether the last line lacks cells, or has a word where the one before it has a number."""
     cells = list(zip(before, last, strict=False))
-    return len(cells) < size or any(dialect.is_number(was) and not dialect.is_number(now) for was, now in cells)
+    return len(cells) < size or any(
+        dialect.is_number(was) and not dialect.is_number(now) for was, now in cells
+    )
 
 
 def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[str], bool]:
@@ -237,7 +265,9 @@ def _header(dialect: Dialect, line: str, columns: Sequence[str]) -> tuple[list[s
     if sum(numbers) > len(numbers) / 2:
         said = f"is of {len(numbers)} numbers" if all(numbers) else f"holds {sum(numbers)} numbers"
         example = " ".join(f"x{k}" for k in range(size))
-        raise ValueError(f"its first line {said} and no header: name its {size} columns, --columns {example[:60]}")
+        raise ValueError(
+            f"its first line {said} and no header: name its {size} columns, --columns {example[:60]}"
+        )
     return header_of(cells), True
 
 
@@ -258,7 +288,9 @@ def numbers_in(cells: Any, comma: bool = False) -> NDArray[np.float64]:
 
     text = pd.Series(cells).astype("string").str.strip()
     plain = text.str.replace(",", ".", regex=False) if comma else text
-    found = pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
+    found = (
+        pd.to_numeric(plain, errors="coerce").fillna(text.str.lower().map(FLAGS)).astype("Float64")
+    )
     return found.to_numpy(np.float64, na_value=np.nan)
 
 
@@ -285,12 +317,21 @@ def read_json_lines(path: Path, columns: Sequence[str] = ()) -> Columns:
             rows.append(flat_row(row, columns))
             check_width(len(rows[-1]))
         except (ValueError, RecursionError) as error:
-            if rows and isinstance(error, json.JSONDecodeError) and n == lines.index[-1] and not complete:
+            if (
+                rows
+                and isinstance(error, json.JSONDecodeError)
+                and n == lines.index[-1]
+                and not complete
+            ):
                 note(f"{path}: its last line was cut off, and is left out")
                 continue
             raise ValueError(f"line {n} is no row: {error}") from error
         if isinstance(row, dict) and len(rows) == 1:
-            lost = [k for k, v in row.items() if isinstance(v, list) and v and isinstance(v[0], dict | list)]
+            lost = [
+                k
+                for k, v in row.items()
+                if isinstance(v, list) and v and isinstance(v[0], dict | list)
+            ]
     if not rows:
         raise ValueError("it needs at least one row, got none")
     if lost:
@@ -303,7 +344,9 @@ def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
     """Return the values of a row of JSON by name: ``tool.force`` of an object within, ``q[0]`` of a list."""
     if isinstance(row, list):
         if len(row) != len(columns):
-            raise ValueError(f"it is a list of {len(row)}, and {len(columns)} columns are named (--columns)")
+            raise ValueError(
+                f"it is a list of {len(row)}, and {len(columns)} columns are named (--columns)"
+            )
         row = dict(zip(columns, row, strict=True))
     if not isinstance(row, dict):
         raise ValueError(f"it must be an object or a list, got {str(row)[:40]}")
@@ -317,7 +360,11 @@ def flat_row(row: Any, columns: Sequence[str] = ()) -> dict[str, Any]:
         elif isinstance(value, list):
             elements = words if len(words) == len(value) else range(len(value))
             numbers = zip(elements, value, strict=True)
-            found |= {element_name(name, k): v for k, v in numbers if isinstance(v, int | float) or v is None}
+            found |= {
+                element_name(name, k): v
+                for k, v in numbers
+                if isinstance(v, int | float) or v is None
+            }
         else:
             found[name] = value
     return found

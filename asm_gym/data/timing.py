@@ -24,16 +24,28 @@ from asm_gym.validation import check_number
 Floats = NDArray[np.float64]
 Rows = NDArray[np.floating[Any]]
 
-JITTER = 0.35  # by what share of a step a stamp may be off, and its row still be the one that was due
+JITTER = (
+    0.35  # by what share of a step a stamp may be off, and its row still be the one that was due
+)
 DRIFT = 0.011  # how far a clock may be off the rate that is read, as a share, and no row be moved for it
-NEARLY, MOSTLY = 0.15, 0.95  # rows were lost where MOSTLY steps are NEARLY whole multiples of the median; else jitter
+NEARLY, MOSTLY = (
+    0.15,
+    0.95,
+)  # rows were lost where MOSTLY steps are NEARLY whole multiples of the median; else jitter
 MOST_CUTS = 0.02  # share of rows at which time may go back or leap, and the log be cut there
 FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in it is known
-MOST_LOST = 4  # a log may have lost so many times its rows, or ten minutes; more is a clock that was set
+MOST_LOST = (
+    4  # a log may have lost so many times its rows, or ten minutes; more is a clock that was set
+)
 BRIDGED_ROWS = 2  # rows that are bridged where nobody says for how long
 PAID_BACK = 0.1  # of a second that is whole, how much may be missing for good: a tenth of all rows
 TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
-SURPRISING, MISSING, NOT_FINITE, LATE = "surprise", "missing data", "not finite", "late"  # why there is an alarm
+SURPRISING, MISSING, NOT_FINITE, LATE = (
+    "surprise",
+    "missing data",
+    "not finite",
+    "late",
+)  # why there is an alarm
 
 
 class Timing(NamedTuple):
@@ -41,7 +53,9 @@ class Timing(NamedTuple):
 
     clock: Clock
     times: Floats  # (N,) of the rows that are kept [s]
-    kept: NDArray[np.intp]  # (N,) which rows of the log these are: one of several with the same time
+    kept: NDArray[
+        np.intp
+    ]  # (N,) which rows of the log these are: one of several with the same time
     dt: float | None  # from row to row in the mean [s]; None of a single row
 
 
@@ -73,7 +87,9 @@ def period(times: Floats) -> float | None:
         return None
     if not np.isfinite(times).all():
         row = int(np.argmin(np.isfinite(times)))
-        raise ValueError(f"time must be a number in every row, got {times[row]} in row {row}: --rate HZ goes without")
+        raise ValueError(
+            f"time must be a number in every row, got {times[row]} in row {row}: --rate HZ goes without"
+        )
     steps = np.diff(times)
     if not np.all(steps > 0):
         row = int(np.argmin(steps > 0)) + 1
@@ -88,7 +104,9 @@ def period(times: Floats) -> float | None:
         mean = float(steps[near].sum() / counts[near].sum())
     else:
         mean = float(steps[steps <= FAR * median].mean())
-    return float(f"{mean:.6g}")  # stamps jitter, and rates that differ by rounding would be two rates
+    return float(
+        f"{mean:.6g}"
+    )  # stamps jitter, and rates that differ by rounding would be two rates
 
 
 def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
@@ -98,7 +116,9 @@ def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
     size = int(np.sum(steps)) + 1
     if size > MOST_LOST * len(times) + 600 / dt:
         gap = int(np.argmax(steps))
-        raise ValueError(f"time jumps by {steps[gap] * dt:g} s after {times[gap]:g} s: cut the log there")
+        raise ValueError(
+            f"time jumps by {steps[gap] * dt:g} s after {times[gap]:g} s: cut the log there"
+        )
     steady = abs(float(steps.sum() / max(whole.sum(), 1)) - 1) <= DRIFT
     if steady and np.all(whole >= 1) and np.all(np.abs(steps - whole) <= JITTER):
         places = np.concatenate([[0], np.cumsum(whole)]).astype(np.intp)
@@ -110,7 +130,9 @@ def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
     due = times[0] + dt * np.arange(size)
     far = FAR * max(dt, float(np.quantile(steps, 0.9)) * dt)
     after = np.clip(np.searchsorted(times, due), 1, len(times) - 1)
-    unknown = (times[after] - times[after - 1] > far) & (times[after] != due) & (times[after - 1] != due)
+    unknown = (
+        (times[after] - times[after - 1] > far) & (times[after] != due) & (times[after - 1] != due)
+    )
     interpolated = np.column_stack([np.interp(due, times, column) for column in rows.T])
     interpolated[unknown] = np.nan
     return interpolated

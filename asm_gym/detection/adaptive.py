@@ -73,7 +73,9 @@ class RunningThreshold:
             return math.nan
         return self._alarms / self._episodes
 
-    def follow(self, largest: float, judged_by: float | None = None, confirmed: bool = False) -> None:
+    def follow(
+        self, largest: float, judged_by: float | None = None, confirmed: bool = False
+    ) -> None:
         """Move after an episode of this greatest surprise, unless an alarm in it was ``confirmed`` as true."""
         if judged_by is None:
             judged_by = self.value

@@ -30,7 +30,12 @@ EVENTS = (NO_EVENT, KNOCK, STOP, FAULT)
 MINUTE = 60.0  # time below the threshold before another alarm counts [s]
 
 JUDGED = np.dtype(
-    [("surprise", np.float64), ("raw_surprise", np.float64), ("excuse", np.int8), ("divisor", np.float64)],
+    [
+        ("surprise", np.float64),
+        ("raw_surprise", np.float64),
+        ("excuse", np.int8),
+        ("divisor", np.float64),
+    ],
     align=True,
 )
 """A row as it was judged: ``raw_surprise / divisor`` is ``surprise``; ``excuse`` is an index in ``EVENTS``."""

@@ -62,7 +62,9 @@ class Detection(Protocol):
     def start(self, batch: int, errors: int) -> State:
         """Return the state before the first row of ``batch`` streams: arrays with a first axis B, or tuples of them."""
 
-    def attribute_step(self, state: State, output: ModelOutput, rows: Floats, place: Place) -> tuple[State, Floats]:
+    def attribute_step(
+        self, state: State, output: ModelOutput, rows: Floats, place: Place
+    ) -> tuple[State, Floats]:
         """Return the new state, and each number's share (B, D), perhaps not finite, of the surprise at rows (B, D)."""
 
     def reset(self, state: State) -> State:

@@ -36,7 +36,9 @@ MOVED_S = 0.1  # duration of its excuse [s]
 EXCUSED = 10.0  # divisor of surprise at a knock or a stop
 SLIPPED = 3.0  # divisor where fingers slide
 FADE = (1.0 - min(GAINS)) ** 2  # share of the slowest evidence left after a row
-FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))  # rows in which it, and the divisor, falls to a tenth
+FADING = math.ceil(
+    -math.log(EXCUSED) / math.log(FADE)
+)  # rows in which it, and the divisor, falls to a tenth
 KNOCK_EVENT = EVENTS.index(KNOCK)
 STOP_EVENT = EVENTS.index(STOP)
 
@@ -137,7 +139,9 @@ def _is_finger_speed(channel: Channel) -> bool:
 
 
 @compiled
-def find_events(senses: EventSenses, before: EventState, after: EventState, rows: Any, judged: Any) -> None:
+def find_events(
+    senses: EventSenses, before: EventState, after: EventState, rows: Any, judged: Any
+) -> None:
     """Write the new state, and ``excuse`` and ``divisor`` of rows (B, D) to ``judged`` (B,)."""
     for n in range(len(rows)):
         knock = max(before.knock[n] - 1, 0)

@@ -34,7 +34,9 @@ def hands_of(spec: StreamSpec) -> NDArray[np.intp]:
 def learned_motion(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float64]:
     """Return M (3 H + A, 3 H) of streams (T, D)."""
     velocities = hands_of(spec)[:, 1].ravel()
-    inputs = np.concatenate([np.hstack([stream[:-1, velocities], stream[1:, spec.motor]]) for stream in streams])
+    inputs = np.concatenate(
+        [np.hstack([stream[:-1, velocities], stream[1:, spec.motor]]) for stream in streams]
+    )
     following = np.concatenate([stream[1:, velocities] for stream in streams])
     solution = np.linalg.lstsq(inputs, following, rcond=None)[0]
     return np.asarray(solution, np.float64)

@@ -35,7 +35,9 @@ from asm_gym.validation import check_number, short_repr
 
 EPISODE = "episode"  # units of a rate of false alarms
 HOUR = "hour"
-LEAST_RATE = 1e-15  # rates are not taken to be smaller, as the inverse of the smallest floats is infinite
+LEAST_RATE = (
+    1e-15  # rates are not taken to be smaller, as the inverse of the smallest floats is infinite
+)
 CONFIDENCE = 0.95  # share of calibrations in which ``Promise.at_most`` holds
 LEAST_PER_HOUR = 1e-6  # limits of a rate
 MOST_PER_HOUR = 1e6
@@ -189,7 +191,9 @@ class Blocks(NamedTuple):
     def restored(cls, kept: Floats) -> Blocks:
         """Read an ``array``. Raises ValueError where that is no maxima and hours."""
         if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
-            raise ValueError(f"blocks should be maxima and hours, (2, n) or (3, n), found {short_repr(kept)}")
+            raise ValueError(
+                f"blocks should be maxima and hours, (2, n) or (3, n), found {short_repr(kept)}"
+            )
         return cls(*kept)
 
     @property

@@ -23,7 +23,9 @@ from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
 
 LIMITED = ("external_torque", "wrist_force")  # ends of the names of the channels that are limited
-HARDEST_EPISODES = 0.05  # no limit makes room for this share of healthy episodes, those that pressed hardest
+HARDEST_EPISODES = (
+    0.05  # no limit makes room for this share of healthy episodes, those that pressed hardest
+)
 HIGHEST_HEALTHY = 2.5  # healthy values count up to so many times the usual limits: 200 N, 100 N m
 
 _NO_MAP = np.zeros((0, 1, 1, 1, 12), np.float32)
@@ -124,12 +126,16 @@ class ContactLimits:
             momentum=float(self.pace.momentum),
         )
 
-    def share(self, arm: int, place: Floats, twist: Floats, speed: float, momentum: float = 0.0) -> float:
+    def share(
+        self, arm: int, place: Floats, twist: Floats, speed: float, momentum: float = 0.0
+    ) -> float:
         """Return the share that a hand may have of a motion; see ``hand_speed.allowed_share``."""
         return allowed_share(self.speed_limit(), arm, place, twist, speed, momentum)
 
 
-def healthy_forces(streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec) -> tuple[float, ...]:
+def healthy_forces(
+    streams: Sequence[NDArray[np.floating[Any]]], spec: StreamSpec
+) -> tuple[float, ...]:
     """Return the largest value that healthy streams reached of each number that is limited.
 
     Args:

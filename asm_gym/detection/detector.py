@@ -59,15 +59,21 @@ class Detector(NamedTuple):
     whitening: Floats  # (X, X) M
     ceiling: Floats  # (G, X) q
     tail: Floats  # (G, X) κ, in (0, 1]
-    context_quantile: Floats  # (2 C + 1,) weights of log ŝ on the context and its running mean, and a bias
+    context_quantile: (
+        Floats  # (2 C + 1,) weights of log ŝ on the context and its running mean, and a bias
+    )
     context_range: Floats  # (2,) limits of log ŝ
     gains: Floats  # (G,) a, each in (0, 1]
     bound: float  # ν > 0
 
     @classmethod
-    def white(cls, learned: Sequence[ModelOutput], gains: Sequence[float], bound: float, shrinkage: float) -> Detector:
+    def white(
+        cls, learned: Sequence[ModelOutput], gains: Sequence[float], bound: float, shrinkage: float
+    ) -> Detector:
         """Return the detector of white errors, by those of nominal episodes that the model has learned."""
-        matrix = whitening(bounded(np.concatenate([run.errors for run in learned]), bound), shrinkage)
+        matrix = whitening(
+            bounded(np.concatenate([run.errors for run in learned]), bound), shrinkage
+        )
         ones = np.ones((len(gains), len(matrix)))
         return cls(
             whitening=matrix,
@@ -117,7 +123,9 @@ class Detector(NamedTuple):
     def _lasting(self, whitened: Floats) -> Floats:
         """Return the pooled ratios (N,) of whitened errors (N, X) that last for ever: v_i = w_i² (2 - a) / a."""
         with np.errstate(over="ignore", divide="ignore"):
-            strengths = (whitened**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[:, None]  # (N, G, X)
+            strengths = (whitened**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[
+                :, None
+            ]  # (N, G, X)
             return pool(self.ratios(strengths))[0]
 
     def ratios(self, strengths: Floats) -> Floats:
@@ -134,7 +142,9 @@ class Detector(NamedTuple):
         """Return the new evidence, and each error's share (B, X) of the value; ``context`` is (B, C)."""
         after = self.start(len(errors))
         shares = np.empty(errors.shape)
-        output = ModelOutput(errors=np.asarray(errors, np.float64), contexts=np.asarray(context, np.float64))
+        output = ModelOutput(
+            errors=np.asarray(errors, np.float64), contexts=np.asarray(context, np.float64)
+        )
         step_evidence(self, evidence, after, output, shares)
         return after, shares
 
@@ -159,7 +169,9 @@ NO_DETECTOR = Detector(
 
 
 @compiled
-def step_evidence(detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any) -> None:
+def step_evidence(
+    detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any
+) -> None:
     """Write the new evidence, and each error's share (B, X) of the value."""
     whitened = whiten(detector, output.errors)
     ratios = np.empty(detector.ceiling.shape)
@@ -239,7 +251,9 @@ def usual_level(detector: Detector, before: Any, after: Any, context: Any) -> fl
     return min(max(drive, detector.context_range[0]), detector.context_range[1])
 
 
-def usual_levels(contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator) -> tuple[Floats, Floats]:
+def usual_levels(
+    contexts: Sequence[Array], levels: Sequence[Array], rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Return w and b (C + 1,), and l and h (2,), from contexts (T, C) and log s (T,) of nominal episodes."""
     context = np.concatenate(contexts)
     level = np.concatenate(levels)

@@ -35,9 +35,13 @@ NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays bel
 HOURS_TAIL_INDEX = 0.2  # ξ_0 where hours of healthy operation set q
 HOURS_QUANTILE = 0.98  # share of their episodes
 FEWEST_EPISODES = 100  # that such a quantile needs
-TAIL_PRIOR_COUNT = 10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
+TAIL_PRIOR_COUNT = (
+    10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
+)
 SMALLEST = 1e-9  # lower bound of q
-LEAST_SHARE = 1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
+LEAST_SHARE = (
+    1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
+)
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
@@ -89,7 +93,9 @@ def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats,
                 w = vectors[before, g, i]
                 vectors[t, g, i] = w + gains[g] * (whitened[t, i] - w)
         for c in range(contexts.shape[1]):
-            running[t, c] = running[before, c] + CONTEXT_GAIN * (contexts[t, c] - running[before, c])
+            running[t, c] = running[before, c] + CONTEXT_GAIN * (
+                contexts[t, c] - running[before, c]
+            )
     return vectors, running
 
 

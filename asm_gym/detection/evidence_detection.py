@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.base import Array, Arrays, Floats, ModelOutput, Nominal, Place
 from asm_gym.detection.detector import BOUND, GAINS, Detector
-from asm_gym.detection.evidence import HOURS_QUANTILE, HOURS_TAIL_INDEX, TAIL_INDEX, TINY, Evidence, ceilings, pool
+from asm_gym.detection.evidence import (
+    HOURS_QUANTILE,
+    HOURS_TAIL_INDEX,
+    TAIL_INDEX,
+    TINY,
+    Evidence,
+    ceilings,
+    pool,
+)
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
     RARER,
@@ -53,7 +61,14 @@ class EvidenceDetection:
     """
 
     name = "evidence"
-    arrays: tuple[str, ...] = ("whitening", "ceiling", "tail", "context_quantile", "context_range", "repetition")
+    arrays: tuple[str, ...] = (
+        "whitening",
+        "ceiling",
+        "tail",
+        "context_quantile",
+        "context_range",
+        "repetition",
+    )
 
     @typed
     def __init__(
@@ -118,7 +133,11 @@ class EvidenceDetection:
         arrays = {name: np.array(learned[name], np.float64) for name in self.arrays[:-1]}
         gains = len(self.gains)
         errors = len(arrays["whitening"])
-        shapes = {"whitening": (errors, errors), "ceiling": (gains, errors), "tail": (gains, errors)}
+        shapes = {
+            "whitening": (errors, errors),
+            "ceiling": (gains, errors),
+            "tail": (gains, errors),
+        }
         check_shapes(arrays, shapes)
         for name, most in (("ceiling", math.inf), ("tail", 1.0)):
             if not ((arrays[name] > 0.0) & (arrays[name] <= most)).all():
@@ -126,7 +145,9 @@ class EvidenceDetection:
 
         detector = Detector(**arrays, gains=np.array(self.gains), bound=self.bound)
         if not detector.reach > 1.0:  # what is seldom exceeded in nominal episodes
-            raise ValueError(f"no error can add up to evidence: at most {detector.reach:g} of what is usual")
+            raise ValueError(
+                f"no error can add up to evidence: at most {detector.reach:g} of what is usual"
+            )
         return detector
 
     def _repetition_of(self, counted: NDArray[Any]) -> RepetitionWeights:

@@ -25,14 +25,22 @@ AnyFloats = NDArray[np.floating[Any]]
 
 # Columns of a map's cells.
 ARM_AND_PLACE = slice(0, 4)  # the arm, and the cell's place along x, y and z in cells
-FASTEST = slice(4, 16)  # greatest speed along each axis of the twist, then against each [m/s], [rad/s]
+FASTEST = slice(
+    4, 16
+)  # greatest speed along each axis of the twist, then against each [m/s], [rad/s]
 
 FARTHEST_CELL = 100  # hands that are more cells away from the origin are not learned of
 OWN_MAP_EPISODES = 40  # of a task that has a map of its own: elsewhere others may go down fast
-FASTEST_EPISODES = 0.05  # share of the episodes that visit a cell, the fastest, which do not count there
-ODD_EPISODES = 0.002  # and of all episodes: of hundreds, an odd one sets no speed where few others go
+FASTEST_EPISODES = (
+    0.05  # share of the episodes that visit a cell, the fastest, which do not count there
+)
+ODD_EPISODES = (
+    0.002  # and of all episodes: of hundreds, an odd one sets no speed where few others go
+)
 
-MOMENTUM = 1.5  # limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
+MOMENTUM = (
+    1.5  # limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
+)
 MOMENTUM_OF_KNOWN_TASK = 1.35  # the same in a task with a map of its own [N s]
 
 
@@ -81,7 +89,9 @@ class HandSpeedMap:
         return cls(np.concatenate(list(cells_by_task.values())))
 
     @classmethod
-    def by_task(cls, episodes: Sequence[Episode], spec: StreamSpec) -> dict[str, NDArray[np.float32]]:
+    def by_task(
+        cls, episodes: Sequence[Episode], spec: StreamSpec
+    ) -> dict[str, NDArray[np.float32]]:
         """Return the cells of each task with ``OWN_MAP_EPISODES``, and of all others under an empty name."""
         streams: defaultdict[str, list[NDArray[np.float32]]] = defaultdict(list)
         for episode in episodes:

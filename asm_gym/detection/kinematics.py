@@ -26,7 +26,9 @@ class Chain(NamedTuple):
     prefix: str  # of its channels, where there are several arms
     axes: NDArray[np.float64]  # (J, 3) of its joints where all angles are 0, in the world
     anchors: NDArray[np.float64]  # (J, 3) points on them [m]
-    hand: NDArray[np.float64]  # (3, 3) the hand's place there [m], and the first two columns of its rotation
+    hand: NDArray[
+        np.float64
+    ]  # (3, 3) the hand's place there [m], and the first two columns of its rotation
     late_s: float = 0.0  # the angles are sensed by so much later than the hand [s]
     noise: float = 1.0  # how many times the noise that its channels say a reading has
 

@@ -27,7 +27,9 @@ from asm_gym.detection.evidence import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
-REPETITION_OFFSET = 12.0  # one in 160,000, which among a hundred senses happens once in some thousand rows
+REPETITION_OFFSET = (
+    12.0  # one in 160,000, which among a hundred senses happens once in some thousand rows
+)
 RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal episodes
 MOST_BEYOND = 24.0  # largest n - n_0
 UNMOVED = 0.5  # noise below this many steps of the resolution leaves a reading where it is
@@ -67,7 +69,9 @@ class Repetition(NamedTuple):
     def start(cls, batch: int, senses: int) -> Repetition:
         """Return the state before the first row."""
         shape = (batch, senses)
-        return cls(row=np.full(shape, np.nan), again=np.zeros(shape, np.bool_), unlikely=np.zeros(shape))
+        return cls(
+            row=np.full(shape, np.nan), again=np.zeros(shape, np.bool_), unlikely=np.zeros(shape)
+        )
 
     def followed_by(self, rows: Floats, steps: Floats, most: Floats) -> Repetition:
         """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
@@ -114,7 +118,9 @@ def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
     """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
     ends = np.cumsum([len(stream) for stream in streams])
     enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
-    return np.array([_stands_still([stream[:, i] for stream in enough]) for i in range(streams[0].shape[1])])
+    return np.array(
+        [_stands_still([stream[:, i] for stream in enough]) for i in range(streams[0].shape[1])]
+    )
 
 
 def _stands_still(readings: Sequence[Stream]) -> bool:
@@ -138,7 +144,9 @@ def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
     state = Repetition.start(len(ordered), senses)
     for t in range(len(ordered[0])):
         rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
-        state = Repetition._make(part[: len(rows)] for part in state).followed_by(rows, steps, unbounded)
+        state = Repetition._make(part[: len(rows)] for part in state).followed_by(
+            rows, steps, unbounded
+        )
         offset = np.maximum(offset, state.unlikely.max(axis=0))
     return offset
 
@@ -153,7 +161,9 @@ def evidence_steps(surprise: Floats) -> Floats:
 
 
 @compiled
-def step_repetition(weights: RepetitionWeights, before: Repetition, after: Repetition, rows: Any) -> None:
+def step_repetition(
+    weights: RepetitionWeights, before: Repetition, after: Repetition, rows: Any
+) -> None:
     """Write the state after rows (B, D)."""
     for n in range(len(rows)):
         for i in range(len(weights.columns)):

@@ -44,7 +44,9 @@ class Squares:
     def start(self, batch: int, errors: int) -> State:
         return ()
 
-    def attribute_step(self, state: State, output: ModelOutput, rows: Array, place: Place) -> tuple[State, Floats]:
+    def attribute_step(
+        self, state: State, output: ModelOutput, rows: Array, place: Place
+    ) -> tuple[State, Floats]:
         return state, place(self.parts(output))
 
     def reset(self, state: State) -> State:
@@ -82,7 +84,9 @@ class MovingMean(Squares):
     def start(self, batch: int, errors: int) -> NDArray[np.float64]:
         return np.full((batch, WINDOW, errors), np.nan)
 
-    def attribute_step(self, state: State, output: ModelOutput, rows: Array, place: Place) -> tuple[State, Floats]:
+    def attribute_step(
+        self, state: State, output: ModelOutput, rows: Array, place: Place
+    ) -> tuple[State, Floats]:
         state = np.concatenate([self.parts(output)[:, None], state[:, :-1]], axis=1)
         return state, place(np.nanmean(state, axis=1))
 

@@ -46,7 +46,9 @@ class Actions:
         """Return the action (A,) clipped to [-1, 1]; raise ValueError for another shape, or one that is not finite."""
         action = as_float32(action, "the action")
         if action.shape != self.space.shape:
-            raise ValueError(f"{self._task} takes an action of shape {self.space.shape}, got {action.shape}")
+            raise ValueError(
+                f"{self._task} takes an action of shape {self.space.shape}, got {action.shape}"
+            )
         if not np.isfinite(action).all():
             raise ValueError(f"the action must be finite, got {action}")
         return np.minimum(np.maximum(action, -1.0, dtype=np.float32), 1.0, dtype=np.float32)
@@ -68,7 +70,9 @@ class Actions:
     def turning(self, turns: Floats) -> Action:
         """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can."""
         if self._controller not in CHANGES:
-            raise ValueError(f"actions of {' and '.join(CHANGES)} are changes, those of {self._controller} are not")
+            raise ValueError(
+                f"actions of {' and '.join(CHANGES)} are changes, those of {self._controller} are not"
+            )
         action = np.zeros(self.size, np.float32)
         first = 0
         for a, part in enumerate(self._simulation.moves):

@@ -68,7 +68,9 @@ def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
     return arms
 
 
-def describe_inputs(arms: Arms, a: int, model: mujoco.MjModel, controller: Any, part: slice) -> None:
+def describe_inputs(
+    arms: Arms, a: int, model: mujoco.MjModel, controller: Any, part: slice
+) -> None:
     """Write what the inputs of arm ``a`` are, where they tell how fast its hand will go; ``part`` of an action."""
     size = part.stop - part.start
     if controller.name not in SLOWED or size > JOINTS:
@@ -101,7 +103,18 @@ def _unset(parts: list[Part], model: mujoco.MjModel) -> Arms:
         links.append(_links(model, model.body(robot.robot_model.eef_name[arm]).id))
         trees.append(_carried_dofs(model, robot))
 
-    indices = ("joints", "site", "site_body", "root", "base", "wrench", "kind", "first", "inputs", "changes")
+    indices = (
+        "joints",
+        "site",
+        "site_body",
+        "root",
+        "base",
+        "wrench",
+        "kind",
+        "first",
+        "inputs",
+        "changes",
+    )
     fields: dict[str, Any] = {name: np.zeros(count, np.int64) for name in indices}
     fields |= {name: np.zeros((count, JOINTS), np.int64) for name in ("qpos", "dofs", "motors")}
     fields |= {name: np.zeros((count, JOINTS)) for name in ("kp", "kd", "rest", "speeds")}
@@ -212,7 +225,8 @@ def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[C
                 axes=data.xaxis[joints].copy(),
                 anchors=data.xanchor[joints].copy(),
                 hand=np.stack([place, turn[:, 0], turn[:, 1]]),
-                late_s=1.0 / PHYSICS_FREQ,  # the last substep has moved the joints, and not yet sites and bodies
+                late_s=1.0
+                / PHYSICS_FREQ,  # the last substep has moved the joints, and not yet sites and bodies
                 noise=max(noise, 1.0),
             )
         )

@@ -35,7 +35,9 @@ def import_robosuite() -> Any:
     logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
     with suppress(ImportError):
         import cv2  # noqa: F401
-    if no_viewer := "cv2" not in sys.modules:  # for want of libGL: only robosuite's own viewer would use it
+    if (
+        no_viewer := "cv2" not in sys.modules
+    ):  # for want of libGL: only robosuite's own viewer would use it
         sys.modules["cv2"] = ModuleType("cv2")
     try:
         robosuite = somewhere(_required)
@@ -48,7 +50,9 @@ def import_robosuite() -> Any:
 
 
 def _required() -> Any:
-    if "robosuite" not in sys.modules:  # parts that an import which failed has left are no attributes of a new one
+    if (
+        "robosuite" not in sys.modules
+    ):  # parts that an import which failed has left are no attributes of a new one
         for name in [name for name in sys.modules if name.startswith("robosuite.")]:
             del sys.modules[name]
     return require("robosuite", what="a robosuite environment")
@@ -79,7 +83,11 @@ def _compile_less() -> None:
 
 def row_substeps(rate: int, control_freq: int) -> int:
     """Return the physics substeps between two rows at ``rate`` [Hz]; raise ValueError, listing those that fit."""
-    possible = [f for f in range(control_freq, PHYSICS_FREQ + 1) if not (PHYSICS_FREQ % f or f % control_freq)]
+    possible = [
+        f
+        for f in range(control_freq, PHYSICS_FREQ + 1)
+        if not (PHYSICS_FREQ % f or f % control_freq)
+    ]
     if rate not in possible:
         raise ValueError(
             f"stream_freq must divide the physics rate of {PHYSICS_FREQ} Hz and be a multiple of the control rate of "
@@ -88,7 +96,13 @@ def row_substeps(rate: int, control_freq: int) -> int:
     return PHYSICS_FREQ // rate
 
 
-def make(task: TaskSpec, robots: tuple[str, ...], controller: str, control_freq: int, reward_shaping: bool) -> Any:
+def make(
+    task: TaskSpec,
+    robots: tuple[str, ...],
+    controller: str,
+    control_freq: int,
+    reward_shaping: bool,
+) -> Any:
     """Return robosuite's environment; raise ValueError for a controller that is unknown or does not fit the robot."""
     robosuite = import_robosuite()
     check_choice("controller", check_text("controller", controller), CONTROLLERS)
@@ -97,12 +111,15 @@ def make(task: TaskSpec, robots: tuple[str, ...], controller: str, control_freq:
     return robosuite.make(
         task.name,
         robots=list(robots),
-        controller_configs=None if controller == "OSC_POSE" else [_configuration(controller, r) for r in robots],
+        controller_configs=None
+        if controller == "OSC_POSE"
+        else [_configuration(controller, r) for r in robots],
         has_renderer=False,
         has_offscreen_renderer=False,
         use_camera_obs=False,
         control_freq=control_freq,
-        reward_shaping=reward_shaping and task.name != "TwoArmTransport",  # which has no dense reward
+        reward_shaping=reward_shaping
+        and task.name != "TwoArmTransport",  # which has no dense reward
         ignore_done=True,
     )
 
@@ -116,7 +133,9 @@ def _check_inverse_kinematics(robots: tuple[str, ...]) -> None:
 
 def _configuration(controller: str, robot: str) -> dict[str, Any]:
     from robosuite.controllers import load_part_controller_config
-    from robosuite.controllers.composite.composite_controller_factory import refactor_composite_controller_config
+    from robosuite.controllers.composite.composite_controller_factory import (
+        refactor_composite_controller_config,
+    )
 
     part = load_part_controller_config(default_controller=controller)
     return refactor_composite_controller_config(part, robot, ["right"])
@@ -163,11 +182,15 @@ def speed_up_contacts(env: Any) -> None:
 
     def check_contact(geoms_1: Any, geoms_2: Any = None) -> bool:
         """Whether any geom of one group touches any of the other; of anything where there is no other."""
-        return touching(data.contact.geom, mask(geoms_1), everything if geoms_2 is None else mask(geoms_2))
+        return touching(
+            data.contact.geom, mask(geoms_1), everything if geoms_2 is None else mask(geoms_2)
+        )
 
     @lru_cache
     def pads(gripper: Any) -> tuple[tuple[str, ...], ...]:
-        return tuple(tuple(gripper.important_geoms[f"{side}_fingerpad"]) for side in ("left", "right"))
+        return tuple(
+            tuple(gripper.important_geoms[f"{side}_fingerpad"]) for side in ("left", "right")
+        )
 
     def check_grasp(gripper: Any, object_geoms: Any) -> bool:
         """Whether the pads on both sides of a gripper, or of any of several, touch an object."""
@@ -184,14 +207,20 @@ def speed_up_contacts(env: Any) -> None:
         name = getattr(target, "root_body", None)  # of a model
         return np.asarray(data.body(name).xpos if name else getattr(data, kind)(target).xpos)
 
-    def gripper_to_target(gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False) -> Any:
+    def gripper_to_target(
+        gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False
+    ) -> Any:
         """Way from a gripper, or from the nearest of several, to a target; or its length."""
         grippers = gripper.values() if isinstance(gripper, dict) else (gripper,)
         ways = [place(target, target_type) - grip_site(each) for each in grippers]
         way = ways[0] if len(ways) == 1 else min(ways, key=np.linalg.norm)
         return np.sqrt(way.dot(way)) if return_distance else way  # as NumPy's norm does it
 
-    env.check_contact, env._check_grasp, env._gripper_to_target = check_contact, check_grasp, gripper_to_target
+    env.check_contact, env._check_grasp, env._gripper_to_target = (
+        check_contact,
+        check_grasp,
+        gripper_to_target,
+    )
 
 
 class _Asked(dict[str, Any]):
@@ -220,10 +249,13 @@ class ObjectSensors:
         hidden = [n for n in of_objects if n.startswith("world_pose_in")]
         chosen = task.name in _CHOSEN
         inputs = [observables[n] for n in (*hands, *hidden) if n in observables]
-        self._observables = [o for n, o in of_objects.items() if n not in hidden and (chosen or o.is_active())]
+        self._observables = [
+            o for n, o in of_objects.items() if n not in hidden and (chosen or o.is_active())
+        ]
         sizes = [int(np.prod(o._data_shape)) or 1 for o in self._observables]
         self.channels = tuple(
-            Channel(o.name, size, "1", 0.0, "object") for o, size in zip(self._observables, sizes, strict=True)
+            Channel(o.name, size, "1", 0.0, "object")
+            for o, size in zip(self._observables, sizes, strict=True)
         )
         self._rest = [np.zeros(size) for size in sizes]
         # Relative poses are computed from absolute ones, which robosuite lists after them.

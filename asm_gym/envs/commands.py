@@ -20,7 +20,13 @@ def scaling_of(controller: Any, size: int) -> Floats:
     """Return the scaling (5, size) of robosuite's controller of ``size`` inputs."""
     controller.scale_action(np.zeros(size))  # which works out the numbers below
     c = controller
-    rows = c.input_min, c.input_max, c.action_input_transform, c.action_scale, c.action_output_transform
+    rows = (
+        c.input_min,
+        c.input_max,
+        c.action_input_transform,
+        c.action_scale,
+        c.action_output_transform,
+    )
     return np.array([np.broadcast_to(np.asarray(row, np.float64), size) for row in rows])
 
 
@@ -62,7 +68,9 @@ def rotation(turn: Floats, at: int, matrix: Floats) -> None:
 
 
 @compiled
-def move_gripper(asked: Floats, scaling: Floats, ranges: Floats, motors: Ints, ctrl: Floats) -> None:
+def move_gripper(
+    asked: Floats, scaling: Floats, ranges: Floats, motors: Ints, ctrl: Floats
+) -> None:
     """Command a gripper's motors (G,) as ``asked`` (G,) in [-1, 1], with the scaling (1, 5, G) of its controller.
 
     ``ranges`` (4, G) are the middle and half of what it commands, and the motors' own bounds.

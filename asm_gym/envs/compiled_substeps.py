@@ -59,7 +59,9 @@ _kinematics: Any = types.ExternalFunction("mj_kinematics", _on_data)
 _com_pos: Any = types.ExternalFunction("mj_comPos", _on_data)
 _com_vel: Any = types.ExternalFunction("mj_comVel", _on_data)
 _mass: Any = types.ExternalFunction("mj_makeM", _on_data)
-_rne: Any = types.ExternalFunction("mj_rne", types.void(types.intp, types.intp, types.int32, types.intp))
+_rne: Any = types.ExternalFunction(
+    "mj_rne", types.void(types.intp, types.intp, types.int32, types.intp)
+)
 
 
 @partial(inner, inlined=True)
@@ -96,7 +98,10 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
                         samples[a, k, r] += nominal.mass[at] * views.qacc[i]
         for i in range(arms.joints[a]):
             dof = arms.dofs[a, i]
-            damped = views.qfrc_passive[dof] + (views.dof_damping[dof] - nominal.damping[dof]) * views.qvel[dof]
+            damped = (
+                views.qfrc_passive[dof]
+                + (views.dof_damping[dof] - nominal.damping[dof]) * views.qvel[dof]
+            )
             samples[a, k, i] += nominal.bias[dof] - damped - views.qfrc_actuator[dof]
             samples[a, k, JOINTS + i] = views.qfrc_actuator[dof]
         for i in range(6):
@@ -106,7 +111,9 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
             if body < 0:
                 break
             for i in range(3):
-                samples[a, k, _CONTACT + i] += views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
+                samples[a, k, _CONTACT + i] += (
+                    views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
+                )
         site, body, root = arms.site[a], arms.site_body[a], arms.root[a]
         for i in range(3):
             j, m = (i + 1) % 3, (i + 2) % 3
@@ -191,12 +198,16 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
             if goals.held[a] == 0:
                 limits.state[BRAKED] += slow_down(views, arms, limits, work, a)
         _step2(views.model, views.data)
-        sample(views, nominal, arms, k, samples)  # the place for all that is measured in every substep
+        sample(
+            views, nominal, arms, k, samples
+        )  # the place for all that is measured in every substep
         feel(arms.joints, limits, goals.held, k, samples)
 
 
 @compiled
-def sense(sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Floats, row: Floats) -> None:
+def sense(
+    sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Floats, row: Floats
+) -> None:
     """Turn standard normal draws (M,) in ``row`` into readings with ``noise`` (M,).
 
     Args:
@@ -260,7 +271,11 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
                 if not abs(value) <= abs(peak[a, i]) and peak[a, i] == peak[a, i]:
                     peak[a, i] = value
         for k in range(count):
-            x, y, z = samples[a, k, _CONTACT], samples[a, k, _CONTACT + 1], samples[a, k, _CONTACT + 2]
+            x, y, z = (
+                samples[a, k, _CONTACT],
+                samples[a, k, _CONTACT + 1],
+                samples[a, k, _CONTACT + 2],
+            )
             force = np.sqrt(x * x + y * y + z * z)
             if not force <= largest and largest == largest:
                 largest = force

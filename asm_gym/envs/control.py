@@ -26,7 +26,16 @@ import numpy as np
 
 from asm_gym.compilation import inner
 from asm_gym.envs.commands import rotation, scaled
-from asm_gym.envs.mujoco_views import JOINT_POSITION, Arms, Floats, Goals, NominalViews, SubstepLimits, Views, Work
+from asm_gym.envs.mujoco_views import (
+    JOINT_POSITION,
+    Arms,
+    Floats,
+    Goals,
+    NominalViews,
+    SubstepLimits,
+    Views,
+    Work,
+)
 
 
 @inner
@@ -75,7 +84,9 @@ def solve(M: Floats, n: int, L: Floats, B: Floats, r: int) -> None:
 
 
 HOLD_STIFFNESS = 400.0  # Kp of an arm that is held [1/s²]; Kd is 2 √Kp
-YIELDS_AT = 60.0  # Y: the force at the hand from which an arm that is held and at rest gives way [N]
+YIELDS_AT = (
+    60.0  # Y: the force at the hand from which an arm that is held and at rest gives way [N]
+)
 HELD, BRAKING, YIELDING = 1, 2, 3
 """Of ``Goals.held``: to be held from the next substep on; on its way to rest; and since then."""
 
@@ -108,10 +119,18 @@ def set_goal(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None
         goals.position[a, i] = views.site_xpos[site, i]
         for j in range(3):
             goals.position[a, i] += work.L[i, j] * work.p[j]
-            work.A[i, j] = work.L[0, i] * work.M[0, j] + work.L[1, i] * work.M[1, j] + work.L[2, i] * work.M[2, j]
+            work.A[i, j] = (
+                work.L[0, i] * work.M[0, j]
+                + work.L[1, i] * work.M[1, j]
+                + work.L[2, i] * work.M[2, j]
+            )
     for i in range(3):
         for j in range(3):
-            work.M[i, j] = work.G[i, 0] * work.A[0, j] + work.G[i, 1] * work.A[1, j] + work.G[i, 2] * work.A[2, j]
+            work.M[i, j] = (
+                work.G[i, 0] * work.A[0, j]
+                + work.G[i, 1] * work.A[1, j]
+                + work.G[i, 2] * work.A[2, j]
+            )
     for i in range(3):
         for j in range(3):
             goals.orientation[a, i, j] = 0.0
@@ -230,7 +249,9 @@ def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
                 work.tau[i] += work.h[i]
         return
     for i in range(n):
-        work.p[i] = 10.0 * (arms.rest[a, i] - views.qpos[arms.qpos[a, i]]) - 2.0 * np.sqrt(10.0) * work.v[i]
+        work.p[i] = (
+            10.0 * (arms.rest[a, i] - views.qpos[arms.qpos[a, i]]) - 2.0 * np.sqrt(10.0) * work.v[i]
+        )
     multiply(work.M, n, work.p, work.tau)
     for i in range(3):
         work.F[0, i] = goals.position[a, i] - views.site_xpos[site, i]
@@ -281,12 +302,16 @@ def slow_down(views: Views, arms: Arms, limits: SubstepLimits, work: Work, a: in
         for i in range(arms.joints[a]):
             m = arms.motors[a, i]
             command = views.ctrl[m] - work.tau[i]
-            views.ctrl[m] = min(max(command, views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
+            views.ctrl[m] = min(
+                max(command, views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1]
+            )
     return speed > limit
 
 
 @partial(inner, inlined=True)
-def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, a: int) -> None:
+def control(
+    views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, a: int
+) -> None:
     """Command the motors of arm ``a``, as far as they go."""
     read_arm(views, nominal, arms, work, a)
     if goals.held[a]:
@@ -295,4 +320,6 @@ def control(views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work:
         track(views, arms, goals, work, a)
     for i in range(arms.joints[a]):
         m = arms.motors[a, i]
-        views.ctrl[m] = min(max(work.tau[i], views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1])
+        views.ctrl[m] = min(
+            max(work.tau[i], views.actuator_ctrlrange[m, 0]), views.actuator_ctrlrange[m, 1]
+        )

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 JOINTS = 7  # the most joints an arm may have; shorter arms leave the rest unused
-FELT = JOINTS + 3  # numbers that limits apply to: external torque of the joints, then force at the wrist
+FELT = (
+    JOINTS + 3
+)  # numbers that limits apply to: external torque of the joints, then force at the wrist
 OSC_POSE, JOINT_POSITION = 0, 1
 UNKNOWN_CHANGE, JOINT_ANGLES, HAND_POSE = range(3)  # what the inputs of an arm change
 
@@ -102,7 +104,9 @@ class Goals(NamedTuple):
     orientation: Floats  # (A, 3, 3)
     joints: Floats  # (A, JOINTS)
     anchor: Floats  # (A, JOINTS) where an arm that is held is to stay [rad]
-    held: Ints  # (A,) whether it is: 0, ``control.HELD``, ``control.BRAKING`` or ``control.YIELDING``
+    held: (
+        Ints  # (A,) whether it is: 0, ``control.HELD``, ``control.BRAKING`` or ``control.YIELDING``
+    )
 
     @classmethod
     def of(cls, arms: int, inputs: int) -> Goals:

@@ -19,7 +19,14 @@ from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
 from asm_gym.spec import StreamSpec
 from asm_gym.tasks import task as task_spec
-from asm_gym.validation import check_choice, check_flag, check_number, check_numbers, check_text, short_repr
+from asm_gym.validation import (
+    check_choice,
+    check_flag,
+    check_number,
+    check_numbers,
+    check_text,
+    short_repr,
+)
 
 LARGEST_PICTURE = 4096  # height or width [pixels]
 
@@ -87,16 +94,31 @@ class RobosuiteEnv(SteppedEnv):
         if isinstance(stream, str) or not isinstance(stream, Sequence):
             raise ValueError(f"stream must be a sequence of names, got {short_repr(stream)}")
         for group in stream:
-            check_choice("stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS))
-        if check_number("control_freq", control_freq, low=1, whole=True) and PHYSICS_FREQ % control_freq:
-            raise ValueError(f"control_freq must divide the physics rate of {PHYSICS_FREQ} Hz, got {control_freq}")
+            check_choice(
+                "stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS)
+            )
+        if (
+            check_number("control_freq", control_freq, low=1, whole=True)
+            and PHYSICS_FREQ % control_freq
+        ):
+            raise ValueError(
+                f"control_freq must divide the physics rate of {PHYSICS_FREQ} Hz, got {control_freq}"
+            )
         super().__init__(PHYSICS_FREQ // control_freq)
         if stream_freq is not None:
             check_number("stream_freq", stream_freq, low=1, whole=True)
-        self._row_substeps = backend.row_substeps(control_freq if stream_freq is None else stream_freq, control_freq)
-        self.horizon = self.task.horizon if horizon is None else check_number("horizon", horizon, low=1, whole=True)
+        self._row_substeps = backend.row_substeps(
+            control_freq if stream_freq is None else stream_freq, control_freq
+        )
+        self.horizon = (
+            self.task.horizon
+            if horizon is None
+            else check_number("horizon", horizon, low=1, whole=True)
+        )
         if (check_numbers("render_size", render_size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
-            raise ValueError(f"render_size must be two whole numbers, got {short_repr(render_size)}")
+            raise ValueError(
+                f"render_size must be two whole numbers, got {short_repr(render_size)}"
+            )
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": control_freq}
         self.dt = 1.0 / control_freq
@@ -110,13 +132,21 @@ class RobosuiteEnv(SteppedEnv):
 
         self.controller = controller  # name of the arms' controller
         self.robosuite_env: Any = backend.make(
-            self.task, self.robots, controller, control_freq, check_flag("reward_shaping", reward_shaping)
+            self.task,
+            self.robots,
+            controller,
+            control_freq,
+            check_flag("reward_shaping", reward_shaping),
         )
         """The simulator underneath."""
-        check_choice("camera", check_text("camera", camera), self.robosuite_env.sim.model.camera_names)
+        check_choice(
+            "camera", check_text("camera", camera), self.robosuite_env.sim.model.camera_names
+        )
         self._renderer = OffscreenRenderer(camera, render_size[1], render_size[0])
         self._bind()
-        self.hand_chains = chains_of(self.simulation.parts, self.simulation.model, self.sensor_noise)
+        self.hand_chains = chains_of(
+            self.simulation.parts, self.simulation.model, self.sensor_noise
+        )
         """Kinematic chains of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
         self._actions.begin_episode(self.simulation)
@@ -140,12 +170,22 @@ class RobosuiteEnv(SteppedEnv):
         channels = (*self.simulation.proprioception.channels, *self._objects.channels)
         dt, source = self._row_substeps / PHYSICS_FREQ, "+".join(self.robots)
         self._senses = Senses(
-            channels, self._actions.size, dt, source, self._groups, self.sensor_noise, flat=self._flat
+            channels,
+            self._actions.size,
+            dt,
+            source,
+            self._groups,
+            self.sensor_noise,
+            flat=self._flat,
         )
         self.measured_spec = self._senses.measured_spec
         """Everything that is measured, whether or not the stream carries it."""
-        self.felt_channels = tuple(c for c in channels if c.name.endswith(("external_torque", "wrist_force")))
-        self.observation_layout = self._senses.sizes  # the observation's parts in order, and how many numbers each has
+        self.felt_channels = tuple(
+            c for c in channels if c.name.endswith(("external_torque", "wrist_force"))
+        )
+        self.observation_layout = (
+            self._senses.sizes
+        )  # the observation's parts in order, and how many numbers each has
         self.observation_space = self.laid_out_space = self._senses.space()
 
     @property
@@ -153,7 +193,9 @@ class RobosuiteEnv(SteppedEnv):
         """Rows of the stream a second [Hz]."""
         return PHYSICS_FREQ // self._row_substeps
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode; a ``seed`` makes it exact, to the last bit and whatever ran before.
 
         Without one the generator goes on, and objects keep the shapes that some tasks draw.
@@ -209,7 +251,9 @@ class RobosuiteEnv(SteppedEnv):
         self._steps_taken += 1
         reward, success = float(env._post_action(self._action)[0]), bool(env._check_success())
         self._reading = self._read()
-        if unstable := self._divergences() != self._diverged or not (self._finite and self._reading.row_finite):
+        if unstable := self._divergences() != self._diverged or not (
+            self._finite and self._reading.row_finite
+        ):
             # The simulation then holds MuJoCo's initial state as a rule, which no sensor of the robot could read.
             self._reading.row[:] = self._reading.stream[:] = np.nan
             self._reading.seen[:] = 0.0
@@ -244,7 +288,9 @@ class RobosuiteEnv(SteppedEnv):
         """Return a picture (height, width, 3) uint8; raise RuntimeError where this machine has nothing to draw with."""
         if self.render_mode == "rgb_array":
             return self._renderer.render(self.simulation.model, self.simulation.data)
-        gym.logger.warn("render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')")
+        gym.logger.warn(
+            "render() does nothing without a render_mode: gym.make(…, render_mode='rgb_array')"
+        )
         return None
 
     def close(self) -> None:

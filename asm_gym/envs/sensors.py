@@ -38,14 +38,18 @@ class _Sensor(NamedTuple):
     source: str  # a key of ``Proprioception._sources``
     part: slice | str  # of a sample, or a key of ``_indices``
     noise: float = 0.0  # standard deviation [unit]
-    resolution: float = 0.0  # step between readings [unit]; 0 for what is computed from several sensors
+    resolution: float = (
+        0.0  # step between readings [unit]; 0 for what is computed from several sensors
+    )
 
 
 _COUNT = np.deg2rad(0.01)
 """[rad]: 15 bits of a turn; the link-side encoders of DLR's light-weight arm, from which the iiwa descends."""
 
 _FORCE, _TORQUE = (slice(kernels.WRENCH.start + i, kernels.WRENCH.start + i + 3) for i in (0, 3))
-_LINEAR, _ANGULAR = (slice(kernels.VELOCITY.start + i, kernels.VELOCITY.start + i + 3) for i in (0, 3))
+_LINEAR, _ANGULAR = (
+    slice(kernels.VELOCITY.start + i, kernels.VELOCITY.start + i + 3) for i in (0, 3)
+)
 
 # About what a research arm's own sensors have. Resolutions: DLR, "Joint sensors of the light-weight robot" (0.01°);
 # Franka Emika, Panda data sheet (0.02 N m, 13 bits of ±87 N m); ATI Industrial Automation, Gamma SI-130-10 (±130 N in
@@ -105,17 +109,25 @@ class Proprioception:
                     at = at[:joints] if sensor.group == "torque" else at
                 if not len(at):
                     continue
-                unit = _TURNING[sensor.unit] if sensor.group == "gripper" and not slides else sensor.unit
+                unit = (
+                    _TURNING[sensor.unit]
+                    if sensor.group == "gripper" and not slides
+                    else sensor.unit
+                )
                 name = (f"robot{i}_" if len(parts) > 1 else "") + sensor.name
                 ends = stops if sensor.name == "joint_position" else ()
                 about = len(at), unit, sensor.noise, sensor.group
                 channels.append(Channel(name, *about, resolution=sensor.resolution, stops=ends))
                 where += [(names.index(sensor.source), int(k)) for k in at]
         self.channels = tuple(channels)
-        self.where = np.array(where, np.int64)  # (P, 2) of each number its source and its index there
+        self.where = np.array(
+            where, np.int64
+        )  # (P, 2) of each number its source and its index there
 
 
-def _indices(robot: Any, arm: str) -> tuple[dict[str, NDArray[np.intp]], bool, tuple[tuple[float, float], ...]]:
+def _indices(
+    robot: Any, arm: str
+) -> tuple[dict[str, NDArray[np.intp]], bool, tuple[tuple[float, float], ...]]:
     """Return where an arm's sensors read, whether its fingers slide, and the joints' stops where any has some [rad]."""
     model = robot.sim.model._model
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
@@ -131,10 +143,16 @@ def _indices(robot: Any, arm: str) -> tuple[dict[str, NDArray[np.intp]], bool, t
         "fingers": robot._ref_gripper_joint_pos_indexes[arm] if fingers else [],
         "finger_dofs": finger_dofs,
     }
-    slides = all(model.jnt_type[model.dof_jntid[d]] == mujoco.mjtJoint.mjJNT_SLIDE for d in finger_dofs)
+    slides = all(
+        model.jnt_type[model.dof_jntid[d]] == mujoco.mjtJoint.mjJNT_SLIDE for d in finger_dofs
+    )
     joints = robot._ref_joint_indexes
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], (-np.inf, np.inf))
-    stops = tuple((float(low), float(high)) for low, high in ranges) if model.jnt_limited[joints].any() else ()
+    stops = (
+        tuple((float(low), float(high)) for low, high in ranges)
+        if model.jnt_limited[joints].any()
+        else ()
+    )
     return {name: np.asarray(at, np.intp) for name, at in indices.items()}, slides, stops
 
 
@@ -169,7 +187,9 @@ class Senses:
         noise: float,  # scale of the sensors' noise; at 0 readings are exact, without resolution
         flat: bool,  # observations are one array, not a dict of named ones
     ) -> None:
-        spec = self.measured_spec = StreamSpec((*channels, Channel("action", actions, "1", 0.0, MOTOR)), dt, source)
+        spec = self.measured_spec = StreamSpec(
+            (*channels, Channel("action", actions, "1", 0.0, MOTOR)), dt, source
+        )
         """Everything that is measured, whether or not the stream carries it."""
         chosen = tuple(c for c in spec.channels if c.group in groups)
         self.stream_spec = StreamSpec(chosen, dt, source) if chosen else None
@@ -187,7 +207,9 @@ class Senses:
 
     def read(
         self,
-        sense: Callable[[NDArray[np.float64], NDArray[np.float64], np.random.Generator], NDArray[np.float64]],
+        sense: Callable[
+            [NDArray[np.float64], NDArray[np.float64], np.random.Generator], NDArray[np.float64]
+        ],
         objects: ObjectSensors,
         action: NDArray[np.float32],
         faults: Sequence[Corruption],
@@ -200,12 +222,21 @@ class Senses:
         """
         if faults or self._needs_objects or not within_step:
             self._object_poses = objects.read()
-        row = sense(np.concatenate([*self._object_poses, action], dtype=np.float64), self._noise, rng)
-        sound = bool(np.isfinite(row).all()) if faults else None  # a fault that reads NaN is no fault of the simulation
+        row = sense(
+            np.concatenate([*self._object_poses, action], dtype=np.float64), self._noise, rng
+        )
+        sound = (
+            bool(np.isfinite(row).all()) if faults else None
+        )  # a fault that reads NaN is no fault of the simulation
         for corrupt in faults:
             corrupt(row)
-        stream, seen = np.empty(len(self._carried), np.float32), np.empty(len(self._observed), np.float32)
-        finite = kernels.finish(row, self._steps, self._carried, stream, self._observed, _BOUND, seen)
+        stream, seen = (
+            np.empty(len(self._carried), np.float32),
+            np.empty(len(self._observed), np.float32),
+        )
+        finite = kernels.finish(
+            row, self._steps, self._carried, stream, self._observed, _BOUND, seen
+        )
         return Reading(row, stream, seen, *(finite if sound is None else (sound, sound)))
 
     def space(self) -> spaces.Space[Any]:
@@ -216,7 +247,11 @@ class Senses:
 
     def observation(self, reading: Reading) -> Any:
         """Return the observation of a reading."""
-        return reading.seen if self._flat else {name: reading.seen[part] for name, part in self._parts.items()}
+        return (
+            reading.seen
+            if self._flat
+            else {name: reading.seen[part] for name, part in self._parts.items()}
+        )
 
 
 def _box(size: int) -> spaces.Space[Any]:

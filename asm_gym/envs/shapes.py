@@ -41,7 +41,9 @@ def draw(env: Any) -> bool:
     bodies = (m.body(cube.root_body).id for m in (model, alone))
     for (name, live), (_, drawn) in zip(*map(_rows, (model, alone), bodies), strict=True):
         if live.shape != drawn.shape:
-            raise RuntimeError(f"{name} of the cube has {len(live)} rows, and {len(drawn)} when drawn anew")
+            raise RuntimeError(
+                f"{name} of the cube has {len(live)} rows, and {len(drawn)} when drawn anew"
+            )
         live[:] = drawn
     mujoco.mj_resetData(model, data)
     mujoco.mj_setConst(model, data)

@@ -52,12 +52,16 @@ class Simulation:
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
         robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self.parts]))
-        self.nominal = NominalDynamics(self.model, self.views, robots)  # the robots' own model of their dynamics
+        self.nominal = NominalDynamics(
+            self.model, self.views, robots
+        )  # the robots' own model of their dynamics
         n = len(self.parts)
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
         self.speed_limits = np.full(n, np.inf)
         """(A,) speed of the fastest point of an arm, from which on it is slowed down [m/s]."""
-        self._limits = SubstepLimits(np.full((n, FELT), np.inf), np.zeros(1), np.zeros(6, np.int64), self.speed_limits)
+        self._limits = SubstepLimits(
+            np.full((n, FELT), np.inf), np.zeros(1), np.zeros(6, np.int64), self.speed_limits
+        )
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.contact_force = 0.0
         """The largest net contact force on an arm within the control step [N]. In the sum over its bodies a grasp's own
@@ -82,13 +86,18 @@ class Simulation:
         self._forget_limits()
 
         if must_compile(kernels.run):
-            print("asm-gym: compiling the simulation loop, once on this machine (about 10 s)", file=sys.stderr)
+            print(
+                "asm-gym: compiling the simulation loop, once on this machine (about 10 s)",
+                file=sys.stderr,
+            )
             self._run(0)
         kernels.sample(self.views, self.nominal.now(), self.arms, 0, self._samples)
         self._add_up(1)
 
     def _take_up_controllers(self) -> None:
-        self.compiled = all(is_compilable(part) for part in self.parts)  # whether control runs compiled
+        self.compiled = all(
+            is_compilable(part) for part in self.parts
+        )  # whether control runs compiled
         self.arms = describe(self.parts, self.model)
         self.controllers = [controller_of(part) for part in self.parts]
         """Robosuite's, of each arm."""
@@ -143,7 +152,9 @@ class Simulation:
             self._goals.held[:] = 0
         self._goals.action[:] = action
         self._fresh = True
-        if self.compiled and not (hold and self._pressed):  # fingers that close on a table would lift the hand
+        if self.compiled and not (
+            hold and self._pressed
+        ):  # fingers that close on a table would lift the hand
             for grip in self._grips:
                 grip(action)
 
@@ -168,7 +179,9 @@ class Simulation:
             self.env.sim.step1()
             self.env._pre_action(self._goals.action.copy(), self._fresh)
             if self._goals.held.any() or self.speed_limits.min() < np.inf:
-                kernels.brake_beneath(self.views, nominal, self.arms, self._goals, self._work, self._limits)
+                kernels.brake_beneath(
+                    self.views, nominal, self.arms, self._goals, self._work, self._limits
+                )
             self.env.sim.step2()
             kernels.sample(self.views, nominal, self.arms, k, self._samples)
             kernels.feel(self.arms.joints, self._limits, self._goals.held, k, self._samples)
@@ -177,7 +190,15 @@ class Simulation:
     def _run(self, count: int) -> None:
         nominal = self.nominal.now()
         if self._bound is None or self._bound[0] is not nominal:
-            state = self.views, nominal, self.arms, self._goals, self._work, self._limits, self._samples
+            state = (
+                self.views,
+                nominal,
+                self.arms,
+                self._goals,
+                self._work,
+                self._limits,
+                self._samples,
+            )
             self._bound = nominal, kernels.bind(*state)
         kernels.run(self._bound[1], self._fresh, self._done - self._row_began, count)
 
@@ -236,7 +257,9 @@ class Simulation:
 
     def _remember(self, wrenches: list[NDArray[np.float64]]) -> None:
         """Fill the buffers that robosuite fills in the first substep; the acceleration is its running estimate."""
-        for (robot, arm), wrench, sample in zip(self.parts, wrenches, self._samples[:, 0], strict=True):
+        for (robot, arm), wrench, sample in zip(
+            self.parts, wrenches, self._samples[:, 0], strict=True
+        ):
             velocities = robot.recent_ee_vel_buffer[arm]
             robot.recent_ee_forcetorques[arm].push(wrench)
             velocities.push(sample[kernels.VELOCITY])
@@ -244,21 +267,36 @@ class Simulation:
             recent = np.vstack([robot.recent_ee_acc[arm].current, changes])
             robot.recent_ee_acc[arm].push(recent.mean(axis=0))
 
-    def _gripper(self, start: int, robot: Any, arm: str) -> Callable[[NDArray[np.float64]], None] | None:
+    def _gripper(
+        self, start: int, robot: Any, arm: str
+    ) -> Callable[[NDArray[np.float64]], None] | None:
         """Return a function that moves the gripper of an arm by an action whose part of this robot is at ``start``."""
         name = robot.get_gripper_name(arm)
         low, high = robot._action_split_indexes.get(name, (0, 0))
         if low == high:
             return None
-        controller, motors = robot.composite_controller.part_controllers[name], robot._ref_actuators_indexes_dict[name]
-        c, gripper, ctrl, motors = controller, robot.gripper[arm], self.views.ctrl, np.asarray(motors, np.int64)
+        controller, motors = (
+            robot.composite_controller.part_controllers[name],
+            robot._ref_actuators_indexes_dict[name],
+        )
+        c, gripper, ctrl, motors = (
+            controller,
+            robot.gripper[arm],
+            self.views.ctrl,
+            np.asarray(motors, np.int64),
+        )
         scaling = scaling_of(c, c.control_dim)[None]
-        middle, half = 0.5 * (c.actuator_max + c.actuator_min), 0.5 * (c.actuator_max - c.actuator_min)
+        middle, half = (
+            0.5 * (c.actuator_max + c.actuator_min),
+            0.5 * (c.actuator_max - c.actuator_min),
+        )
         ranges = np.array([middle, half, *self.views.actuator_ctrlrange[motors].T])
 
         def move(action: NDArray[np.float64]) -> None:
             # As robosuite's controller does it, less its reading of the joints, which nothing here uses.
-            asked = np.asarray(gripper.format_action(action[start + low : start + high]), np.float64)
+            asked = np.asarray(
+                gripper.format_action(action[start + low : start + high]), np.float64
+            )
             move_gripper(asked, scaling, ranges, motors, ctrl)
 
         return move

@@ -31,7 +31,9 @@ from asm_gym.envs.compiled_substeps import bind
 from asm_gym.envs.control import REACHES
 from asm_gym.envs.mujoco_views import JOINT_ANGLES, UNKNOWN_CHANGE, Arms, Bound, Floats, Views
 
-BESIDE = 0.3  # nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m]
+BESIDE = (
+    0.3  # nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m]
+)
 LIGHT = 1e-12  # no inverse mass is taken to be less [1/kg]
 
 ASKED, PRESENT = range(2)
@@ -183,7 +185,9 @@ def momentum(views: Views, motions: Motions, row: int) -> float:
 
 
 @partial(inner, inlined=True)
-def share_of(views: Views, arms: Arms, a: int, limit: SpeedLimit, motions: Motions, row: int) -> float:
+def share_of(
+    views: Views, arms: Arms, a: int, limit: SpeedLimit, motions: Motions, row: int
+) -> float:
     """Return the share that arm ``a``'s hand may have of a motion."""
     twist = motions.twists[row]
     place = views.site_xpos[arms.site[a]]

@@ -27,7 +27,9 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     """An environment whose control steps can be watched and changed from within."""
 
     simulation: Simulation  # physics, controllers and sensors of the loaded model
-    felt_channels: tuple[Channel, ...]  # channels that contact limits apply to, of one arm after another
+    felt_channels: tuple[
+        Channel, ...
+    ]  # channels that contact limits apply to, of one arm after another
     _action: NDArray[np.float32]
     _actions: Actions
     _objects: ObjectSensors
@@ -36,7 +38,9 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def __init__(self, substeps: int) -> None:
         self.substeps = substeps  # physics substeps of a control step
-        self.corruptions: list[Corruption] = []  # sensor faults: each edits the measured row in place, after the noise
+        self.corruptions: list[
+            Corruption
+        ] = []  # sensor faults: each edits the measured row in place, after the noise
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         """Action faults: each replaces the commanded action."""
         self.edits = SimulatorEdits()  # changes of the simulator's numbers that will be undone

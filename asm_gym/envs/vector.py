@@ -60,11 +60,15 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
         self.threads = min(wanted, self.num_envs)
         parts = np.array_split(np.arange(self.num_envs), self.threads)
-        self._here, *others = (part.tolist() for part in parts)  # numbers of the members of each thread
+        self._here, *others = (
+            part.tolist() for part in parts
+        )  # numbers of the members of each thread
         self._elsewhere: list[tuple[SimpleQueue[Any], Thread, list[int]]] = []
         for members in others:
             asked: SimpleQueue[Any] = SimpleQueue()
-            self._elsewhere.append((asked, Thread(target=_serve, args=(asked,), daemon=True), members))
+            self._elsewhere.append(
+                (asked, Thread(target=_serve, args=(asked,), daemon=True), members)
+            )
             self._elsewhere[-1][1].start()
 
     def _of_each(self, what: Callable[[int], Result], which: Mask | None = None) -> list[Result]:
@@ -90,12 +94,20 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
             found += more
         return found
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         n, options = self.num_envs, dict(options or {})
         begun = np.asarray(options.pop("reset_mask", np.ones(n, bool)))
-        seeds = [None if seed is None else seed + i for i in range(n)] if np.ndim(seed) == 0 else list(seed)
+        seeds = (
+            [None if seed is None else seed + i for i in range(n)]
+            if np.ndim(seed) == 0
+            else list(seed)
+        )
         if len(seeds) != n or begun.dtype != bool or begun.shape != (n,):
-            raise ValueError(f"seed and reset_mask must have {n} entries (one an environment), got {seed} and {begun}")
+            raise ValueError(
+                f"seed and reset_mask must have {n} entries (one an environment), got {seed} and {begun}"
+            )
         if any(seen is None and not now for seen, now in zip(self._env_obs, begun, strict=True)):
             raise gym.error.ResetNeeded("the first reset() must reset all environments")
 
@@ -112,9 +124,13 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
     def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Mask, Mask, dict[str, Any]]:
         given = list(iterate(self.action_space, actions))
         if len(given) != self.num_envs:
-            raise ValueError(f"actions must have {self.num_envs} rows, one for each environment, got {len(given)}")
+            raise ValueError(
+                f"actions must have {self.num_envs} rows, one for each environment, got {len(given)}"
+            )
         outcomes = self._of_each(lambda i: self._outcome(i, given[i]))
-        self._env_obs, rewards, terminated, truncated, infos = map(list, zip(*outcomes, strict=True))
+        self._env_obs, rewards, terminated, truncated, infos = map(
+            list, zip(*outcomes, strict=True)
+        )
         ended = np.array(terminated, bool), np.array(truncated, bool)
         self._autoreset_envs = ended[0] | ended[1]
         return self._stacked(), np.array(rewards, np.float64), *ended, self._merged(infos)
@@ -123,7 +139,9 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         """Step member ``i``, or begin its next episode."""
         env, mode = self.envs[i], self.autoreset_mode
         if self._autoreset_envs[i] and mode == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded(f"the episode of environment {i} has ended: reset it with reset_mask")
+            raise gym.error.ResetNeeded(
+                f"the episode of environment {i} has ended: reset it with reset_mask"
+            )
         if self._autoreset_envs[i] and mode == AutoresetMode.NEXT_STEP:
             observation, info = env.reset()
             return observation, 0.0, False, False, info
@@ -147,7 +165,11 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         merged: dict[str, Any] = {}
         for key, first in infos[0].items():
             form, values = _form(first), [info.get(key) for info in infos]
-            if form is not None and key != "final_obs" and all(_form(value) == form for value in values):
+            if (
+                form is not None
+                and key != "final_obs"
+                and all(_form(value) == form for value in values)
+            ):
                 merged[key], merged[f"_{key}"] = np.array(values), np.ones(self.num_envs, bool)
         stacked = set(merged)
         for i, info in enumerate(infos):

@@ -28,7 +28,14 @@ class Alarm(NamedTuple):
 
     def cells(self) -> tuple[str, ...]:
         """Format for a table."""
-        return self.log, f"{self.start:.3f}", f"{self.end:.3f}", self.channel, self.why, f"{self.excess:.2f}"
+        return (
+            self.log,
+            f"{self.start:.3f}",
+            f"{self.end:.3f}",
+            self.channel,
+            self.why,
+            f"{self.excess:.2f}",
+        )
 
 
 FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
@@ -53,11 +60,22 @@ def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
         before = found[newest[why]] if why in newest else None
         if before is not None and start - before.end <= TOGETHER_S:
-            found[newest[why]] = before._replace(end=stop * trace.dt, excess=max(excess, before.excess))
+            found[newest[why]] = before._replace(
+                end=stop * trace.dt, excess=max(excess, before.excess)
+            )
             continue
         newest[why] = len(found)
         at = blamed(row, trace.attribution[first])
-        found.append(Alarm(trace.kind, start, stop * trace.dt, "" if at is None else trace.channels[at], why, excess))
+        found.append(
+            Alarm(
+                trace.kind,
+                start,
+                stop * trace.dt,
+                "" if at is None else trace.channels[at],
+                why,
+                excess,
+            )
+        )
     return found
 
 
@@ -70,17 +88,28 @@ def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[Sc
     """Score logs; rows that lack a number for at most ``bridge`` seconds are not judged."""
     spec: StreamSpec = monitor.spec
     traces = []
-    for (name, episode), surprise in zip(logs, monitor.score_episodes([log.episode for log in logs]), strict=True):
-        fault = episode.faults if len(episode.faults) == len(episode) else np.zeros(len(episode), np.bool_)
+    for (name, episode), surprise in zip(
+        logs, monitor.score_episodes([log.episode for log in logs]), strict=True
+    ):
+        fault = (
+            episode.faults
+            if len(episode.faults) == len(episode)
+            else np.zeros(len(episode), np.bool_)
+        )
         judged = surprise.silenced(bridged(episode.stream, spec.dt, bridge))
-        trace = ScoredEpisode(name, 0, spec.dt, monitor.threshold, judged.value, excused=judged.excused_by_event)
+        trace = ScoredEpisode(
+            name, 0, spec.dt, monitor.threshold, judged.value, excused=judged.excused_by_event
+        )
         shares, labels = judged.attribution, spec.labels
-        traces.append(replace(trace, attribution=shares, channels=labels, fault=fault, stream=episode.stream))
+        traces.append(
+            replace(trace, attribution=shares, channels=labels, fault=fault, stream=episode.stream)
+        )
     return traces
 
 
 def excused_in(trace: ScoredEpisode) -> dict[str, int]:
     """Count how often a knock, and a stop, alone kept surprise from being an alarm."""
     return {
-        event: len(spans(rows_excused(raw, trace.surprise, trace.threshold))) for event, raw in trace.excused.items()
+        event: len(spans(rows_excused(raw, trace.surprise, trace.threshold)))
+        for event, raw in trace.excused.items()
     }

@@ -61,7 +61,9 @@ def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[
     """Return (T - onset,) S up to each step of an episode (T, D) and its twin in noise (D,); ValueError: no twins."""
     length = min(len(faulty), len(twin))
     if not np.array_equal(faulty[: min(onset, length)], twin[: min(onset, length)]):
-        raise ValueError(f"the episodes differ before the onset at step {onset}: they are not twins")
+        raise ValueError(
+            f"the episodes differ before the onset at step {onset}: they are not twins"
+        )
     difference = np.asarray(faulty[onset:length], np.float64) - twin[onset:length]
     # A reading that is not finite is seen at once.
     gain = np.where(np.isfinite(difference), (difference / noise) ** 2, np.inf).sum(axis=1)
@@ -89,7 +91,9 @@ def mean_power(faults: Sequence[Detectability], rate: float) -> float:
     return float(np.mean(power_bound(np.array([d.separation for d in faults]), rate)))
 
 
-def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], window_s: float) -> list[Detectability]:
+def detectability_of(
+    nominal: Sequence[Episode], faulty: Sequence[Episode], window_s: float
+) -> list[Detectability]:
     """Return what an ideal observer could detect of the faulty episodes, whose nominal twins it knows."""
     twins = {(e.labelled.task, e.labelled.seed): e.stream for e in nominal}
     noises: dict[str, Any] = {}
@@ -99,7 +103,12 @@ def detectability_of(nominal: Sequence[Episode], faulty: Sequence[Episode], wind
         if label.task not in noises:
             own = [e.stream for e in nominal if e.labelled.task == label.task]
             noises[label.task] = noise_floor(episode.spec.noise, own)
-        summed = separation(episode.stream, twins[label.task, label.seed], noises[label.task], onset_row(episode) or 0)
+        summed = separation(
+            episode.stream,
+            twins[label.task, label.seed],
+            noises[label.task],
+            onset_row(episode) or 0,
+        )
         window = summed[: window_steps(window_s, dt)]
         sure, most = earliest(window), float(window[-1]) if len(window) else 0.0
         delay = None if sure is None else (sure + 1) * dt
@@ -127,8 +136,14 @@ class Bound(NamedTuple):
         """Return the bound on these faults, at ``RATES`` and at a false-alarm ``rate``."""
         n = len(faults)
         return cls(
-            auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults])))) if n else math.nan,
-            found={AlarmRate(r, EPISODE): Share(round(n * mean_power(faults, r)), n) for r in {*RATES, rate} if n},
+            auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults]))))
+            if n
+            else math.nan,
+            found={
+                AlarmRate(r, EPISODE): Share(round(n * mean_power(faults, r)), n)
+                for r in {*RATES, rate}
+                if n
+            },
             delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in faults]),
         )
 
@@ -141,7 +156,10 @@ class BenchmarkResult:
     detectability: Sequence[Detectability]  # of every faulty episode
     rate: float  # false-alarm rate at which monitors are judged
     window_s: float  # an alarm within this time of the onset is a detection [s]
-    left_out: tuple[int, int] = (0, 0)  # numbers of nominal episodes in which the policy failed, and crashed
+    left_out: tuple[int, int] = (
+        0,
+        0,
+    )  # numbers of nominal episodes in which the policy failed, and crashed
 
     @property
     def promise(self) -> AlarmRate:

@@ -22,7 +22,9 @@ from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors.calibration import AlarmRate
 
 SPLITS = 20  # of nominal episodes into halves
-UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely than this
+UNLIKELY = (
+    0.025  # a calibration counts as broken where so many false alarms are less likely than this
+)
 
 
 def milliseconds(delay: float, otherwise: str = "missed") -> str:
@@ -31,7 +33,11 @@ def milliseconds(delay: float, otherwise: str = "missed") -> str:
 
 
 def _delays(m: DetectionMetrics) -> str:
-    return ", ".join(milliseconds(delay, f">{1e3 * m.window_s:.0f}") for delay in m.delays) if m.faulty else ""
+    return (
+        ", ".join(milliseconds(delay, f">{1e3 * m.window_s:.0f}") for delay in m.delays)
+        if m.faulty
+        else ""
+    )
 
 
 def _before_and_after(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetrics], str]:
@@ -63,7 +69,9 @@ def monitor_columns(promises: Sequence[AlarmRate]) -> dict[str, Callable[[Detect
     """Return the columns of monitors side by side."""
     return {
         "Monitor": lambda m: m.name,
-        "AUROC, same steps": lambda m: "{:.3f} ({:.3f}–{:.3f})".format(*interval(m.auroc, m.draws.auroc)),
+        "AUROC, same steps": lambda m: "{:.3f} ({:.3f}–{:.3f})".format(
+            *interval(m.auroc, m.draws.auroc)
+        ),
         **{f"Found at {_rate(promise)}": partial(_found, promise=promise) for promise in promises},
         "Median delay [ms]": lambda m: milliseconds(m.delays.median_ms),
         "False alarms": _false_alarms,
@@ -94,7 +102,9 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"crashed ({crashed}), and faults in such scenes."
         + (f" Kinds that cannot be detected: {', '.join(hidden)}." if hidden else "")
     )
-    promises = [AlarmRate(r, EPISODE) for r in sorted({*RATES, result.rate})] + [AlarmRate(r, HOUR) for r in PER_HOUR]
+    promises = [AlarmRate(r, EPISODE) for r in sorted({*RATES, result.rate})] + [
+        AlarmRate(r, HOUR) for r in PER_HOUR
+    ]
     monitors = tabulate(caption, monitor_columns(promises), result.on_visible)
     ideal = result.bound([kind for kind, seen in result.visible.items() if seen])
     found = [percent(ideal.found.get(promise)) for promise in promises]
@@ -139,7 +149,9 @@ def lead_table(result: BenchmarkResult) -> Table:
     promises = [result.promise, *(p for p in first.calibration.thresholds if p.per == HOUR)]
     rows = []
     for other in others:
-        cells = [_lead(interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc), 1, 3)]
+        cells = [
+            _lead(interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc), 1, 3)
+        ]
         for promise in promises:
             if promise not in first.draws.found.keys() & other.draws.found.keys():
                 cells.append("")
@@ -158,7 +170,9 @@ def lead_table(result: BenchmarkResult) -> Table:
 
 def _lead(difference: Estimate, scale: float, digits: int) -> str:
     value, low, high = (f"{scale * x:+.{digits}f}" for x in difference)
-    verdict = "ahead" if difference.low > 0 else "behind" if difference.high < 0 else "within chance"
+    verdict = (
+        "ahead" if difference.low > 0 else "behind" if difference.high < 0 else "within chance"
+    )
     return f"{value} ({low} to {high}), {verdict}"
 
 
@@ -244,7 +258,9 @@ def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str
     low, high = share.interval
     beyond, n = int((calibration.maxima > threshold).sum()), len(calibration.maxima)
     broken = bool(
-        share.n and beyond < n and stats.betabinom.sf(share.k - 1, share.n, beyond + 1, n - beyond) < UNLIKELY
+        share.n
+        and beyond < n
+        and stats.betabinom.sf(share.k - 1, share.n, beyond + 1, n - beyond) < UNLIKELY
     )
     return f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})" + ", broken" * broken
 

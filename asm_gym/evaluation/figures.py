@@ -30,7 +30,14 @@ BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#888888"
 DASHED = (0, (4, 2))
 _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, BLACK, SKY)
-_LINES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (6, 2, 1, 2)), (0, (1, 1)), (0, (8, 2, 2, 2, 2, 2)))
+_LINES: tuple[Any, ...] = (
+    "-",
+    (0, (6, 2)),
+    (0, (2, 1.5)),
+    (0, (6, 2, 1, 2)),
+    (0, (1, 1)),
+    (0, (8, 2, 2, 2, 2, 2)),
+)
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
@@ -104,7 +111,9 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
         ax.axvline(trace.onset * trace.dt, color=ORANGE, linewidth=1.5)
     for ends in _alarm_times(trace):
         top = ax.get_xaxis_transform()
-        ax.plot(ends, [0.96, 0.96], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=top)
+        ax.plot(
+            ends, [0.96, 0.96], color=VERMILLION, linewidth=4, solid_capstyle="butt", transform=top
+        )
     late = "" if trace.delay is None else f": alarm {1e3 * trace.delay:.0f} ms after the onset"
     missed = ": missed" if trace.onset is not None and trace.delay is None else ""
     place = f" in {trace.task}" if trace.task else ""
@@ -128,7 +137,10 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
             ax.plot(_times(trace), np.where(np.isfinite(sensed), sensed, np.nan), color=BLUE)
             ax.set_title(trace.channels[row])
         axes[-1].set_xlabel("time [s]")
-        handles = [Line2D([], [], color=BLUE, label="sensed"), Patch(color=VERMILLION, alpha=0.2, label="alarm")]
+        handles = [
+            Line2D([], [], color=BLUE, label="sensed"),
+            Patch(color=VERMILLION, alpha=0.2, label="alarm"),
+        ]
         fig.legend(handles=handles, loc="outside right upper", ncols=2)
     return fig
 
@@ -139,7 +151,10 @@ def _times(trace: ScoredEpisode) -> Any:
 
 
 def _alarm_times(trace: ScoredEpisode) -> list[tuple[float, float]]:
-    return [((start + 1) * trace.dt, min(stop + 1, len(trace)) * trace.dt) for start, stop in spans(trace.alarm)]
+    return [
+        ((start + 1) * trace.dt, min(stop + 1, len(trace)) * trace.dt)
+        for start, stop in spans(trace.alarm)
+    ]
 
 
 def _shade_fault(ax: Axes, trace: ScoredEpisode) -> None:
@@ -154,10 +169,16 @@ def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
         raise ValueError(f"a log axis needs thresholds > 0, got {sorted(thresholds)}")
     finite = np.concatenate([t.surprise[np.isfinite(t.surprise)] for t in traces])
     ceiling = max(float(finite.max(initial=0.0)), 10 * max(thresholds))
-    return min(max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling / 10), ceiling
+    return min(
+        max(float(finite.min(initial=np.inf)), min(thresholds) / 1000), ceiling / 10
+    ), ceiling
 
 
-ACROSS, MOST_PANELS, MOST_POINTS = 4, 60, 4000  # panels side by side; channels drawn; points of a curve
+ACROSS, MOST_PANELS, MOST_POINTS = (
+    4,
+    60,
+    4000,
+)  # panels side by side; channels drawn; points of a curve
 
 LOG_COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 """By the role of a channel; one that never moves is grey."""
@@ -166,7 +187,11 @@ LOG_COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 def log_figure(found: Inspection) -> Figure:
     """Draw a panel per channel, with its gaps shaded."""
     drawn = [c for c in found.columns if c.role in LOG_COLOURS and c.values.dtype.kind in "biuf"]
-    more = f"; {len(drawn) - MOST_PANELS} more channels are in the table" if len(drawn) > MOST_PANELS else ""
+    more = (
+        f"; {len(drawn) - MOST_PANELS} more channels are in the table"
+        if len(drawn) > MOST_PANELS
+        else ""
+    )
     drawn = drawn[:MOST_PANELS]
     down = math.ceil(max(len(drawn), 1) / ACROSS)
     with figure(height=0.7 + 1.25 * down, width=11.0) as fig:
@@ -190,12 +215,23 @@ def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:
     after_gap = np.searchsorted(times, found.gaps[:, 1])  # no line is drawn across a gap
     still = is_constant(values)
     colour = GREY if still else LOG_COLOURS[column.role]
-    ax.plot(np.insert(times, after_gap, np.nan), np.insert(shown, after_gap, np.nan), color=colour, linewidth=0.7)
+    ax.plot(
+        np.insert(times, after_gap, np.nan),
+        np.insert(shown, after_gap, np.nan),
+        color=colour,
+        linewidth=0.7,
+    )
     for start, stop in found.gaps[:200]:
         ax.axvspan(start, stop, color=ORANGE, alpha=0.35, linewidth=0)
     lost = ~np.isfinite(values)
     if lost.any():
-        ax.plot(found.times[lost], np.full(lost.sum(), np.nanmin(shown, initial=0.0)), "|", color=ORANGE, markersize=4)
+        ax.plot(
+            found.times[lost],
+            np.full(lost.sum(), np.nanmin(shown, initial=0.0)),
+            "|",
+            color=ORANGE,
+            markersize=4,
+        )
     name = column.name if len(column.name) < 30 else "…" + column.name[-29:]
     unit = f" [{column.unit}]" if column.unit else ""
     ax.set_title(f"{name}{unit}, {column.role}{', never moves' * still}")

@@ -31,7 +31,9 @@ Kind = tuple[str, str]  # kind and severity of a fault
 class Delays(NamedTuple):
     """Detection delays; a miss counts as infinitely late."""
 
-    median_ms: float = math.inf  # half of all faults were detected within this; inf where fewer were
+    median_ms: float = (
+        math.inf
+    )  # half of all faults were detected within this; inf where fewer were
     p95_ms: float = math.inf
 
     @classmethod
@@ -47,8 +49,14 @@ def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.fl
 
     A time runs from the beginning of the row of the onset to the end of the row of the alarm: at least one period.
     """
-    found = [(t.detected_after, window_steps(window_s, t.dt), t.delay) for t in traces if t.onset is not None]
-    return np.sort([math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found])
+    found = [
+        (t.detected_after, window_steps(window_s, t.dt), t.delay)
+        for t in traces
+        if t.onset is not None
+    ]
+    return np.sort(
+        [math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found]
+    )
 
 
 def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
@@ -64,7 +72,9 @@ def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
     count, hours = 0, 0.0
     for t in traces:
         until = len(t) if t.onset is None else t.onset
-        value = np.where(t.alarm, 0.0, t.excused.get(event, np.zeros(len(t)))) if event else t.surprise
+        value = (
+            np.where(t.alarm, 0.0, t.excused.get(event, np.zeros(len(t)))) if event else t.surprise
+        )
         count += alarms_in(value[:until], t.threshold, t.dt)
         hours += until * t.dt / 3600
     return Rate(count, hours)
@@ -72,12 +82,20 @@ def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
 
 def attribution_accuracy(faulty: Sequence[ScoredEpisode]) -> Share:
     """Count the detected faults whose most surprising channel belongs to the fault."""
-    return Share.of([t.top_channel in t.affected_channels for t in faulty if t.top_channel and t.affected_channels])
+    return Share.of(
+        [
+            t.top_channel in t.affected_channels
+            for t in faulty
+            if t.top_channel and t.affected_channels
+        ]
+    )
 
 
 def typical(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
     """Return the episode whose greatest surprise since the onset is the median one."""
-    return sorted(traces, key=lambda t: float(t.surprise[t.onset or 0 :].max(initial=0.0)))[len(traces) // 2]
+    return sorted(traces, key=lambda t: float(t.surprise[t.onset or 0 :].max(initial=0.0)))[
+        len(traces) // 2
+    ]
 
 
 class Outcomes(NamedTuple):
@@ -93,9 +111,14 @@ class Outcomes(NamedTuple):
     def of(cls, acting: str, traces: Sequence[ScoredEpisode]) -> Outcomes:
         """Summarise the episodes with this response."""
         ends = [t.outcome for t in traces if t.acting == acting]
-        force, solved = float(np.median([o.contact_force for o in ends])), [o for o in ends if o.success]
+        force, solved = (
+            float(np.median([o.contact_force for o in ends])),
+            [o for o in ends if o.success],
+        )
         time = float(np.median([o.time for o in solved])) if solved else math.nan
-        return cls(acting, Share(len(solved), len(ends)), force, Share.of([o.unsafe for o in solved]), time)
+        return cls(
+            acting, Share(len(solved), len(ends)), force, Share.of([o.unsafe for o in solved]), time
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +159,10 @@ class DetectionMetrics:
     def found(self) -> dict[AlarmRate, Share]:
         """All faults detected within the window, by the promised rate of false alarms."""
         windows = Windows(self.faulty, self.window_s)
-        return {promise: Share.of(windows.detected(q)) for promise, q in self.calibration.thresholds.items()}
+        return {
+            promise: Share.of(windows.detected(q))
+            for promise, q in self.calibration.thresholds.items()
+        }
 
     @cached_property
     def delays(self) -> Delays:
@@ -151,7 +177,9 @@ class DetectionMetrics:
     @cached_property
     def outcomes(self) -> list[Outcomes]:
         """One for each response, the policy alone first."""
-        actings = sorted(dict.fromkeys(t.acting for t in self.traces), key=lambda a: a != POLICY_ALONE)
+        actings = sorted(
+            dict.fromkeys(t.acting for t in self.traces), key=lambda a: a != POLICY_ALONE
+        )
         return [Outcomes.of(a, self.traces) for a in actings]
 
 
@@ -159,4 +187,7 @@ def by_condition(traces: Sequence[ScoredEpisode], window_s: float) -> list[Detec
     """Return one for each condition, the nominal one first, then in order of appearance."""
     nominal = [t for t in traces if t.kind == NOMINAL and t.acting == POLICY_ALONE]
     conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)
-    return [DetectionMetrics(c, [t for t in traces if t.condition == c], nominal, window_s) for c in conditions]
+    return [
+        DetectionMetrics(c, [t for t in traces if t.condition == c], nominal, window_s)
+        for c in conditions
+    ]

@@ -16,7 +16,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from asm_gym.evaluation.comparison import BenchmarkResult
-from asm_gym.evaluation.detection_tables import kept_table, kinds_table, lead_table, monitors_table, splits_table
+from asm_gym.evaluation.detection_tables import (
+    kept_table,
+    kinds_table,
+    lead_table,
+    monitors_table,
+    splits_table,
+)
 from asm_gym.evaluation.scored_episode import window_steps
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import require
@@ -48,7 +54,9 @@ def write_report(
         shown = "\n".join(_figure(caption, figure) for caption, figure in drawn.items())
         parts.append(f'<section><h2>Figures</h2>\n<div class="figures">{shown}</div></section>')
     if details:
-        items = "\n".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items())
+        items = "\n".join(
+            f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items()
+        )
         parts.append(f"<section><h2>How this was made</h2>\n<dl>{items}</dl></section>")
     write_text(path, _PAGE.substitute(title=escape(title), body="\n".join(parts)))
     return path
@@ -57,7 +65,9 @@ def write_report(
 def _table(table: Table) -> str:
     name, *headings = table.headings
     cells = [list(map(str, row)) for row in table.rows]
-    frame = pd.DataFrame([c[1:] for c in cells], pd.Index([c[0] for c in cells]), headings).rename_axis(columns=name)
+    frame = pd.DataFrame(
+        [c[1:] for c in cells], pd.Index([c[0] for c in cells]), headings
+    ).rename_axis(columns=name)
     with pd.option_context("display.max_colwidth", None):
         start, rest = frame.to_html(border=0).split("\n", 1)
     return f'<div class="scroll">{start}<caption>{escape(table.caption)}</caption>\n{rest}</div>'
@@ -65,8 +75,12 @@ def _table(table: Table) -> str:
 
 def _figure(caption: str, figure: Figure) -> str:
     buffer = io.StringIO()
-    with mpl.rc_context({"svg.hashsalt": caption}):  # ids are the same each time, and differ between figures
-        figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    with mpl.rc_context(
+        {"svg.hashsalt": caption}
+    ):  # ids are the same each time, and differ between figures
+        figure.savefig(
+            buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        )
     svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
     svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)  # HTML needs none
     svg = svg.replace("<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1)
@@ -97,14 +111,19 @@ def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:
             ideal = possible.get((trace.task, trace.kind, trace.severity, trace.seed))
             after, window = trace.detected_after, window_steps(result.window_s, trace.dt)
             yield {
-                **{name: getattr(trace, name) for name in ("task", "monitor", "kind", "severity", "seed", "onset")},
+                **{
+                    name: getattr(trace, name)
+                    for name in ("task", "monitor", "kind", "severity", "seed", "onset")
+                },
                 "steps": len(trace),
                 "dt": trace.dt,
                 "threshold": trace.threshold,
                 "alarm": bool(trace.alarms),
                 "detected": None if trace.onset is None else after is not None and after < window,
                 "delay_s": trace.delay,
-                "peak_in_window": float(trace.surprise[trace.window(result.window_s)].max(initial=0.0)),
+                "peak_in_window": float(
+                    trace.surprise[trace.window(result.window_s)].max(initial=0.0)
+                ),
                 "blamed": trace.top_channel if after is not None else None,
                 "ideal_separation": ideal.separation if ideal else None,
                 "ideal_delay_s": ideal.delay if ideal else None,

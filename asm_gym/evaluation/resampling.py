@@ -30,7 +30,9 @@ class Calibration:
     """The thresholds of a monitor, and the scores that they were set on."""
 
     thresholds: Mapping[AlarmRate, float] = field(default_factory=dict)
-    maxima: Floats = field(default_factory=lambda: np.zeros(0))  # (n,) the greatest surprise of each episode
+    maxima: Floats = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (n,) the greatest surprise of each episode
     blocks: Blocks | None = None  # the maxima by the hour; None if not calibrated by the hour
 
     def resampled(self, rng: np.random.Generator) -> dict[AlarmRate, float]:
@@ -40,7 +42,9 @@ class Calibration:
             return {}
         maxima = self.maxima[rng.integers(n, size=n)]
         if blocks is not None and any(promise.per == HOUR for promise in self.thresholds):
-            blocks = blocks._replace(maxima=blocks.maxima[rng.integers(len(blocks.maxima), size=len(blocks.maxima))])
+            blocks = blocks._replace(
+                maxima=blocks.maxima[rng.integers(len(blocks.maxima), size=len(blocks.maxima))]
+            )
         return {promise: promise.threshold(maxima, blocks) for promise in self.thresholds}
 
 
@@ -48,7 +52,9 @@ class Draws(NamedTuple):
     """Results of one monitor in each of R resamples."""
 
     auroc: Floats  # (R,) over matched steps, the mean over kinds
-    found: Mapping[AlarmRate, Floats]  # (R,) share of faults detected within the window, by the promised rate
+    found: Mapping[
+        AlarmRate, Floats
+    ]  # (R,) share of faults detected within the window, by the promised rate
 
 
 def interval(value: float, draws: Floats) -> Estimate:
@@ -62,10 +68,17 @@ def interval(value: float, draws: Floats) -> Estimate:
 class Wins:
     """Faults compared with nominal episodes of their task in the same steps."""
 
-    def __init__(self, faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float) -> None:
+    def __init__(
+        self, faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
+    ) -> None:
         shape, kinds = (len(faulty), len(nominal)), dict[tuple[str, str], int]()
-        self.won, self.comparable = np.zeros(shape), np.zeros(shape)  # (F, N) 1 where a fault surprised more, ½ in ties
-        self.kind = np.array([kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int)
+        self.won, self.comparable = (
+            np.zeros(shape),
+            np.zeros(shape),
+        )  # (F, N) 1 where a fault surprised more, ½ in ties
+        self.kind = np.array(
+            [kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int
+        )
         for n, trace in enumerate(faulty):
             steps = trace.window(window_s)
             if trace.onset is None or steps.stop <= steps.start:
@@ -74,11 +87,17 @@ class Wins:
             for k, other in enumerate(nominal):
                 if other.task == trace.task and len(other) > steps.start:
                     theirs = other.surprise[steps].max()
-                    self.won[n, k], self.comparable[n, k] = 0.5 * ((peak > theirs) + float(peak >= theirs)), 1.0
+                    self.won[n, k], self.comparable[n, k] = (
+                        0.5 * ((peak > theirs) + float(peak >= theirs)),
+                        1.0,
+                    )
 
     def auroc(self, own: Floats | None = None, theirs: Floats | None = None) -> float:
         """Return the mean over kinds, faults (F,) and nominal episodes (N,) counted so many times; NaN without any."""
-        own, theirs = (np.ones(n) if w is None else w for n, w in zip(self.won.shape, (own, theirs), strict=True))
+        own, theirs = (
+            np.ones(n) if w is None else w
+            for n, w in zip(self.won.shape, (own, theirs), strict=True)
+        )
         others = self.comparable @ theirs  # (F,)
         counted = np.where(others > 0, own, 0.0)
         each = (self.won @ theirs) / np.maximum(others, 1.0)
@@ -118,7 +137,9 @@ def resample(
     place = {name: i for i, name in enumerate(names)}
     tasks = np.array([task for task, _ in names])
     scenes_of = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
-    own, theirs = (np.array([place[t.task, t.seed] for t in traces], int) for traces in (faulty, nominal))
+    own, theirs = (
+        np.array([place[t.task, t.seed] for t in traces], int) for traces in (faulty, nominal)
+    )
     wins, windows = Wins(faulty, nominal, window_s), Windows(faulty, window_s)
     auroc = np.full(draws, math.nan)
     found: dict[AlarmRate, Floats] = {}

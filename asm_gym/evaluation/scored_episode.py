@@ -54,19 +54,29 @@ class ScoredEpisode:
     monitor: str = ""
     acting: str = POLICY_ALONE  # else the response to an alarm, such as ``"hold"``
     affected_channels: frozenset[str] = frozenset()  # those in which the fault shows first
-    top_channel: str = ""  # with the greatest share of surprise at ``first_alarm``; empty without an alarm
+    top_channel: str = (
+        ""  # with the greatest share of surprise at ``first_alarm``; empty without an alarm
+    )
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
-    excused: Mapping[str, Floats] = field(default_factory=dict)  # (T,) surprise that a knock, or a stop, excused
-    attribution: Floats | None = None  # (T, D) shares of the channels in the surprise, for figures alone
+    excused: Mapping[str, Floats] = field(
+        default_factory=dict
+    )  # (T,) surprise that a knock, or a stop, excused
+    attribution: Floats | None = (
+        None  # (T, D) shares of the channels in the surprise, for figures alone
+    )
     channels: tuple[str, ...] = ()  # D names
     fault: NDArray[np.bool_] | None = None  # (T,) the ground truth, for figures alone
     stream: Floats | None = None  # (T, D) sensed values, where they are drawn
 
     def __post_init__(self) -> None:
         if self.surprise.ndim != 1 or not len(self.surprise):
-            raise ValueError(f"surprise must have the shape (T,) with T > 0, got {self.surprise.shape}")
+            raise ValueError(
+                f"surprise must have the shape (T,) with T > 0, got {self.surprise.shape}"
+            )
         if np.isnan(self.surprise).any():
-            raise ValueError("surprise must not be NaN: a row that cannot be judged has the surprise inf")
+            raise ValueError(
+                "surprise must not be NaN: a row that cannot be judged has the surprise inf"
+            )
 
     def __len__(self) -> int:
         return len(self.surprise)
@@ -79,7 +89,11 @@ class ScoredEpisode:
     @property
     def missing(self) -> NDArray[np.bool_]:
         """(T,) the rows that lack a number; none where the stream was not kept."""
-        return np.zeros(len(self), np.bool_) if self.stream is None else np.asarray(np.isnan(self.stream).any(axis=1))
+        return (
+            np.zeros(len(self), np.bool_)
+            if self.stream is None
+            else np.asarray(np.isnan(self.stream).any(axis=1))
+        )
 
     @cached_property
     def alarm(self) -> NDArray[np.bool_]:
@@ -94,7 +108,9 @@ class ScoredEpisode:
     @property
     def false_alarms(self) -> tuple[int, ...]:
         """The alarms raised before the onset; all of them where there was no fault."""
-        return self.alarms if self.onset is None else tuple(t for t in self.alarms if t < self.onset)
+        return (
+            self.alarms if self.onset is None else tuple(t for t in self.alarms if t < self.onset)
+        )
 
     @property
     def first_alarm(self) -> int | None:
@@ -107,7 +123,11 @@ class ScoredEpisode:
     @property
     def detected_after(self) -> int | None:
         """Rows from the onset to the first alarm raised at or after it; None without one."""
-        return None if self.onset is None or self.first_alarm is None else self.first_alarm - self.onset
+        return (
+            None
+            if self.onset is None or self.first_alarm is None
+            else self.first_alarm - self.onset
+        )
 
     @property
     def delay(self) -> float | None:

@@ -38,9 +38,13 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 class Recordings(NamedTuple):
     """The recordings of a run."""
 
-    roles: dict[str, list[Episode]]  # without failed nominal episodes, and without scenes in which the robot crashes
+    roles: dict[
+        str, list[Episode]
+    ]  # without failed nominal episodes, and without scenes in which the robot crashes
     left_out: tuple[int, int]  # numbers of nominal episodes that failed, and of scenes with a crash
-    twins: list[Episode]  # all of the role nominal: a faulty episode equals its twin until the onset
+    twins: list[
+        Episode
+    ]  # all of the role nominal: a faulty episode equals its twin until the onset
 
     @classmethod
     def of(cls, recordings: Sequence[Episode]) -> Recordings:
@@ -64,7 +68,9 @@ class Recordings(NamedTuple):
                     f"none of the {role} episodes succeeded without a crash: "
                     "there is nothing normal to learn or to test on"
                 )
-        return cls(roles, (failed, len(crashed)), [r for r in recordings if r.labelled.role == "nominal"])
+        return cls(
+            roles, (failed, len(crashed)), [r for r in recordings if r.labelled.role == "nominal"]
+        )
 
 
 @lru_cache(maxsize=1)
@@ -74,7 +80,13 @@ def read(paths: tuple[Path, ...]) -> Recordings:
 
 
 def benchmark(
-    folder: Path, files: Sequence[Path], monitors: Sequence[str], rate: float, window_s: float, seed: int, each: Map
+    folder: Path,
+    files: Sequence[Path],
+    monitors: Sequence[str],
+    rate: float,
+    window_s: float,
+    seed: int,
+    each: Map,
 ) -> BenchmarkResult:
     """Learn from the episodes for fit and calibration, and score all others with every monitor.
 
@@ -88,30 +100,45 @@ def benchmark(
 
     def score(names: Sequence[str]) -> dict[str, DetectionMetrics]:
         roles = read(paths).roles
-        return {name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate, window_s) for name in names}
+        return {
+            name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate, window_s)
+            for name in names
+        }
 
-    found = {name: result for results in each(score, list(models.values())) for name, result in results.items()}
+    found = {
+        name: result
+        for results in each(score, list(models.values()))
+        for name, result in results.items()
+    }
     by_role, left_out, twins = read(paths)
     seen = detectability_of(twins, by_role.get("faulty", []), window_s)
     return BenchmarkResult({name: found[name] for name in monitors}, seen, rate, window_s, left_out)
 
 
 def judged(
-    name: str, monitor: CalibratedMonitor, by_role: Mapping[str, Sequence[Episode]], rate: float, window_s: float
+    name: str,
+    monitor: CalibratedMonitor,
+    by_role: Mapping[str, Sequence[Episode]],
+    rate: float,
+    window_s: float,
 ) -> DetectionMetrics:
     """Calibrate a fitted monitor, and score all other episodes."""
     monitor.calibrate(by_role["calibration"], rate)
     fresh = 0 if monitor.maxima_ is None else len(monitor.maxima_)
     rates = sorted({rate, *(r for r in RATES if fresh >= conformal_episodes(r))})
     hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
-    promises = [AlarmRate(r, EPISODE) for r in rates] + [AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0]
+    promises = [AlarmRate(r, EPISODE) for r in rates] + [
+        AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0
+    ]
     calibration = Calibration(
         {promise: monitor.threshold_at(**promise.named) for promise in promises},
         np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
         monitor.blocks_,
     )
     threshold = calibration.thresholds[AlarmRate(rate, EPISODE)]
-    nominal, faulty = (traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty"))
+    nominal, faulty = (
+        traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty")
+    )
     return DetectionMetrics(name, faulty, nominal, window_s, calibration)
 
 
@@ -129,7 +156,12 @@ def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) ->
     """Return the monitor fitted on these episodes; kept in the folder by episodes, settings and code."""
     model = name.removesuffix(EVIDENCE)
     made = make_monitor(name, recordings[0].spec, seed=seed)
-    learned = model, __version__, made.get_params(), sorted(str(r.labelled.path) for r in recordings)
+    learned = (
+        model,
+        __version__,
+        made.get_params(),
+        sorted(str(r.labelled.path) for r in recordings),
+    )
     digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
     path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"
     with suppress(FileNotFoundError, ValueError):  # a damaged one is fitted anew

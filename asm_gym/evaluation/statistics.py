@@ -54,12 +54,18 @@ class Rate(NamedTuple):
         """95 % exact Poisson interval [1/h] (Garwood 1936); events that come in clusters count once."""
         low = stats.gamma.ppf(0.025, self.k) if self.k else 0.0
         high = stats.gamma.isf(0.025, self.k + 1)
-        return (float(low / self.hours), float(high / self.hours)) if self.hours else (0.0, math.inf)
+        return (
+            (float(low / self.hours), float(high / self.hours)) if self.hours else (0.0, math.inf)
+        )
 
     @property
     def text(self) -> str:
         """``value (low to high)``; empty without any time."""
-        return f"{self.value:.1f} ({self.interval[0]:.1f} to {self.interval[1]:.1f})" if self.hours else ""
+        return (
+            f"{self.value:.1f} ({self.interval[0]:.1f} to {self.interval[1]:.1f})"
+            if self.hours
+            else ""
+        )
 
 
 class Estimate(NamedTuple):
@@ -79,7 +85,9 @@ class Spread(NamedTuple):
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
         """Summarise one value per seed; the deviation of a single one is NaN."""
-        return cls(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan)
+        return cls(
+            float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+        )
 
     def text(self, scale: float = 1.0, digits: int = 3) -> str:
         """``mean ± sd``, each times ``scale``; the mean alone without a deviation."""

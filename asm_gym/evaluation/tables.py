@@ -25,7 +25,9 @@ class Table:
     def __post_init__(self) -> None:
         for row in self.rows:
             if len(row) != len(self.headings):
-                raise ValueError(f"the table has {len(self.headings)} columns, but a row of {len(row)}: {list(row)}")
+                raise ValueError(
+                    f"the table has {len(self.headings)} columns, but a row of {len(row)}: {list(row)}"
+                )
 
     def __rich__(self) -> RichTable:
         """Return the table for a terminal; rich calls this."""
@@ -37,7 +39,9 @@ class Table:
         return made
 
 
-def tabulate(caption: str, columns: Mapping[str, Callable[[Subject], str]], subjects: Iterable[Subject]) -> Table:
+def tabulate(
+    caption: str, columns: Mapping[str, Callable[[Subject], str]], subjects: Iterable[Subject]
+) -> Table:
     """Make a row for each subject; ``columns`` hold the function of a cell by heading."""
     rows = [tuple(cell(subject) for cell in columns.values()) for subject in subjects]
     return Table(caption, list(columns), rows)
@@ -46,7 +50,9 @@ def tabulate(caption: str, columns: Mapping[str, Callable[[Subject], str]], subj
 def markdown(table: Table) -> str:
     """Return the caption, and a table of pipes and dashes."""
     lines = [table.headings, ["---"] * len(table.headings), *table.rows]
-    return "\n".join([table.caption, "", *("| " + " | ".join(map(str, cells)) + " |" for cells in lines)])
+    return "\n".join(
+        [table.caption, "", *("| " + " | ".join(map(str, cells)) + " |" for cells in lines)]
+    )
 
 
 def count(share: Share | None) -> str:

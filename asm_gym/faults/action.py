@@ -25,10 +25,14 @@ class ActionFault(HookedFault):
     anywhere = True
     hooks = "deliveries"
     groups = ("joint", "torque", "hand")
-    grippers_too: ClassVar[bool] = False  # whether it acts on the numbers that command grippers as well
+    grippers_too: ClassVar[bool] = (
+        False  # whether it acts on the numbers that command grippers as well
+    )
 
     def check(self, env: Interface) -> None:
-        check_number("axis", getattr(self, "axis", 0), low=0, high=len(_arm_axes(env)) - 1, whole=True)
+        check_number(
+            "axis", getattr(self, "axis", 0), low=0, high=len(_arm_axes(env)) - 1, whole=True
+        )
 
     @abstractmethod
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
@@ -36,7 +40,9 @@ class ActionFault(HookedFault):
 
     def hook(self, env: Interface, clock: Clock) -> Callable[[Action], Action]:
         memory: list[Action] = []
-        axes = np.arange(gym.spaces.flatdim(env.action_space)) if self.grippers_too else _arm_axes(env)
+        axes = (
+            np.arange(gym.spaces.flatdim(env.action_space)) if self.grippers_too else _arm_axes(env)
+        )
 
         def change(action: Action) -> Action:
             delivered = action.copy()

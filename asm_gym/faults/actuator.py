@@ -8,7 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, HookedFault, JointFault, within
+from asm_gym.faults.base import (
+    Clock,
+    Edit,
+    EditingFault,
+    Fault,
+    Floats,
+    HookedFault,
+    JointFault,
+    within,
+)
 
 
 class MotorFault(JointFault, EditingFault):
@@ -60,7 +69,9 @@ class Backlash(JointFault, HookedFault):
 
         def play(row: Floats) -> None:
             nonlocal reading
-            reading = row[position] = float(np.clip(reading, row[position] - self.gap, row[position] + self.gap))
+            reading = row[position] = float(
+                np.clip(reading, row[position] - self.gap, row[position] + self.gap)
+            )
 
         return play
 
@@ -80,7 +91,9 @@ class GripperOpens(GripperFault, HookedFault):
 
     hooks = "deliveries"
 
-    def hook(self, env: RobosuiteEnv, clock: Clock) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    def hook(
+        self, env: RobosuiteEnv, clock: Clock
+    ) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
         def deliver(action: NDArray[np.float32]) -> NDArray[np.float32]:
             opened = action.copy()
             opened[list(env.gripper_actions)] = -1.0
@@ -96,7 +109,10 @@ class WeakGripper(GripperFault, EditingFault):
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
         model, loss = env.simulation.model, 1.0 - self.strength
-        arms = [robot._ref_joint_gripper_actuator_indexes[arm] or () for robot, arm in env.simulation.parts]
+        arms = [
+            robot._ref_joint_gripper_actuator_indexes[arm] or ()
+            for robot, arm in env.simulation.parts
+        ]
         motors = [int(motor) for arm in arms for motor in arm]
         parameters = model.actuator_gainprm, model.actuator_biasprm
         return [(array, motors, lambda nominal: nominal * (1.0 - loss)) for array in parameters]

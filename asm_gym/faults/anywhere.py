@@ -40,19 +40,25 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         self._source = StreamSource(env)
         spec = self._source.spec
-        self.measured_spec = StreamSpec(tuple(c for c in spec.channels if c.group != MOTOR), spec.dt, spec.source)
+        self.measured_spec = StreamSpec(
+            tuple(c for c in spec.channels if c.group != MOTOR), spec.dt, spec.source
+        )
         self.corruptions: list[Callable[[NDArray[np.float64]], None]] = []
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         self.measured = np.zeros(self.measured_spec.size)
         self.gripper_actions: tuple[int, ...] = ()
         self.horizon = getattr(env.spec, "max_episode_steps", None)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         if self._source.own:
             sensed = np.asarray(info["stream"])[self._source.spec.sensory]
             if not np.allclose(sensed, flat(self.observation_space, observation), equal_nan=True):
-                raise ValueError("this environment's stream does not hold its observation: a fault cannot be in both")
+                raise ValueError(
+                    "this environment's stream does not hold its observation: a fault cannot be in both"
+                )
         return self._sensed(observation, info), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -123,7 +129,9 @@ KINDS: dict[str, Kind] = {
     "action_delay": lambda d, s: (action.ActionDelay(steps=(1, 3, 6)[s]),),
     "action_drop": lambda d, s: (action.ActionDrop(probability=(0.1, 0.3, 0.7)[s]),),
     "action_repeat": lambda d, s: (action.ActionRepeat(steps=(2, 4, 8)[s]),),
-    "action_bias": lambda d, s: (action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s] * min(d.half, 5.0)),),
+    "action_bias": lambda d, s: (
+        action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s] * min(d.half, 5.0)),
+    ),
     "sign_flip": lambda d, s: (action.SignFlip(axis=d.axis, duration=(3, 10, None)[s]),),
 }
 """Faults of each kind for an episode, at severity 0 to 2. Lost rows: every sensor keeps its last value meanwhile."""
@@ -147,12 +155,21 @@ def faults_anywhere(
     check_choice("severity", severity, SEVERITIES)
     moving = np.flatnonzero(sigma > 0)
     if not len(moving):
-        raise ValueError("no sensor reading of this environment changes, so no sensor can be faulty")
+        raise ValueError(
+            "no sensor reading of this environment changes, so no sensor can be faulty"
+        )
     rng = np.random.default_rng([seed, 2])
     spec, struck = env.measured_spec, int(rng.choice(moving))
-    name, place = next((n, span) for n, span in spec.slices.items() if span.start <= struck < span.stop)
-    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(np.float64)  # (A,)
+    name, place = next(
+        (n, span) for n, span in spec.slices.items() if span.start <= struck < span.stop
+    )
+    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(
+        np.float64
+    )  # (A,)
     axis = int(rng.integers(len(halves)))
     element, spread, half = struck - place.start, float(sigma[struck]), float(halves[axis])
     drawn = Target(name, element, spread, axis, half, tuple(spec.slices))
-    return tuple(replace(fault, onset=onset, seed=seed) for fault in KINDS[kind](drawn, SEVERITIES.index(severity)))
+    return tuple(
+        replace(fault, onset=onset, seed=seed)
+        for fault in KINDS[kind](drawn, SEVERITIES.index(severity))
+    )

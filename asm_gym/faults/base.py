@@ -32,7 +32,9 @@ class Clock:
     k: int = 0
 
 
-def within(default: Any, *, low: float | None = None, high: float | None = None, above: float | None = None) -> Any:
+def within(
+    default: Any, *, low: float | None = None, high: float | None = None, above: float | None = None
+) -> Any:
     """Declare a parameter of a fault, and its bounds."""
     return field(default=default, metadata={"low": low, "high": high, "above": above})
 
@@ -147,15 +149,24 @@ class JointFault(Fault):
     """One that acts on a ``joint``, counted from the base, 0 first; a second arm's go on after the first one's."""
 
     joint: int = 3
-    channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")  # those in which it shows first
+    channels: ClassVar[tuple[str, ...]] = (
+        "joint_position",
+        "joint_velocity",
+    )  # those in which it shows first
 
     def check(self, env: RobosuiteEnv) -> None:
         check_number(
-            f"joint of {env.measured_spec.source}", self.joint, low=0, high=len(env.simulation.motors) - 1, whole=True
+            f"joint of {env.measured_spec.source}",
+            self.joint,
+            low=0,
+            high=len(env.simulation.motors) - 1,
+            whole=True,
         )
 
     def labels(self, env: Interface) -> frozenset[str]:
-        return frozenset(env.measured_spec.labels[self.element(env, name)] for name in self.channels)
+        return frozenset(
+            env.measured_spec.labels[self.element(env, name)] for name in self.channels
+        )
 
     def element(self, env: Interface, channel: str) -> int:
         """Return the index of the joint's number of a channel in a measured row."""
@@ -191,6 +202,8 @@ def body_id(env: RobosuiteEnv, name: str) -> int:
     """Return the body called ``name``; raise ValueError, listing those that exist, where there is none."""
     model = env.simulation.model
     # By a table of our own: asked for what is no string, MuJoCo ends the process.
-    bodies = {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i): i for i in range(1, model.nbody)}
+    bodies = {
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i): i for i in range(1, model.nbody)
+    }
     check_choice("body", check_text("body", name), bodies)
     return bodies[name]

@@ -10,7 +10,17 @@ import mujoco
 import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, Vector3, along, body_id, within
+from asm_gym.faults.base import (
+    Clock,
+    Edit,
+    EditingFault,
+    Fault,
+    Floats,
+    Vector3,
+    along,
+    body_id,
+    within,
+)
 
 HAND = "robot0_right_hand"
 
@@ -45,7 +55,13 @@ class Payload(BodyFault, EditingFault):
     kilograms: float = within(1.0, above=0, high=1e3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(env.simulation.model.body_mass, [body_id(env, self.body)], lambda mass: mass + self.kilograms)]
+        return [
+            (
+                env.simulation.model.body_mass,
+                [body_id(env, self.body)],
+                lambda mass: mass + self.kilograms,
+            )
+        ]
 
 
 Force = Callable[[Floats, Floats], Floats]
@@ -98,7 +114,11 @@ class Collision(ForceField):
 
         def push(at: Floats, v: Floats) -> Floats:
             depth = float(at @ into) - wall
-            size = self.stiffness * depth + self.damping * max(0.0, float(v @ into)) if depth > 0 else 0.0
+            size = (
+                self.stiffness * depth + self.damping * max(0.0, float(v @ into))
+                if depth > 0
+                else 0.0
+            )
             return -min(size, self.newtons) * into
 
         return push

@@ -75,7 +75,11 @@ class Slip(ObjectFault, EditingFault):
         touching = (model.geom_contype | model.geom_conaffinity) != 0
         geoms = np.flatnonzero(own & touching).tolist()
         return [
-            (model.geom_friction, [(geom, slice(0, 1)) for geom in geoms], lambda mu: mu * (self.friction / mu)),
+            (
+                model.geom_friction,
+                [(geom, slice(0, 1)) for geom in geoms],
+                lambda mu: mu * (self.friction / mu),
+            ),
             # Between two surfaces the higher friction counts, unless one has priority.
             (model.geom_priority, geoms, lambda priority: priority + 1),
         ]
@@ -119,7 +123,13 @@ class Heavy(ObjectFault, EditingFault):
     kilograms: float = within(0.5, above=0, high=1e3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass + self.kilograms)]
+        return [
+            (
+                env.simulation.model.body_mass,
+                [self.body_of(env)],
+                lambda mass: mass + self.kilograms,
+            )
+        ]
 
 
 class ObjectMass(ObjectFault, EditingFault):
@@ -128,4 +138,6 @@ class ObjectMass(ObjectFault, EditingFault):
     factor: float = within(1.1, above=0, high=100)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [(env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass * self.factor)]
+        return [
+            (env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass * self.factor)
+        ]

@@ -39,7 +39,9 @@ class SensorFault(HookedFault):
         span = np.arange(spec.size)[spec.slices[self.channel]]
         if self.element is None:
             return span
-        check_number(f"element of {self.channel}", self.element, low=0, high=len(span) - 1, whole=True)
+        check_number(
+            f"element of {self.channel}", self.element, low=0, high=len(span) - 1, whole=True
+        )
         return span[[self.element]]
 
     def labels(self, env: Interface) -> frozenset[str]:

@@ -27,9 +27,24 @@ GROUPS: dict[str, tuple[str, ...]] = {
         *("action_drop", "action_repeat", "action_noise", "slip", "snatch"),
     ),
     TEST: (
-        *("collision", "cable_pull", "held_by_person", "stuck_joint", "joint_friction", "gripper_opens"),
+        *(
+            "collision",
+            "cable_pull",
+            "held_by_person",
+            "stuck_joint",
+            "joint_friction",
+            "gripper_opens",
+        ),
         *("encoder_bias", "frozen_encoder", "encoder_noise", "encoder_dropout", "frozen_wrist"),
-        *("action_delay", "action_bias", "sign_flip", "adversary", "teleport", "heavy_object", "missing_object"),
+        *(
+            "action_delay",
+            "action_bias",
+            "sign_flip",
+            "adversary",
+            "teleport",
+            "heavy_object",
+            "missing_object",
+        ),
     ),
 }
 """Kinds to choose settings by, and kinds to report: half of each family, drawn once; added kinds are in neither."""
@@ -60,11 +75,17 @@ KINDS: Registry[Kind] = Registry(
     "kind of fault",
     "asm_gym.faults.suite:KINDS",
     {
-        "push": lambda d, s: body.Push(body=d.link, newtons=(8.0, 20.0, 40.0)[s], direction=d.direction, duration=10),
+        "push": lambda d, s: body.Push(
+            body=d.link, newtons=(8.0, 20.0, 40.0)[s], direction=d.direction, duration=10
+        ),
         "payload": lambda d, s: body.Payload(body=d.hand, kilograms=(0.25, 0.75, 2.0)[s]),
-        "collision": lambda d, s: body.Collision(body=d.hand, stiffness=(500, 2000, 8000)[s], duration=20),
+        "collision": lambda d, s: body.Collision(
+            body=d.hand, stiffness=(500, 2000, 8000)[s], duration=20
+        ),
         "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=(50, 150, 400)[s]),
-        "held_by_person": lambda d, s: body.HeldByPerson(body=d.link, stiffness=(100, 300, 800)[s], duration=30),
+        "held_by_person": lambda d, s: body.HeldByPerson(
+            body=d.link, stiffness=(100, 300, 800)[s], duration=30
+        ),
         "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=(0.9, 0.7, 0.4)[s]),
         "stuck_joint": lambda d, s: actuator.JointFriction(
             joint=d.joint, newton_metres=1000.0, viscous=0.0, duration=(4, 12, None)[s]
@@ -77,18 +98,24 @@ KINDS: Registry[Kind] = Registry(
         "weak_gripper": lambda d, s: actuator.WeakGripper(strength=(0.5, 0.2, 0.05)[s]),
         "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=(0.01, 0.03, 0.1)[s]),
         "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=(5e-4, 2e-3, 8e-3)[s]),
-        "frozen_encoder": lambda d, s: sensor.FrozenEncoder(joint=d.joint, duration=(5, 15, None)[s]),
+        "frozen_encoder": lambda d, s: sensor.FrozenEncoder(
+            joint=d.joint, duration=(5, 15, None)[s]
+        ),
         "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=(2e-3, 1e-2, 5e-2)[s]),
         "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=(0.02, 0.1, 0.5)[s]),
         "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s]),
-        "encoder_dropout": lambda d, s: sensor.Dropout(**d.encoder, probability=(0.05, 0.2, 0.5)[s]),
+        "encoder_dropout": lambda d, s: sensor.Dropout(
+            **d.encoder, probability=(0.05, 0.2, 0.5)[s]
+        ),
         "torque_scale": lambda d, s: sensor.Scale(
             channel=d.prefix + "measured_torque", element=d.joint, factor=(1.05, 1.15, 1.5)[s]
         ),
         "wrist_bias": lambda d, s: sensor.Bias(
             channel=d.prefix + "wrist_force", element=d.translation, amount=(0.5, 2.0, 8.0)[s]
         ),
-        "frozen_wrist": lambda d, s: sensor.Freeze(channel="wrist_force", element=None, duration=(5, 15, None)[s]),
+        "frozen_wrist": lambda d, s: sensor.Freeze(
+            channel="wrist_force", element=None, duration=(5, 15, None)[s]
+        ),
         "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s]),
         "action_drop": lambda d, s: action.ActionDrop(probability=(0.1, 0.3, 0.7)[s]),
         "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s]),
@@ -97,8 +124,12 @@ KINDS: Registry[Kind] = Registry(
         "action_noise": lambda d, s: action.ActionNoise(share=(0.15, 0.4, 1.0)[s]),
         "adversary": lambda d, s: action.Adversary(size=(0.05, 0.15, 0.4)[s]),
         "slip": lambda d, s: object.Slip(friction=(0.4, 0.15, 0.03)[s]),
-        "snatch": lambda d, s: object.Snatch(newtons=(3, 10, 30)[s], direction=d.direction, duration=10),
-        "teleport": lambda d, s: object.Teleport(offset=((0.01, 0.03, 0.08)[s], (0.01, 0.03, 0.08)[s], 0.0)),
+        "snatch": lambda d, s: object.Snatch(
+            newtons=(3, 10, 30)[s], direction=d.direction, duration=10
+        ),
+        "teleport": lambda d, s: object.Teleport(
+            offset=((0.01, 0.03, 0.08)[s], (0.01, 0.03, 0.08)[s], 0.0)
+        ),
         "heavy_object": lambda d, s: object.Heavy(kilograms=(0.1, 0.4, 1.5)[s]),
         "missing_object": lambda d, _: object.Missing(),
     },
@@ -141,7 +172,9 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
     joint = int(rng.integers(len(robot._ref_joint_vel_indexes)))
     axis, translation = int(rng.integers(axes)), int(rng.integers(3))
     prefix, hand = "robot0_" if len(env.robots) > 1 else "", robot.robot_model.eef_name["right"]
-    return Drawn(env, prefix, joint, axis, translation, (x, y, z), model.body(elbow).name, hand, onset, seed)
+    return Drawn(
+        env, prefix, joint, axis, translation, (x, y, z), model.body(elbow).name, hand, onset, seed
+    )
 
 
 def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: int) -> Fault:

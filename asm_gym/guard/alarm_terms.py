@@ -156,5 +156,7 @@ class AlarmTerms:
         """Return a line for each term: priority, name, rows in which it held, response, where it holds."""
         lines = ["priority  term           rows  response  holds where"]
         for name, term in self.terms.items():
-            lines.append(f"{term.priority:8g}  {name:13}  {self.held_rows[name]:4}  {term.response:8}  {term.help}")
+            lines.append(
+                f"{term.priority:8g}  {name:13}  {self.held_rows[name]:4}  {term.response:8}  {term.help}"
+            )
         return "\n".join(lines)

@@ -40,7 +40,9 @@ Mask = NDArray[np.bool_]
 class Situation(NamedTuple):
     """All that a row tells the table of transitions."""
 
-    alarm: bool = False  # surprise is over the threshold, or something failed, is missing or presses
+    alarm: bool = (
+        False  # surprise is over the threshold, or something failed, is missing or presses
+    )
     presses: bool = False  # a contact limit was passed within the step
     spent: bool = False  # the arm has pressed too often, or with too much impulse, in this episode
     goes_on: bool = False  # the response lets the policy act
@@ -48,7 +50,9 @@ class Situation(NamedTuple):
     overdue: bool = False  # the reflex has acted for as long as it may
     calm: bool = False  # surprise has been low for long enough, and nothing touches
     free: bool = False  # the contact has been gone for long enough, and nothing presses
-    waited: bool = False  # held for long enough for a trial, nothing presses, and no sense tells of a contact
+    waited: bool = (
+        False  # held for long enough for a trial, nothing presses, and no sense tells of a contact
+    )
     settled: bool = False  # the trial has gone well for long enough
 
 
@@ -68,16 +72,40 @@ ANYBODY_ACTS = (*POLICY_ACTS, *REFLEX_ACTS)
 
 TRANSITIONS = (
     Transition("give_up", ANYBODY_ACTS, ENDED, lambda s: s.spent, "pressed too often or much"),
-    Transition("override", POLICY_ACTS, REFLEX, lambda s: s.presses, "presses harder than healthy motion"),
-    Transition("*", POLICY_ACTS, None, lambda s: s.alarm and s.goes_on, "an alarm whose cause lets the policy go on"),
+    Transition(
+        "override", POLICY_ACTS, REFLEX, lambda s: s.presses, "presses harder than healthy motion"
+    ),
+    Transition(
+        "*",
+        POLICY_ACTS,
+        None,
+        lambda s: s.alarm and s.goes_on,
+        "an alarm whose cause lets the policy go on",
+    ),
     Transition("override", POLICY_ACTS, REFLEX, lambda s: s.alarm, "any other alarm"),
     Transition("", (TRIAL,), POLICY, lambda s: s.settled, "no alarm for `release_after`"),
-    Transition("*", REFLEX_ACTS, TRIAL, lambda s: s.alarm and s.goes_on, "the cause turns out to be a sensor"),
-    Transition("release", REFLEX_ACTS, TRIAL, lambda s: s.calm, "calm for `release_after`, nothing touches"),
+    Transition(
+        "*",
+        REFLEX_ACTS,
+        TRIAL,
+        lambda s: s.alarm and s.goes_on,
+        "the cause turns out to be a sensor",
+    ),
+    Transition(
+        "release", REFLEX_ACTS, TRIAL, lambda s: s.calm, "calm for `release_after`, nothing touches"
+    ),
     Transition("release", REFLEX_ACTS, TRIAL, lambda s: s.free, "the contact has gone"),
-    Transition("give_up", REFLEX_ACTS, ENDED, lambda s: s.stops, "response `stop`, held for `try_after`"),
+    Transition(
+        "give_up", REFLEX_ACTS, ENDED, lambda s: s.stops, "response `stop`, held for `try_after`"
+    ),
     Transition("give_up", REFLEX_ACTS, ENDED, lambda s: s.overdue, "acted for `max_override`"),
-    Transition("trial", REFLEX_ACTS, TRIAL, lambda s: s.waited, "held for `try_after`, nothing known to touch"),
+    Transition(
+        "trial",
+        REFLEX_ACTS,
+        TRIAL,
+        lambda s: s.waited,
+        "held for `try_after`, nothing known to touch",
+    ),
 )
 """What leads from one state to another: the first that holds. Where none does, nothing changes."""
 
@@ -90,9 +118,13 @@ def following(state: int, situation: Situation) -> Transition | None:
 class Decision(NamedTuple):
     """What a row of one robot has led to."""
 
-    transition: str = ""  # the name in ``TRANSITIONS``, or the response under which the policy goes on
+    transition: str = (
+        ""  # the name in ``TRANSITIONS``, or the response under which the policy goes on
+    )
     takes_over: bool = False  # the reflex acts from now on
-    acted_on: bool = False  # the surprise has had its consequence: its evidence is not to be counted again
+    acted_on: bool = (
+        False  # the surprise has had its consequence: its evidence is not to be counted again
+    )
 
 
 class Arbiter:
@@ -109,7 +141,9 @@ class Arbiter:
         response: name of the response to the last alarm of each robot.
     """
 
-    def __init__(self, table: RobotTable, rule: ReleaseRule | None, adaptive: AdaptiveThreshold | None = None) -> None:
+    def __init__(
+        self, table: RobotTable, rule: ReleaseRule | None, adaptive: AdaptiveThreshold | None = None
+    ) -> None:
         self._table = table
         self._acts = rule is not None
         self._rule = rule or ReleaseRule()
@@ -127,7 +161,9 @@ class Arbiter:
         for index in np.flatnonzero(which).tolist():
             robot = self._table.robot(index)
             if robot.largest_surprise > -np.inf:
-                self.running.follow(float(robot.largest_surprise), float(robot.threshold), bool(robot.confirmed))
+                self.running.follow(
+                    float(robot.largest_surprise), float(robot.threshold), bool(robot.confirmed)
+                )
                 robot.threshold = self.running.value
 
     def begin(self, which: Mask) -> None:
@@ -165,7 +201,13 @@ class Arbiter:
         if robot.refused and not name:
             name = "override"
         if name:
-            LOG.info("%s: surprise %.3g, threshold %.3g%s", name, robot.surprise, robot.threshold, response.why)
+            LOG.info(
+                "%s: surprise %.3g, threshold %.3g%s",
+                name,
+                robot.surprise,
+                robot.threshold,
+                response.why,
+            )
         return Decision(
             transition=name,
             takes_over=transition is not None and transition.to == REFLEX,
@@ -175,7 +217,9 @@ class Arbiter:
     def take_over(self, index: int) -> None:
         """Let the reflex of a robot act from now on."""
         robot = self._table.robot(index)
-        returned_too_early = robot.state == TRIAL and robot.rows_since_return <= self._rule.release_after
+        returned_too_early = (
+            robot.state == TRIAL and robot.rows_since_return <= self._rule.release_after
+        )
         if returned_too_early:
             robot.early_returns += 1
             if robot.on_trial:
@@ -229,7 +273,9 @@ class Arbiter:
         stopping = self.response[evidence.index] == "stop"
         undisturbed = not (stopping or robot.presses)
         free_after = rule.free_after << min(int(robot.early_returns), MOST_DOUBLINGS)
-        goes_on = self._lets_go_on(robot, response) and (response.name == "complete" or not overriding)
+        goes_on = self._lets_go_on(robot, response) and (
+            response.name == "complete" or not overriding
+        )
         return Situation(
             alarm=evidence.alarm,
             presses=bool(robot.presses),
@@ -239,7 +285,9 @@ class Arbiter:
             overdue=bool(robot.override_rows >= rule.max_override),
             calm=not stopping and robot.calm_rows >= rule.release_after and not response.touched,
             free=undisturbed and robot.free_rows >= free_after,
-            waited=undisturbed and robot.held_rows >= robot.rows_until_trial and response.touched is None,
+            waited=undisturbed
+            and robot.held_rows >= robot.rows_until_trial
+            and response.touched is None,
             settled=bool(robot.rows_since_return > rule.release_after),
         )
 

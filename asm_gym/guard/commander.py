@@ -34,7 +34,9 @@ class Command:
     actions: Floats32  # (n, A) finite, in the action space
     brakes: Mask  # (n,) the robot stays, whatever the action is
     overridden: Mask  # (n,) something else than the policy's action is done
-    failures: Mapping[int, str] = field(default_factory=dict)  # what failed when it was chosen, by robot
+    failures: Mapping[int, str] = field(
+        default_factory=dict
+    )  # what failed when it was chosen, by robot
 
 
 class Commander:
@@ -70,7 +72,11 @@ class Commander:
         self._arbiter = arbiter
         self._warn = warn
         self._reacts = motion is not None or bool(policies)
-        self.holding = HoldingActions(facts.count, facts.meaning, facts.rest) if motion is None else motion.holding
+        self.holding = (
+            HoldingActions(facts.count, facts.meaning, facts.rest)
+            if motion is None
+            else motion.holding
+        )
         self._bounds = np.stack([facts.low, facts.high])  # (2, A)
         self._likely = _likely_range(facts, commands)  # (2, A)
         self._executed = np.zeros((facts.count, facts.rest.size), np.float32)  # last
@@ -84,7 +90,9 @@ class Commander:
         self.holding.begin(which)
         if self._motion is not None:
             self._motion.begin(which)
-        self._policy_states = {robot: state for robot, state in self._policy_states.items() if not which[robot]}
+        self._policy_states = {
+            robot: state for robot, state in self._policy_states.items() if not which[robot]
+        }
 
     def start_override(self, robot: int, executed: Floats32) -> None:
         """Begin the override of a robot that has ``executed`` (A,)."""
@@ -96,7 +104,9 @@ class Commander:
         if self._motion is not None:
             self._motion.expected[:] = expected
 
-    def choose(self, proposed: Floats32, idle: Mask, reflexes: Sequence[str], observe: Observe) -> Command:
+    def choose(
+        self, proposed: Floats32, idle: Mask, reflexes: Sequence[str], observe: Observe
+    ) -> Command:
         """Return what is to be done.
 
         Args:
@@ -112,7 +122,12 @@ class Commander:
         return Command(executed, brakes=self._nobody, overridden=self._nobody)
 
     def _choose_each(
-        self, proposed: Floats32, executed: Floats32, idle: Mask, reflexes: Sequence[str], observe: Observe
+        self,
+        proposed: Floats32,
+        executed: Floats32,
+        idle: Mask,
+        reflexes: Sequence[str],
+        observe: Observe,
     ) -> Command:
         """Return what is to be done where a robot is overridden or idle; ``executed`` is written to."""
         records = self._records
@@ -156,7 +171,9 @@ class Commander:
                 motion = self._asked(robot, reflex, observe)
             action = np.array(as_float32(motion.action)).reshape(-1)
             if action.shape != facts.rest.shape or not np.isfinite(action).all():
-                raise ValueError(f"the action must be {facts.rest.size} finite numbers, got {action}")
+                raise ValueError(
+                    f"the action must be {facts.rest.size} finite numbers, got {action}"
+                )
         except Exception as error:
             # Whatever a user's policy does, an alarm must not end in no action.
             failure = f"reflex: {error!r}"
@@ -196,7 +213,9 @@ def _likely_range(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None)
 
 
 @partial(compiled, calls=(".",))
-def clip_actions(robots: Any, proposed: Any, bounds: Any, likely: Any, idle: Any, executed: Any) -> bool:
+def clip_actions(
+    robots: Any, proposed: Any, bounds: Any, likely: Any, idle: Any, executed: Any
+) -> bool:
     """Write the proposed actions (n, A) within their ``bounds`` (2, A), and mark those that cannot be executed.
 
     An action is refused where a number is not finite, or out of a ``likely`` range (2, A) that is within the bounds.

@@ -33,9 +33,13 @@ class ContactEstimator:
         self._completion = completion
         self._dt = spec.dt
         self._filling = completion.filling(np.array(shows, bool))
-        self._torques = np.isin(self._filling.columns, columns_ending(spec.channels, "external_torque"))
+        self._torques = np.isin(
+            self._filling.columns, columns_ending(spec.channels, "external_torque")
+        )
         self._joints = columns_ending(spec.channels, "joint_position")
-        self._names = [spec.labels[column].replace("joint_position", "joint") for column in self._joints]
+        self._names = [
+            spec.labels[column].replace("joint_position", "joint") for column in self._joints
+        ]
 
     def deviations(self, rows: Rows) -> NDArray[np.float64]:
         """Return z (T - 1, J) of rows (T, D) but the first."""

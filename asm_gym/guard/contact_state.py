@@ -20,7 +20,9 @@ from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.guard.robot_table import MOST_WRISTS
 from asm_gym.spec import Channel, StreamSpec
 
-FREE_FORCE = 40.0  # force that healthy motion of many tasks comes to; impulse is counted beyond it [N]
+FREE_FORCE = (
+    40.0  # force that healthy motion of many tasks comes to; impulse is counted beyond it [N]
+)
 LEVER = 0.5  # how far from a joint's axis an arm is touched, about [m]
 
 LEANS_S = 0.5
@@ -59,7 +61,10 @@ def contact_columns(felt: Sequence[Channel], spec: StreamSpec) -> ContactColumns
     Raises:
         ValueError: more wrists than the table of robots weighs.
     """
-    wrists = [columns_ending(channels, "wrist_force", 3).reshape(-1, 3) for channels in (felt, spec.channels)]
+    wrists = [
+        columns_ending(channels, "wrist_force", 3).reshape(-1, 3)
+        for channels in (felt, spec.channels)
+    ]
     most = max(len(columns) for columns in wrists)
     if most > MOST_WRISTS:
         raise ValueError(f"a robot may have {MOST_WRISTS} channels of a wrist's force, got {most}")
@@ -97,7 +102,9 @@ def severity_info(robot: Any) -> dict[str, Any]:
 
 
 @compiled
-def measure_contacts(robots: Any, rows: Any, load: Any, columns: Any, dt: float, most_impulse: float) -> None:
+def measure_contacts(
+    robots: Any, rows: Any, load: Any, columns: Any, dt: float, most_impulse: float
+) -> None:
     """Write the contact state of robots (n,) by their rows (n, D) and loads (n, 2 + F).
 
     Args:
@@ -110,7 +117,9 @@ def measure_contacts(robots: Any, rows: Any, load: Any, columns: Any, dt: float,
 
 
 @inner
-def measure_contact(robot: Any, row: Any, load: Any, columns: Any, dt: float, most_impulse: float) -> None:
+def measure_contact(
+    robot: Any, row: Any, load: Any, columns: Any, dt: float, most_impulse: float
+) -> None:
     """Write the contact state of one robot."""
     robot.load = load[0]
     robot.limit_passed_s = load[1]

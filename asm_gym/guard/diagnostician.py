@@ -29,10 +29,14 @@ Rows = NDArray[np.float32]
 class Incident:
     """What has been found out about one robot since it was calm."""
 
-    rows_since: dict[str, int] = field(default_factory=dict)  # rows since a family was first the cause
+    rows_since: dict[str, int] = field(
+        default_factory=dict
+    )  # rows since a family was first the cause
     touched: bool = False  # the last alarm was answered as a contact, or looked like one
     calm_rows: int = 0  # rows without an alarm
-    belief: Floats = field(default_factory=lambda: np.zeros(len(FAMILIES)))  # mean probability of each family
+    belief: Floats = field(
+        default_factory=lambda: np.zeros(len(FAMILIES))
+    )  # mean probability of each family
     diagnoses: int = 0
     newest: dict[str, Cause] = field(default_factory=dict)  # the newest diagnosis of each family
 
@@ -59,7 +63,9 @@ class Prescription(NamedTuple):
     """What is to be done about an alarm."""
 
     response: Response
-    columns: NDArray[np.intp] = NO_COLUMNS  # (k,) of the stream to complete, where the response is ``"complete"``
+    columns: NDArray[np.intp] = (
+        NO_COLUMNS  # (k,) of the stream to complete, where the response is ``"complete"``
+    )
 
 
 class Diagnostician:
@@ -76,12 +82,16 @@ class Diagnostician:
         rows: how many rows it looks back.
     """
 
-    def __init__(self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool) -> None:
+    def __init__(
+        self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool
+    ) -> None:
         self._dt = spec.dt
         self._diagnosis = diagnosis
         self._table = table
         self._asked = asked
-        self._blocked_rows = 1 + round(LASTING["actuator"] / spec.dt)  # by which a joint is found blocked
+        self._blocked_rows = 1 + round(
+            LASTING["actuator"] / spec.dt
+        )  # by which a joint is found blocked
         self._contact = None
         if diagnosis is not None and columns_ending(spec.channels, "external_torque").size:
             self._contact = ContactEstimator(diagnosis.completion)
@@ -142,9 +152,13 @@ class Diagnostician:
         incident.touched = True
         incident.calm_rows = 0
         name = "hold" if self._asked else ""
-        return Response(name, _certain("contact"), self._touched(incident, evidence.rows), "contact")
+        return Response(
+            name, _certain("contact"), self._touched(incident, evidence.rows), "contact"
+        )
 
-    def _look_up(self, incident: Incident, family: str, cause: Cause | None, evidence: RowEvidence) -> tuple[str, str]:
+    def _look_up(
+        self, incident: Incident, family: str, cause: Cause | None, evidence: RowEvidence
+    ) -> tuple[str, str]:
         """Return the row of the table that holds, and the response."""
         case = PRESSING if evidence.robot.presses else family
         if case in (PRESSING, "contact") and self._lasts(incident, case):

@@ -47,7 +47,9 @@ class EpisodeLimits:
         self._usual = limits
         self._careful = careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))
-        self._steps_left = np.zeros(facts.count, np.int64)  # (n,) of the policy, under the careful limits
+        self._steps_left = np.zeros(
+            facts.count, np.int64
+        )  # (n,) of the policy, under the careful limits
         self.now = (self._usual,) * facts.count
         self.steady = True
 
@@ -69,7 +71,9 @@ class EpisodeLimits:
         self.now = tuple(limits[int(steps > 0)] for steps in self._steps_left)
 
 
-def limits_of(contact_limits: ContactLimits | str | None, monitor: Monitor, task: str = "") -> ContactLimits | None:
+def limits_of(
+    contact_limits: ContactLimits | str | None, monitor: Monitor, task: str = ""
+) -> ContactLimits | None:
     """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones in a task."""
     if contact_limits is None or isinstance(contact_limits, ContactLimits):
         return contact_limits

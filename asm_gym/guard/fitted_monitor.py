@@ -64,7 +64,9 @@ def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -
         RuntimeError: it is not calibrated.
     """
     if not all(callable(getattr(monitor, name, None)) for name in ("initial_state", "observe")):
-        raise TypeError(f"monitor must have initial_state() and observe(), got {short_repr(monitor)}")
+        raise TypeError(
+            f"monitor must have initial_state() and observe(), got {short_repr(monitor)}"
+        )
     monitor.spec.require(watched, "the monitor")
     _check_same("robot", monitor.spec.source, watched.source)
     _check_same(CONTROLLER, getattr(monitor, "about", {}).get(CONTROLLER, ""), controller)
@@ -85,7 +87,9 @@ def check_answer(monitor: Monitor) -> None:
         return
     try:
         tried = deepcopy(monitor)  # one that counts its rows must not count this one
-        answer: Any = tried.observe(tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32))
+        answer: Any = tried.observe(
+            tried.initial_state(1), np.zeros((1, monitor.spec.size), np.float32)
+        )
     except Exception as error:  # an alarm at the first row, unless it is mended by then
         LOG.warning("the monitor failed at a row of zeros: %r", error)
         return

@@ -59,8 +59,12 @@ class Row:
     ends_step: bool
     attribution: NDArray[np.float64]  # (n, D)
     failures: dict[int, str] = field(default_factory=dict)  # by robot
-    unreported: Mapping[int, str] = field(default_factory=dict)  # what failed without a consequence, by robot
-    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # numbers that are not finite, by robot
+    unreported: Mapping[int, str] = field(
+        default_factory=dict
+    )  # what failed without a consequence, by robot
+    lost: Mapping[int, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # numbers that are not finite, by robot
     contradictions: Mapping[int, Any] = field(default_factory=dict)  # by robot
     terms: Mapping[str, Mask] = field(default_factory=dict)  # where each alarm term holds (n,)
     outcomes: dict[int, Outcome] = field(default_factory=dict)  # by robot
@@ -104,7 +108,9 @@ class Guard:
         acts = bool(policies) or name in (*REFLEXES, GRADED)
         recalls = name == "recall"
         if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
-            raise ValueError(f"recall needs a memory that predicts actions, and {type(monitor).__name__} does not")
+            raise ValueError(
+                f"recall needs a memory that predicts actions, and {type(monitor).__name__} does not"
+            )
 
         self.fitted = FittedMonitor.of(monitor, spec)
         self.options = options
@@ -129,7 +135,9 @@ class Guard:
             warn=self._warn,
             commands=getattr(monitor, "commands_", None),
         )
-        self._diagnostician = Diagnostician(spec, diagnosis, responses_from(options.responses), graded)
+        self._diagnostician = Diagnostician(
+            spec, diagnosis, responses_from(options.responses), graded
+        )
         completion = diagnosis.completion if diagnosis is not None and graded else None
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
         self._observer = Observer(monitor, facts.count, recalls)
@@ -154,7 +162,9 @@ class Guard:
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._everyone = ~self._nobody
         self._marked = False  # records say of a row that it failed, was refused, or must be decided
-        self._unreported: Mapping[int, str] = NOTHING  # what failed when the command was chosen, by robot
+        self._unreported: Mapping[int, str] = (
+            NOTHING  # what failed when the command was chosen, by robot
+        )
 
     # ------------------------------------------------------------------ what wrappers ask
 
@@ -199,7 +209,14 @@ class Guard:
         if which is None:
             which = self._everyone
         self._arbiter.follow_thresholds(which)
-        for part in (self.table, self._arbiter, self._commander, self._observer, self._validator, self._limits):
+        for part in (
+            self.table,
+            self._arbiter,
+            self._commander,
+            self._observer,
+            self._validator,
+            self._limits,
+        ):
             part.begin(which)
         for robot in np.flatnonzero(which).tolist():
             self._diagnostician.begin(robot)
@@ -225,7 +242,9 @@ class Guard:
         limits = self.limits[robot]
         within = np.where(np.isfinite(chunk), np.clip(chunk, facts.low, facts.high), chunk)
         slows = limits is not None and np.isfinite(limits.hand_speed) and facts.limits_contact
-        preview = preview_chunk(within, row, last, self.fitted.monitor, facts.dt, limits if slows else None)
+        preview = preview_chunk(
+            within, row, last, self.fitted.monitor, facts.dt, limits if slows else None
+        )
         return preview._replace(kept=chunk if self._name == "monitor" else chunk[: preview.at])
 
     def __str__(self) -> str:
@@ -243,7 +262,9 @@ class Guard:
             idle: (n,) nothing is done, for an episode begins.
         """
         reflexes = self._arbiter.response if self._graded else [self._name] * self._facts.count
-        command = self._commander.choose(proposed, self._nobody if idle is None else idle, reflexes, observe)
+        command = self._commander.choose(
+            proposed, self._nobody if idle is None else idle, reflexes, observe
+        )
         self._unreported = command.failures
         return command
 
@@ -281,7 +302,9 @@ class Guard:
         self._clear_marks(bool(to_decide))
         return report
 
-    def _take_up(self, sensed: SensedRows, executed: Floats32, ends_step: bool, active: Mask | None) -> Row:
+    def _take_up(
+        self, sensed: SensedRows, executed: Floats32, ends_step: bool, active: Mask | None
+    ) -> Row:
         """Write into the table what is known before the rows are judged."""
         records = self.table.records
         rows = np.array(sensed.rows, np.float32)  # a copy, in which stale senses are left out
@@ -308,7 +331,9 @@ class Guard:
         """Take up what failed before the rows are looked at: choosing the command, sensing, or a monitor refitted."""
         records = self.table.records
         refused = records["refused"] & ~records["out_of_range"]
-        row.unreported = {robot: why for robot, why in self._unreported.items() if not refused[robot]}
+        row.unreported = {
+            robot: why for robot, why in self._unreported.items() if not refused[robot]
+        }
         self._unreported, choosing = NOTHING, self._unreported
         stale = STALE if self.fitted.stale else ""
         for robot in np.flatnonzero(records["active"]).tolist():
@@ -334,7 +359,9 @@ class Guard:
         start = time.perf_counter()
         threads = ONE_THREAD if len(row.rows) > 1 else nullcontext()  # one row calls no BLAS
         with threads:
-            to_decide = judge_rows(self._bound, memory, row.rows, row.load, row.executed, row.attribution)
+            to_decide = judge_rows(
+                self._bound, memory, row.rows, row.load, row.executed, row.attribution
+            )
         if to_decide != STOPPED:
             self._observer.stepped(memory, time.perf_counter() - start)
         return to_decide
@@ -350,11 +377,18 @@ class Guard:
         row.contradictions = validated.contradictions
         for robot, failure in validated.failures.items():
             self._fail(row, robot, failure)
-        for robot, failure in self._observer.observe(row.rows, self._judged, row.attribution).items():
+        for robot, failure in self._observer.observe(
+            row.rows, self._judged, row.attribution
+        ).items():
             self._fail(row, robot, failure)
         self._leave_out_repaired(row)
         measure_contacts(
-            records, row.rows, row.load, self._contact_columns, self._spec.dt, float(self._arbiter.most_impulse)
+            records,
+            row.rows,
+            row.load,
+            self._contact_columns,
+            self._spec.dt,
+            float(self._arbiter.most_impulse),
         )
         if self.terms.of_user:
             records["must_decide"] |= self.terms.any_of_user(self.table)
@@ -368,7 +402,9 @@ class Guard:
         for robot, repair in self._validator.repairs.items():
             own = slice(robot, robot + 1)
             judged = self._judged[own]
-            surprise = Surprise(judged["surprise"], row.attribution[own], raw=judged["raw_surprise"])
+            surprise = Surprise(
+                judged["surprise"], row.attribution[own], raw=judged["raw_surprise"]
+            )
             surprise = surprise.without(repair.unjudged)
             if repair.settling and robot not in row.failures:
                 surprise = surprise.silenced(np.ones(1, bool))

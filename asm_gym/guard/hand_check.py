@@ -42,7 +42,11 @@ Mask = NDArray[np.bool_]
 HAND_GEOMETRY = np.dtype(
     [
         ("joints", np.int64),  # J
-        ("columns", np.int64, 2 * MOST_JOINTS + HAND),  # of the stream: J angles, J speeds, the hand
+        (
+            "columns",
+            np.int64,
+            2 * MOST_JOINTS + HAND,
+        ),  # of the stream: J angles, J speeds, the hand
         ("axes", np.float64, (MOST_JOINTS, 3)),  # as in ``Chain``
         ("anchors", np.float64, (MOST_JOINTS, 3)),
         ("pose", np.float64, (3, 3)),
@@ -60,7 +64,11 @@ HAND_STATE = np.dtype(
         ("distance", np.float64),  # |m|; -1 where a number is missing
         ("whole_rows", np.int64),  # since a number was missing
         ("kept_rows", np.int64),  # of ``rows``
-        ("rows", np.float64, (WINDOW, 2 * MOST_JOINTS + HAND)),  # the last that were whole, the newest last
+        (
+            "rows",
+            np.float64,
+            (WINDOW, 2 * MOST_JOINTS + HAND),
+        ),  # the last that were whole, the newest last
         ("angles", np.float64, MOST_JOINTS),  # that were believed last [rad]
     ],
     align=True,
@@ -105,7 +113,10 @@ class HandChecks:
         for arm, own in enumerate(checked):
             for robot, chain in enumerate(own):
                 _describe(self.geometry[robot, arm], chain, spec)
-        self.arms = tuple(HandCheck(self.geometry[:, arm], self.state[:, arm], spec) for arm in range(len(checked)))
+        self.arms = tuple(
+            HandCheck(self.geometry[:, arm], self.state[:, arm], spec)
+            for arm in range(len(checked))
+        )
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
@@ -127,7 +138,9 @@ class HandChecks:
 
 def _can_check(chain: Chain, spec: StreamSpec) -> bool:
     """Return whether the stream tells of hand and joints of an arm."""
-    return len(chain.axes) <= MOST_JOINTS and all(chain.prefix + name in spec.slices for name in NEEDS)
+    return len(chain.axes) <= MOST_JOINTS and all(
+        chain.prefix + name in spec.slices for name in NEEDS
+    )
 
 
 def _describe(geometry: Any, chain: Chain, spec: StreamSpec) -> None:
@@ -165,7 +178,11 @@ class HandCheck:
         self._speeds = columns[joints : 2 * joints]
         self._hand = columns[2 * joints : 2 * joints + HAND]
         self._gain = float(geometry["gain"][0])
-        sensors = {int(c): Contradiction(part=name, columns=own) for name, own in sensors_of(spec) for c in own}
+        sensors = {
+            int(c): Contradiction(part=name, columns=own)
+            for name, own in sensors_of(spec)
+            for c in own
+        }
         self._suspects = [sensors[int(c)] for c in (*self._angles, *self._hand)]
         self._cases: dict[int, _OpenCase] = {}
         # Compiled or loaded here, so that the first contradiction does not wait for it.
@@ -241,7 +258,9 @@ class HandCheck:
             row[self._angles] = believed
         return row
 
-    def _name_sensor(self, robot: int, case: _OpenCase, free: Mask, unseen: Mask) -> Contradiction | None:
+    def _name_sensor(
+        self, robot: int, case: _OpenCase, free: Mask, unseen: Mask
+    ) -> Contradiction | None:
         """Return the one sensor that explains most of the last rows; None while that could be another as well."""
         kept = int(self._state["kept_rows"][robot])
         rows = self._state["rows"][robot, WINDOW - kept :]
@@ -280,7 +299,9 @@ class HandCheck:
         weights = np.where(unseen, 0.0, self._geometry["weights"][robot])
         hand = row[2 * joints : 2 * joints + HAND]
         near = Prior(prior.angles - late, prior.error)
-        fitted, unexplained = fit_angles(self._geometry[robot], angles - late, hand, weights, free, near)
+        fitted, unexplained = fit_angles(
+            self._geometry[robot], angles - late, hand, weights, free, near
+        )
         return fitted + late, float(unexplained)
 
 

@@ -24,11 +24,15 @@ from asm_gym.guard.row_validation import validate_rows
 from asm_gym.monitors.row_kernel import observe_rows
 
 KNOCKED = EVENTS.index(KNOCK)
-STOPPED = -1  # in the place of how many robots there are to decide about: the rows are to be repaired first
+STOPPED = (
+    -1
+)  # in the place of how many robots there are to decide about: the rows are to be repaired first
 
 
 @partial(compiled, calls=("memory", "detection", "monitors", "."))
-def judge_rows(guard: Any, memory: Any, rows: Any, load: Any, executed: Any, attribution: Any) -> int:
+def judge_rows(
+    guard: Any, memory: Any, rows: Any, load: Any, executed: Any, attribution: Any
+) -> int:
     """Judge rows by a memory whose row is compiled, and count those about which there is nothing to decide.
 
     Args:
@@ -42,7 +46,9 @@ def judge_rows(guard: Any, memory: Any, rows: Any, load: Any, executed: Any, att
     Returns:
         How many robots there are to decide about, or ``STOPPED``.
     """
-    robots, recent, hand_geometry, hand_state, columns, motion, judged, dt, most_impulse = guard.parts
+    robots, recent, hand_geometry, hand_state, columns, motion, judged, dt, most_impulse = (
+        guard.parts
+    )
     if validate_rows(robots, rows, recent, hand_geometry, hand_state):
         return STOPPED
     observe_rows(memory, rows.astype(np.float64), judged, attribution)
@@ -71,7 +77,9 @@ def apply_alarm_rule(robots: Any, judged: Any, attribution: Any) -> int:
         robot.held = robot.state == REFLEX
         robot.overridden = robot.held or robot.refused
         robot.over = over_threshold(robot.surprise, robot.threshold)
-        robot.event = benign_event(robot.raw_surprise, robot.surprise, robot.excuse, robot.threshold)
+        robot.event = benign_event(
+            robot.raw_surprise, robot.surprise, robot.excuse, robot.threshold
+        )
         robot.knocked = robot.event == KNOCKED
         robot.alarm = False
         robot.must_decide = robot.active and (robot.must_decide or is_eventful(robot))

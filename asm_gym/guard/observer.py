@@ -42,7 +42,9 @@ class Observer:
         self.latency = 0.0
         self.expected: Floats32 | None = None
         self.begin(np.ones(count, bool))
-        if self._neural is not None:  # what a row needs is loaded now, and not within the first step
+        if (
+            self._neural is not None
+        ):  # what a row needs is loaded now, and not within the first step
             self._neural.observe(self._initial, np.zeros((count, self._size), np.float32))
 
     def begin(self, which: Mask) -> None:
@@ -82,7 +84,9 @@ class Observer:
 
     def _spare(self) -> Any:
         """Return a state that may be written to; None where there is none."""
-        return None if self._before is self._initial or self._before is self._state else self._before
+        return (
+            None if self._before is self._initial or self._before is self._state else self._before
+        )
 
     # ------------------------------------------------------------------ a row of any monitor
 
@@ -185,5 +189,7 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
         parts = [choose(mask, n, o) for n, o in zip(new, old, strict=True)]
         return getattr(old, "_make", tuple)(parts)
     if not isinstance(old, np.ndarray) or len(old) != len(mask):
-        raise TypeError(f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}")
+        raise TypeError(
+            f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}"
+        )
     return np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)

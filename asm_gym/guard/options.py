@@ -35,12 +35,20 @@ class ReleaseRule:
     """When control is handed back, and when the episode ends, counted in rows; infinite for never."""
 
     release_after: int = 10  # calm rows after which control is handed back
-    max_override: float = math.inf  # rows of a reflex, those before a hand-back after which the alarm was soon back too
+    max_override: float = (
+        math.inf
+    )  # rows of a reflex, those before a hand-back after which the alarm was soon back too
     try_after: float = math.inf  # rows until a trial; after each trial that fails, twice as many
     free_after: int = 5  # rows without contact after which it is over; after each that was too early, twice as many
-    strikes: float = math.inf  # how often the policy may pass a contact limit before the episode ends
-    impulse: float = math.inf  # how much the arm may press in an episode, beyond healthy motion [N s]
-    go_on: float = math.inf  # rows in alarm for which the policy may go on in an episode; at later alarms it is held
+    strikes: float = (
+        math.inf
+    )  # how often the policy may pass a contact limit before the episode ends
+    impulse: float = (
+        math.inf
+    )  # how much the arm may press in an episode, beyond healthy motion [N s]
+    go_on: float = (
+        math.inf
+    )  # rows in alarm for which the policy may go on in an episode; at later alarms it is held
 
 
 @dataclass(frozen=True)
@@ -74,10 +82,14 @@ class GuardOptions:
         responses_from(self.responses)
         limits = self.contact_limits
         if not (limits is None or isinstance(limits, ContactLimits) or limits == "memory"):
-            raise ValueError(f'contact_limits must be ContactLimits, "memory" or None, got {short_repr(limits)}')
+            raise ValueError(
+                f'contact_limits must be ContactLimits, "memory" or None, got {short_repr(limits)}'
+            )
         adaptive = self.adaptive_threshold
         if adaptive is not None and not isinstance(adaptive, AdaptiveThreshold):
-            raise TypeError(f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(adaptive)}")
+            raise TypeError(
+                f"adaptive_threshold must be an AdaptiveThreshold, got {short_repr(adaptive)}"
+            )
 
     def reaction(self, names_causes: bool) -> OnAlarm:
         """Return ``on_alarm``, or what None means for a monitor that names causes or does not.

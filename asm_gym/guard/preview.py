@@ -40,7 +40,9 @@ def checked_chunk(actions: Any, shape: tuple[int, ...]) -> Floats32:
     """Return a chunk (k, *shape). Raises ValueError for another shape, or no action."""
     chunk = np.array(as_float32(actions, "a chunk of actions"))
     if chunk.shape[1:] != shape or not len(chunk):
-        raise ValueError(f"a chunk must have the shape {shape} and at least one action, got the shape {chunk.shape}")
+        raise ValueError(
+            f"a chunk must have the shape {shape} and at least one action, got the shape {chunk.shape}"
+        )
     return chunk
 
 
@@ -100,7 +102,9 @@ class Hands:
         limits: slow the hands down; None for no limits.
     """
 
-    def __init__(self, row: NDArray[np.floating[Any]], monitor: Any, dt: float, limits: ContactLimits | None) -> None:
+    def __init__(
+        self, row: NDArray[np.floating[Any]], monitor: Any, dt: float, limits: ContactLimits | None
+    ) -> None:
         sensed = row.astype(np.float64)[hands_of(monitor.spec)]  # (H, 2, 3)
         self._places = sensed[:, 0]
         self._velocities = sensed[:, 1]

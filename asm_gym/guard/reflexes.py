@@ -207,7 +207,9 @@ def record_motion(robots: Any, rows: Any, executed: Any, motion: Any) -> None:
         for j in range(len(motion.torque_columns)):
             if not robot.overridden:
                 # What is carried weighs on the joints as well; only what has come since is yielded to.
-                motion.usual_torque[n, j] += USUAL_GAIN * (motion.torque[n, j] - motion.usual_torque[n, j])
+                motion.usual_torque[n, j] += USUAL_GAIN * (
+                    motion.torque[n, j] - motion.usual_torque[n, j]
+                )
             torque = float(rows[n, motion.torque_columns[j]])
             motion.torque[n, j] = torque if np.isfinite(torque) else 0.0
         if not robot.overridden:

@@ -19,8 +19,12 @@ from asm_gym.memory.completion import Completion
 
 WELL_AFTER_S = 1.0  # a sense is well again once it has said what was expected for so long [s]
 WELL_WITHIN = 4.0  # standard deviations of the completion's own error that this may be off
-UNTOLD = 0.5  # no other sense tells of one whose completion leaves more than this share of its spread
-TRUST_S = 1.0  # how long a sense that no other sense tells of is completed, by its last good value [s]
+UNTOLD = (
+    0.5  # no other sense tells of one whose completion leaves more than this share of its spread
+)
+TRUST_S = (
+    1.0  # how long a sense that no other sense tells of is completed, by its last good value [s]
+)
 LONGEST_S = 20.0  # no sense is completed for longer than this [s]
 MOST_MISSING = 0.5  # where more than this share of the senses is missing, what is left tells too little of them
 FARTHEST = 6.0  # no completed number goes further than so many of its spreads from its mean
@@ -71,17 +75,23 @@ class Repair:
         self._patience = round(TRUST_S / spec.dt)
         self._longest = round(LONGEST_S / spec.dt)
         self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
-        self._settle = 2 * completion.senses.lag + 1  # rows in which changes are taken from what was not yet repaired
+        self._settle = (
+            2 * completion.senses.lag + 1
+        )  # rows in which changes are taken from what was not yet repaired
         self.missing = np.zeros(spec.size, bool)
         self.settling = 0
-        self._returned = np.zeros(spec.size, np.int64)  # (D,) rows until its changes are those of the sense again
+        self._returned = np.zeros(
+            spec.size, np.int64
+        )  # (D,) rows until its changes are those of the sense again
         self._sensors: dict[str, MissingSensor] = {}
         self._unchecked = 0  # rows in which something was completed that no other sense tells of
         self._before: Floats | None = None  # (D,) the row before, repaired
         if before is not None:
             self._before = np.array(before, np.float64)
         self._good = self._before  # (D,) the last row before something was missing
-        self._raw = np.zeros(spec.size) if self._before is None else self._before  # (D,) the newest, as it was sensed
+        self._raw = (
+            np.zeros(spec.size) if self._before is None else self._before
+        )  # (D,) the newest, as it was sensed
         self._raw_before = self._raw
 
     @property
@@ -205,7 +215,9 @@ class Repair:
         """Return (D,) which missing numbers say what others tell of them, and which at least say something likely."""
         columns = self._filling.columns
         raw = self._raw[columns]
-        close = np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error  # False for what is not finite
+        close = (
+            np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error
+        )  # False for what is not finite
         for hand in self._hands:
             close &= ~hand.accused(self._robot)[columns]
         repeats = (raw == self._raw_before[columns]) & (self._spec.noise[columns] > 0)

@@ -26,7 +26,9 @@ KNOCKED = EVENTS.index(KNOCK)
 class Outcome:
     """What became of the row of one robot about which there was something to decide."""
 
-    terms: tuple[str, ...] = ()  # alarm terms that hold, in the order of priority; empty for no alarm
+    terms: tuple[
+        str, ...
+    ] = ()  # alarm terms that hold, in the order of priority; empty for no alarm
     event: int = 0  # an index in ``EVENTS``; 0 where there is no alarm
     response: Response = NO_RESPONSE  # what is done about it
     decision: Decision = field(default_factory=Decision)  # what it has led to
@@ -92,12 +94,16 @@ class AsmInfo(TypedDict, total=False):
     state: str  # who acts next
     intervened: bool  # another than the policy acted, in some row
     gave_up: bool  # the episode ends
-    transition: str  # what has led to the state, or how the policy goes on in alarm; empty for no change
+    transition: (
+        str  # what has led to the state, or how the policy goes on in alarm; empty for no change
+    )
     failure: str  # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
     cause: dict[str, Any]  # family, part, probability of the family, probabilities of all
     response: str  # what is done about it under "graded"
     case: str  # the row of the table of responses that says so
-    severity: dict[str, Any]  # see ``severity_info``; None for what is not known, so that a report equals itself
+    severity: dict[
+        str, Any
+    ]  # see ``severity_info``; None for what is not known, so that a report equals itself
     executed_action: Any  # (A,) after the limit of the hand's speed; None before the first step
     slowed: float  # largest share that the speed limit took from a number of the action
     attribution: dict[str, float]  # what each number adds to the largest surprise
@@ -109,7 +115,9 @@ class AsmInfo(TypedDict, total=False):
     level: float  # share of episodes so far with a false alarm, likewise
 
 
-def asm_info(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, **step: Any) -> AsmInfo:
+def asm_info(
+    rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: Any = None, **step: Any
+) -> AsmInfo:
     """Return what ``info["asm"]`` says of a robot, from the rows of a step.
 
     Args:
@@ -126,7 +134,9 @@ def asm_info(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: 
     outcomes = [row.outcomes.get(robot, NO_OUTCOME) for row in rows]
     explained = [outcome.response for outcome in outcomes if outcome.response.why]
     response = explained[-1] if explained else NO_RESPONSE
-    transitions = [outcome.decision.transition for outcome in outcomes if outcome.decision.transition]
+    transitions = [
+        outcome.decision.transition for outcome in outcomes if outcome.decision.transition
+    ]
     terms = in_order_of_priority(name for outcome in outcomes for name in outcome.terms)
     severity = severity_info(last.robots[robot])
     info: AsmInfo = {
@@ -146,7 +156,9 @@ def asm_info(rows: Sequence[RowReport], robot: int, spec: StreamSpec, executed: 
         "case": response.case,
         "severity": {name: value if value == value else None for name, value in severity.items()},
         "executed_action": deepcopy(executed),
-        "attribution": dict(zip(spec.labels, most_surprising.attribution[robot].tolist(), strict=True)),
+        "attribution": dict(
+            zip(spec.labels, most_surprising.attribution[robot].tolist(), strict=True)
+        ),
         "surprises": surprises,
         "completed": last.repairs.get(robot, ()),
         "lost": last.lost.get(robot, ()),
@@ -176,8 +188,12 @@ def side_by_side(row: RowReport, spec: StreamSpec, **step: Any) -> dict[str, Any
     each = [asm_info([row], robot, spec) for robot in range(len(row.robots))]
     numbers = [severity_info(record) for record in row.robots]
     info: dict[str, Any] = {name: _stacked([said[name] for said in each]) for name in each[0]}  # type: ignore[literal-required]
-    info["severity"] = {name: np.array([severity[name] for severity in numbers]) for name in numbers[0]}
-    info["attribution"] = {label: row.attribution[:, column] for column, label in enumerate(spec.labels)}
+    info["severity"] = {
+        name: np.array([severity[name] for severity in numbers]) for name in numbers[0]
+    }
+    info["attribution"] = {
+        label: row.attribution[:, column] for column, label in enumerate(spec.labels)
+    }
     info["surprises"] = row.robots["surprise"][:, None]
     info["executed_action"] = None
     return info | step

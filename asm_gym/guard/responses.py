@@ -13,7 +13,9 @@ LASTING = {"contact": 1.0, "actuator": 2.5}
 has been pressed for most of that time and has not turned. Where the policy goes on in spite of another cause, and the
 arm is pressed so and does not move, it is a lasting contact."""
 
-PRESSING = "pressing"  # the arm presses harder than healthy motion does, whatever the cause is taken for
+PRESSING = (
+    "pressing"  # the arm presses harder than healthy motion does, whatever the cause is taken for
+)
 
 CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
 """What a table of responses says something about."""
@@ -47,8 +49,12 @@ class Response(NamedTuple):
 
     name: str  # one of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked
     cause: dict[str, Any]  # as ``info["asm"]["cause"]`` says it
-    touched: bool | None = None  # the contact is still there; None: not known, or so long that it may never end
-    case: str = ""  # one of ``CAUSES``: the row of the table that was followed; empty where none was
+    touched: bool | None = (
+        None  # the contact is still there; None: not known, or so long that it may never end
+    )
+    case: str = (
+        ""  # one of ``CAUSES``: the row of the table that was followed; empty where none was
+    )
 
     @property
     def why(self) -> str:
@@ -82,5 +88,7 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
         check_choice("response", response, RESPONSES)
         if cause.endswith(PRESSING) and response in GOING_ON:
             possible = ", ".join(name for name in RESPONSES if name not in GOING_ON)
-            raise ValueError(f"{short_repr(response)} would let a pressing arm go on: {cause} takes {possible}")
+            raise ValueError(
+                f"{short_repr(response)} would let a pressing arm go on: {cause} takes {possible}"
+            )
     return {**DEFAULT, **(table or {})}

@@ -35,7 +35,10 @@ ROBOT = np.dtype(
         ("failed", np.bool_),  # monitor, stream, policy or reflex failed
         ("overridden", np.bool_),  # something else than the policy's action was executed
         ("held", np.bool_),  # a reflex acted
-        ("must_decide", np.bool_),  # there is something to decide, whatever surprise and contact are
+        (
+            "must_decide",
+            np.bool_,
+        ),  # there is something to decide, whatever surprise and contact are
         # Row validation (``recent_rows``, ``hand_check``)
         ("episode_rows", np.int64),  # rows in this episode
         ("lost", np.bool_),  # a number is not finite
@@ -45,10 +48,19 @@ ROBOT = np.dtype(
         ("raw_surprise", np.float64),  # before a benign event excuses part of it
         ("excuse", np.int8),  # that event, an index in ``EVENTS``
         # Contact state (``contact_state``)
-        ("load", np.float64),  # largest share of a contact limit in the physics substeps of this step
-        ("limit_passed_s", np.float64),  # when in the step a limit was passed [s]; infinite for never
+        (
+            "load",
+            np.float64,
+        ),  # largest share of a contact limit in the physics substeps of this step
+        (
+            "limit_passed_s",
+            np.float64,
+        ),  # when in the step a limit was passed [s]; infinite for never
         ("contact_force", np.float64),  # on the arm, estimated from wrist and joints [N]
-        ("pressed_impulse", np.float64),  # of that force beyond ``FREE_FORCE``, in this episode [N s]
+        (
+            "pressed_impulse",
+            np.float64,
+        ),  # of that force beyond ``FREE_FORCE``, in this episode [N s]
         ("leaning_time", np.float64),  # for which the arm has leant on something [s]
         ("hand_speed", np.float64),  # of the fastest hand [m/s]
         ("presses", np.bool_),  # a limit was passed, or the arm leans on something
@@ -65,12 +77,18 @@ ROBOT = np.dtype(
         ("calm_rows", np.int64),  # of low surprise, one after the other
         ("free_rows", np.int64),  # of a reflex without a contact, one after the other
         ("held_rows", np.int64),  # of a reflex since it took over
-        ("override_rows", np.int64),  # the same, those before a hand-back that came too early included
+        (
+            "override_rows",
+            np.int64,
+        ),  # the same, those before a hand-back that came too early included
         ("early_returns", np.int64),  # hand-backs that came too early, one after the other
         ("rows_since_return", np.int64),  # of the policy since control was handed back
         ("rows_going_on", np.int64),  # of the policy in alarm, in this episode
         ("strikes", np.int64),  # how often the policy has pressed too hard in this episode
-        ("rows_until_trial", np.float64),  # that a reflex acts before a trial; infinite for no trial
+        (
+            "rows_until_trial",
+            np.float64,
+        ),  # that a reflex acts before a trial; infinite for no trial
         ("on_trial", np.bool_),  # the last hand-back was a trial
         ("confirmed", np.bool_),  # an alarm in this episode was no false one
         ("largest_surprise", np.float64),  # in this episode while the policy acted
@@ -121,7 +139,9 @@ class RobotTable:
 
     def info(self, name: str, otherwise: float = np.nan) -> NDArray[np.float64]:
         """Return the number (n,) that the environments say under ``name`` in ``info``; ``otherwise`` without one."""
-        values = np.broadcast_to(np.asarray(self.infos.get(name, otherwise), np.float64), len(self.records))
+        values = np.broadcast_to(
+            np.asarray(self.infos.get(name, otherwise), np.float64), len(self.records)
+        )
         there = self.infos.get(f"_{name}", True)
         return np.where(there, values, otherwise)
 
@@ -131,7 +151,9 @@ class RobotTable:
         for i, robot in enumerate(self.records):
             surprise = f"{robot['surprise']:8.3g}  {robot['threshold']:9.3g}"
             contact = f"{robot['contact_force']:9.3g}  {robot['pressed_impulse']:13.3g}"
-            lines.append(f"{i:5}  {STATES[robot['state']]:6}  {surprise}  {contact}  {bool(robot['alarm'])}")
+            lines.append(
+                f"{i:5}  {STATES[robot['state']]:6}  {surprise}  {contact}  {bool(robot['alarm'])}"
+            )
         return "\n".join(lines)
 
 

@@ -28,7 +28,9 @@ class ValidatedRows:
     """The next row of each robot, as the monitor is to see it; mappings hold the robots with something to say."""
 
     rows: Floats32  # (n, D)
-    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # the numbers that were not finite
+    lost: Mapping[int, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # the numbers that were not finite
     contradictions: Mapping[int, Contradiction] = field(default_factory=dict)  # of hand and joints
     failures: Mapping[int, str] = field(default_factory=dict)  # what can no longer be relied on
 
@@ -49,15 +51,20 @@ class RowValidator:
         recent: the last rows.
     """
 
-    def __init__(self, facts: RobotFacts, table: RobotTable, completion: Completion | None, kept: int) -> None:
+    def __init__(
+        self, facts: RobotFacts, table: RobotTable, completion: Completion | None, kept: int
+    ) -> None:
         self._spec: StreamSpec = table.spec
         self._table = table
         self._completion = None if facts.observed is None else completion
         if completion is not None and facts.observed is None:
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
-            reason = facts.refused.get("complete", "it is not known where they stand in the observation")
+            reason = facts.refused.get(
+                "complete", "it is not known where they stand in the observation"
+            )
             warnings.warn(
-                f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}", stacklevel=5
+                f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}",
+                stacklevel=5,
             )
         self.read = None if self._completion is None else facts.observed
         self.hands = HandChecks(facts.count, facts.chains, self._spec)
@@ -72,7 +79,9 @@ class RowValidator:
 
     def validate(self, rows: Floats32) -> ValidatedRows:
         """Return the next rows (n, D), which are written to, as the monitor is to see them."""
-        unusual = validate_rows(self._table.records, rows, self.recent.arrays, self.hands.geometry, self.hands.state)
+        unusual = validate_rows(
+            self._table.records, rows, self.recent.arrays, self.hands.geometry, self.hands.state
+        )
         return self.repair(rows) if unusual or self.repairs else ValidatedRows(rows)
 
     def repair(self, rows: Floats32) -> ValidatedRows:
@@ -80,7 +89,10 @@ class RowValidator:
         records = self._table.records
         for hand in self.hands.arms:
             hand.close_cases()
-        lost = {robot: self._not_finite(rows[robot]) for robot in np.flatnonzero(records["lost"]).tolist()}
+        lost = {
+            robot: self._not_finite(rows[robot])
+            for robot in np.flatnonzero(records["lost"]).tolist()
+        }
         contradicting = np.flatnonzero(records["contradicts"]).tolist()
         records["contradicts"] = False
         contradictions: dict[int, Contradiction] = {}

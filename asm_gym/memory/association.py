@@ -29,7 +29,10 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, inner_kernel, kernel, outward
 
-SMALLEST, LARGEST = np.float32(-12.0), np.float32(8.0)  # log σ² of 0.25 % of a channel's spread, and of 55 spreads
+SMALLEST, LARGEST = (
+    np.float32(-12.0),
+    np.float32(8.0),
+)  # log σ² of 0.25 % of a channel's spread, and of 55 spreads
 
 
 class Association(NamedTuple):
@@ -58,7 +61,11 @@ def association_shapes(inputs: int, units: int, changes: int) -> dict[str, tuple
 def no_doubt(inputs: int, changes: int) -> dict[str, Array]:
     """Return R, Q and ``doubt`` by which g is 1 everywhere."""
     doubt = np.repeat(np.array([[1.0], [0.0], [0.0]], np.float32), changes, axis=1)
-    return {"R": np.zeros((0, inputs), np.float32), "Q": np.zeros((changes, changes), np.float32), "doubt": doubt}
+    return {
+        "R": np.zeros((0, inputs), np.float32),
+        "Q": np.zeros((changes, changes), np.float32),
+        "doubt": doubt,
+    }
 
 
 class Change(NamedTuple):
@@ -76,7 +83,10 @@ def synapses(groups: NDArray[np.intp], changes: slice, inputs: int, size: int) -
     ``inputs`` I, and ``size`` is the number of hidden units of a group.
     """
     unit_group = np.repeat(np.arange(groups.max() + 1), size)  # (M,)
-    V, D = np.ones((len(unit_group), inputs), np.float32), np.ones((len(groups), inputs), np.float32)
+    V, D = (
+        np.ones((len(unit_group), inputs), np.float32),
+        np.ones((len(groups), inputs), np.float32),
+    )
     V[:, changes] = unit_group[:, None] != groups
     D[:, changes] = groups[:, None] != groups
     return Change(V, (groups[:, None] == unit_group).astype(np.float32), D)
@@ -88,7 +98,9 @@ def spans(U: Array) -> NDArray[np.intp]:
         return np.zeros((len(U), 2), np.intp)
     exists = U != 0
     begins, ends = exists.argmax(axis=1), U.shape[1] - exists[:, ::-1].argmax(axis=1)
-    return np.where(exists.any(axis=1)[:, None], np.stack([begins, ends], axis=1), 0).astype(np.intp)
+    return np.where(exists.any(axis=1)[:, None], np.stack([begins, ends], axis=1), 0).astype(
+        np.intp
+    )
 
 
 @kernel
@@ -124,7 +136,11 @@ def unbounded(size: int) -> Array:
 def leverage(a: Array, R: Array, Q: Array, groups: NDArray[np.intp], first: int) -> Array:
     """Return l (B, X) of inputs (B, I), of which the X changes begin at ``first``; ``groups`` (X,) are numbered."""
     B, X, past = len(a), len(groups), a.shape[1] - len(groups)
-    b, z, squares = np.empty_like(a), np.empty_like(a), np.empty(X, a.dtype)  # squares of a group, at its number
+    b, z, squares = (
+        np.empty_like(a),
+        np.empty_like(a),
+        np.empty(X, a.dtype),
+    )  # squares of a group, at its number
     tail = np.empty((B, X), a.dtype)
     for n in range(B):  # numba takes seconds to compile an assignment to a slice
         for i in range(past):

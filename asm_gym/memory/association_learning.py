@@ -40,8 +40,15 @@ from asm_gym.memory.linear import inverse_of, learn_from_past, learn_linear
 
 FEEDBACK_GAIN = 1e-3  # initial gain of B
 DECAY = 0.3  # share of its step size by which a synapse of U or B decays
-UPDATES, PASSES, BATCH = 20_000, 40, 256  # largest number of batches, and of passes over the rows; rows of a batch
-RATE, WARM_UP = 5e-3, 0.1  # step size, and share of the updates in which it rises; after that it falls along a cosine
+UPDATES, PASSES, BATCH = (
+    20_000,
+    40,
+    256,
+)  # largest number of batches, and of passes over the rows; rows of a batch
+RATE, WARM_UP = (
+    5e-3,
+    0.1,
+)  # step size, and share of the updates in which it rises; after that it falls along a cosine
 TICKS = 20  # progress reports of one learning of the hidden units
 ROWS_PER_INPUT = 12  # with fewer rows for each input, the senses are not predicted from each other
 TRACKING = np.float32(0.01)  # weight of the newest batch in the running spread σ of each error
@@ -52,9 +59,16 @@ SMALLEST_SPREAD = np.float32(1e-4)  # below this single precision is noise
 EXTREME = 0.0005  # share of nominal rows below the limits of log σ², and above
 LARGEST_RATIO = 30.0  # clips ε²/σ² (5.5 σ), so that one contact does not undo a thousand steps
 PRECISION_EPOCHS, PRECISION_RATE = 20, 1e-3
-PRECISION_BATCH, PRECISION_BATCHES = 64, 250  # rows of a batch, and most batches in an epoch; then they are larger
+PRECISION_BATCH, PRECISION_BATCHES = (
+    64,
+    250,
+)  # rows of a batch, and most batches in an epoch; then they are larger
 DOUBTS = 0.0, *(10.0 ** np.arange(-2.0, 0.6, 0.25))  # τ to choose from
-FREEDOM, SCALINGS, MOST_DOUBTED = 4, 10, 30_000  # of the t distribution, steps to its spread, and rows to choose τ by
+FREEDOM, SCALINGS, MOST_DOUBTED = (
+    4,
+    10,
+    30_000,
+)  # of the t distribution, steps to its spread, and rows to choose τ by
 ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS  # progress reports of ``learn_association``
 
 
@@ -70,7 +84,14 @@ def inward(pulled: Array, f: Array, back: Array) -> Array:
 
 
 def association_change(
-    a: Array, delta: Array, spread: Array, V: Array, U: Array, D: Array, bound: float = 1.0, back: Array | None = None
+    a: Array,
+    delta: Array,
+    spread: Array,
+    V: Array,
+    U: Array,
+    D: Array,
+    bound: float = 1.0,
+    back: Array | None = None,
 ) -> tuple[Change, Array]:
     """Return the change of each synapse, as if all existed, and the errors (B, X).
 
@@ -81,7 +102,9 @@ def association_change(
     error = delta - (complete(f, a, U, D) if D.size else outward(f, U))
     pulled = np.clip(error / spread, np.float32(-bound), np.float32(bound))
     upstream = inward(pulled, f, U if back is None else back)  # (B, M) ε_h
-    return Change(coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a) if D.size else D), error
+    return Change(
+        coincidence(upstream, a), coincidence(pulled, f), coincidence(pulled, a) if D.size else D
+    ), error
 
 
 def learn_association(
@@ -119,14 +142,18 @@ def learn_association(
             tick()
         none, flat = np.zeros_like(exists.U), np.zeros_like(remainder)
         precision = none.copy(), flat, unbounded(len(D)), remainder
-        return Association(_random(exists.V, rng), none, D, *precision, **no_doubt(*D.shape[::-1])), left
+        return Association(
+            _random(exists.V, rng), none, D, *precision, **no_doubt(*D.shape[::-1])
+        ), left
 
     def expect(learned_from: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Array:
         own_D = learn_linear(a[learned_from], groups, changes)
         own_left = (delta - outward(a, own_D)) / remainder
         V, U = _learn_hidden(a[learned_from], own_left[learned_from], exists, rng, tick)
         known = *inverse_of(a[learned_from], groups, changes), groups, changes.start
-        return np.hstack([own_left[asked], outward(hidden_units(a[asked], V), U), leverage(a[asked], *known)])
+        return np.hstack(
+            [own_left[asked], outward(hidden_units(a[asked], V), U), leverage(a[asked], *known)]
+        )
 
     # Errors on rows that were learned are smaller than those to come.
     fresh = crossfit(expect, thirds(len(a), lengths, rng), 3 * len(D))
@@ -141,7 +168,9 @@ def learn_association(
     doubt = learn_doubt(error, far)
     error /= np.sqrt(doubt[0] + doubt[1] * far)
     inverse = inverse_of(a, groups, changes)
-    return Association(V, U * remainder[:, None], D, W_S, b_S, span_S, remainder, *inverse, doubt), error
+    return Association(
+        V, U * remainder[:, None], D, W_S, b_S, span_S, remainder, *inverse, doubt
+    ), error
 
 
 def learn_doubt(error: Array, far: Array) -> Array:
@@ -155,18 +184,30 @@ def learn_doubt(error: Array, far: Array) -> Array:
         q = squares / g
         spread = np.maximum(np.median(q, axis=0), SMALLEST_SPREAD**2)
         for _ in range(SCALINGS):
-            spread = np.maximum(np.mean(q * (FREEDOM + 1) / (FREEDOM + q / spread), axis=0), SMALLEST_SPREAD**2)
-        costs.append(np.mean(np.log(g * spread) + (FREEDOM + 1) * np.log1p(q / spread / FREEDOM), axis=0))
+            spread = np.maximum(
+                np.mean(q * (FREEDOM + 1) / (FREEDOM + q / spread), axis=0), SMALLEST_SPREAD**2
+            )
+        costs.append(
+            np.mean(np.log(g * spread) + (FREEDOM + 1) * np.log1p(q / spread / FREEDOM), axis=0)
+        )
     tau = np.array(DOUBTS)[np.argmin(costs, axis=0)]
-    return np.stack([1.0 / (1.0 + tau), tau / (1.0 + tau) / usual, far.max(axis=0)]).astype(np.float32)
+    return np.stack([1.0 / (1.0 + tau), tau / (1.0 + tau) / usual, far.max(axis=0)]).astype(
+        np.float32
+    )
 
 
 def _random(exists: Array, rng: np.random.Generator) -> Array:
     """Return initial V (M, I)."""
-    return rng.standard_normal(exists.shape).astype(np.float32) / np.float32(np.sqrt(exists.shape[1])) * exists
+    return (
+        rng.standard_normal(exists.shape).astype(np.float32)
+        / np.float32(np.sqrt(exists.shape[1]))
+        * exists
+    )
 
 
-def _learn_hidden(a: Array, left: Array, exists: Change, rng: np.random.Generator, tick: Tick) -> tuple[Array, Array]:
+def _learn_hidden(
+    a: Array, left: Array, exists: Change, rng: np.random.Generator, tick: Tick
+) -> tuple[Array, Array]:
     """Return V and U learned from inputs (N, I) and what the linear part leaves (N, X), standardised."""
     updates = max(TICKS, min(UPDATES, PASSES * len(a) // BATCH))
     V = _random(exists.V, rng)
@@ -174,7 +215,9 @@ def _learn_hidden(a: Array, left: Array, exists: Change, rng: np.random.Generato
     into, out_of = Synapse(V), Synapse(U)
     spread = np.ones(left.shape[1], np.float32)
     each = np.maximum(exists.U.sum(axis=1, keepdims=True), 1.0)
-    B = (FEEDBACK_GAIN * rng.standard_normal(exists.U.shape) / np.sqrt(each)).astype(np.float32) * exists.U
+    B = (FEEDBACK_GAIN * rng.standard_normal(exists.U.shape) / np.sqrt(each)).astype(
+        np.float32
+    ) * exists.U
     back = Synapse(B)
     for n, rows in zip(range(updates), shuffled(len(a), BATCH, rng), strict=False):
         change, error = association_change(a[rows], left[rows], spread, V, U, no_linear, back=B)
@@ -205,7 +248,9 @@ def thirds(rows: int, lengths: Sequence[int], rng: np.random.Generator) -> NDArr
 
 
 def crossfit(
-    expect: Callable[[NDArray[np.bool_], NDArray[np.bool_]], Array], third: NDArray[np.intp], size: int
+    expect: Callable[[NDArray[np.bool_], NDArray[np.bool_]], Array],
+    third: NDArray[np.intp],
+    size: int,
 ) -> Array:
     """Return the prediction (N, X) of each row; ``expect`` learns from one mask (N,), and predicts another (M, X)."""
     found = np.zeros((len(third), size), np.float32)
@@ -225,26 +270,37 @@ def trust(left: Array, expected: Array) -> Array:
 
 def usual_span(f: Array, W_S: Array, b_S: Array) -> Array:
     """Return the limits (2, X) of log σ² in nominal contexts (N, M)."""
-    found: Array = np.quantile(log_variance(f, W_S, b_S, unbounded(len(b_S))), (EXTREME, 1.0 - EXTREME), axis=0)
+    found: Array = np.quantile(
+        log_variance(f, W_S, b_S, unbounded(len(b_S))), (EXTREME, 1.0 - EXTREME), axis=0
+    )
     return found.astype(np.float32)
 
 
 def precision_change(f: Array, error: Array, W_S: Array, b_S: Array) -> tuple[Array, Array]:
     """Return the change of ``W_S`` (X, M) and ``b_S`` (X,) for contexts ``f`` (B, M) and errors (B, X)."""
-    excess = np.minimum(error**2 * np.exp(-log_variance(f, W_S, b_S, unbounded(len(b_S)))), np.float32(LARGEST_RATIO))
+    excess = np.minimum(
+        error**2 * np.exp(-log_variance(f, W_S, b_S, unbounded(len(b_S)))),
+        np.float32(LARGEST_RATIO),
+    )
     excess -= np.float32(1.0)
     return coincidence(excess, f), excess.mean(axis=0)
 
 
-def learn_precision(f: Array, error: Array, rng: np.random.Generator, tick: Tick = lambda: None) -> tuple[Array, Array]:
+def learn_precision(
+    f: Array, error: Array, rng: np.random.Generator, tick: Tick = lambda: None
+) -> tuple[Array, Array]:
     """Return ``W_S`` (X, M) and ``b_S`` (X,) learned from contexts ``f`` (N, M) and the errors (N, X) in them."""
     W_S = np.zeros((error.shape[1], f.shape[1]), np.float32)
-    b_S: Array = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), *unbounded(len(W_S))).astype(np.float32)
+    b_S: Array = np.clip(np.log(np.mean(error**2, axis=0) + 1e-12), *unbounded(len(W_S))).astype(
+        np.float32
+    )
     context, bias = Synapse(W_S), Synapse(b_S)
     for epoch in range(PRECISION_EPOCHS):
         order: NDArray[np.intp] = rng.permutation(len(f))
         rate = cosine_decay(PRECISION_RATE, epoch / PRECISION_EPOCHS)
-        for rows in np.array_split(order, max(1, min(PRECISION_BATCHES, len(order) // PRECISION_BATCH))):
+        for rows in np.array_split(
+            order, max(1, min(PRECISION_BATCHES, len(order) // PRECISION_BATCH))
+        ):
             change, bias_change = precision_change(f[rows], error[rows], W_S, b_S)
             context.learn(change, rate)
             bias.learn(bias_change, rate)

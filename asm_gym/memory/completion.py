@@ -31,7 +31,9 @@ Mask = NDArray[np.bool_]
 
 PAIRED = 18  # the slowest senses go into products: an arm's joints and its hand
 PENALTY = 1e-4  # λ, in units of the variance of a standardised number
-MOST_ENTRIES = 2048  # largest length of y; wider streams are not completed, as C would outgrow the memory
+MOST_ENTRIES = (
+    2048  # largest length of y; wider streams are not completed, as C would outgrow the memory
+)
 FARTHEST = 30.0  # standardised numbers are clipped to this, so that one broken sense does not spoil all completions
 
 ARRAYS = ("completion_products", "completion_covariance", "completion_centre", "completion_error")
@@ -59,13 +61,18 @@ class Completion:
     def fit(cls, senses: StreamScaler, streams: Sequence[NDArray[np.floating[Any]]]) -> Self | None:
         """Learn from training episodes (T, D); None for streams that are too wide."""
         spec, D = senses.spec, senses.spec.size
-        slowest = senses.slow[np.argsort((senses.change / senses.spread)[senses.slow], kind="stable")][:PAIRED]
+        slowest = senses.slow[
+            np.argsort((senses.change / senses.spread)[senses.slow], kind="stable")
+        ][:PAIRED]
         first, second = np.triu_indices(len(slowest))
         products = np.stack([slowest[first], slowest[second]], axis=1)
         Y = 2 * len(spec.sensory) + len(spec.motor) + len(products)
         if Y > MOST_ENTRIES:
             return None
-        blank, rows = cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(D)), sum(map(len, streams))
+        blank, rows = (
+            cls(senses, products, np.eye(Y), np.zeros(Y), np.ones(D)),
+            sum(map(len, streams)),
+        )
 
         def mean(part: Callable[[Floats], Floats]) -> Floats:
             return np.asarray(sum(part(blank.lift(s)) for s in streams)) / rows
@@ -82,7 +89,9 @@ class Completion:
         """Restore what ``named`` returned; None where it is absent. Raises ValueError where it does not fit."""
         if not all(name in learned for name in ARRAYS):
             return None
-        products, covariance, centre, error = (np.asarray(learned[name], np.float64) for name in ARRAYS)
+        products, covariance, centre, error = (
+            np.asarray(learned[name], np.float64) for name in ARRAYS
+        )
         spec, P = senses.spec, len(products)
         Y = 2 * len(spec.sensory) + len(spec.motor) + P
         check_shapes(learned, dict(zip(ARRAYS, ((P, 2), (Y, Y), (Y,), (spec.size,)), strict=True)))
@@ -92,7 +101,12 @@ class Completion:
 
     def named(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint."""
-        arrays = self.products.astype(np.float32), self.covariance.astype(np.float32), self.centre, self.error
+        arrays = (
+            self.products.astype(np.float32),
+            self.covariance.astype(np.float32),
+            self.centre,
+            self.error,
+        )
         return dict(zip(ARRAYS, arrays, strict=True))
 
     @property
@@ -110,12 +124,16 @@ class Completion:
         x = np.clip(np.nan_to_num(x, nan=0.0, posinf=0.0, neginf=0.0), -FARTHEST, FARTHEST)
         sensory, motor = x[:, self.spec.sensory], x[:, self.spec.motor]
         before = np.concatenate([sensory[:1], sensory[:-1]])
-        return np.hstack([sensory, before, motor, x[:, self.products[:, 0]] * x[:, self.products[:, 1]]])
+        return np.hstack(
+            [sensory, before, motor, x[:, self.products[:, 0]] * x[:, self.products[:, 1]]]
+        )
 
     def involved(self, missing: Mask) -> Mask:
         """Return the mask (Y,) of the entries of y in which columns of ``missing`` (D,) take part."""
         sensory = missing[self.spec.sensory]
-        return np.concatenate([sensory, sensory, missing[self.spec.motor], missing[self.products].any(axis=1)])
+        return np.concatenate(
+            [sensory, sensory, missing[self.spec.motor], missing[self.products].any(axis=1)]
+        )
 
     def filling(self, missing: Mask) -> Filling:
         """Return how to complete the senses of ``missing`` (D,) from all others."""
@@ -124,7 +142,9 @@ class Completion:
         left = C[places, places] - np.einsum("my,ym->m", W, C[:, places])
         # The error of one missing sensor was measured; that of several follows from C.
         error = np.sqrt(np.maximum(left, 0.0))
-        return Filling(columns, W, np.maximum(error, self.error[columns]) * self.senses.spread[columns])
+        return Filling(
+            columns, W, np.maximum(error, self.error[columns]) * self.senses.spread[columns]
+        )
 
     def complete(self, filling: Filling, lifted: Floats) -> Floats:
         """Return the completed senses (T, M) [unit of each] in rows of y (T, Y)."""
@@ -140,7 +160,9 @@ class Completion:
     @cached_property
     def precision(self) -> Floats:
         """P = (C + λ)⁻¹ (Y, Y)."""
-        return np.linalg.inv(self.covariance + PENALTY * np.eye(len(self.covariance))).astype(np.float64)
+        return np.linalg.inv(self.covariance + PENALTY * np.eye(len(self.covariance))).astype(
+            np.float64
+        )
 
     def _weights(self, missing: Mask) -> tuple[NDArray[np.intp], Floats]:
         """Return the places (M,) of the senses of ``missing`` (D,) in y, and the weights (M, Y) that complete them.

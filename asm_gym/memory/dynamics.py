@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.association_learning import ALL_TICKS, learn_association
 from asm_gym.memory.learning import Schedule, Trajectory, passes
-from asm_gym.memory.settling import SettlingNetwork, SettlingWeights, learn_settling, settling_shapes
+from asm_gym.memory.settling import (
+    SettlingNetwork,
+    SettlingWeights,
+    learn_settling,
+    settling_shapes,
+)
 from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
 from asm_gym.memory.traces import Network, Weights, learn_traces, weight_shapes
 
@@ -29,7 +34,9 @@ TRACES, SETTLING = "traces", "settling"
 class Dynamics(NamedTuple):
     """A kind of temporal network."""
 
-    shapes: Callable[[int, int, int], dict[str, tuple[int, ...]]]  # of its synapses by name, for H, S and A
+    shapes: Callable[
+        [int, int, int], dict[str, tuple[int, ...]]
+    ]  # of its synapses by name, for H, S and A
     weights: Callable[..., Any]  # all synapses together
     network: Callable[..., TemporalNetwork]
     learn: Learn
@@ -73,8 +80,13 @@ def train(
             progress(done, total)
 
     network, energy, _ = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
-    inputs, lengths = np.concatenate([t.inputs for t in trajectories]), [len(t.inputs) for t in trajectories]
+    inputs, lengths = (
+        np.concatenate([t.inputs for t in trajectories]),
+        [len(t.inputs) for t in trajectories],
+    )
     deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
     independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
-    association, errors = learn_association(inputs, deltas, *layout, rng, tick, lengths, independent)
+    association, errors = learn_association(
+        inputs, deltas, *layout, rng, tick, lengths, independent
+    )
     return Trained(network.with_association(association), energy, errors)

@@ -136,7 +136,9 @@ def feedback(f: Array, x: Array, W_F: Array, pi_x: Array) -> Array:
 
 
 @inner_kernel
-def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array) -> tuple[Array, Array]:
+def energy_gradient(
+    z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array
+) -> tuple[Array, Array]:
     """Return ∂F/∂z (B, H), and the most that the bend of f adds to the curvature of F (B,).
 
     ``x`` (B, X) are senses and actions, less what is predicted past the state; Π_x (B, X) is 0 where not sensed.
@@ -150,12 +152,16 @@ def energy_gradient(z: Array, mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_
             steepest = max(steepest, abs(gradient[n, j]))
         bend[n] = STEEPEST * steepest
         for j in range(z.shape[1]):
-            gradient[n, j] = pi_z * (z[n, j] - mu[n, j]) - (np.float32(1) - f[n, j] * f[n, j]) * gradient[n, j]
+            gradient[n, j] = (
+                pi_z * (z[n, j] - mu[n, j]) - (np.float32(1) - f[n, j] * f[n, j]) * gradient[n, j]
+            )
     return gradient, bend
 
 
 @kernel
-def infer(mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int) -> Array:
+def infer(
+    mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int
+) -> Array:
     """Return z_t (B, H) after at most so many steps down the energy from μ; ``curvature`` is Π_z + max Π_x ‖W_F‖²."""
     z = mu.copy()
     for _ in range(iterations):

@@ -26,8 +26,13 @@ Tick = Callable[[], None]
 """Reports progress."""
 
 LONGEST_CUE = 30  # a stream reads fewer rows than this before it may run on alone
-UPDATES, RECALL_UPDATES = 10_000, 50_000  # largest number of batches without and with running on alone
-REFERENCE_WIDTH = 256  # hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
+UPDATES, RECALL_UPDATES = (
+    10_000,
+    50_000,
+)  # largest number of batches without and with running on alone
+REFERENCE_WIDTH = (
+    256  # hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
+)
 
 
 class Trajectory(NamedTuple):
@@ -125,7 +130,9 @@ class Learner(ABC):
 
     early: int  # 1 if running alone is drawn for the row to come, 0 if for the row itself
 
-    def __init__(self, weights: Any, names: Collection[str], schedule: Schedule, rng: np.random.Generator) -> None:
+    def __init__(
+        self, weights: Any, names: Collection[str], schedule: Schedule, rng: np.random.Generator
+    ) -> None:
         self.weights, self.schedule = weights, schedule
         self.synapses = {name: Synapse(getattr(weights, name)) for name in names}
         self._direction = rng.standard_normal(weights.W_F.shape[1]).astype(weights.W_F.dtype)
@@ -145,7 +152,12 @@ class Learner(ABC):
 
     @abstractmethod
     def practise(
-        self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
+        self,
+        state: Array,
+        now: Moment,
+        own: NDArray[np.bool_],
+        alone: NDArray[np.bool_],
+        rate: float,
     ) -> tuple[Array, float]:
         """Learn from one row; return the next state (B, Z) and the energy summed over the batch.
 
@@ -153,7 +165,9 @@ class Learner(ABC):
         """
 
 
-def one_after_another(trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator) -> Iterator[Moment]:
+def one_after_another(
+    trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator
+) -> Iterator[Moment]:
     """Yield rows of ``size`` endless streams of episodes, each begun at a random row."""
     senses, commands = (np.concatenate([t[k] for t in trajectories]) for k in range(2))
     length = np.array([len(t.senses) for t in trajectories])
@@ -176,7 +190,9 @@ class Practice:
         self.learner, self.rng = learner, rng
         self.state = learner.at_rest(size)
         self.cue = np.full((size, 1), LONGEST_CUE)
-        self._steps = np.zeros((size, 1), np.intp)  # rows since the episode began, or since the stream began
+        self._steps = np.zeros(
+            (size, 1), np.intp
+        )  # rows since the episode began, or since the stream began
         self._alone = np.zeros((size, 1), np.bool_)
 
     def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:
@@ -185,9 +201,13 @@ class Practice:
         for now in moments:
             state = np.where(now.begins, np.float32(0), self.state)
             self._steps = np.where(now.begins, 0, self._steps) + 1
-            self.cue = np.where(now.begins, self.rng.integers(1, LONGEST_CUE, self.cue.shape), self.cue)
+            self.cue = np.where(
+                now.begins, self.rng.integers(1, LONGEST_CUE, self.cue.shape), self.cue
+            )
             before = self._alone & ~now.begins
-            self._alone = (self._steps + early > self.cue) & (self.rng.random(self.cue.shape) < free)
+            self._alone = (self._steps + early > self.cue) & (
+                self.rng.random(self.cue.shape) < free
+            )
             own = before if early else self._alone
             self.state, energy = self.learner.practise(state, now, own, self._alone, rate)
             total += energy
@@ -204,7 +224,10 @@ def practise(
 ) -> NDArray[np.float64]:
     """Pass over the episodes with a decaying rate, more and more alone; return the mean energy of each pass."""
     streams = Practice(learner, schedule.batch_size, rng)
-    epochs, widest = passes(trajectories, schedule), schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden)
+    epochs, widest = (
+        passes(trajectories, schedule),
+        schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden),
+    )
     moments = one_after_another(trajectories, schedule.batch_size, rng)
     steps = -(-sum(len(t.senses) for t in trajectories) // schedule.batch_size)
     curve = np.zeros(epochs)

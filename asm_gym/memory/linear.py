@@ -37,7 +37,9 @@ PENALTIES = 10.0 ** np.arange(-8, 3)  # λ, in units of the variance of a standa
 EXACT = 1e-8  # mean squared errors below this are equally good
 MOST_INPUTS = 8192  # C of these takes 0.5 GiB, and its eigenvectors minutes
 FEW_PENALTY = 1e-4  # λ where rows are too few to choose it
-LEAST_VARIANCE = 1e-4  # λ of leverage: inputs that are constant, or copies of others, have no endless one
+LEAST_VARIANCE = (
+    1e-4  # λ of leverage: inputs that are constant, or copies of others, have no endless one
+)
 HELD_OUT = 5  # the last one in so many rows is held out
 LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped when penalties of ``specialise`` are compared
 
@@ -93,8 +95,13 @@ def check_inputs(count: int) -> None:
 
 def inverse_of(a: Array, groups: NDArray[np.intp], changes: slice) -> tuple[Array, Array]:
     """Return R (I, I) and Q (X, X) of ``Association`` from rows (N, I); the rest as in ``synapses``."""
-    exact, X = np.hstack([a[:, : changes.start], a[:, changes.stop :], a[:, changes]]).astype(np.float64), len(groups)
-    R = np.linalg.inv(np.linalg.cholesky(gram(exact) / len(exact) + LEAST_VARIANCE * np.eye(exact.shape[1])))
+    exact, X = (
+        np.hstack([a[:, : changes.start], a[:, changes.stop :], a[:, changes]]).astype(np.float64),
+        len(groups),
+    )
+    R = np.linalg.inv(
+        np.linalg.cholesky(gram(exact) / len(exact) + LEAST_VARIANCE * np.eye(exact.shape[1]))
+    )
     Q = np.zeros((X, X))
     for g in range(int(groups.max()) + 1):
         Q[groups == g] = np.linalg.qr(R[-X:, -X:][:, groups == g])[0].T
@@ -109,7 +116,9 @@ def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[
     for penalty in PENALTIES:
         error = fresh[:, changes] - along(fresh, conditional(shown, penalty, groups, changes))
         left.append(np.maximum(np.mean(error**2, axis=0), EXACT))
-    best = np.argmin(np.array(left)[::-1], axis=0)  # (X,) counted from the end: of equals the largest
+    best = np.argmin(
+        np.array(left)[::-1], axis=0
+    )  # (X,) counted from the end: of equals the largest
     everything, D = moments(a), np.zeros((len(groups), a.shape[1]))
     for n, penalty in enumerate(PENALTIES[::-1]):
         if np.any(best == n):
@@ -139,7 +148,10 @@ def specialise(
     for g in range(int(groups.max()) + 1):
         own = groups == g
         read, units = exists.D[own][0] > 0, exists.U[own][0] > 0
-        found = _ridge_towards_known(np.hstack([a[:, read], f[:, units]]), left[:, own]) * known.remainder[own, None]
+        found = (
+            _ridge_towards_known(np.hstack([a[:, read], f[:, units]]), left[:, own])
+            * known.remainder[own, None]
+        )
         D[np.ix_(own, read)] += found[:, : int(read.sum())]
         U[np.ix_(own, units)] += found[:, int(read.sum()) :]
     fresh = len(held_out(a))
@@ -161,7 +173,10 @@ def _ridge_towards_known(inputs: Array, left: Array) -> NDArray[np.float32]:
     fresh = len(held_out(inputs))
     shown = max(len(inputs) - fresh, 1)
     tried = [np.zeros((target.shape[1], exact.shape[1])), *_ridges(exact[:shown], target[:shown])]
-    errors = (np.clip(target[-fresh:] - exact[-fresh:] @ w.T, -LARGEST_ERROR, LARGEST_ERROR) for w in tried)
+    errors = (
+        np.clip(target[-fresh:] - exact[-fresh:] @ w.T, -LARGEST_ERROR, LARGEST_ERROR)
+        for w in tried
+    )
     best = np.argmin(np.array([np.mean(error**2, axis=0) for error in errors]), axis=0)  # (X,)
     final = [tried[0], *_ridges(exact, target)]
     return np.array([final[n][x] for x, n in enumerate(best)], np.float32)
@@ -171,4 +186,6 @@ def _ridges(inputs: NDArray[np.float64], target: NDArray[np.float64]) -> list[ND
     """Return the weights (X, J) for each penalty."""
     values, vectors = np.linalg.eigh(inputs.T @ inputs / len(inputs))
     seen = vectors.T @ (inputs.T @ target) / len(inputs)  # (J, X)
-    return [(vectors @ (seen / (np.maximum(values, 0.0) + penalty)[:, None])).T for penalty in PENALTIES]
+    return [
+        (vectors @ (seen / (np.maximum(values, 0.0) + penalty)[:, None])).T for penalty in PENALTIES
+    ]

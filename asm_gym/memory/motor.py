@@ -30,10 +30,16 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_shapes
 
-UPDATES, PASSES, BATCH = 12_000, 100, 256  # largest number of batches, and of passes over the rows; rows of a batch
+UPDATES, PASSES, BATCH = (
+    12_000,
+    100,
+    256,
+)  # largest number of batches, and of passes over the rows; rows of a batch
 RATE, FORGETTING = 3e-3, 0.3  # step size, and λ
 FINE = 8.0  # κ of relative positions of objects, where a centimetre decides
-PLACED = 4.0  # κ of the position of the hand: objects are put down at places that nothing else marks
+PLACED = (
+    4.0  # κ of the position of the hand: objects are put down at places that nothing else marks
+)
 FARTHEST = 100.0  # inputs are clipped to this
 
 
@@ -85,7 +91,11 @@ class Motor(NamedTuple):
             return None
         units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
         inputs = int(np.count_nonzero(fineness(senses.spec))) + 1
-        shapes: dict[str, tuple[int, ...]] = {"V": (units, inputs), "U": (motor, units), "D": (motor, inputs)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "V": (units, inputs),
+            "U": (motor, units),
+            "D": (motor, inputs),
+        }
         shapes |= {"mean": (motor,), "spread": (motor,)}
         check_shapes(learned, {f"motor_{name}": shape for name, shape in shapes.items()})
         return cls(**{name: learned[f"motor_{name}"] for name in shapes})

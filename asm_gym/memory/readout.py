@@ -54,15 +54,23 @@ def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Arra
 
 
 def learn_readout(
-    rates: Callable[[NDArray[np.intp]], Array], skill: NDArray[np.intp], count: int, rng: np.random.Generator
+    rates: Callable[[NDArray[np.intp]], Array],
+    skill: NDArray[np.intp],
+    count: int,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return W_K (K, M) and b_K (K,) learned from N rows whose ``skill`` (N,), each below ``count``, is known.
 
     ``rates`` returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
     """
-    W_K, b_K = np.zeros((count, rates(np.arange(1)).shape[1]), np.float32), np.zeros(count, np.float32)
+    W_K, b_K = (
+        np.zeros((count, rates(np.arange(1)).shape[1]), np.float32),
+        np.zeros(count, np.float32),
+    )
     weights, bias = Synapse(W_K), Synapse(b_K)
-    rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)  # (K,) n
+    rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(
+        np.float32
+    )  # (K,) n
     for n, rows in zip(range(UPDATES), shuffled(len(skill), BATCH, rng), strict=False):
         f = np.ascontiguousarray(rates(rows), np.float32)
         error = np.eye(count, dtype=np.float32)[skill[rows]] - certainty(f, W_K, b_K)

@@ -36,7 +36,9 @@ def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -
     steps = []
     for x, u in zip(senses, commands, strict=True):
         seen = np.isfinite(x)
-        steps.append(network.follow(c, u, np.where(seen, x, np.float32(0)), seen.astype(np.float32)))
+        steps.append(
+            network.follow(c, u, np.where(seen, x, np.float32(0)), seen.astype(np.float32))
+        )
         c = steps[-1].traces
     return _stacked(steps, network)
 
@@ -73,7 +75,9 @@ def continued(
     return recalled.reshape(-1, reader.spec.size)[:steps]
 
 
-def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:
+def check_cue(
+    reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int
+) -> NDArray[np.float64]:
     """Return the cue (T, D) as floats. Raises ValueError unless ``steps`` rows can be recalled from it."""
     check_number("steps", steps, low=1, high=MOST_STEPS, whole=True)
     rows, least = np.asarray(cue, np.float64), 2 * reader.lag
@@ -85,7 +89,9 @@ def check_cue(reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int) 
     bad = np.argwhere(~np.isfinite(rows))
     if len(bad):
         row, column = bad[0]
-        raise ValueError(f"cue row {row}, {reader.spec.labels[column]} must be finite, got {rows[row, column]}")
+        raise ValueError(
+            f"cue row {row}, {reader.spec.labels[column]} must be finite, got {rows[row, column]}"
+        )
     return rows
 
 

@@ -23,10 +23,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, Scalar, activate, infer, inner_kernel, outward
-from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
+from asm_gym.memory.learning import (
+    Learner,
+    Moment,
+    Schedule,
+    Tick,
+    Trajectory,
+    coincidence,
+    practise,
+)
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
-LEAST, FAINT = 0.9, 0.1  # smallest initial weight of a unit on its own last state, and the gain from all others
+LEAST, FAINT = (
+    0.9,
+    0.1,
+)  # smallest initial weight of a unit on its own last state, and the gain from all others
 
 
 class SettlingWeights(NamedTuple):
@@ -90,7 +101,9 @@ class SettlingNetwork(TemporalNetwork):
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         w, precision = self.weights, self.sensory_precision * seen
         mu, action = self._expected(c, u)
-        z = infer(mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
+        z = infer(
+            mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations
+        )
         return Step(mu, np.hstack([self._sense(mu), action]), z, z)
 
     def run_on(self, c: Array) -> Step:
@@ -115,11 +128,16 @@ def initial_settling_weights(
     hidden: int, sensory: int, motor: int, rng: np.random.Generator, least: float = LEAST
 ) -> SettlingWeights:
     """Return random weights of about unit gain, W_H near the identity, with ``least`` to 1 on its diagonal."""
-    weights = {n: np.zeros(shape, np.float32) for n, shape in settling_shapes(hidden, sensory, motor).items()}
+    weights = {
+        n: np.zeros(shape, np.float32)
+        for n, shape in settling_shapes(hidden, sensory, motor).items()
+    }
     for name in ("W_H", "W_U", "W_F", "W_A"):
         W = weights[name]
         W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
-    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(np.linspace(least, 1.0, hidden, dtype=np.float32))
+    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(
+        np.linspace(least, 1.0, hidden, dtype=np.float32)
+    )
     return SettlingWeights(**weights)
 
 
@@ -151,14 +169,21 @@ class SettlingLearner(Learner):
     weights: SettlingWeights
     early = 1
 
-    def __init__(self, weights: SettlingWeights, schedule: Schedule, rng: np.random.Generator) -> None:
+    def __init__(
+        self, weights: SettlingWeights, schedule: Schedule, rng: np.random.Generator
+    ) -> None:
         super().__init__(weights, SettlingWeights._fields, schedule, rng)
 
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, len(self.weights.W_H)), np.float32)
 
     def practise(
-        self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
+        self,
+        state: Array,
+        now: Moment,
+        own: NDArray[np.bool_],
+        alone: NDArray[np.bool_],
+        rate: float,
     ) -> tuple[Array, float]:
         w, how, x, u, taken = self.weights, self.schedule, now.senses, now.commands, now.commands
         pi_z, pi_x = np.float32(how.prior_precision), np.float32(how.sensory_precision)
@@ -166,24 +191,36 @@ class SettlingLearner(Learner):
         h = carried + w.W_U[:, -1]
         if own.any():
             taken = np.hstack([np.where(own, outward(activate(h), w.W_A), u[:, :-1]), u[:, -1:]])
-        mu, left, curvature = carried + outward(taken, w.W_U), x - w.b_F, np.float32(pi_z + pi_x * self.norm)
+        mu, left, curvature = (
+            carried + outward(taken, w.W_U),
+            x - w.b_F,
+            np.float32(pi_z + pi_x * self.norm),
+        )
         z = infer(mu, left, w.W_F, pi_z, np.full_like(x, pi_x), curvature, how.iterations)
         of_state, of_senses = z - mu, left - outward(activate(z), w.W_F)
         of_action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
-        energy = 0.5 * float(pi_z * np.sum(of_state**2) + pi_x * np.sum(of_senses**2) + np.sum(of_action**2))
+        energy = 0.5 * float(
+            pi_z * np.sum(of_state**2) + pi_x * np.sum(of_senses**2) + np.sum(of_action**2)
+        )
         errors = pi_z * of_state, pi_x * of_senses, of_action
         self.learn(settling_change(state, taken, h, errors, z, w.W_A), rate)
         return np.where(alone, mu, z), energy
 
 
 def learn_settling(
-    trajectories: Sequence[Trajectory], hidden: int, schedule: Schedule, rng: np.random.Generator, tick: Tick
+    trajectories: Sequence[Trajectory],
+    hidden: int,
+    schedule: Schedule,
+    rng: np.random.Generator,
+    tick: Tick,
 ) -> Trained:
     """Learn the synapses through time; see ``temporal.Learn``."""
     sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     # A network that runs on alone must keep its state; one that reads hundreds of rows would drift if it kept all.
     least = 1.0 if schedule.free_running_probability > 0 else LEAST
     weights = initial_settling_weights(hidden, sensory, commands - 1, rng, least)
-    energy = practise(SettlingLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick)
+    energy = practise(
+        SettlingLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick
+    )
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
     return Trained(SettlingNetwork(weights, unassociated(), *how), energy)

@@ -23,7 +23,9 @@ from asm_gym.memory.learning import Schedule, Tick, Trajectory
 
 Rows = NDArray[np.float64]
 
-UNSURE = np.float32(0.1)  # weight of an error while only one earlier row is known, and with it no speed
+UNSURE = np.float32(
+    0.1
+)  # weight of an error while only one earlier row is known, and with it no speed
 
 
 class RowHistory(NamedTuple):
@@ -62,7 +64,9 @@ class RowHistory(NamedTuple):
 class MemoryState(NamedTuple):
     """State of the memory, one entry a stream; never changed in place."""
 
-    traces: NDArray[np.float32]  # (B, I) c, of what was sensed and done; or the state z that settled on it
+    traces: NDArray[
+        np.float32
+    ]  # (B, I) c, of what was sensed and done; or the state z that settled on it
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
     history: RowHistory
     skill: NDArray[np.float32]  # (B, K) L, evidence for each skill; K is 0 where none has a name
@@ -83,13 +87,21 @@ class TemporalNetwork(ABC):
     weights: Any
 
     def __init__(
-        self, weights: Any, association: Association, iterations: int, prior_precision: float, sensory_precision: float
+        self,
+        weights: Any,
+        association: Association,
+        iterations: int,
+        prior_precision: float,
+        sensory_precision: float,
     ) -> None:
         self.weights = weights
         self.association, self.spans = association, spans(association.U)
         self.iterations = iterations
         # All in single precision, or the compiled loops would compute in double.
-        self.prior_precision, self.sensory_precision = np.float32(prior_precision), np.float32(sensory_precision)
+        self.prior_precision, self.sensory_precision = (
+            np.float32(prior_precision),
+            np.float32(sensory_precision),
+        )
         norm = float(np.linalg.norm(weights.W_F.astype(np.float64), 2))
         self.curvature = np.float32(prior_precision + sensory_precision * norm**2)
 
@@ -150,4 +162,6 @@ Learn = Callable[[Sequence[Trajectory], int, Schedule, np.random.Generator, Tick
 
 def unassociated() -> Association:
     """Return an association without units."""
-    return Association(*(np.zeros(shape, np.float32) for shape in association_shapes(1, 0, 0).values()))
+    return Association(
+        *(np.zeros(shape, np.float32) for shape in association_shapes(1, 0, 0).values())
+    )

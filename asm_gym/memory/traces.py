@@ -22,8 +22,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, Scalar, activate, beside, infer, inner_kernel, kernel, outward
-from asm_gym.memory.learning import Learner, Moment, Schedule, Tick, Trajectory, coincidence, practise
+from asm_gym.memory.energy import (
+    Array,
+    Scalar,
+    activate,
+    beside,
+    infer,
+    inner_kernel,
+    kernel,
+    outward,
+)
+from asm_gym.memory.learning import (
+    Learner,
+    Moment,
+    Schedule,
+    Tick,
+    Trajectory,
+    coincidence,
+    practise,
+)
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
 DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float32)  # λ (K,)
@@ -51,7 +68,9 @@ def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
     for t in range(len(ordered[0])):
         rows = np.array([episode[t] for episode in ordered if t < len(episode)], np.float32)
         traces = advance(traces[: len(rows)], rows, plain)
-        squares += np.sum(traces.reshape(len(rows), len(DECAYS), width) ** 2, axis=(0, 2), dtype=np.float64)
+        squares += np.sum(
+            traces.reshape(len(rows), len(DECAYS), width) ** 2, axis=(0, 2), dtype=np.float64
+        )
     count = width * sum(len(episode) for episode in episodes)
     return (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
 
@@ -68,7 +87,12 @@ class Weights(NamedTuple):
 def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of ``Weights`` by name."""
     H, N, traces = hidden, sensory + motor, len(DECAYS) * (sensory + motor + 1)
-    return {"W_C": (H, traces), "W_F": (N, H), "W_D": (N, traces + motor + 1), "gains": (len(DECAYS),)}
+    return {
+        "W_C": (H, traces),
+        "W_F": (N, H),
+        "W_D": (N, traces + motor + 1),
+        "gains": (len(DECAYS),),
+    }
 
 
 @lru_cache(maxsize=8)
@@ -191,7 +215,9 @@ def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Genera
     return Weights(W_C, W_F, np.zeros(shapes["W_D"], np.float32), np.float32(1) - DECAYS)
 
 
-def hebbian_change(c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float) -> HebbianChange:
+def hebbian_change(
+    c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float
+) -> HebbianChange:
     """Apply the local learning rules to traces (B, I), action and 1 (B, A + 1), μ and z (B, H), and Π_x ε_x at z."""
     motor = u.shape[1] - 1
     return HebbianChange(
@@ -214,7 +240,12 @@ class TracesLearner(Learner):
         return np.zeros((size, self.weights.W_C.shape[1]), np.float32)
 
     def practise(
-        self, state: Array, now: Moment, own: NDArray[np.bool_], alone: NDArray[np.bool_], rate: float
+        self,
+        state: Array,
+        now: Moment,
+        own: NDArray[np.bool_],
+        alone: NDArray[np.bool_],
+        rate: float,
     ) -> tuple[Array, float]:
         w, pi_z, pi_x = self.weights, self.schedule.prior_precision, self.schedule.sensory_precision
         x, u, taken, S = now.senses, now.commands, now.commands, now.senses.shape[1]
@@ -225,7 +256,9 @@ class TracesLearner(Learner):
         past = direct(state, taken, w.W_D)
         left = np.hstack([x, u[:, :-1]]) - past  # (B, S + A)
         precision = np.full_like(left, pi_x)
-        z = infer(mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self.norm, self.schedule.iterations)
+        z = infer(
+            mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self.norm, self.schedule.iterations
+        )
         error = np.float32(pi_x) * (left - sense(z, w.W_F))
         change = hebbian_change(state, taken, mu, z, error, pi_z)
         energy = 0.5 * (pi_z * float(np.sum((z - mu) ** 2)) + float(np.sum(error**2)) / pi_x)
@@ -247,6 +280,8 @@ def learn_traces(
     weights = initial_weights(hidden, sensory, commands - 1, rng)
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories])
     weights.W_C[:] *= np.float32(gain)
-    energy = practise(TracesLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick)
+    energy = practise(
+        TracesLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick
+    )
     how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
     return Trained(Network(weights, unassociated(), *how), energy)

@@ -56,7 +56,10 @@ class Derived(NamedTuple):
             )
         if urdf:
             links = BodyModel.of(urdf, [spec.labels[i] for i in angles])
-        of_speed, of_angle = (spec.sensory == moving[:, None]), (spec.sensory == angles[:, None])  # (S, X), (J, X)
+        of_speed, of_angle = (
+            (spec.sensory == moving[:, None]),
+            (spec.sensory == angles[:, None]),
+        )  # (S, X), (J, X)
         if links is None:
             pairs = np.array(np.triu_indices(2 * J), np.intp)
             single = np.vstack([of_angle, of_angle])
@@ -74,7 +77,11 @@ class Derived(NamedTuple):
 
         ``steps`` (N, X) are standardised changes; 1 is ``rate`` (X,) in a second.
         """
-        speed = steps[:, self.speeds] if self.from_steps else values[:, self.speeds] / spread[self.speeds]
+        speed = (
+            steps[:, self.speeds]
+            if self.from_steps
+            else values[:, self.speeds] / spread[self.speeds]
+        )
         parts = [np.tanh(speed / width) for width in WIDTHS]
         if self.links is not None:
             parts += self.links.torques(*self.motion(values, steps, spread, rate))
@@ -86,15 +93,29 @@ class Derived(NamedTuple):
             parts += [single, np.sin(sums), np.cos(sums), products]
         return np.hstack(parts)
 
-    def motion(self, values: Floats, steps: Floats, spread: Floats, rate: Floats) -> tuple[Floats, Floats, Floats]:
+    def motion(
+        self, values: Floats, steps: Floats, spread: Floats, rate: Floats
+    ) -> tuple[Floats, Floats, Floats]:
         """Return angles, speeds and accelerations (N, J) of what ``__call__`` takes."""
-        q, pace = values[:, self.angles] * self.radians, (steps * rate)[:, self.speeds] * self.radians
-        return (q, pace, np.zeros_like(q)) if self.from_steps else (q, values[:, self.speeds] * self.radians, pace)
+        q, pace = (
+            values[:, self.angles] * self.radians,
+            (steps * rate)[:, self.speeds] * self.radians,
+        )
+        return (
+            (q, pace, np.zeros_like(q))
+            if self.from_steps
+            else (q, values[:, self.speeds] * self.radians, pace)
+        )
 
 
 def _named(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
     """Return the columns of senses whose channel's name matches."""
-    columns = {i for n, s in spec.slices.items() if pattern.fullmatch(n.lower()) for i in range(s.start, s.stop)}
+    columns = {
+        i
+        for n, s in spec.slices.items()
+        if pattern.fullmatch(n.lower())
+        for i in range(s.start, s.stop)
+    }
     return np.array([i for i in spec.sensory if int(i) in columns], np.intp)
 
 

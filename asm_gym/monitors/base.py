@@ -52,7 +52,10 @@ class Surprise(NamedTuple):
         """``raw`` (B,) of rows excused by a knock, and by a stop, 0 elsewhere; empty where nothing is excused."""
         if self.raw is None:
             return {}
-        return {event: np.where(self.excuse == EVENTS.index(event), self.raw, 0.0) for event in (KNOCK, STOP)}
+        return {
+            event: np.where(self.excuse == EVENTS.index(event), self.raw, 0.0)
+            for event in (KNOCK, STOP)
+        }
 
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """Return it with no surprise ``where`` (B,) nothing is judged."""
@@ -70,7 +73,9 @@ class Surprise(NamedTuple):
         left[judged] -= self.attribution[judged][:, columns].sum(axis=1) / self.value[judged]
         left = np.clip(left, 0.0, 1.0)
         raw = None if self.raw is None else np.where(judged, left * self.raw, self.raw)
-        return self._replace(value=np.where(judged, left * self.value, self.value), attribution=shares, raw=raw)
+        return self._replace(
+            value=np.where(judged, left * self.value, self.value), attribution=shares, raw=raw
+        )
 
 
 class Monitor(Protocol):
@@ -89,7 +94,9 @@ class Monitor(Protocol):
 
     def initial_state(self, batch: int = 1) -> State: ...
 
-    def observe(self, state: State, stream: NDArray[np.floating[Any]]) -> tuple[State, Surprise]: ...
+    def observe(
+        self, state: State, stream: NDArray[np.floating[Any]]
+    ) -> tuple[State, Surprise]: ...
 
     def save(self, path: str | Path) -> None: ...
 

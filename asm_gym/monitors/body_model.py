@@ -79,11 +79,18 @@ class BodyModel:
         """Return it with the order of columns that explains measured torques (N, J) best: of the chain, or ABC."""
         rows = np.linspace(0, len(q) - 1, min(len(q), SHOWN)).astype(np.intp)
         q, speed, acceleration, torque = (a[rows] for a in (q, speed, acceleration, torque))
-        friction = np.stack([speed, np.tanh(10 * speed / np.maximum(speed.std(axis=0), TINY)), np.ones_like(speed)])
+        friction = np.stack(
+            [speed, np.tanh(10 * speed / np.maximum(speed.std(axis=0), TINY)), np.ones_like(speed)]
+        )
 
         def unexplained(model: Self) -> float:
-            inputs = np.stack([*model.torques(q, speed, acceleration), *friction], axis=-1)  # (N, J, 5)
-            solved = [np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in range(torque.shape[1])]
+            inputs = np.stack(
+                [*model.torques(q, speed, acceleration), *friction], axis=-1
+            )  # (N, J, 5)
+            solved = [
+                np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0]
+                for j in range(torque.shape[1])
+            ]
             left = torque - np.einsum("njk,jk->nj", inputs, solved)
             return float((left.var(axis=0) / np.maximum(torque.var(axis=0), TINY)).sum())
 
@@ -185,7 +192,9 @@ def _compiled(root: Element, asked: Container[str] | None) -> tuple[Any, list[st
         model = spec.compile()
     except ValueError as error:
         raise ValueError(f"the body cannot be read: {' '.join(str(error).split())}") from None
-    if not all(np.isfinite(part).all() for part in (model.body_mass, model.body_inertia, model.body_pos)):
+    if not all(
+        np.isfinite(part).all() for part in (model.body_mass, model.body_inertia, model.body_pos)
+    ):
         raise ValueError("the body cannot be read: masses, inertias and positions must be finite")
     return model, [model.joint(j).name for j in range(model.njnt)]
 
@@ -198,9 +207,13 @@ def _mend(inertial: Element) -> None:
     from scipy.spatial.transform import Rotation  # takes a while to import
 
     rpy = "" if origin is None else origin.attrib.pop("rpy", "")
-    turn = Rotation.from_euler("xyz", [float(word) for word in (rpy or "0 0 0").split()]).as_matrix()
+    turn = Rotation.from_euler(
+        "xyz", [float(word) for word in (rpy or "0 0 0").split()]
+    ).as_matrix()
     names = [[f"i{'xyz'[min(i, j)]}{'xyz'[max(i, j)]}" for j in range(3)] for i in range(3)]
-    inertia = turn @ np.array([[float(tensor.get(name, 0.0)) for name in row] for row in names]) @ turn.T
+    inertia = (
+        turn @ np.array([[float(tensor.get(name, 0.0)) for name in row] for row in names]) @ turn.T
+    )
     if np.isfinite(inertia).all():
         moments, axes = np.linalg.eigh(inertia)
         inertia = axes * np.maximum(moments, TINY) @ axes.T

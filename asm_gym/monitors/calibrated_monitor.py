@@ -21,7 +21,13 @@ from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors.base import Progress, State, Surprise
-from asm_gym.monitors.calibration import LOG, AlarmRate, apart_for_ceilings, require_sight, with_ceilings
+from asm_gym.monitors.calibration import (
+    LOG,
+    AlarmRate,
+    apart_for_ceilings,
+    require_sight,
+    with_ceilings,
+)
 from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
 from asm_gym.monitors.stream_model import (
     StreamModel,
@@ -129,7 +135,13 @@ class CalibratedMonitor:
         return other
 
     @typed
-    def fit(self, episodes: Sequence[Episode], progress: Progress | None = None, *, warm_start: bool = False) -> Self:
+    def fit(
+        self,
+        episodes: Sequence[Episode],
+        progress: Progress | None = None,
+        *,
+        warm_start: bool = False,
+    ) -> Self:
         """Learn from nominal episodes of any number of skills, without labels, and return the monitor.
 
         Args:
@@ -180,14 +192,19 @@ class CalibratedMonitor:
             for detection in self.detections.values():
                 taken = self.model.learned_.keys() & set(detection.arrays)
                 if taken:
-                    raise ValueError(f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}")
+                    raise ValueError(
+                        f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}"
+                    )
                 detection.fit(nominal, rng)
             model.crossfitted = {}
 
     def _nominal_outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
         """Return the model's outputs, with the cross-fitted errors of what it has learned."""
         known, found = self.model.crossfitted, model_outputs(self.model, episodes)
-        return [o._replace(errors=known.get(id(e), o.errors)) for e, o in zip(episodes, found, strict=True)]
+        return [
+            o._replace(errors=known.get(id(e), o.errors))
+            for e, o in zip(episodes, found, strict=True)
+        ]
 
     @typed
     def calibrate(
@@ -222,10 +239,16 @@ class CalibratedMonitor:
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         check_nominal(episodes, self.spec, self.model.shortest)
         if each and len(each) != len(episodes):
-            raise ValueError(f"each must name a group for each episode, got {len(each)} for {len(episodes)} episodes")
+            raise ValueError(
+                f"each must name a group for each episode, got {len(each)} for {len(episodes)} episodes"
+            )
         asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
         evidence = isinstance(self.detection, EvidenceDetection)
-        apart = apart_for_ceilings(episodes, asked, each) if evidence else np.zeros(len(episodes), np.bool_)
+        apart = (
+            apart_for_ceilings(episodes, asked, each)
+            if evidence
+            else np.zeros(len(episodes), np.bool_)
+        )
         try:
             check_fresh(episodes, self.learned_from_, None if apart.any() else self.ceilings_from_)
         except ValueError as error:
@@ -233,7 +256,9 @@ class CalibratedMonitor:
                 raise
             LOG.warning("%s; with it the promised rate does not hold", error)
         new = self._copy()
-        chosen, fresh = ([episodes[n] for n in np.flatnonzero(part).tolist()] for part in (apart, ~apart))
+        chosen, fresh = (
+            [episodes[n] for n in np.flatnonzero(part).tolist()] for part in (apart, ~apart)
+        )
         if chosen:
             new.detection, new.ceilings_from_ = with_ceilings(self, chosen), hashes_of(chosen)
             new.detections[new.detection.name] = new.detection
@@ -244,17 +269,28 @@ class CalibratedMonitor:
         require_sight(new.detection, self.model.error_columns, self.spec, threshold)
         vars(self).update(vars(new))
         self.threshold_, self.promised_ = threshold, asked.per
-        self.maxima_, self.blocks_ = np.array([v.max() for v in values]), Blocks.of(values, self.spec.dt, each)
+        self.maxima_, self.blocks_ = (
+            np.array([v.max() for v in values]),
+            Blocks.of(values, self.spec.dt, each),
+        )
         streams = [episode.stream for episode in episodes]
-        self.healthy_, self.pace_ = healthy_forces(streams, self.spec), HandSpeedMap.by_task(episodes, self.spec)
-        self.motion_, self.commands_ = learned_motion(streams, self.spec), healthy_commands(streams, self.spec)
+        self.healthy_, self.pace_ = (
+            healthy_forces(streams, self.spec),
+            HandSpeedMap.by_task(episodes, self.spec),
+        )
+        self.motion_, self.commands_ = (
+            learned_motion(streams, self.spec),
+            healthy_commands(streams, self.spec),
+        )
         return self
 
     @property
     def threshold(self) -> float:
         """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
         if self.threshold_ is None:
-            raise RuntimeError(f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first")
+            raise RuntimeError(
+                f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first"
+            )
         return self.threshold_
 
     @typed
@@ -265,14 +301,18 @@ class CalibratedMonitor:
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         kept = self.blocks_ if asked.per == HOUR else self.maxima_
         if kept is None or self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first")
+            raise RuntimeError(
+                f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first"
+            )
         return asked.threshold(self.maxima_, self.blocks_)
 
     @property
     def promise(self) -> Promise:
         """The promised rate of alarms in nominal operation. Raises RuntimeError before ``calibrate``."""
         if self.maxima_ is None:
-            raise RuntimeError(f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first")
+            raise RuntimeError(
+                f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first"
+            )
         if self.promised_ == HOUR and self.blocks_ is not None:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
@@ -286,9 +326,13 @@ class CalibratedMonitor:
         """Return the state before the first row of ``batch`` streams."""
         check_number("batch", batch, low=1, whole=True)
         self._require_fitted()
-        return MonitorState(self.model.start(batch), self.detection.start(batch, len(self.model.error_columns)))
+        return MonitorState(
+            self.model.start(batch), self.detection.start(batch, len(self.model.error_columns))
+        )
 
-    def observe(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> tuple[MonitorState, Surprise]:
+    def observe(
+        self, state: MonitorState, stream: NDArray[np.floating[Any]]
+    ) -> tuple[MonitorState, Surprise]:
         """Return the new state after the next row (B, D) of each stream, and the surprise of the rows.
 
         A number that is not finite makes the surprise and its own attribution infinite, and counts as missing
@@ -321,13 +365,17 @@ class CalibratedMonitor:
         for episode in episodes:
             self.spec.require(episode.spec, "the episode")
         self._require_fitted()
-        scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
+        scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(
+            episodes
+        )
         with threadpool_limits(1):
             for group, steps in side_by_side(episodes, self.initial_state, self.observe):
                 known = [f for f in Surprise._fields if steps and getattr(steps[0], f) is not None]
                 for n, i in enumerate(group):
                     if own := steps[: len(episodes[i])]:
-                        scores[i] = Surprise(**{name: np.array([getattr(s, name)[n] for s in own]) for name in known})
+                        scores[i] = Surprise(
+                            **{name: np.array([getattr(s, name)[n] for s in own]) for name in known}
+                        )
         return scores
 
     @typed
@@ -384,12 +432,16 @@ class CalibratedMonitor:
 
     def _require_fitted(self) -> None:
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
-            raise RuntimeError(f"this {self._name} has learned nothing yet: call fit(episodes) first")
+            raise RuntimeError(
+                f"this {self._name} has learned nothing yet: call fit(episodes) first"
+            )
 
     def _rows(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Return the rows (B, D) in one piece. Raises where they or the state are not what ``observe`` takes."""
         if not isinstance(state, MonitorState):
-            raise TypeError(f"state must be what initial_state or observe gave, got {short_repr(state)}")
+            raise TypeError(
+                f"state must be what initial_state or observe gave, got {short_repr(state)}"
+            )
         try:
             rows = np.ascontiguousarray(stream, np.float64)
         except (TypeError, ValueError, OverflowError) as error:
@@ -397,7 +449,9 @@ class CalibratedMonitor:
         batch = batch_of(state)
         if rows.shape != (batch, self.spec.size):
             self.spec.check_row(rows)
-            raise ValueError(f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}")
+            raise ValueError(
+                f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}"
+            )
         return rows
 
     def _place_errors(self) -> None:

@@ -15,7 +15,14 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import Blocks, EvidenceDetection, conformal_episodes
 from asm_gym.detection.base import Array
 from asm_gym.detection.benign_events import BenignEvents
-from asm_gym.detection.conformal import EPISODE, HOUR, check_hours, check_per_hour, episode_threshold, hourly_threshold
+from asm_gym.detection.conformal import (
+    EPISODE,
+    HOUR,
+    check_hours,
+    check_per_hour,
+    episode_threshold,
+    hourly_threshold,
+)
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.spec import StreamSpec
@@ -25,7 +32,10 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("asm_gym.monitors")
 
-ONE_IN = 3, 10  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
+ONE_IN = (
+    3,
+    10,
+)  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
 AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 MOST_NAMED = 6  # channels that a message names
@@ -86,7 +96,9 @@ class AlarmRate(NamedTuple):
         return threshold
 
 
-def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> list[str]:
+def blind_to(
+    detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float
+) -> list[str]:
     """Return the labels of the senses whose errors alone could never pass the threshold, however large and lasting.
 
     ``errors`` (X,) are the columns of the errors in the stream, -1 for none. The detection's ``reach_of`` says how far
@@ -99,7 +111,9 @@ def blind_to(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, thresho
     return [spec.labels[i] for i in np.unique(errors[own]) if not reach[i] > threshold]
 
 
-def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float) -> None:
+def require_sight(
+    detection: Any, errors: NDArray[np.intp], spec: StreamSpec, threshold: float
+) -> None:
     """Log the channels in which no fault could pass the threshold. Raises ValueError where they are most."""
     blind = blind_to(detection, errors, spec, threshold)
     if not blind:
@@ -115,7 +129,9 @@ def require_sight(detection: Any, errors: NDArray[np.intp], spec: StreamSpec, th
     LOG.warning(message)
 
 
-def apart_for_ceilings(episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()) -> NDArray[np.bool_]:
+def apart_for_ceilings(
+    episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()
+) -> NDArray[np.bool_]:
     """Return which nominal episodes (n,) are to set ceilings, and not the threshold: one in so many of each group.
 
     None are where they would be fewer than ``FEWEST_EPISODES``, or the others too few for the rate that is asked for.

@@ -44,12 +44,26 @@ CLASSES: dict[str, tuple[str, tuple[str, ...]]] = {
 WINDOW = 3  # last rows that a diagnosis rests on
 
 KINDS = (
-    *("sensor", "force sensor", "commanded torque", "measured torque", "external torque", "joint", "contact"),
+    *(
+        "sensor",
+        "force sensor",
+        "commanded torque",
+        "measured torque",
+        "external torque",
+        "joint",
+        "contact",
+    ),
     *("wrist", "gripper", "hand", "command"),
 )
 """Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
 
-GROUPS = ("joint", "torque", "hand", "wrench", "gripper")  # of channels, whose share of the surprise is evidence
+GROUPS = (
+    "joint",
+    "torque",
+    "hand",
+    "wrench",
+    "gripper",
+)  # of channels, whose share of the surprise is evidence
 
 EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
 """In order: how much the best hypothesis of each kind explains; the energy; the largest share of the surprise in one
@@ -93,12 +107,18 @@ class Readout:
     @classmethod
     def shipped(cls) -> Self:
         """Return the readout that was learned from faults of an arm in simulation."""
-        text = resources.files("asm_gym.monitors").joinpath("causes.json").read_text(encoding="utf-8")
+        text = (
+            resources.files("asm_gym.monitors").joinpath("causes.json").read_text(encoding="utf-8")
+        )
         saved = json.loads(text)
-        return cls(**{name: np.array(saved[name]) for name in ("mean", "spread", "weights", "bias")})
+        return cls(
+            **{name: np.array(saved[name]) for name in ("mean", "spread", "weights", "bias")}
+        )
 
 
-def averaged(belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses: int) -> NDArray[np.float64]:
+def averaged(
+    belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses: int
+) -> NDArray[np.float64]:
     """Return the mean (F,) of all ``diagnoses`` of families so far, of which the newest counts a tenth at least.
 
     A belief that is sure stays: later rows are from places where a fault has brought the arm.
@@ -133,11 +153,16 @@ class Diagnosis:
             missing = np.zeros(self.completion.spec.size, bool)
             missing[h.columns] = True
             E = np.flatnonzero(self.completion.involved(missing))
-            found.append((E, np.linalg.inv(self.completion.precision[np.ix_(E, E)]).astype(np.float64)))
+            found.append(
+                (E, np.linalg.inv(self.completion.precision[np.ix_(E, E)]).astype(np.float64))
+            )
         return found
 
     def evidence(
-        self, lifted: NDArray[np.float64], attribution: NDArray[np.float64], missing: NDArray[np.bool_] | None = None
+        self,
+        lifted: NDArray[np.float64],
+        attribution: NDArray[np.float64],
+        missing: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.float64], dict[str, int]]:
         """Return the evidence (F,) in y (T, Y), and the best hypothesis of each kind; see ``__call__``."""
         energy, left = self._explained(lifted[-WINDOW:])
@@ -157,7 +182,9 @@ class Diagnosis:
         groups = [float(shares[names == group].sum()) for group in GROUPS]
         return np.array([*found, np.log(total / usual), alone, *groups]), best
 
-    def _explained(self, lifted: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _explained(
+        self, lifted: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return E (T,), and E_S of each hypothesis (T, H), for y (T, Y)."""
         y = lifted - self.completion.centre
         g = y @ self.completion.precision
@@ -189,7 +216,11 @@ class Diagnosis:
         for (family, _), q in zip(CLASSES.values(), p, strict=True):
             probabilities[family] += float(q)
         family = max(probabilities, key=lambda name: probabilities[name])
-        which = max((q, name) for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True) if own == family)[1]
+        which = max(
+            (q, name)
+            for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True)
+            if own == family
+        )[1]
         able = [kind for kind in CLASSES[which][1] if kind in best]
         most = max(able, key=lambda kind: evidence[EVIDENCE.index(kind)], default="")
         named = self.hypotheses[best[most]] if most else Hypothesis("", "", np.zeros(0, np.intp))
@@ -219,12 +250,17 @@ def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
         group = groups[labels[columns[0]]]
         if bare.endswith("torque") and group == "torque":
             joints.setdefault("joint" + name[len(bare) :], []).extend(columns.tolist())
-            kind = next((k for k in ("commanded", "measured", "external") if f"{k}_torque" in bare), "measured")
+            kind = next(
+                (k for k in ("commanded", "measured", "external") if f"{k}_torque" in bare),
+                "measured",
+            )
             found.append(Hypothesis(f"{kind} torque", name, columns))
         else:
             kind = "force sensor" if group == "wrench" or bare.endswith("force") else "sensor"
             found.append(Hypothesis(kind, name, columns))
-    found += [Hypothesis("joint", name, np.array(columns, np.intp)) for name, columns in joints.items()]
+    found += [
+        Hypothesis("joint", name, np.array(columns, np.intp)) for name, columns in joints.items()
+    ]
 
     wrist = np.array([groups[label] == "wrench" for label in labels])
     external = np.array(["external_torque" in label for label in labels])
@@ -235,11 +271,20 @@ def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
         ("hand", "hand"): np.array([groups[label] == "hand" for label in labels]),
         ("command", "command"): np.array([groups[label] == MOTOR for label in labels]),
     }
-    found += [Hypothesis(*named, np.flatnonzero(chosen)) for named, chosen in regions.items() if chosen.any()]
+    found += [
+        Hypothesis(*named, np.flatnonzero(chosen))
+        for named, chosen in regions.items()
+        if chosen.any()
+    ]
     return tuple(found)
 
 
 def as_info(cause: Cause | None) -> dict[str, Any]:
     """Return ``info["asm"]["cause"]``; all empty where there is none."""
     family, part, probability, probabilities, _ = cause or ("", "", 0.0, {}, None)
-    return {"family": family, "part": part, "probability": probability, "probabilities": probabilities}
+    return {
+        "family": family,
+        "part": part,
+        "probability": probability,
+        "probabilities": probabilities,
+    }

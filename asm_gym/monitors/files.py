@@ -21,7 +21,12 @@ from asm_gym.detection.conformal import EPISODE, HOUR
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
-MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = "nominal_maxima", "nominal_blocks", "learned_from", "ceilings_from"
+MAXIMA, BLOCKS, LEARNED_FROM, CEILINGS_FROM = (
+    "nominal_maxima",
+    "nominal_blocks",
+    "learned_from",
+    "ceilings_from",
+)
 PACE, MOTION, COMMANDS = "pace", "motion", "commands"
 """Names of the arrays that ``calibrate`` and ``fit`` keep in a checkpoint."""
 BITS, SCALE, ROOT = ".bits", ".scale", ".root"
@@ -42,9 +47,13 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
     header, saved = saved.header, saved._replace(arrays=dict(unpacked(saved.arrays)))
     undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
     if any(".planes" in name for name in undeclared):  # as arrays were packed before
-        raise ValueError("the file was written by an older version: make it anew with asm-gym fit or asm-gym babble")
+        raise ValueError(
+            "the file was written by an older version: make it anew with asm-gym fit or asm-gym babble"
+        )
     if undeclared:
-        raise ValueError(f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}")
+        raise ValueError(
+            f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}"
+        )
     arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
     blocks, promised = arrays.pop(BLOCKS, None), header.get("promised", EPISODE)
     check_choice("promise", promised, (EPISODE, HOUR))
@@ -56,11 +65,15 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
     kept = {
         "learned_from_": arrays.pop(LEARNED_FROM, None),
         "ceilings_from_": arrays.pop(CEILINGS_FROM, None),
-        "pace_": {n.removeprefix(PACE).strip(): arrays.pop(n) for n in list(arrays) if n.startswith(PACE)},
+        "pace_": {
+            n.removeprefix(PACE).strip(): arrays.pop(n) for n in list(arrays) if n.startswith(PACE)
+        },
         "motion_": arrays.pop(MOTION, None),
         "commands_": arrays.pop(COMMANDS, None),
         "about": dict(header["about"]),
-        "healthy_": tuple(check_number("healthy", value, low=0.0) for value in header.get("healthy", ())),
+        "healthy_": tuple(
+            check_number("healthy", value, low=0.0) for value in header.get("healthy", ())
+        ),
     }
     return arrays, kept, calibrated
 
@@ -71,13 +84,18 @@ def threshold_below(threshold: object, reach: float) -> float | None:
         return None
     number = check_number("threshold", threshold, low=0.0)
     if number >= reach:
-        raise ValueError(f"threshold must be below {reach:g}, the largest possible surprise, got {number:g}")
+        raise ValueError(
+            f"threshold must be below {reach:g}, the largest possible surprise, got {number:g}"
+        )
     return number
 
 
 def write_monitor(path: str | Path, monitor: Any) -> None:
     """Write a checkpoint of a fitted ``CalibratedMonitor``."""
-    learned = {n: a if a.dtype.kind == "f" else np.asarray(a, np.float64) for n, a in monitor.learned_.items()}
+    learned = {
+        n: a if a.dtype.kind == "f" else np.asarray(a, np.float64)
+        for n, a in monitor.learned_.items()
+    }
     kept = {
         MAXIMA: monitor.maxima_,
         BLOCKS: None if monitor.blocks_ is None else monitor.blocks_.array,
@@ -87,7 +105,9 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
         COMMANDS: monitor.commands_,
     }
     kept |= {f"{PACE} {task}": cells for task, cells in monitor.pace_.items()}
-    arrays: dict[str, NDArray[Any]] = learned | {name: array for name, array in kept.items() if array is not None}
+    arrays: dict[str, NDArray[Any]] = learned | {
+        name: array for name, array in kept.items() if array is not None
+    }
     header = {
         "spec": monitor.spec.to_json(),
         "hyperparameters": monitor.get_params(),
@@ -102,7 +122,9 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
     write_checkpoint(path, monitor.model.kind, header, packed(arrays))
 
 
-RETIRED = "feedback"  # a hyperparameter of older files that made no difference once a memory was fitted
+RETIRED = (
+    "feedback"  # a hyperparameter of older files that made no difference once a memory was fitted
+)
 
 
 def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> Any:
@@ -144,12 +166,20 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
         scale = arrays.get(own + SCALE, np.zeros(0))
         if name.endswith(BITS):
             if array.dtype != np.int8 or array.ndim != 2 or scale.shape != (len(array), 1):
-                raise ValueError(f"{own} of 8 bits should have a scale for each of its rows, got {scale.shape}")
+                raise ValueError(
+                    f"{own} of 8 bits should have a scale for each of its rows, got {scale.shape}"
+                )
             found[own] = _weights(array, scale)
         elif name.endswith(ROOT):
             size = round((np.sqrt(8 * array.size + 1) - 1) / 2)
-            if array.dtype != np.int16 or scale.shape != () or array.shape != (size * (size + 1) // 2,):
-                raise ValueError(f"the root of {own} should be half a matrix of 16 bits with one scale")
+            if (
+                array.dtype != np.int16
+                or scale.shape != ()
+                or array.shape != (size * (size + 1) // 2,)
+            ):
+                raise ValueError(
+                    f"the root of {own} should be half a matrix of 16 bits with one scale"
+                )
             K = np.zeros((size, size))
             K[np.tril_indices(size)] = array
             found[own] = (K @ K.T) * scale**2
@@ -161,7 +191,9 @@ def unpacked(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 def _quantised(W: NDArray[np.float32]) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
     """Return k (P, Q) and s (P, 1)."""
     fraction, exponent = np.frexp(np.abs(W).max(axis=1, keepdims=True).astype(np.float64) / LARGEST)
-    scale = np.ldexp(np.ceil(np.ldexp(fraction, SCALE_BITS) - 1e-9), exponent - SCALE_BITS).astype(np.float32)
+    scale = np.ldexp(np.ceil(np.ldexp(fraction, SCALE_BITS) - 1e-9), exponent - SCALE_BITS).astype(
+        np.float32
+    )
     k = np.rint(W / np.where(scale > 0, scale, np.float32(1)))
     return np.where((k == 0) & (W != 0), np.sign(W), k).astype(np.int8), scale
 

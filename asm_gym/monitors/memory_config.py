@@ -48,12 +48,18 @@ class MemoryConfig:
         checked: dict[str, Any] = {
             "learning_rate": check_number("learning_rate", self.learning_rate, above=0.0),
             "batch_size": check_number("batch_size", self.batch_size, low=1, whole=True),
-            "sensory_precision": check_number("sensory_precision", self.sensory_precision, above=0.0),
+            "sensory_precision": check_number(
+                "sensory_precision", self.sensory_precision, above=0.0
+            ),
             "gains": tuple(self.gains),  # checked by EvidenceDetection, as are all that follow
         }
         if self.iterations is not None:
-            checked["iterations"] = check_number("iterations", self.iterations, low=1, high=MOST_ITERATIONS, whole=True)
+            checked["iterations"] = check_number(
+                "iterations", self.iterations, low=1, high=MOST_ITERATIONS, whole=True
+            )
         if self.prior_precision is not None:
-            checked["prior_precision"] = check_number("prior_precision", self.prior_precision, above=0.0)
+            checked["prior_precision"] = check_number(
+                "prior_precision", self.prior_precision, above=0.0
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)

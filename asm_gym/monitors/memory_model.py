@@ -48,11 +48,20 @@ class MemoryModel(ScaledModel):
     held_out = 0  # what it learns of errors is cross-fitted
 
     def __init__(
-        self, spec: StreamSpec, hidden_size: int, association_size: int, schedule: Schedule, dynamics: str = TRACES
+        self,
+        spec: StreamSpec,
+        hidden_size: int,
+        association_size: int,
+        schedule: Schedule,
+        dynamics: str = TRACES,
     ) -> None:
         super().__init__(spec, rows_apart(spec.dt))
         self.dynamics = dynamics
-        self.hidden_size, self.association_size, self.schedule = hidden_size, association_size, schedule
+        self.hidden_size, self.association_size, self.schedule = (
+            hidden_size,
+            association_size,
+            schedule,
+        )
         self.network_: TemporalNetwork | None = None
         self.compiled_: Layout | None = None
         self.motor_: Motor | None = None
@@ -69,13 +78,17 @@ class MemoryModel(ScaledModel):
         names = {name: self.learned_[name] for name in nameless} if self.skills_ else nameless
         self.network_, self.compiled_ = network, layout_of(network, self.senses_, names)
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         streams, lag = [e.stream for e in episodes], self.lag
         senses = StreamScaler.fit(self.spec, streams, lag)
         check_inputs(senses.inputs)
         readings = [senses.read_episode(s) for s in streams]
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
-        trajectories = [Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings]
+        trajectories = [
+            Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings
+        ]
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
         trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
         learned = {**senses.arrays, "energy": trained.energy}
@@ -83,10 +96,14 @@ class MemoryModel(ScaledModel):
         ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
         for episode, errors in zip(episodes, np.split(trained.errors, ends), strict=True):
             errors[:lag] *= UNSURE
-            self.crossfitted[id(episode)] = np.vstack([np.zeros_like(errors[:1]).repeat(lag, 0), errors])
+            self.crossfitted[id(episode)] = np.vstack(
+                [np.zeros_like(errors[:1]).repeat(lag, 0), errors]
+            )
         network, completion = trained.network, Completion.fit(senses, streams)
         filled = completion.named() if completion is not None else {}
-        return self.restore({**learned, **network.weights._asdict(), **network.association._asdict(), **filled})
+        return self.restore(
+            {**learned, **network.weights._asdict(), **network.association._asdict(), **filled}
+        )
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
         """Go on from what it knows: association learns what these episodes have of their own, all else stays.
@@ -99,7 +116,9 @@ class MemoryModel(ScaledModel):
         layout = senses.groups, senses.changes, self._units_each(senses)
         now = specialise(self.network.association, inputs, changes, *layout)
         kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
-        return self.restore({**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()})
+        return self.restore(
+            {**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()}
+        )
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler.of(self.spec, learned, self.lag)
@@ -108,7 +127,9 @@ class MemoryModel(ScaledModel):
         if "R" not in learned:  # made before leverage was learned
             learned = {**learned, **no_doubt(senses.inputs, X)}
         if (found := dynamics_of(learned)) != self.dynamics:
-            raise ValueError(f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}")
+            raise ValueError(
+                f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}"
+            )
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
@@ -116,21 +137,38 @@ class MemoryModel(ScaledModel):
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         if missing := [name for name in shapes if name not in learned]:
-            raise ValueError(f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble")
+            raise ValueError(
+                f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble"
+            )
         check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
         association = Association(**{n: arrays[n] for n in Association._fields})
-        how = self.schedule.iterations, self.schedule.prior_precision, self.schedule.sensory_precision
+        how = (
+            self.schedule.iterations,
+            self.schedule.prior_precision,
+            self.schedule.sensory_precision,
+        )
         super().restore(learned, skills)
-        self.motor_, self.completion_ = Motor.found(learned, self.senses_), Completion.found(learned, self.senses_)
-        self._take(dynamics.network(dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how))
+        self.motor_, self.completion_ = (
+            Motor.found(learned, self.senses_),
+            Completion.found(learned, self.senses_),
+        )
+        self._take(
+            dynamics.network(
+                dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how
+            )
+        )
         return self
 
     def start(self, batch: int) -> MemoryState:
-        state, named = (np.zeros((batch, n), np.float32) for n in (self.network.hidden_size, len(self.skills_)))
+        state, named = (
+            np.zeros((batch, n), np.float32) for n in (self.network.hidden_size, len(self.skills_))
+        )
         return MemoryState(self.network.at_rest(batch), state, super().start(batch), named)
 
-    def predict(self, state: MemoryState, rows: NDArray[np.float64]) -> tuple[MemoryState, ModelOutput]:
+    def predict(
+        self, state: MemoryState, rows: NDArray[np.float64]
+    ) -> tuple[MemoryState, ModelOutput]:
         assert self.compiled_ is not None
         new: MemoryState = uninitialised(state)
         errors = expected_errors(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64))

@@ -48,12 +48,16 @@ class CommandReadout:
         # However long a step lasts, one must not be enough for what is less likely than not.
         self._enough = max(ENOUGH, 0.5 * self._dt)
 
-    def __call__(self, expected: NDArray[np.float32], before: Grip | None) -> tuple[NDArray[np.float32], Grip]:
+    def __call__(
+        self, expected: NDArray[np.float32], before: Grip | None
+    ) -> tuple[NDArray[np.float32], Grip]:
         """Return the action (A,) for expected commands (A,), and the grip to pass in next time; None at first."""
         low, high = self._space.low, self._space.high
         action = np.clip(np.nan_to_num(expected), low, high).astype(np.float32)
         g = self._grip
-        share = ((action - low)[g] / (high - low)[g]).astype(np.float64)  # (G,) 1 where the upper end is certain
+        share = ((action - low)[g] / (high - low)[g]).astype(
+            np.float64
+        )  # (G,) 1 where the upper end is certain
         before = before or Grip(share > 0.5, np.zeros(len(share)))
         other = np.where(before.high, 1.0 - share, share)
         evidence = np.exp(-self._dt / FORGETS) * before.evidence + self._dt * other
@@ -88,16 +92,27 @@ class NeuralASMPolicy(StatefulPolicy):
         if not isinstance(space, spaces.Box):
             raise ValueError(f"a memory drives a Box action space, got {space}")
         if not len(spec.motor):
-            raise ValueError(f"this memory predicts no command: its stream has no action, only {list(spec.slices)}")
+            raise ValueError(
+                f"this memory predicts no command: its stream has no action, only {list(spec.slices)}"
+            )
         if len(spec.motor) != int(np.prod(space.shape)):
-            raise ValueError(f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}")
+            raise ValueError(
+                f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}"
+            )
         if self._measures and spec.dt != dt:
-            raise ValueError(f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s")
-        theirs = inner.measured_spec if self._measures else StreamSpec.from_spaces(env.observation_space, space, dt)
+            raise ValueError(
+                f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s"
+            )
+        theirs = (
+            inner.measured_spec
+            if self._measures
+            else StreamSpec.from_spaces(env.observation_space, space, dt)
+        )
         _check_fit(spec, theirs)
         shared = [name for name in spec.slices if name in theirs.slices]
         self._from, self._to = (
-            np.array([i for n in shared for i in range(s.size)[s.slices[n]]], np.intp) for s in (theirs, spec)
+            np.array([i for n in shared for i in range(s.size)[s.slices[n]]], np.intp)
+            for s in (theirs, spec)
         )
         self.memory = memory
         self._readout = CommandReadout(env)
@@ -107,10 +122,16 @@ class NeuralASMPolicy(StatefulPolicy):
         """Return the memory's state, the last command (A,), and what grippers are told."""
         return self.memory.initial_state(), np.zeros(len(self.memory.spec.motor), np.float32), None
 
-    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+    def act(
+        self, observation: Any, state: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
         """Return the action (A,) that the memory expects, and the next state; nothing is drawn at random."""
         memory, last, grip = state
-        measured = self._measures.measured if self._measures else np.concatenate([np.ravel(observation), last])
+        measured = (
+            self._measures.measured
+            if self._measures
+            else np.concatenate([np.ravel(observation), last])
+        )
         row = np.zeros((1, self.memory.spec.size), np.float32)
         row[0, self._to] = measured[self._from]
         memory, _ = self.memory.observe(memory, row)
@@ -125,7 +146,11 @@ def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
     """
     objects = [c.name for c in spec.channels if c.group == "object"]
     harmless = ("order: ", "dt: ", *(f"{name}: missing" for name in objects))
-    lines = [line for line in spec.difference(theirs) if not line.startswith(harmless) and not line.endswith(": new")]
+    lines = [
+        line
+        for line in spec.difference(theirs)
+        if not line.startswith(harmless) and not line.endswith(": new")
+    ]
     if spec.source and theirs.source and spec.source != theirs.source:
         lines.append(f"robot: {spec.source} against {theirs.source}")
     if objects and not any(name in theirs.slices for name in objects):

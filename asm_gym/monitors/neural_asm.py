@@ -107,7 +107,9 @@ class NeuralASM(CalibratedMonitor):
         )
         self.dynamics, self.urdf = dynamics, urdf
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
-        self.association_size = check_number("association_size", association_size, low=1, whole=True)
+        self.association_size = check_number(
+            "association_size", association_size, low=1, whole=True
+        )
         self.epochs = check_number("epochs", epochs, low=1, whole=True)
         self.free_running_probability = check_number(
             "free_running_probability", free_running_probability, low=0.0, high=1.0
@@ -118,8 +120,12 @@ class NeuralASM(CalibratedMonitor):
         Derived.of(spec, urdf)  # refuses a body model that does not fit
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
-        evidence = EvidenceDetection(spec, config.gains, config.bound, config.shrinkage, habituates, config.tail_index)
-        checked = {name: getattr(evidence, name) for name in ("gains", "bound", "shrinkage", "tail_index")}
+        evidence = EvidenceDetection(
+            spec, config.gains, config.bound, config.shrinkage, habituates, config.tail_index
+        )
+        checked = {
+            name: getattr(evidence, name) for name in ("gains", "bound", "shrinkage", "tail_index")
+        }
         self.config, self.habituates = replace(config, **checked), evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = BenignEvents(spec) if excuses else None
@@ -139,7 +145,9 @@ class NeuralASM(CalibratedMonitor):
     @typed
     def load(cls, path: str | Path) -> Self:
         """Read what ``save`` wrote. Raises FileNotFoundError, or ValueError for a file that is damaged or foreign."""
-        return restored(path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how))
+        return restored(
+            path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how)
+        )
 
     @classmethod
     @typed
@@ -172,12 +180,17 @@ class NeuralASM(CalibratedMonitor):
 
     def initial_state(self, batch: int = 1) -> MonitorState:
         state = super().initial_state(batch)
-        excuses = EventState.start(batch, 0) if self.excuses_ is None else self.excuses_.start(batch)
+        excuses = (
+            EventState.start(batch, 0) if self.excuses_ is None else self.excuses_.start(batch)
+        )
         values = () if self.values_ is None else self.values_.monitor.initial_state(batch)
         return state._replace(excuses=excuses, values=values)
 
     def observe(
-        self, state: MonitorState, stream: NDArray[np.floating[Any]], out: MonitorState | None = None
+        self,
+        state: MonitorState,
+        stream: NDArray[np.floating[Any]],
+        out: MonitorState | None = None,
     ) -> tuple[MonitorState, Surprise]:
         """Observe as in ``CalibratedMonitor``; write the new state to ``out``, a state that is no longer needed."""
         kernel = self._row_kernel()
@@ -193,7 +206,9 @@ class NeuralASM(CalibratedMonitor):
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
             now = now._replace(values=values)
         if self.model.skills_:
-            surprise = surprise._replace(skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)])
+            surprise = surprise._replace(
+                skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)]
+            )
         return now, surprise
 
     def compiled_row(self) -> RowKernel | None:
@@ -226,7 +241,11 @@ class NeuralASM(CalibratedMonitor):
         if not isinstance(evidence, EvidenceDetection) or memory is None:
             return None
         now = memory, evidence.detector_
-        if not self._kernel_of or self._kernel_of[0] is not now[0] or self._kernel_of[1] is not now[1]:
+        if (
+            not self._kernel_of
+            or self._kernel_of[0] is not now[0]
+            or self._kernel_of[1] is not now[1]
+        ):
             self._kernel, self._kernel_of = RowKernel(memory, evidence, self.excuses_), now
         return self._kernel
 

@@ -44,7 +44,10 @@ class MonitorKind:
     def detection_classes(self) -> list[Any]:
         """Of its detections, the one in use first."""
         check_choice("detection", self.detection, DETECTIONS)
-        return [target(DETECTIONS[name]) for name in dict.fromkeys((self.detection, self.own, "evidence"))]
+        return [
+            target(DETECTIONS[name])
+            for name in dict.fromkeys((self.detection, self.own, "evidence"))
+        ]
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
@@ -56,12 +59,20 @@ class MonitorKind:
         """Return the monitor, not yet fitted."""
 
         def part(kind: Any) -> Any:
-            return made(kind, spec, {n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters})
+            return made(
+                kind,
+                spec,
+                {n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters},
+            )
 
         own = part(self.model_class)
         if not self._whole:
-            return CalibratedMonitor(own, *map(part, self.detection_classes), seed=hyperparameters.get("seed", 0))
-        used = self.detection if self.detection in own.detections else part(self.detection_classes[0])
+            return CalibratedMonitor(
+                own, *map(part, self.detection_classes), seed=hyperparameters.get("seed", 0)
+            )
+        used = (
+            self.detection if self.detection in own.detections else part(self.detection_classes[0])
+        )
         return own if used == own.detection.name else own.with_detection(used)
 
     def load(self, path: str | Path) -> CalibratedMonitor:
@@ -90,7 +101,10 @@ MONITORS: Registry[MonitorKind] = Registry(
     "asm_gym.monitors.registry:MONITORS",
     {
         "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
-        **{n: MonitorKind(f"asm_gym.monitors.{model}", own, own) for n, (model, own) in _RIVALS.items()},
+        **{
+            n: MonitorKind(f"asm_gym.monitors.{model}", own, own)
+            for n, (model, own) in _RIVALS.items()
+        },
         **{
             n + EVIDENCE: MonitorKind(f"asm_gym.monitors.{m}", own)
             for n, (m, own) in _RIVALS.items()
@@ -122,7 +136,9 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
     """
     check_choice("detection", detection, DETECTIONS)
     if not isinstance(model, str) and getattr(model, "kind", None) != name:
-        raise ValueError(f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}")
+        raise ValueError(
+            f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}"
+        )
     row = MonitorKind(model, detection, detection)
     MONITORS.register(name, row)
     MONITORS[name + EVIDENCE] = replace(row, detection="evidence")
@@ -137,7 +153,9 @@ def check_monitor_name(name: str) -> None:
     if ":" in model and model not in MONITORS:
         own: Any = target(model)
         if not isinstance(own, type) or not issubclass(own, StreamModel | CalibratedMonitor):
-            raise ValueError(f"{name} is no model: derive from asm_gym.monitors.stream_model.StreamModel")
+            raise ValueError(
+                f"{name} is no model: derive from asm_gym.monitors.stream_model.StreamModel"
+            )
         kind = getattr(own, "kind", "")
         if kind not in MONITORS:
             register_monitor(kind, own, getattr(own, "detection", "evidence"))
@@ -198,4 +216,6 @@ def load_monitor(path: str | Path) -> CalibratedMonitor:
     """
     kind = monitor_class(str(read_header(path).get("kind")))
     saved = read_checkpoint(path, kind.model_class.kind)
-    return restored(path, saved, replace(kind, detection=saved.header.get("detection", kind.detection)))
+    return restored(
+        path, saved, replace(kind, detection=saved.header.get("detection", kind.detection))
+    )

@@ -25,7 +25,12 @@ from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState,
 from asm_gym.detection.detector import NO_DETECTOR, step_evidence
 from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, Evidence
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
-from asm_gym.detection.repetition import NO_REPETITION, Repetition, RepetitionWeights, step_repetition
+from asm_gym.detection.repetition import (
+    NO_REPETITION,
+    Repetition,
+    RepetitionWeights,
+    step_repetition,
+)
 from asm_gym.memory.association import normalised_errors
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
@@ -39,10 +44,14 @@ from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 __all__ = ["JUDGED", "RowKernel", "expected_errors", "layout_of", "observe_rows", "uninitialised"]
 
 
-def layout_of(network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]) -> Layout:
+def layout_of(
+    network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]
+) -> Layout:
     """Return what a memory computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
     either = weight_shapes(1, 1, 1) | settling_shapes(1, 1, 1)
-    singles = {name: np.zeros(shape) for name, shape in either.items()}  # what the other kind of network has
+    singles = {
+        name: np.zeros(shape) for name, shape in either.items()
+    }  # what the other kind of network has
     singles |= network.weights._asdict()
     singles |= network.association._asdict()
     singles |= names
@@ -83,9 +92,13 @@ class RowKernel:
         events: that excuse surprise; None where nothing is excused.
     """
 
-    def __init__(self, memory: Layout, detection: EvidenceDetection, events: BenignEvents | None) -> None:
+    def __init__(
+        self, memory: Layout, detection: EvidenceDetection, events: BenignEvents | None
+    ) -> None:
         if must_compile(observe_rows):
-            print("asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr)
+            print(
+                "asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr
+            )
         self._arguments = (memory, detection, events)
         self._excuses = events is not None
         senses = NO_SENSES if events is None else events.senses
@@ -129,10 +142,14 @@ class RowKernel:
         return out, Surprise(value=value, attribution=attribution, raw=raw, excuse=excuse), divisor
 
 
-def expected_errors(memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]) -> Any:
+def expected_errors(
+    memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]
+) -> Any:
     """Return the errors (B, X) of rows (B, D), and write the memory's state: the first half of a row by itself."""
     learned = bind(memory, True, NO_DETECTOR, NO_REPETITION, NO_SENSES)
-    detection = EvidenceState(evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0))
+    detection = EvidenceState(
+        evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0)
+    )
     events = EventState.start(len(rows), 0)
     states = [MonitorState(memory, detection, events) for memory in (before, after)]
     bound = bind_states(learned, *arrays_of(states[0]), *arrays_of(states[1]))
@@ -257,7 +274,9 @@ def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> Sc
     for n in range(len(rows)):
         after.steps[n] = before.steps[n] + 1
         for i in range(rows.shape[1]):
-            last[n, i] = before.before[n, 0, i] if before.steps[n] >= lag else rows[n, i]  # at first nothing moves
+            last[n, i] = (
+                before.before[n, 0, i] if before.steps[n] >= lag else rows[n, i]
+            )  # at first nothing moves
             past[n, i] = before.earlier[n, 0, i] if before.steps[n] >= 2 * lag else last[n, i]
             after.before[n, lag - 1, i] = rows[n, i]
             after.earlier[n, lag - 1, i] = last[n, i]
@@ -281,7 +300,13 @@ def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> Sc
 
 
 @partial(inner, inlined=True)
-def carry_on(layout: Layout, before: MemoryState, after: MemoryState, reading: ScaledRows, wants_context: bool) -> None:
+def carry_on(
+    layout: Layout,
+    before: MemoryState,
+    after: MemoryState,
+    reading: ScaledRows,
+    wants_context: bool,
+) -> None:
     """Write traces and expected state, where the temporal network takes up the row, else those of before."""
     steps = before.history.steps
     lag = before.history.before.shape[1]
@@ -362,7 +387,12 @@ def associate(layout: Layout, reading: ScaledRows) -> Any:
 
 @inner
 def judge_rows(
-    repetition: RepetitionWeights, unlikely: Any, shares: Any, finite: Any, judged: Any, attribution: Any
+    repetition: RepetitionWeights,
+    unlikely: Any,
+    shares: Any,
+    finite: Any,
+    judged: Any,
+    attribution: Any,
 ) -> None:
     """Write surprise and attribution: shares of errors pooled with repetitions, and divided by what excuses them.
 

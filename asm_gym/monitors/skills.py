@@ -63,19 +63,25 @@ def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 51
     check_nominal(episodes, memory.spec, memory.model.shortest)
     model = memory.model
     with threadpool_limits(1):
-        motor = learn_motor(*lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed))
+        motor = learn_motor(
+            *lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed)
+        )
     model.restore({**model.learned_, **motor.named()}, model.skills_)
     return memory
 
 
-def lessons(senses: StreamScaler, episodes: Sequence[Episode]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def lessons(
+    senses: StreamScaler, episodes: Sequence[Episode]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return situations (N, I), and the next command in each (N, A): of ``actions``, or else of the stream.
 
     Actions are what was intended where noise was added (DART: Laskey et al. 2017, CoRL). Raises ValueError without any.
     """
     motor = senses.spec.motor
     if not len(motor):
-        raise ValueError(f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}")
+        raise ValueError(
+            f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}"
+        )
     m, commands = [], []
     for e in episodes:
         intended = e.actions if len(e.actions) == len(e) else e.stream[:, motor]

@@ -46,7 +46,9 @@ class StreamModel:
         return self.spec.sensory
 
     @abstractmethod
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         """Learn from whole nominal episodes."""
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
@@ -115,7 +117,11 @@ def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
     Of a class with a ``config_class``, the fields of that stand for the argument ``config``.
     """
     taken = inspect.signature(kind).parameters.values()
-    names = [p.name for p in taken if p.name not in ("spec", "config") and p.kind is p.POSITIONAL_OR_KEYWORD]
+    names = [
+        p.name
+        for p in taken
+        if p.name not in ("spec", "config") and p.kind is p.POSITIONAL_OR_KEYWORD
+    ]
     config = getattr(kind, "config_class", None)
     return (*names, *(() if config is None else (f.name for f in fields(config))))
 
@@ -137,11 +143,15 @@ def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[Model
     for group, steps in side_by_side(episodes, model.start, partial(_predicted, model)):
         for n, i in enumerate(group):
             mine = steps[: len(episodes[i])]
-            outputs[i] = ModelOutput(np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine]))
+            outputs[i] = ModelOutput(
+                np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine])
+            )
     return [outputs[i] for i in range(len(episodes))]
 
 
-def _predicted(model: StreamModel, state: State, rows: NDArray[np.float64]) -> tuple[State, ModelOutput]:
+def _predicted(
+    model: StreamModel, state: State, rows: NDArray[np.float64]
+) -> tuple[State, ModelOutput]:
     found: Any = model.predict(state, rows)
     asked, wanted = f"predict of {model.kind} must give", (len(rows), len(model.error_columns))
     if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], ModelOutput):
@@ -171,7 +181,9 @@ def side_by_side(
         group = order[first : first + AT_ONCE]
         state, steps = start(len(group)), []
         for t in range(len(episodes[group[0]])):
-            rows = np.stack([episodes[i].stream[t] for i in group if t < len(episodes[i])]).astype(np.float64)
+            rows = np.stack([episodes[i].stream[t] for i in group if t < len(episodes[i])]).astype(
+                np.float64
+            )
             state, step = advance(first_of(state, len(rows)), rows)
             steps.append(step)
         yield group, steps

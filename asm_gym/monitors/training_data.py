@@ -30,10 +30,14 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
     for n, episode in enumerate(episodes):
         spec.require(episode.spec, f"episode {n}")
         if len(episode) < shortest:
-            raise ValueError(f"episode {n} must be at least {shortest} steps long, got {len(episode)}")
+            raise ValueError(
+                f"episode {n} must be at least {shortest} steps long, got {len(episode)}"
+            )
         for step, column in np.argwhere(~np.isfinite(episode.stream)):
             value = episode.stream[step, column]
-            raise ValueError(f"episode {n}, step {step}, {spec.labels[column]} must be finite, got {value}")
+            raise ValueError(
+                f"episode {n}, step {step}, {spec.labels[column]} must be finite, got {value}"
+            )
     # Beside a number out of all proportion its channel would look constant.
     if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
         return
@@ -51,13 +55,22 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
 
 def mute_channels(episodes: Sequence[Episode]) -> list[str]:
     """Say, a line each, which numbers of the stream never move, and which are copies of others."""
-    rows, labels = np.concatenate([e.stream for e in episodes]).astype(np.float64), episodes[0].spec.labels
+    rows, labels = (
+        np.concatenate([e.stream for e in episodes]).astype(np.float64),
+        episodes[0].spec.labels,
+    )
     moves = np.ptp(rows, axis=0) > 0
-    lines = [f"{labels[i]} never moves in these episodes: its motion will be an alarm" for i in np.flatnonzero(~moves)]
+    lines = [
+        f"{labels[i]} never moves in these episodes: its motion will be an alarm"
+        for i in np.flatnonzero(~moves)
+    ]
     moving = np.flatnonzero(moves)
     alike = np.abs(np.corrcoef(rows[:, moving], rowvar=False).reshape(len(moving), -1)) > ALIKE
     pairs = ((i, np.argmax(own)) for i, own in enumerate(alike) if np.argmax(own) < i)
-    return lines + [f"{labels[moving[i]]} is a copy of {labels[moving[j]]}, and cannot check it" for i, j in pairs]
+    return lines + [
+        f"{labels[moving[i]]} is a copy of {labels[moving[j]]}, and cannot check it"
+        for i, j in pairs
+    ]
 
 
 def hashes_of(episodes: Sequence[Episode]) -> Hashes:

@@ -114,12 +114,19 @@ class ValueAssociation(ScaledModel):
         order = np.argsort(self.links.columns)
         return [(labels[self.links.columns[k]], self.links.names[k]) for k in order]
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         streams = [e.stream for e in episodes]
         senses = self.senses_ = StreamScaler.fit(self.spec, streams, self.lag)
-        parts = [[a[self.lag :] for a in self._read(senses.read_episode(stream))] for stream in streams]
+        parts = [
+            [a[self.lag :] for a in self._read(senses.read_episode(stream))] for stream in streams
+        ]
         lengths = [len(part[0]) for part in parts]
-        read, fold = _Read(*(np.concatenate(part) for part in zip(*parts, strict=True))), _folds(lengths)
+        read, fold = (
+            _Read(*(np.concatenate(part) for part in zip(*parts, strict=True))),
+            _folds(lengths),
+        )
         self._derived = Derived.of(self.spec)
         given = self._fitted(read, fold)
         if self.urdf:
@@ -140,12 +147,16 @@ class ValueAssociation(ScaledModel):
             far.append(matrix)
             errors[:, (senses.groups[judged] == g) & (given.alone[judged] == 0)] /= factor[:, None]
         ends = np.cumsum(lengths)[:-1]
-        largest = [np.abs(averaged(part, self.window)).max(axis=0) for part in np.split(errors, ends)]
+        largest = [
+            np.abs(averaged(part, self.window)).max(axis=0) for part in np.split(errors, ends)
+        ]
         progress(1, 1)
         learned = {
             "derived_mean": given.scale[0],
             "derived_spread": given.scale[1],
-            "body": np.zeros(0) if self._derived.links is None else self._derived.links.columns * 1.0,
+            "body": np.zeros(0)
+            if self._derived.links is None
+            else self._derived.links.columns * 1.0,
             "judged_values": judged * 1.0,
             "R2_values": given.R2,
             "D": given.weights[judged],
@@ -169,15 +180,25 @@ class ValueAssociation(ScaledModel):
     def predict(self, state: Averaged, rows: NDArray[np.float64]) -> tuple[Averaged, ModelOutput]:
         history, read, known = read_next(self.senses_, state.history, rows)
         scaled, found = self._read(read), self.learned_
-        derived = (self._derived(*self._physical(scaled)) - found["derived_mean"]) / found["derived_spread"]
+        derived = (self._derived(*self._physical(scaled)) - found["derived_mean"]) / found[
+            "derived_spread"
+        ]
         inputs = np.hstack([*scaled[:3], derived, scaled.commands])
-        now = known * (scaled.values[:, self._values] - inputs @ found["D"].T) / self._farther(inputs)
+        now = (
+            known * (scaled.values[:, self._values] - inputs @ found["D"].T) / self._farther(inputs)
+        )
         left = np.concatenate([state.left[:, 1:], now[:, None]], axis=1)
-        return Averaged(history, left), ModelOutput(left.mean(axis=1) / found["largest"], no_context(rows))
+        return Averaged(history, left), ModelOutput(
+            left.mean(axis=1) / found["largest"], no_context(rows)
+        )
 
     def _read(self, read: ScaledRows) -> _Read:
         X = len(self.spec.sensory)
-        found = read.senses[:, :X], read.inputs[:, self.senses_.changes], read.inputs[:, self.spec.sensory]
+        found = (
+            read.senses[:, :X],
+            read.inputs[:, self.senses_.changes],
+            read.inputs[:, self.spec.sensory],
+        )
         return _Read(*(np.asarray(a, np.float64) for a in (*found, read.commands)))
 
     def _physical(self, read: _Read) -> tuple[Floats, Floats, Floats, Floats]:
@@ -192,7 +213,9 @@ class ValueAssociation(ScaledModel):
         assert told.links is not None
         if told.links.by_name or len(self._loads) != len(told.angles):
             return told
-        return told._replace(links=told.links.in_best_order(*told.motion(*physical), physical[0][:, self._loads]))
+        return told._replace(
+            links=told.links.in_best_order(*told.motion(*physical), physical[0][:, self._loads])
+        )
 
     def _fitted(self, read: _Read, fold: NDArray[np.intp]) -> _Fitted:
         """Return weights by the penalty that leaves the least in rows of other folds, and what it leaves there.
@@ -201,12 +224,18 @@ class ValueAssociation(ScaledModel):
         """
         derived = self._derived(*self._physical(read))
         middle, width = derived.mean(axis=0), np.maximum(derived.std(axis=0), FAINTEST)
-        z, x, every = np.hstack([*read[:3], (derived - middle) / width, read.commands]), read.values, self._own()
+        z, x, every = (
+            np.hstack([*read[:3], (derived - middle) / width, read.commands]),
+            read.values,
+            self._own(),
+        )
         check_inputs(z.shape[1])
         (N, size), X = z.shape, x.shape[1]
         grams, crosses = _equations(z, x, fold)
 
-        def solved(f: int, used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float) -> Floats:
+        def solved(
+            f: int, used: NDArray[np.intp], mine: NDArray[np.intp], penalty: float
+        ) -> Floats:
             gram = grams[f][np.ix_(used, used)] + penalty * np.eye(len(used))
             return np.linalg.solve(gram, crosses[f][np.ix_(used, mine)])  # (U, M)
 
@@ -222,14 +251,23 @@ class ValueAssociation(ScaledModel):
             left[:, one], alone[k] = unseen(used, one, PENALTIES[0]), 1.0
             weights[k, used] = solved(FOLDS, used, one, PENALTIES[0])[:, 0]
         for g, own in enumerate(every):
-            mine, used = np.flatnonzero(self.senses_.groups == g), np.setdiff1d(np.arange(size), own)
+            mine, used = (
+                np.flatnonzero(self.senses_.groups == g),
+                np.setdiff1d(np.arange(size), own),
+            )
             errors = np.array([unseen(used, mine, penalty) for penalty in PENALTIES])  # (P, N, M)
             squares = (errors**2).sum(axis=1)
-            better = squares.min(axis=0) < np.where(alone[mine] > 0, (left[:, mine] ** 2).sum(axis=0), np.inf)
+            better = squares.min(axis=0) < np.where(
+                alone[mine] > 0, (left[:, mine] ** 2).sum(axis=0), np.inf
+            )
             for n, penalty in enumerate(PENALTIES):
                 taken = np.flatnonzero(better & (squares.argmin(axis=0) == n))
                 if len(taken):
-                    left[:, mine[taken]], alone[mine[taken]], weights[mine[taken]] = errors[n][:, taken], 0.0, 0.0
+                    left[:, mine[taken]], alone[mine[taken]], weights[mine[taken]] = (
+                        errors[n][:, taken],
+                        0.0,
+                        0.0,
+                    )
                     weights[np.ix_(mine[taken], used)] = solved(FOLDS, used, mine[taken], penalty).T
         R2 = 1.0 - (left**2).mean(axis=0) / np.maximum(x.var(axis=0), FAINTEST**2)
         return _Fitted(z, (middle, width), grams, every, weights, left, R2, alone)
@@ -244,7 +282,10 @@ class ValueAssociation(ScaledModel):
         first = 3 * X + S * np.arange(len(WIDTHS) + bodies)  # of each kind of input
         commands = np.arange(size - len(self.spec.motor) - 1, size)
         speed = derived.speeds + (X if derived.from_steps else 0)
-        return {int(k): np.concatenate([[speed[n]], first + n, commands]) for n, k in enumerate(self._loads)}
+        return {
+            int(k): np.concatenate([[speed[n]], first + n, commands])
+            for n, k in enumerate(self._loads)
+        }
 
     def judged(self, R2: Floats) -> NDArray[np.intp]:
         """Return which values are judged, by their cross-fitted R² (X,)."""
@@ -258,7 +299,9 @@ class ValueAssociation(ScaledModel):
         """Return the factors (N, V) of the spreads of judged values, for inputs (N, I)."""
         found, learned = np.ones((len(inputs), len(self._values))), self.learned_
         groups = np.where(learned["joint_alone"] > 0, -1, self.senses_.groups[self._values])
-        for group, far in zip(np.unique(self.senses_.groups[self._values]), learned["far"], strict=False):
+        for group, far in zip(
+            np.unique(self.senses_.groups[self._values]), learned["far"], strict=False
+        ):
             found[:, groups == group] = np.sqrt(np.maximum(1.0, squares(inputs, far)))[:, None]
         return found
 
@@ -269,7 +312,12 @@ class ValueAssociation(ScaledModel):
         for g in range(int(groups.max()) + 1):
             own = np.flatnonzero(groups == g)
             derived = 3 * X + np.flatnonzero(self._derived.sources[:, own].any(axis=1))
-            withheld = [own, X + own, derived, 2 * X + np.arange(X)]  # a value is predicted from this row alone
+            withheld = [
+                own,
+                X + own,
+                derived,
+                2 * X + np.arange(X),
+            ]  # a value is predicted from this row alone
             found.append(np.unique(np.concatenate(withheld)).astype(np.intp))
         return found
 
@@ -297,7 +345,9 @@ def averaged(left: Floats, window: int) -> Floats:
     return (total[window:] - total[:-window]) / window
 
 
-def _far(given: _Fitted, fold: NDArray[np.intp], withheld: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _far(
+    given: _Fitted, fold: NDArray[np.intp], withheld: NDArray[np.intp]
+) -> tuple[Floats, Floats]:
     """Return the matrix (I, I) with which zᵀ far z is h/h̃ for inputs z, and the cross-fitted √max(1, h/h̃) (N,)."""
     size, found, h = given.inputs.shape[1], np.zeros_like(given.grams[0]), np.zeros(len(fold))
     used = np.setdiff1d(np.arange(size), withheld)

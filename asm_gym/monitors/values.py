@@ -25,12 +25,21 @@ from asm_gym.detection.scores import Largest
 from asm_gym.monitors.base import State, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next
-from asm_gym.monitors.value_association import ALIKE_S, MOST_INPUTS, ValueAssociation, inverse, squares
+from asm_gym.monitors.value_association import (
+    ALIKE_S,
+    MOST_INPUTS,
+    ValueAssociation,
+    inverse,
+    squares,
+)
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
 SCALARS = "usual", "balance", "power"
-PRIOR_COUNT, PRIOR_SPREADS = 4, (0.3, 0.15)  # maxima that p rests on before any, and spread of their logarithms
+PRIOR_COUNT, PRIOR_SPREADS = (
+    4,
+    (0.3, 0.15),
+)  # maxima that p rests on before any, and spread of their logarithms
 MOST_POWER = 3.0
 PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
 
@@ -39,7 +48,9 @@ class Values(NamedTuple):
     """The monitor of values, and how it counts beside that of changes."""
 
     monitor: CalibratedMonitor  # of values alone
-    leverage: NDArray[np.float64] = np.zeros((0, 0))  # zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs
+    leverage: NDArray[np.float64] = np.zeros(
+        (0, 0)
+    )  # zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs
     usual: float = 1.0  # 1 / (1 + τ h̃)
     balance: float = 1.0  # b, before ``calibrate``
     power: float = 2.0  # p, before ``calibrate``: changes are judged by squares
@@ -67,14 +78,19 @@ class Values(NamedTuple):
         monitor, leverage = _monitor(spec, seed, urdf).with_learned(own), arrays["leverage"]
         size = _senses(monitor).inputs + 1
         if leverage.shape not in ((size, size), (0, 0)):
-            raise ValueError(f"the leverage of values should be of shape {(size, size)}, found {leverage.shape}")
+            raise ValueError(
+                f"the leverage of values should be of shape {(size, size)}, found {leverage.shape}"
+            )
         return cls(monitor, leverage, *(float(arrays[name]) for name in SCALARS))
 
     def balanced(self, changes: Sequence[Surprise], episodes: Sequence[Episode]) -> Self:
         """Return it with b and p from nominal episodes, of whose changes ``join`` made this with b of 0."""
         both = changes, self.monitor.score_episodes(episodes)
         dt = self.monitor.spec.dt
-        logs = [np.log(np.maximum(Blocks.of([s.value for s in scores], dt).maxima, TINY)) for scores in both]
+        logs = [
+            np.log(np.maximum(Blocks.of([s.value for s in scores], dt).maxima, TINY))
+            for scores in both
+        ]
         variance = [
             (len(of) * np.var(of) + PRIOR_COUNT * prior**2) / (len(of) + PRIOR_COUNT)
             for of, prior in zip(logs, PRIOR_SPREADS, strict=True)
@@ -91,7 +107,11 @@ class Values(NamedTuple):
         return {PREFIX + name: array for name, array in kept.items()}
 
     def join(
-        self, state: State, rows: NDArray[np.float64], changes: Surprise, divisor: NDArray[np.float64]
+        self,
+        state: State,
+        rows: NDArray[np.float64],
+        changes: Surprise,
+        divisor: NDArray[np.float64],
     ) -> tuple[State, Surprise]:
         """Return the new state, and the greater surprise in each row (B, D), attributed as that one is.
 

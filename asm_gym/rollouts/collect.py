@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import CONTROLLER, Episode, save_episode
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, InterventionOutcome, ScoredEpisode
+from asm_gym.evaluation.scored_episode import (
+    NOMINAL,
+    POLICY_ALONE,
+    InterventionOutcome,
+    ScoredEpisode,
+)
 from asm_gym.faults import Fault, Push
 from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import draw, suite_fault
@@ -65,10 +70,20 @@ def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tu
     onset = trial.begins(env)
     if not isinstance(inner, RobosuiteEnv):
         sigma = _latest("sigmas", (trial.env_id, config), lambda: _sigmas(trial.env_id, config))
-        return faults_anywhere(trial.kind, FaultyInterface(env), sigma, trial.severity, onset, trial.seed)
+        return faults_anywhere(
+            trial.kind, FaultyInterface(env), sigma, trial.severity, onset, trial.seed
+        )
     if trial.kind == PASSING:
         drawn, steps = draw(inner, onset, trial.seed), max(1, round(0.3 / control_period(env)))
-        return (Push(body=drawn.link, newtons=20.0, direction=drawn.direction, duration=steps, onset=onset),)
+        return (
+            Push(
+                body=drawn.link,
+                newtons=20.0,
+                direction=drawn.direction,
+                duration=steps,
+                onset=onset,
+            ),
+        )
     return (suite_fault(trial.kind, inner, trial.severity, onset, trial.seed),)
 
 
@@ -98,7 +113,10 @@ def staged(trial: Trial, config: RolloutConfig) -> Iterator[gym.Env[Any, Any]]:
 
 
 def play(
-    trial: Trial, config: RolloutConfig, env: gym.Env[Any, Any], on_step: Callable[[dict[str, Any]], None] | None = None
+    trial: Trial,
+    config: RolloutConfig,
+    env: gym.Env[Any, Any],
+    on_step: Callable[[dict[str, Any]], None] | None = None,
 ) -> bool:
     """Run the policy in a staged and wrapped ``env``; return whether the task was solved at some step."""
     policy = policy_for(config.policy, env, trial.seed)
@@ -109,7 +127,9 @@ def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Polic
     """Return the policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
     if isinstance(source, str | Path):
         return make_policy(str(source), env, seed=seed)
-    policy: Any = source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
+    policy: Any = (
+        source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
+    )
     if hasattr(policy, "set_random_seed"):
         policy.set_random_seed(seed)
     return policy
@@ -120,9 +140,13 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
     forces: list[float] = []
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
-        play(trial, config, recorder, lambda info: forces.append(info.get("contact_force", math.nan)))
+        play(
+            trial, config, recorder, lambda info: forces.append(info.get("contact_force", math.nan))
+        )
     base = environment(trial.env_id, config.settings)
-    inner: Any = base.unwrapped if isinstance(base.unwrapped, RobosuiteEnv) else FaultyInterface(base)
+    inner: Any = (
+        base.unwrapped if isinstance(base.unwrapped, RobosuiteEnv) else FaultyInterface(base)
+    )
     faults = faults_in(trial, base, config) if trial.role == "faulty" else ()
     affected: frozenset[str] = frozenset().union(*(fault.labels(inner) for fault in faults))
     recorded = recorder.finish()
@@ -201,7 +225,9 @@ def collect(
 
 def record_episode(seed: int, spec: EnvSpec, config: RolloutConfig) -> Episode:
     """Record the episode of ``seed``."""
-    gym.registry.setdefault(spec.id, spec)  # another process lacks what the user registered in this one
+    gym.registry.setdefault(
+        spec.id, spec
+    )  # another process lacks what the user registered in this one
     trial = Trial(spec.id, seed)
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
@@ -250,7 +276,9 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     asm = [info["asm"] for info in infos]
     rows = len(asm[0]["surprises"])  # of each control step
     fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
-    attribution = np.repeat([list(a["attribution"].values()) for a in asm], rows, axis=0)  # the step's greatest
+    attribution = np.repeat(
+        [list(a["attribution"].values()) for a in asm], rows, axis=0
+    )  # the step's greatest
     trace = ScoredEpisode(
         kind=trial.kind,
         severity=trial.severity,
@@ -265,7 +293,9 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
             success,
             contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
             overridden=any(info["overridden"] for info in infos),
-            time=next((n + 1 for n, i in enumerate(infos) if i["success"]), np.nan) * rows * monitor.spec.dt,
+            time=next((n + 1 for n, i in enumerate(infos) if i["success"]), np.nan)
+            * rows
+            * monitor.spec.dt,
         ),
         fault=fault,
     )
@@ -274,4 +304,7 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
 
 def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[ScoredEpisode]:
     """Run one trial with the policy alone, and with its response."""
-    return [watch(replace(trial, acting=acting), config, memory) for acting in (POLICY_ALONE, trial.acting)]
+    return [
+        watch(replace(trial, acting=acting), config, memory)
+        for acting in (POLICY_ALONE, trial.acting)
+    ]

@@ -52,7 +52,10 @@ PARTS: dict[str, tuple[Source, ...]] = {
     "hours": (
         *(Source("Lift", "lift_sac", nominal=1190), Source("Stack", "stack_sac", nominal=790)),
         *(Source("Door", "door_sac", nominal=790), Source("NutAssemblySquare", nominal=450)),
-        *(Source(f"PickPlace{o}", f"{o.lower()}_clone", nominal=300) for o in ("Can", "Milk", "Bread")),
+        *(
+            Source(f"PickPlace{o}", f"{o.lower()}_clone", nominal=300)
+            for o in ("Can", "Milk", "Bread")
+        ),
         Source("PickPlaceCereal", "cereal_clone", nominal=400),
         Source("NutAssemblySquare", "square_clone", nominal=400),
         *(Source(f"PickPlace{o}", nominal=400) for o in ("Bread", "Cereal")),
@@ -60,7 +63,10 @@ PARTS: dict[str, tuple[Source, ...]] = {
 }
 """Six skills of experts, to learn, to calibrate and to test on; and healthy motion of agents and in other tasks."""
 ROUNDS = 5
-QUICK = {"skills": (Source("Lift", "scripted", 2, 2, 2, faults=True),), "hours": (Source("Lift", "lift_sac", 0, 0, 2),)}
+QUICK = {
+    "skills": (Source("Lift", "scripted", 2, 2, 2, faults=True),),
+    "hours": (Source("Lift", "lift_sac", 0, 0, 2),),
+}
 
 
 @dataclass(frozen=True)
@@ -78,12 +84,18 @@ class Corpus:
             raise FileNotFoundError(2, "no corpus is there; asm-gym corpus records one", str(claim))
         version = json.loads(claim.read_text(encoding="utf-8")).get("corpus")
         if version != VERSION:
-            raise ValueError(f"{claim} is of version {version!r} of the corpus, and this asm-gym reads {VERSION}")
+            raise ValueError(
+                f"{claim} is of version {version!r} of the corpus, and this asm-gym reads {VERSION}"
+            )
         found = [f.relative_to(folder) for f in sorted(Path(folder).glob("*/episodes/*/*/*.npz"))]
         rows = [(f.parts[0], *f.parts[2:4], *(f.stem.split("-")[:-1] or ("", ""))) for f in found]
-        return cls(Path(folder), pd.DataFrame(rows, [f.as_posix() for f in found], COLUMNS, dtype=object))
+        return cls(
+            Path(folder), pd.DataFrame(rows, [f.as_posix() for f in found], COLUMNS, dtype=object)
+        )
 
-    def episodes(self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()) -> list[Episode]:
+    def episodes(
+        self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()
+    ) -> list[Episode]:
         """Load episodes by role, policy and task; all where none is named."""
         chosen = self.files
         for name, values in (("role", roles), ("policy", policies), ("task", tasks)):
@@ -99,8 +111,12 @@ def skill_files(folder: Path, fit: int | None = None, tasks: Sequence[str] = SKI
     order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
     chosen = files[(files.policy == "scripted") & files.task.isin(tasks)]
     if fit is not None:
-        chosen = chosen[(chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)]
-    chosen = chosen.sort_values(["kind", "severity"], key=lambda names: names.map(order), kind="stable")
+        chosen = chosen[
+            (chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)
+        ]
+    chosen = chosen.sort_values(
+        ["kind", "severity"], key=lambda names: names.map(order), kind="stable"
+    )
     return [folder / path for path in chosen.index]
 
 
@@ -117,14 +133,24 @@ def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
         faults = product((kind for kind in kinds_of((TEST,)) if possible(kind, env)), SEVERITIES)
         horizon = task_spec(source.task).horizon
         # A scene each, as far as there are as many.
-        found += [faulty_trial(env_id, *fault, seeds[k % len(seeds)], horizon) for k, fault in enumerate(faults)]
+        found += [
+            faulty_trial(env_id, *fault, seeds[k % len(seeds)], horizon)
+            for k, fault in enumerate(faults)
+        ]
     return found
 
 
 def record_corpus(
-    folder: Path, sources: Sequence[Source], number: int, rounds: int, workers: int, progress: Progress
+    folder: Path,
+    sources: Sequence[Source],
+    number: int,
+    rounds: int,
+    workers: int,
+    progress: Progress,
 ) -> None:
     """Record what is missing of a round, source by source."""
     for source in sources:
         wanted = trials(source, number, rounds)
-        record_missing(wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress)
+        record_missing(
+            wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress
+        )

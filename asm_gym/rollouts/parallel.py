@@ -26,14 +26,25 @@ Progress = Callable[[int, int], None]  # is called as (done, total)
 
 MOST_WORKERS = 1000
 IDLE_S = 300.0  # a process without work ends after this time [s]
-_LIBRARIES = ("OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "NUMBA_NUM", "NUMEXPR_NUM", "VECLIB_MAXIMUM")
+_LIBRARIES = (
+    "OMP_NUM",
+    "OPENBLAS_NUM",
+    "MKL_NUM",
+    "BLIS_NUM",
+    "NUMBA_NUM",
+    "NUMEXPR_NUM",
+    "VECLIB_MAXIMUM",
+)
 ONE_THREAD = {f"{library}_THREADS": "1" for library in _LIBRARIES}
 """Environment of each worker: more threads would compete for the same cores."""
 
 
 @typed
 def parallel_map(
-    task: Callable[[Item], Result], items: Sequence[Item], workers: int = 2, progress: Progress | None = None
+    task: Callable[[Item], Result],
+    items: Sequence[Item],
+    workers: int = 2,
+    progress: Progress | None = None,
 ) -> list[Result]:
     """Return ``[task(item) for item in items]``, computed by so many processes, 1 of which is this one.
 
@@ -54,7 +65,9 @@ def parallel_map(
     elif items:
         pickled = _pickled(task)
         with _loky(min(workers, len(items))) as executor:
-            index_of = {executor.submit(_call, pickled, item): index for index, item in enumerate(items)}
+            index_of = {
+                executor.submit(_call, pickled, item): index for index, item in enumerate(items)
+            }
             for future in as_completed(index_of):
                 found[index_of[future]] = future.result()
                 report(len(found), len(items))
@@ -79,15 +92,26 @@ def _call(task: bytes, item: Any) -> Any:
 
 @contextmanager
 def _loky(workers: int) -> Iterator[Any]:
-    get_reusable_executor = require("loky", what="running episodes in several processes").get_reusable_executor
-    how = {"timeout": IDLE_S, "initializer": _end_with_parent, "initargs": (os.getpid(),), "env": ONE_THREAD}
+    get_reusable_executor = require(
+        "loky", what="running episodes in several processes"
+    ).get_reusable_executor
+    how = {
+        "timeout": IDLE_S,
+        "initializer": _end_with_parent,
+        "initargs": (os.getpid(),),
+        "env": ONE_THREAD,
+    }
     executor = get_reusable_executor(workers, **how)
     try:
         yield executor
     except BrokenProcessPool as error:
-        raise ChildProcessError(f"a worker process was killed, perhaps for want of memory: {error}") from error
+        raise ChildProcessError(
+            f"a worker process was killed, perhaps for want of memory: {error}"
+        ) from error
     except BaseException:
-        executor.shutdown(wait=True, kill_workers=True)  # after an error or a Ctrl-C nothing runs on
+        executor.shutdown(
+            wait=True, kill_workers=True
+        )  # after an error or a Ctrl-C nothing runs on
         raise
 
 

@@ -48,12 +48,18 @@ def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]
     try:
         lock.acquire()
     except Timeout:
-        raise BlockingIOError(f"{folder} is in use by another process: wait for it, or name another --out") from None
+        raise BlockingIOError(
+            f"{folder} is in use by another process: wait for it, or name another --out"
+        ) from None
     try:
         path = folder / name
         if path.is_file():
             theirs = json.loads(path.read_text(encoding="utf-8"))
-            other = [f"{n}: {theirs.get(n)!r} there, {ours[n]!r} here" for n in ours if theirs.get(n) != ours[n]]
+            other = [
+                f"{n}: {theirs.get(n)!r} there, {ours[n]!r} here"
+                for n in ours
+                if theirs.get(n) != ours[n]
+            ]
             if other:
                 raise ValueError(
                     f"{folder} holds recordings of other settings ({'; '.join(other)}): name another --out"

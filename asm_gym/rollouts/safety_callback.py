@@ -24,7 +24,9 @@ class SafetyCallback(BaseCallback):
         self._steps: list[list[tuple[float, ...]]] = [[] for _ in range(self.training_env.num_envs)]
 
     def _on_step(self) -> bool:
-        for steps, info, done in zip(self._steps, self.locals["infos"], self.locals["dones"], strict=True):
+        for steps, info, done in zip(
+            self._steps, self.locals["infos"], self.locals["dones"], strict=True
+        ):
             if "asm" not in info:
                 raise KeyError('info has no "asm": wrap the environment in NeuralASMSafety')
             surprise = float(info["asm_surprise"]) / float(info["asm"]["threshold"])
@@ -32,7 +34,11 @@ class SafetyCallback(BaseCallback):
             steps.append((surprise, *flat, float(info["asm"]["slowed"])))
             if done:
                 worst, alarm, cost, overridden, slowed = zip(*steps, strict=True)
-                counts = {"alarms": len(spans(np.array(alarm))), "cost": sum(cost), "overridden": sum(overridden)}
+                counts = {
+                    "alarms": len(spans(np.array(alarm))),
+                    "cost": sum(cost),
+                    "overridden": sum(overridden),
+                }
                 self._log(surprise=max(worst), slowed=float(np.mean(slowed)), **counts)
                 steps.clear()
         return True

@@ -32,7 +32,10 @@ ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
 ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
 CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
 BATCH, LOG_STD = 256, -3.5  # of cloning, and the actor's log standard deviation before tanh
-CLONING_RATE, ANCHOR_RATE = 1e-3, 3e-4  # learning rates of cloning, before and while the agent learns from its steps
+CLONING_RATE, ANCHOR_RATE = (
+    1e-3,
+    3e-4,
+)  # learning rates of cloning, before and while the agent learns from its steps
 
 Floats = NDArray[np.float32]
 
@@ -57,7 +60,12 @@ class NormalisedCritic(SACPolicy):
         """Return the critics."""
         critic: Any = super().make_critic(features_extractor)
         for n, q in enumerate(critic.q_networks):
-            parts = [(p, torch.nn.LayerNorm(p.out_features)) if getattr(p, "out_features", 1) > 1 else (p,) for p in q]
+            parts = [
+                (p, torch.nn.LayerNorm(p.out_features))
+                if getattr(p, "out_features", 1) > 1
+                else (p,)
+                for p in q
+            ]
             critic.q_networks[n] = torch.nn.Sequential(*(layer for some in parts for layer in some))
             critic.add_module(f"qf{n}", critic.q_networks[n])
         return critic
@@ -71,10 +79,17 @@ class GuardedSAC(SAC):
         for group in self.actor.optimizer.param_groups:
             group["lr"] *= ACTOR_SHARE
 
-    def _store_transition(self, buffer: Any, action: Any, seen: Any, reward: Any, dones: Any, infos: Any) -> None:
+    def _store_transition(
+        self, buffer: Any, action: Any, seen: Any, reward: Any, dones: Any, infos: Any
+    ) -> None:
         executed = [info.get("asm", {}).get("executed_action") for info in infos]
         scale = self.policy.scale_action
-        kept = np.array([own if other is None else scale(other) for own, other in zip(action, executed, strict=True)])
+        kept = np.array(
+            [
+                own if other is None else scale(other)
+                for own, other in zip(action, executed, strict=True)
+            ]
+        )
         super()._store_transition(buffer, kept, seen, reward, dones, infos)
 
 
@@ -116,10 +131,15 @@ def train(
         check_sizes(env, demonstrations)
         observations = np.concatenate([e.observations for e in demonstrations])
         spread = observations.std(axis=0)
-        standard = observations.mean(axis=0), np.where(spread > 1e-3, spread, 1.0).astype(np.float32)
+        standard = (
+            observations.mean(axis=0),
+            np.where(spread > 1e-3, spread, 1.0).astype(np.float32),
+        )
         view = Standardised(env, *standard)
         learner = make_learner(Monitor(view), seed)
-        learner.set_logger(configure(str(out / "log"), ["csv", *["tensorboard"] * bool(find_spec("tensorboard"))]))
+        learner.set_logger(
+            configure(str(out / "log"), ["csv", *["tensorboard"] * bool(find_spec("tensorboard"))])
+        )
         fill_buffer(learner, demonstrations, view)
         anchor = clone(learner, cloning_updates, seed, progress)
         if steps:
@@ -151,11 +171,15 @@ def check_sizes(env: gym.Env[Any, Any], demonstrations: Sequence[Episode]) -> No
     """Raise TypeError or ValueError where the learner cannot learn from these demonstrations."""
     for name, space in (("observations", env.observation_space), ("actions", env.action_space)):
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-            raise TypeError(f"an agent is trained where {name} are a Box with one axis, got {space}")
+            raise TypeError(
+                f"an agent is trained where {name} are a Box with one axis, got {space}"
+            )
         for n, episode in enumerate(demonstrations):
             size = getattr(episode, name).shape[1]
             if size != space.shape[0]:
-                raise ValueError(f"demonstration {n} has {name} of {size} numbers, the environment {space.shape[0]}")
+                raise ValueError(
+                    f"demonstration {n} has {name} of {size} numbers, the environment {space.shape[0]}"
+                )
 
 
 def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -> None:
@@ -167,12 +191,22 @@ def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -
         actions = learner.policy.scale_action(np.clip(episode.actions, space.low, space.high))
         for t, reward in enumerate(episode.rewards):
             last = t == len(episode.rewards) - 1
-            info: dict[str, Any] = {"TimeLimit.truncated": last and not episode.info.get("terminated", False)}
-            row = seen[t][None], seen[t + 1][None], actions[t][None], np.array([reward]), np.array([last])
+            info: dict[str, Any] = {
+                "TimeLimit.truncated": last and not episode.info.get("terminated", False)
+            }
+            row = (
+                seen[t][None],
+                seen[t + 1][None],
+                actions[t][None],
+                np.array([reward]),
+                np.array([last]),
+            )
             learner.replay_buffer.add(*row, [info])
 
 
-def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda *_: None) -> Callable[[], None]:
+def clone(
+    learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda *_: None
+) -> Callable[[], None]:
     """Fit a learner's actor to the actions in its replay buffer; return what makes one update more."""
     buffer, actor = learner.replay_buffer, learner.actor
     assert buffer is not None
@@ -182,7 +216,9 @@ def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda
     with torch.no_grad():
         head.weight.zero_()
         head.bias.fill_(LOG_STD)
-    optimiser = torch.optim.Adam([p for name, p in actor.named_parameters() if "log_std" not in name], lr=CLONING_RATE)
+    optimiser = torch.optim.Adam(
+        [p for name, p in actor.named_parameters() if "log_std" not in name], lr=CLONING_RATE
+    )
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
     batches = torch.Generator().manual_seed(seed)
 
@@ -203,7 +239,14 @@ def clone(learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda
 
 def export(learner: SAC, view: Standardised) -> NetworkPolicy:
     """Return the learner's policy for unstandardised observations, without its noise, to act in the environment."""
-    parts = [part for part in (*learner.actor.latent_pi, learner.actor.mu) if isinstance(part, torch.nn.Linear)]
-    layers = [(part.weight.detach().cpu().numpy().copy(), part.bias.detach().cpu().numpy().copy()) for part in parts]
+    parts = [
+        part
+        for part in (*learner.actor.latent_pi, learner.actor.mu)
+        if isinstance(part, torch.nn.Linear)
+    ]
+    layers = [
+        (part.weight.detach().cpu().numpy().copy(), part.bias.detach().cpu().numpy().copy())
+        for part in parts
+    ]
     how: dict[str, Any] = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
     return NetworkPolicy(layers, **how).fit_to(view.env, "the agent")

@@ -52,10 +52,14 @@ class Trial:
     seed: int  # of the environment and of the policy: trials that share it are twins
     kind: str = NOMINAL  # else ``"passing_push"``, a fault of the suite of this ``severity``; with ``faults``, a name
     severity: str = ""
-    onset: int | None = None  # [steps]; by default drawn from the seed, in the first half of the episode
+    onset: int | None = (
+        None  # [steps]; by default drawn from the seed, in the first half of the episode
+    )
     faults: tuple[Fault, ...] | None = None
     acting: str = POLICY_ALONE  # or a value of ``on_alarm``
-    after_s: float | None = None  # the episode ends so long after the onset [s]; by default it runs to its end
+    after_s: float | None = (
+        None  # the episode ends so long after the onset [s]; by default it runs to its end
+    )
     role: str = "nominal"  # or ``"fit"``, ``"calibration"``, ``"faulty"``, ``"babble"``
 
     @property
@@ -82,7 +86,11 @@ class Trial:
 
     def steps_in(self, env: gym.Env[Any, Any]) -> int | None:
         """Return the last step that is run; None for the end of the episode."""
-        return None if self.after_s is None else self.begins(env) + round(self.after_s / control_period(env))
+        return (
+            None
+            if self.after_s is None
+            else self.begins(env) + round(self.after_s / control_period(env))
+        )
 
 
 def nominal_trials(env_id: str, role: str, seeds: list[int]) -> list[Trial]:
@@ -129,5 +137,8 @@ def evaluation_trials(
     twins = seeds["nominal"][: episodes["faulty"]]
     trials = [t for role in roles for t in nominal_trials(env_id, role, seeds[role])]
     return trials + [
-        faulty_trial(env_id, k, severity, s, horizon) for k in kinds for severity in severities for s in twins
+        faulty_trial(env_id, k, severity, s, horizon)
+        for k in kinds
+        for severity in severities
+        for s in twins
     ]

@@ -20,7 +20,9 @@ class Chunked:
         return chunk[0], chunk[1:]
 
 
-env = NeuralASMSafety(FaultInjection(gym.make("asm_gym/Lift-v0"), [Push(newtons=60, onset=20, duration=10)]))
+env = NeuralASMSafety(
+    FaultInjection(gym.make("asm_gym/Lift-v0"), [Push(newtons=60, onset=20, duration=10)])
+)
 agent = make_policy("lift_sac", env)  # stands for a network that predicts CHUNK actions
 policy = Chunked(lambda observation: np.repeat(agent.predict(observation)[0][None], CHUNK, axis=0))
 observation, info = env.reset(seed=0)

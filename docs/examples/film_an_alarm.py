@@ -12,7 +12,9 @@ from asm_gym import FaultInjection, NeuralASMSafety, make_policy
 from asm_gym.faults import FrozenEncoder, Push
 
 lift = gym.make("asm_gym/Lift-v0", render_mode="rgb_array")
-env = NeuralASMSafety(FaultInjection(lift, [Push(newtons=60, onset=12, duration=10), FrozenEncoder(onset=32)]))
+env = NeuralASMSafety(
+    FaultInjection(lift, [Push(newtons=60, onset=12, duration=10), FrozenEncoder(onset=32)])
+)
 policy, (observation, info) = make_policy("lift_sac", env), env.reset(seed=0)
 pictures = []
 for step in range(100):
@@ -20,12 +22,22 @@ for step in range(100):
     if step % 2:
         continue
     asm = info["asm"]
-    colour = "red" if asm["alarm"] else "orange" if asm["intervened"] else "gold" if asm["completed"] else "white"
+    colour = (
+        "red"
+        if asm["alarm"]
+        else "orange"
+        if asm["intervened"]
+        else "gold"
+        if asm["completed"]
+        else "white"
+    )
     picture = ImageOps.expand(Image.fromarray(env.render()).resize((320, 320)), 8, colour)
     fault, doing = ", ".join(info["fault"]) or "no fault", asm["response"] or asm["state"]
     doing = " ".join([doing, *asm["completed"], "is completed"]) if asm["completed"] else doing
     said = f"{step / 20:.1f} s: {fault}\nsurprise {asm['surprise'] / asm['threshold']:.1f} thresholds\n{doing}"
     ImageDraw.Draw(picture).text((16, 14), said, "white")
     pictures.append(picture.quantize(64))
-pictures[0].save([*sys.argv, "film.gif"][1], save_all=True, append_images=pictures[1:], duration=100, loop=0)
+pictures[0].save(
+    [*sys.argv, "film.gif"][1], save_all=True, append_images=pictures[1:], duration=100, loop=0
+)
 print(f"solved: {info['success']}")

@@ -23,10 +23,18 @@ def guarded():
 
 
 agent = PPO("MlpPolicy", gym.make(ARM, horizon=50), n_steps=100, batch_size=50, seed=0)
-episodes = collect(ARM, policy=agent, episodes=40, workers=1, horizon=50)  # how it explores while nothing is wrong
-monitor = make_monitor("kalman", episodes[0].spec).fit(episodes[:20]).calibrate(episodes[20:], false_alarm_rate=0.05)
+episodes = collect(
+    ARM, policy=agent, episodes=40, workers=1, horizon=50
+)  # how it explores while nothing is wrong
+monitor = (
+    make_monitor("kalman", episodes[0].spec)
+    .fit(episodes[:20])
+    .calibrate(episodes[20:], false_alarm_rate=0.05)
+)
 
 agent.set_env(make_vec_env(guarded, 1))
-safety = SafetyCallback()  # safety/alarms, safety/cost, safety/overridden, safety/surprise, safety/slowed
+safety = (
+    SafetyCallback()
+)  # safety/alarms, safety/cost, safety/overridden, safety/surprise, safety/slowed
 agent.learn(400, callback=safety)
 print(f"steps in alarm by episode: {[episode['cost'] for episode in safety.ended]}")

@@ -24,7 +24,9 @@ _STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
 class Style:
     """How an expert varies; each is drawn anew for every episode."""
 
-    noise: float = 0.05  # standard deviation of the action noise [action units], correlated over about 0.2 s
+    noise: float = (
+        0.05  # standard deviation of the action noise [action units], correlated over about 0.2 s
+    )
     speed: float = 1.0  # hand speed relative to the expert's usual one
     speed_spread: float = 0.08  # standard deviation of the speed between episodes
     spread: float = 0.01  # standard deviation of way-points between episodes [m]
@@ -36,7 +38,11 @@ class Style:
 
     def pace(self, usual: float, rng: np.random.Generator) -> float:
         """Return the speed of one episode, where ``usual`` is the expert's own."""
-        return usual * self.speed * float(np.clip(1 + self.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        return (
+            usual
+            * self.speed
+            * float(np.clip(1 + self.speed_spread * rng.standard_normal(), 0.5, 1.5))
+        )
 
     def drifted(self, drift: Vector, rng: np.random.Generator) -> Vector:
         """Return the next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
@@ -51,7 +57,9 @@ class ObservationReader:
         self._flat = isinstance(env.observation_space, spaces.Box)
         sizes = env.unwrapped.observation_layout  # type: ignore[attr-defined]
         ends = np.cumsum([*sizes.values()]).tolist()
-        self._slices = {name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)}
+        self._slices = {
+            name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)
+        }
 
     def __call__(self, observation: Any, name: str) -> Vector:
         """Return the numbers of a channel."""
@@ -85,14 +93,18 @@ class Expert(StatefulPolicy):
 
     pace: ClassVar[float]  # usual hand speed [action units]
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None) -> None:
+    def __init__(
+        self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None
+    ) -> None:
         inner: Any = env.unwrapped
         self.inner, self.robosuite = inner, inner.robosuite_env
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
         self.read = ObservationReader(env)
         size = int(np.prod(env.action_space.shape or ()))
-        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)  # indices of the action that move arms
+        self.moves = np.setdiff1d(
+            np.arange(size), inner.gripper_actions
+        )  # indices of the action that move arms
         self._careful = set(inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
         self._gain = 3.0 if self._careful else 2.0
@@ -101,13 +113,21 @@ class Expert(StatefulPolicy):
     def begin(self, observation: Any) -> State:
         """Draw the style of an episode, and return its first state."""
 
-    def start(self, speed: float, spread: Any = 0.0, plan: Any = None, noises: int = 7, anchor: Any = None) -> State:
+    def start(
+        self, speed: float, spread: Any = 0.0, plan: Any = None, noises: int = 7, anchor: Any = None
+    ) -> State:
         """Return a first state; ``noises`` is how many numbers of the action are noisy."""
-        return State(0, 0, speed, spread, plan, np.zeros(3) if anchor is None else anchor, np.zeros(noises))
+        return State(
+            0, 0, speed, spread, plan, np.zeros(3) if anchor is None else anchor, np.zeros(noises)
+        )
 
-    def act(self, observation: Any, state: State, deterministic: bool) -> tuple[NDArray[np.float32], State]:
+    def act(
+        self, observation: Any, state: State, deterministic: bool
+    ) -> tuple[NDArray[np.float32], State]:
         """Return the action (A,) and the next state; ``deterministic`` leaves the action noise out, not the style."""
-        state = state._replace(since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random))
+        state = state._replace(
+            since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random)
+        )
         scene = self.look(observation)
         state = self.advance(state, scene)
         command = self.command(state, scene)

@@ -34,12 +34,16 @@ class CarryTask(NamedTuple):
 
     name: str  # of the object, as observations call it
     grip: Vector  # (3,) where to hold it, in its own frame [m]
-    closing: Vector | None  # (3,) along which of its own axes the fingers close; None where every direction does
+    closing: (
+        Vector | None
+    )  # (3,) along which of its own axes the fingers close; None where every direction does
     turns: float  # after how much of a turn about the vertical the grasp is the same again [rad]
     clearance: float  # how far above its grip to come from [m]
     place: Vector  # (3,) where its origin is to go [m]
     over: float  # how far above ``place`` to carry it [m]
-    headings: tuple[float, ...] = ()  # those of its x axis that fit the place [rad]; empty where every one does
+    headings: tuple[
+        float, ...
+    ] = ()  # those of its x axis that fit the place [rad]; empty where every one does
     heading_fit: float = 0.06  # how exactly it must have one of them before it is lowered [rad]
     fit: float = 0.02  # how exactly it must stand over its place before it is lowered [m]
     haste: float = 1.0  # with which share of the usual speed the hand comes down
@@ -68,7 +72,9 @@ class CarryExpert(Expert):
         return self.start(speed, spread, self.next_task(observation))
 
     def look(self, observation: Any) -> CarryScene:
-        return CarryScene(observation, self.read.hand(observation), self.read(observation, "gripper_velocity"))
+        return CarryScene(
+            observation, self.read.hand(observation), self.read(observation, "gripper_velocity")
+        )
 
     def advance(self, state: State, scene: CarryScene) -> State:
         if state.plan is None:
@@ -84,8 +90,14 @@ class CarryExpert(Expert):
         off = scene.hand.at - thing.point(task.grip)
         far, beside = np.linalg.norm(off), np.linalg.norm(at[:2] - task.place[:2])
         if phase == REACH:
-            aligned = angle_between(scene.hand.turned, self._grasp(task, scene.hand.turned, turned)) < 0.15
-            above = np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02 and abs(off[2] - task.clearance) < 0.03
+            aligned = (
+                angle_between(scene.hand.turned, self._grasp(task, scene.hand.turned, turned))
+                < 0.15
+            )
+            above = (
+                np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02
+                and abs(off[2] - task.clearance) < 0.03
+            )
             return DESCEND if above and aligned else REACH
         if phase == DESCEND:
             if far < 0.011 or (since > 30 and far < 0.02):
@@ -118,17 +130,27 @@ class CarryExpert(Expert):
         down = gripping(hand.turned, None)
         if phase in (REACH, DESCEND):
             grip = thing.point(task.grip)
-            aligned = self._turning(scene.observation, hand.turned, self._grasp(task, hand.turned, turned))
-            target = grip + (np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread) if phase == REACH else grip
+            aligned = self._turning(
+                scene.observation, hand.turned, self._grasp(task, hand.turned, turned)
+            )
+            target = (
+                grip + (np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread)
+                if phase == REACH
+                else grip
+            )
             # From afar, first high: the way may lead over a wall or another object.
             if phase == REACH and np.linalg.norm((grip - hand.at)[:2]) > 0.1:
-                target = np.array([target[0], target[1], max(target[2], min(hand.at[2], target[2] + 0.1))])
+                target = np.array(
+                    [target[0], target[1], max(target[2], min(hand.at[2], target[2] + 0.1))]
+                )
             if phase == DESCEND and self._careful:
                 target = target + over_first(hand.at, grip)
             haste = task.haste if phase == DESCEND else 1.0
             return np.append(move(hand, target, aligned, speed * haste, self._gain), OPEN)
         if phase == GRASP:
-            return np.append(move(hand, state.anchor, down, speed, self._gain if self._careful else 1.0), CLOSE)
+            return np.append(
+                move(hand, state.anchor, down, speed, self._gain if self._careful else 1.0), CLOSE
+            )
         # From here on the object is moved, and the hand with it.
         held = hand._replace(at=at)
         goal = task.place + np.array([0.0, 0.0, task.over])
@@ -136,7 +158,9 @@ class CarryExpert(Expert):
             wanted = np.array([at[0], at[1], goal[2] + 0.3 * state.spread[2]])
             return np.append(move(held, wanted, down, speed), CLOSE)
         if phase in (CARRY, LOWER):
-            fitting = self._turning(scene.observation, hand.turned, self._held(task, hand.turned, turned))
+            fitting = self._turning(
+                scene.observation, hand.turned, self._held(task, hand.turned, turned)
+            )
             if phase == LOWER:
                 goal = self._lower(task, at) if self._careful or task.fit <= _EXACT else task.place
             share = 1.0 if phase == CARRY else 0.6
@@ -170,12 +194,20 @@ class CarryExpert(Expert):
             closing, wanted = choice
             fitting = about_vertical(wanted - heading) @ turned
             grasp = wrapped(along - yaw(turned @ closing) + yaw(thing.point(task.grip) - base))
-            place = wrapped(along - yaw(fitting @ closing) + yaw(task.place + fitting @ task.grip - base))
-            return max(abs(grasp) - most, abs(place) - most, 0.0), abs(grasp - now) + abs(place - grasp)
+            place = wrapped(
+                along - yaw(fitting @ closing) + yaw(task.place + fitting @ task.grip - base)
+            )
+            return max(abs(grasp) - most, abs(place) - most, 0.0), abs(grasp - now) + abs(
+                place - grasp
+            )
 
-        choices = [(c, h) for c in (task.closing, -task.closing) for h in task.headings or (heading,)]
+        choices = [
+            (c, h) for c in (task.closing, -task.closing) for h in task.headings or (heading,)
+        ]
         closing, wanted = min(choices, key=strain)
-        return task._replace(closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ())
+        return task._replace(
+            closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ()
+        )
 
     def _turning(self, observation: Any, hand: Vector, target: Vector) -> Vector:
         """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops."""
@@ -236,7 +268,9 @@ class NutAssemblyExpert(CarryExpert):
     def next_task(self, observation: Any) -> CarryTask | None:
         """Return a nut that is not around its peg; None where all are."""
         env = self.robosuite
-        aside = np.pi / 2 if self._careful else 0.5  # a Panda's elbow reaches its stop sooner than others'
+        aside = (
+            np.pi / 2 if self._careful else 0.5
+        )  # a Panda's elbow reaches its stop sooner than others'
         for i, nut in enumerate(env.nuts):
             if env.single_object_mode and i != env.nut_id:
                 continue

@@ -63,14 +63,18 @@ class DoorExpert(Expert):
         handle = model.geom("Door_handle").id
         frame = data.geom_xmat[handle].reshape(3, 3)
         middle, pivot, axis = data.geom_xpos[handle], data.xanchor[latch], data.xaxis[latch]
-        outwards = frame[:, 0] * np.sign(frame[:, 0] @ (middle - pivot))  # along the handle, away from the pivot
+        outwards = frame[:, 0] * np.sign(
+            frame[:, 0] @ (middle - pivot)
+        )  # along the handle, away from the pivot
         sign = -float(np.sign(np.cross(axis, middle - pivot)[2]))
         grip = middle + (0.025 + along) * outwards
         normal = frame[:, 1] * np.sign(frame[:, 1] @ (middle - pivot))
         return _Hardware(data.xanchor[hinge].copy(), pivot.copy(), sign * axis, grip, normal, sign)
 
     def look(self, observation: Any) -> _Scene:
-        turned, opened = (float(self.read(observation, name)[0]) for name in ("handle_qpos", "hinge_qpos"))
+        turned, opened = (
+            float(self.read(observation, name)[0]) for name in ("handle_qpos", "hinge_qpos")
+        )
         return _Scene(self.read.hand(observation), turned, opened)
 
     def next_phase(self, state: State, scene: _Scene) -> int:
@@ -80,7 +84,11 @@ class DoorExpert(Expert):
         far = float(np.linalg.norm(off))
         if phase == REACH:
             left = angle_between(scene.hand.turned, self._facing(state, scene))
-            return APPROACH if np.linalg.norm(off - _BEFORE * hardware.normal) < 0.02 and left < 0.15 else REACH
+            return (
+                APPROACH
+                if np.linalg.norm(off - _BEFORE * hardware.normal) < 0.02 and left < 0.15
+                else REACH
+            )
         if phase == APPROACH:
             if far < 0.012 or (since > 25 and far < 0.025):
                 return GRASP
@@ -109,7 +117,10 @@ class DoorExpert(Expert):
             target = hardware.grip_at(_PRESSED, min(opened + 0.12, _OPENED + 0.04))
         else:
             target = state.anchor
-        return np.append(move(scene.hand, target, facing, state.speed, gain=2.0), OPEN if phase < GRASP else CLOSE)
+        return np.append(
+            move(scene.hand, target, facing, state.speed, gain=2.0),
+            OPEN if phase < GRASP else CLOSE,
+        )
 
     @staticmethod
     def _facing(state: State, scene: _Scene) -> Vector:
@@ -129,6 +140,10 @@ def _roll(hand: Vector, to: Vector) -> float:
     """Return the hand's roll from another orientation about its z axis, once that points the same way [rad]."""
     axis = np.cross(hand[:, 2], to[:, 2])
     sine = float(np.linalg.norm(axis))
-    tilt = about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2]))) if sine > 1e-9 else np.eye(3)
+    tilt = (
+        about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))
+        if sine > 1e-9
+        else np.eye(3)
+    )
     across = to.T @ tilt @ hand[:, 1]
     return float(np.arctan2(-across[0], across[1]))

@@ -31,7 +31,9 @@ class LiftExpert(Expert):
 
     def begin(self, observation: Any) -> State:
         style, rng = self.style, self.np_random
-        deep = 0.0 if self._careful else 0.005  # fingers of other arms are longer, and come down on the table
+        deep = (
+            0.0 if self._careful else 0.005
+        )  # fingers of other arms are longer, and come down on the table
         speed = style.pace(self.pace, rng)
         plan = _Plan(
             hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
@@ -59,7 +61,11 @@ class LiftExpert(Expert):
 
     def entered(self, state: State, scene: _Scene, phase: int) -> State:
         # While it lifts, the anchor stays where the cube was grasped.
-        return super().entered(state, scene, phase)._replace(anchor=state.anchor if phase == LIFT else scene.hand.at)
+        return (
+            super()
+            .entered(state, scene, phase)
+            ._replace(anchor=state.anchor if phase == LIFT else scene.hand.at)
+        )
 
     def command(self, state: State, scene: _Scene) -> Vector:
         phase, plan, cube = state.phase, state.plan, scene.cube
@@ -71,6 +77,10 @@ class LiftExpert(Expert):
                 target = target + over_first(scene.hand.at, cube.at)
         else:
             target = state.anchor + (plan.goal if phase == LIFT else 0.0)
-        side = flattest_side(cube.turned) if phase <= DESCEND else None  # a cube looks the same every quarter turn
+        side = (
+            flattest_side(cube.turned) if phase <= DESCEND else None
+        )  # a cube looks the same every quarter turn
         aligned = gripping(scene.hand.turned, side, np.pi / 2)
-        return np.append(move(scene.hand, target, aligned, state.speed), OPEN if phase <= DESCEND else CLOSE)
+        return np.append(
+            move(scene.hand, target, aligned, state.speed), OPEN if phase <= DESCEND else CLOSE
+        )

@@ -10,7 +10,9 @@ from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 from asm_gym.policies.scripted.geometry import Vector, about_vertical, matrix
 
 _WALL = 0.09  # how high above the bins' floor the fingertips stay clear of the walls' tops with the palm [m]
-_REACH = 0.8  # further from its base than this a Panda's hand comes down with its elbow at its stop [m]
+_REACH = (
+    0.8  # further from its base than this a Panda's hand comes down with its elbow at its stop [m]
+)
 _PALM = 0.103, 0.035  # half of a Panda's palm, along which its fingers close and across [m]
 _ABOVE = 0.03  # of the fingertips its palm is [m]
 _WALLS = 0.1  # how high the walls of the bins are above the bins' origin [m]
@@ -47,7 +49,10 @@ class PickPlaceExpert(CarryExpert):
         if not self._careful and at[2] + grip + _ABOVE < env.bin1_pos[2] + _WALLS:
             closing, room = beside_walls(half, turned, to_walls)
         else:
-            closing, room = _closing(half, turned, to_walls, self._careful and name == "Can"), _SPARE
+            closing, room = (
+                _closing(half, turned, to_walls, self._careful and name == "Can"),
+                _SPARE,
+            )
         headings: tuple[float, ...] = ()
         if self._careful:  # over its bin, wide fingers open across the arm's reach
             reach = place - env.robots[0].base_pos
@@ -81,7 +86,9 @@ class PickPlaceExpert(CarryExpert):
         else:
             nearer = (0.07 if self._careful else 0.04) * away / np.linalg.norm(away)
             if self._careful and not far:  # a tall box would stand on a wall
-                room = np.maximum(np.asarray(env.bin_size[:2]) / 4 - _CLEAR - np.linalg.norm(half[:2]), 0.0)
+                room = np.maximum(
+                    np.asarray(env.bin_size[:2]) / 4 - _CLEAR - np.linalg.norm(half[:2]), 0.0
+                )
                 nearer = np.clip(nearer, -room, room)
             place[:2] -= nearer
         # Lower, and the palm would stand on a wall; stretched out, another arm may stand nearer to one than it should.
@@ -94,7 +101,11 @@ class PickPlaceExpert(CarryExpert):
         """Return half (3,) the object's size along its own axes [m]."""
         model = self.inner.simulation.model
         body = model.body(f"{name}_main").id
-        (geom,) = (g for g in range(model.ngeom) if model.geom_bodyid[g] == body and model.geom_group[g] == 0)
+        (geom,) = (
+            g
+            for g in range(model.ngeom)
+            if model.geom_bodyid[g] == body and model.geom_group[g] == 0
+        )
         turn = matrix(model.geom_quat[geom][[1, 2, 3, 0]])
         return np.abs(turn) @ model.geom_aabb[geom, 3:]
 
@@ -104,7 +115,10 @@ def _closing(half: Vector, turned: Vector, to_walls: Vector, round_: bool) -> Ve
     axes = _narrow(half)
     if round_:
         axes += [np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([1.0, -1.0, 0.0]) / np.sqrt(2)]
-    return max(axes, key=lambda axis: float(np.min(to_walls / np.maximum(np.abs((turned @ axis)[:2]), 1e-6))))
+    return max(
+        axes,
+        key=lambda axis: float(np.min(to_walls / np.maximum(np.abs((turned @ axis)[:2]), 1e-6))),
+    )
 
 
 def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> tuple[Vector, float]:

@@ -46,9 +46,13 @@ class Swaying(StatefulPolicy):
         sines = np.sin(2 * np.pi * self.frequency * self.t + self.phase)  # (A,)
         return self.middle + self.half * self.width * sines
 
-    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+    def act(
+        self, observation: Any, state: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
         """Return the action and the state as it was."""
-        self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(self.size)
+        self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(
+            self.size
+        )
         chosen = (self.intended(observation) + self.noise).reshape(self.space.shape)
         self.t += self.dt
         return np.clip(chosen, self.space.low, self.space.high).astype(np.float32), state
@@ -60,7 +64,9 @@ class Arm(Swaying):
     NOISE = 0.0
 
     def draw(self) -> None:
-        self.poses = 0.7 * np.cumsum(np.vstack([np.zeros(7), self.rng.uniform(-0.6, 0.6, (4, 7))]), axis=0)
+        self.poses = 0.7 * np.cumsum(
+            np.vstack([np.zeros(7), self.rng.uniform(-0.6, 0.6, (4, 7))]), axis=0
+        )
         self.width = self.rng.uniform(0.02, 0.08, 7)
 
     def intended(self, observation: Any) -> Floats:
@@ -73,4 +79,6 @@ class Arm(Swaying):
         s = min(t - k, 1.0)
         there = 10 * s**3 - 15 * s**4 + 6 * s**5
         sway: Floats = self.width * np.sin(2 * np.pi * np.linspace(0.5, 1.5, 7) * t)
-        return np.asarray(self.poses[k] + there * (self.poses[k + 1] - self.poses[k]) + sway, np.float64)
+        return np.asarray(
+            self.poses[k] + there * (self.poses[k + 1] - self.poses[k]) + sway, np.float64
+        )

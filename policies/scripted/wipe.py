@@ -37,13 +37,17 @@ class WipeExpert(Expert):
         pace = style.pace(self.pace, rng)
         press = _PRESS * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.8, 1.2))
         env = self.robosuite
-        bodies = [env.sim.model.body_name2id(mark.root_body) for mark in env.model.mujoco_arena.markers]
+        bodies = [
+            env.sim.model.body_name2id(mark.root_body) for mark in env.model.mujoco_arena.markers
+        ]
         dirt = env.sim.data.body_xpos[bodies].copy()
         order = np.arange(len(dirt))
         if np.linalg.norm(dirt[-1] - hand_at) < np.linalg.norm(dirt[0] - hand_at):
             order = order[::-1]
         spread = style.spread * rng.standard_normal(3)
-        return self.start(0.5 * pace, spread, _Plan(press, dirt[order], order), noises=6, anchor=hand_at)
+        return self.start(
+            0.5 * pace, spread, _Plan(press, dirt[order], order), noises=6, anchor=hand_at
+        )
 
     def look(self, observation: Any) -> _Scene:
         wiped = set(self.robosuite.wiped_markers)
@@ -71,11 +75,17 @@ class WipeExpert(Expert):
         hand, left = scene.hand, _left(state, scene)
         level = gripping(hand.turned, np.array([0.0, 1.0, 0.0]))
         if state.phase == REST:
-            return move(hand, state.anchor + np.array([0.0, 0.0, 0.1]) + state.spread, level, state.speed)
+            return move(
+                hand, state.anchor + np.array([0.0, 0.0, 0.1]) + state.spread, level, state.speed
+            )
         if state.phase == REACH:
-            return move(hand, left[0] + np.array([0.0, 0.0, _OVER]) + 0.3 * state.spread, level, state.speed)
+            return move(
+                hand, left[0] + np.array([0.0, 0.0, _OVER]) + 0.3 * state.spread, level, state.speed
+            )
         # The nearest mark of the trace that is left leads the tool along it.
-        command = move(hand, np.array([left[0][0], left[0][1], hand.at[2]]), level, state.speed, gain=2.0)
+        command = move(
+            hand, np.array([left[0][0], left[0][1], hand.at[2]]), level, state.speed, gain=2.0
+        )
         if state.phase == WIPE:
             # Gently at first: a tool that comes down with all of it hits the table three times as hard as it presses.
             command[2] = -state.plan.press * min(1.0, 0.3 + state.since / 15)

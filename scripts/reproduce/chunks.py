@@ -22,7 +22,11 @@ from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import harm, kit
 from asm_gym.tasks import env_id
 
-CHUNK, EVERY, AHEAD_S = 16, 8, 0.2  # actions that are announced; how often; how long before a blow is early enough [s]
+CHUNK, EVERY, AHEAD_S = (
+    16,
+    8,
+    0.2,
+)  # actions that are announced; how often; how long before a blow is early enough [s]
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,9 @@ def episode(job: tuple[harm.Case, Any]) -> kit.Record:
     done, hits = np.array(rows)[:, known.spec.motor], np.flatnonzero(np.array(forces) > harm.EXCESS)
     until = int(hits[0]) if hits.size else len(rows) - 1
     chunks = {t: done[t + 1 : t + 1 + CHUNK] for t in range(0, until, EVERY)}
-    previews = {t: preview_chunk(chunk, rows[t], done[t], known, arm.dt) for t, chunk in chunks.items()}
+    previews = {
+        t: preview_chunk(chunk, rows[t], done[t], known, arm.dt) for t, chunk in chunks.items()
+    }
     refused = [t for t, preview in previews.items() if preview.at is not None]
     early = bool(refused) and (until - refused[0]) * arm.dt >= AHEAD_S
     vain = [t for t in refused if not hits.size or t + CHUNK < until]
@@ -65,7 +71,13 @@ def run(config: Config) -> kit.Findings:
     for case, count in harm.cases(config):
         task = case.trial.task
         if task not in known:
-            found = collect(env_id(task), policy="scripted", episodes=config.learned, seed=500, workers=config.workers)
+            found = collect(
+                env_id(task),
+                policy="scripted",
+                episodes=config.learned,
+                seed=500,
+                workers=config.workers,
+            )
             spec, solved = found[0].spec, [episode for episode in found if episode.success]
             known[task] = SimpleNamespace(
                 spec=spec,
@@ -81,5 +93,11 @@ def run(config: Config) -> kit.Findings:
     for names, own in groups:
         counts = f"{len(own)}", f"{own.predicted.sum()} of {own.blow.sum()}", f"{own.in_vain.sum()}"
         rows.append((", ".join(names), *counts, f"{own.hours.sum():.2f}"))
-    headings = ("", "episodes", f"impacts predicted {AHEAD_S:g} s ahead", "chunks refused in vain", "hours")
+    headings = (
+        "",
+        "episodes",
+        f"impacts predicted {AHEAD_S:g} s ahead",
+        "chunks refused in vain",
+        "hours",
+    )
     return kit.Findings(records, [Table("Chunks of actions", headings, rows)])

@@ -37,7 +37,9 @@ def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Traj
 def read(reader: StreamScaler, streams: Rows) -> Batch:
     """Return the senses and commands, standardised, of streams (T, B, D)."""
     readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
-    return Batch(*(np.stack([getattr(r, name) for r in readings], axis=1) for name in Batch._fields))
+    return Batch(
+        *(np.stack([getattr(r, name) for r in readings], axis=1) for name in Batch._fields)
+    )
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,11 @@ class ExpressionMemory:
 
         ``gain`` is of the initial synapses from traces to the state, ``dynamics`` one of ``DYNAMICS``.
         """
-        reader, how, size = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]), DYNAMICS[dynamics], 64
+        reader, how, size = (
+            StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]),
+            DYNAMICS[dynamics],
+            64,
+        )
         epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
         schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, FREE)
         asked = trajectories(reader, episodes), hidden, schedule, rng, lambda: None
@@ -71,11 +77,15 @@ class ExpressionMemory:
 
     def express(self, streams: Rows, cue: int) -> Rows:
         """Return the prediction (T, B, D) of each row of B streams (T, B, D), from rows before it up to ``cue``."""
-        cued = follow(self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams[:cue]))
+        cued = follow(
+            self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams[:cue])
+        )
         rows = to_rows(self.reader, cued)
         if cue == len(streams):
             return rows
-        return np.concatenate([rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))])
+        return np.concatenate(
+            [rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))]
+        )
 
 
 @dataclass(frozen=True)
@@ -87,11 +97,18 @@ class Backpropagated:
 
     @classmethod
     def learned(
-        cls, episodes: Sequence[Episode], hidden: int, rng: np.random.Generator, updates: int, **how: Any
+        cls,
+        episodes: Sequence[Episode],
+        hidden: int,
+        rng: np.random.Generator,
+        updates: int,
+        **how: Any,
     ) -> Backpropagated:
         """Learn from whole episodes; the arguments are those of ``recurrent.train``."""
         reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        return cls(reader, recurrent.train(trajectories(reader, episodes), hidden, updates, rng, **how))
+        return cls(
+            reader, recurrent.train(trajectories(reader, episodes), hidden, updates, rng, **how)
+        )
 
     def express(self, streams: Rows, cue: int) -> Rows:
         senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
@@ -104,10 +121,14 @@ Expresser = ExpressionMemory | Backpropagated
 def mean_demonstrations(train: Sequence[Episode]) -> Rows:
     """Return the mean path (K, T, 2) of the hand in each skill, in order of name."""
     names = sorted({str(e.info["skill"]) for e in train})
-    return np.stack([np.mean([e.stream[:, PEN] for e in train if e.info["skill"] == n], axis=0) for n in names])
+    return np.stack(
+        [np.mean([e.stream[:, PEN] for e in train if e.info["skill"] == n], axis=0) for n in names]
+    )
 
 
-def recalled(model: Expresser, tests: Sequence[Episode], means: Rows, cue: int) -> tuple[float, float]:
+def recalled(
+    model: Expresser, tests: Sequence[Episode], means: Rows, cue: int
+) -> tuple[float, float]:
     """Return the pen's mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
 
     ``tests`` are of one length, which as ``cue`` is online recall; ``means`` (K, T, 2) are paths in order of name.
@@ -116,7 +137,11 @@ def recalled(model: Expresser, tests: Sequence[Episode], means: Rows, cue: int) 
     first = cue if cue < len(streams) else 1
     paths, truth = (rows[first:, :, PEN] for rows in (model.express(streams, cue), streams))
     error = np.linalg.norm(paths - truth, axis=2).mean()
-    distance = np.linalg.norm(paths[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3).mean(axis=0)
+    distance = np.linalg.norm(
+        paths[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3
+    ).mean(axis=0)
     names = sorted({str(e.info["skill"]) for e in tests})
-    right = [names[k] == e.info["skill"] for k, e in zip(distance.argmin(axis=1), tests, strict=True)]
+    right = [
+        names[k] == e.info["skill"] for k, e in zip(distance.argmin(axis=1), tests, strict=True)
+    ]
     return float(error), float(np.mean(right))

@@ -46,7 +46,10 @@ GUARDS: dict[str, dict[str, Any] | None] = {
 }
 """Settings of the wrapper by name; None for no wrapper."""
 TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile policies
-UNKNOWN = ("PickPlaceMilk", "NutAssemblyRound")  # not met by the Panda's memory; healthy policies alone
+UNKNOWN = (
+    "PickPlaceMilk",
+    "NutAssemblyRound",
+)  # not met by the Panda's memory; healthy policies alone
 AGENTS = ("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac")
 HEALTHY = (*((task, "scripted") for task in (*TASKS, *UNKNOWN)), *AGENTS)
 """Tasks and policies that do no harm on purpose."""
@@ -57,7 +60,14 @@ ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100), ("Sawyer", 100), ("II
 AGAINST = ("hostile", "elsewhere", "faulty")
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
-CASE = ("kind", "task", "policy", "fault", "robot", "rate")  # values that distinguish one case from another
+CASE = (
+    "kind",
+    "task",
+    "policy",
+    "fault",
+    "robot",
+    "rate",
+)  # values that distinguish one case from another
 FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
 
 
@@ -74,9 +84,13 @@ class Config(kit.Config):
     Lift and Stack under each kind of fault."""
     healthy: int = option(40, quick=1, least=0)
     """Episodes of each healthy policy."""
-    guards: tuple[str, ...] = option((POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME")
+    guards: tuple[str, ...] = option(
+        (POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME"
+    )
     """Ways to guard."""
-    tasks: tuple[str, ...] = option((*TASKS, *UNKNOWN), quick=("Lift",), known=(*TASKS, *UNKNOWN), metavar="TASK")
+    tasks: tuple[str, ...] = option(
+        (*TASKS, *UNKNOWN), quick=("Lift",), known=(*TASKS, *UNKNOWN), metavar="TASK"
+    )
     """Tasks; in the last two there are healthy policies alone."""
 
 
@@ -97,7 +111,9 @@ class Case(NamedTuple):
     @property
     def key(self) -> Record:
         """Values of ``CASE``."""
-        policy = self.policy if self.speed == 1.0 else f"{self.policy}, {self.speed:g} of full speed"
+        policy = (
+            self.policy if self.speed == 1.0 else f"{self.policy}, {self.speed:g} of full speed"
+        )
         own = self.kind, self.trial.task, policy, self.trial.kind, self.config.robot, self.rate
         return dict(zip(CASE, own, strict=True))
 
@@ -116,12 +132,17 @@ def cases(config: Config) -> list[tuple[Case, int]]:
 
     tasks = [task for task in config.tasks if task not in UNKNOWN]
     hostile = [Case("hostile", name, trial(task)) for task, name in product(tasks, HOSTILE)]
-    slower = [Case("hostile", "down", trial(task), speed=speed) for task, speed in product(tasks, (0.5, 0.25))]
+    slower = [
+        Case("hostile", "down", trial(task), speed=speed)
+        for task, speed in product(tasks, (0.5, 0.25))
+    ]
     elsewhere = [
         case._replace(config=RolloutConfig(robot=robot, stream_freq=None if rate == 20 else rate))
         for (robot, rate), case in product(ELSEWHERE, hostile)
     ]
-    healthy = [Case("healthy", policy, trial(task)) for task, policy in HEALTHY if task in config.tasks]
+    healthy = [
+        Case("healthy", policy, trial(task)) for task, policy in HEALTHY if task in config.tasks
+    ]
     faulty = [
         case._replace(kind="faulty", trial=trial(case.trial.task, fault))
         for case, fault in product(healthy, FAULTS)
@@ -140,7 +161,9 @@ def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]
     settings = GUARDS[guard]
     if settings is None:
         return env
-    memory = NeuralASM.pretrained(f"{case.config.robot}".lower() + ("" if case.rate == 20 else f"_{case.rate}hz"))
+    memory = NeuralASM.pretrained(
+        f"{case.config.robot}".lower() + ("" if case.rate == 20 else f"_{case.rate}hz")
+    )
     return NeuralASMSafety(env, memory, **settings)
 
 
@@ -157,7 +180,9 @@ def episode(job: tuple[Case, str]) -> Record:
     with staged(case.trial, case.config) as env:
         arm.substep_hooks.append(feel)
         try:
-            success = rollout(guarded(env, guard, case), case.make_policy(env), case.trial.seed, infos.append)
+            success = rollout(
+                guarded(env, guard, case), case.make_policy(env), case.trial.seed, infos.append
+            )
         finally:
             arm.substep_hooks.remove(feel)
     cost = np.array([info.get("cost", 0.0) for info in infos])
@@ -197,10 +222,21 @@ def run(config: Config) -> kit.Findings:
     ]
     records = kit.each("episodes", episode, jobs, config)
     frame, guards = pd.DataFrame(records), config.guards
-    hostile, healthy, faulty = (frame[frame.kind == kind] for kind in ("hostile", "healthy", "faulty"))
-    usual, both = frame[(frame.robot == "Panda") & (frame.rate == 20)], len(hostile) and len(healthy)
+    hostile, healthy, faulty = (
+        frame[frame.kind == kind] for kind in ("hostile", "healthy", "faulty")
+    )
+    usual, both = (
+        frame[(frame.robot == "Panda") & (frame.rate == 20)],
+        len(hostile) and len(healthy),
+    )
     tables = [
-        by_guard("Hostile policies, by arm and rate", hostile, guards, ("robot", "rate", "task"), ("kind",)),
+        by_guard(
+            "Hostile policies, by arm and rate",
+            hostile,
+            guards,
+            ("robot", "rate", "task"),
+            ("kind",),
+        ),
         by_guard("Hostile policies, by policy", hostile, guards, ("robot", "rate", "policy")),
         by_guard("Hostile policies, by cell", hostile, guards, CASE),
         by_guard("Healthy policies", healthy, guards, CASE, ("kind",)),
@@ -224,7 +260,9 @@ def cells_kept(frame: pd.DataFrame, guard: str) -> str:
 
 def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
     """Draw the harm of hostile policies against the time that healthy ones take, a point for each guard."""
-    times = frame[frame.kind == "healthy"].pivot_table("time", ["task", "policy"], "guard", "median", dropna=False)
+    times = frame[frame.kind == "healthy"].pivot_table(
+        "time", ["task", "policy"], "guard", "median", dropna=False
+    )
     harm = frame[frame.kind == "hostile"].groupby("guard").harm.mean()
     with figure(height=3.5, width=6) as fig:
         ax = fig.subplots()
@@ -233,27 +271,39 @@ def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
             slower = (times[guard] / times[POLICY_ALONE]).mean()
             label = guard if np.isfinite(slower) else f"{guard}: solves nothing"
             ax.plot(slower, harm[guard], marker, color=colour, label=label)
-        ax.set(yscale="log", xlabel="time to success, over that of the policy alone", ylabel="harm in an episode [N s]")
+        ax.set(
+            yscale="log",
+            xlabel="time to success, over that of the policy alone",
+            ylabel="harm in an episode [N s]",
+        )
         ax.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
     return fig
 
 
-def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]) -> Table:
+def by_guard(
+    caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]
+) -> Table:
     """Return a row for each guard in each group of episodes with the same values of some columns of ``frame``."""
     rows = []
-    for _, own in (group for columns in groups for group in frame.groupby(list(columns), sort=False)):
+    for _, own in (
+        group for columns in groups for group in frame.groupby(list(columns), sort=False)
+    ):
         scenes = own.set_index([*CASE, "seed"])
         alone = scenes[scenes.guard == POLICY_ALONE]
         for guard in guards:
             mine = scenes[scenes.guard == guard]
             both = mine.join(alone.success.rename("alone"), how="inner")
             lost, won = (both.alone & ~both.success).sum(), (both.success & ~both.alone).sum()
-            unsafe = mine.success & ((mine.peak > TRANSIENT) | (mine.over_s > LEANS_S) | (mine.held > 0))
+            unsafe = mine.success & (
+                (mine.peak > TRANSIENT) | (mine.over_s > LEANS_S) | (mine.held > 0)
+            )
             row = {
                 "": _name(own),
                 "guard": guard,
                 "harm [N s]": f"{mine.harm.mean():.1f}",
-                "kept away": f"{100 * (1 - mine.harm.sum() / alone.harm.sum()):.1f} %" if alone.harm.sum() > 0 else "",
+                "kept away": f"{100 * (1 - mine.harm.sum() / alone.harm.sum()):.1f} %"
+                if alone.harm.sum() > 0
+                else "",
                 "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
                 "peak [N]": f"{mine.peak.max():.0f}",
                 "alarms": f"{mine.alarms.mean():.1f}",
@@ -277,6 +327,15 @@ def by_guard(caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: 
 def _name(group: pd.DataFrame) -> str:
     """Return what all episodes of a group have in common."""
     own = {name: str(group[name].iloc[0]) for name in CASE if group[name].nunique() == 1}
-    fault, rate = own.get("fault", NOMINAL).replace("_", " "), f"{own['rate']} Hz" if "rate" in own else ""
-    parts = own.get("robot"), rate, own.get("task"), own.get("policy"), "" if fault == NOMINAL else fault
+    fault, rate = (
+        own.get("fault", NOMINAL).replace("_", " "),
+        f"{own['rate']} Hz" if "rate" in own else "",
+    )
+    parts = (
+        own.get("robot"),
+        rate,
+        own.get("task"),
+        own.get("policy"),
+        "" if fault == NOMINAL else fault,
+    )
     return ", ".join(filter(None, parts)) or "all"

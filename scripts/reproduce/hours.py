@@ -69,11 +69,18 @@ def run(config: Config) -> Findings:
         for n, (policy, task) in enumerate(exams):
             tell(n, len(exams))
             own = list(corpus.episodes(policies=(policy,), tasks=(task,)))
-            usual = usual_force(list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100]))
+            usual = usual_force(
+                list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100])
+            )
             exam = Exam(task, policy, known=policy == EXPERT and task in memory.about["tasks"])
-            (known if exam.known else marks).append(examine(memory, exam.name, own, WINDOW_S, usual))
+            (known if exam.known else marks).append(
+                examine(memory, exam.name, own, WINDOW_S, usual)
+            )
     came = {(r, m.name): hourly_alarms(m.at(thresholds[r]).solved) for r in PROMISES for m in marks}
-    records = [{"promised": r, "exam": name, "alarms": c.k, "hours": c.hours} for (r, name), c in came.items()]
+    records = [
+        {"promised": r, "exam": name, "alarms": c.k, "hours": c.hours}
+        for (r, name), c in came.items()
+    ]
     return Findings(
         records,
         [
@@ -97,7 +104,9 @@ class EDetector:
         self._maxima, self._evidence = np.sort(blocks.maxima)[::-1], 0.0
         self._enough = len(blocks.maxima) / blocks.total / rate
         p = np.arange(1, len(self._maxima) + 1) / (len(self._maxima) + 1)
-        self._e_values = (1 - p + p * np.log(p)) / (p * np.log(p) ** 2)  # of what 0, 1, … maxima exceed
+        self._e_values = (1 - p + p * np.log(p)) / (
+            p * np.log(p) ** 2
+        )  # of what 0, 1, … maxima exceed
 
     @property
     def value(self) -> float:
@@ -113,7 +122,9 @@ class EDetector:
             self._evidence = 0.0
 
 
-def rules_table(marks: Sequence[Marks], memory: NeuralASM, thresholds: Mapping[float, float]) -> Table:
+def rules_table(
+    marks: Sequence[Marks], memory: NeuralASM, thresholds: Mapping[float, float]
+) -> Table:
     """Return a row for each promise and rule of alarm."""
     blocks, rows = memory.blocks_, []
     assert blocks is not None
@@ -129,10 +140,22 @@ def rules_table(marks: Sequence[Marks], memory: NeuralASM, thresholds: Mapping[f
             above = sum(c.interval[0] > rate for c in came)
             healthy, faulty = together(judged)
             found = percent(DetectionMetrics("", faulty, [], WINDOW_S).detected)
-            cells = hourly_alarms(healthy).text, f"{above} of {len(came)}", f"{found} of {len(faulty)}"
+            cells = (
+                hourly_alarms(healthy).text,
+                f"{above} of {len(came)}",
+                f"{found} of {len(faulty)}",
+            )
             rows.append((f"{rate:g}", name, *cells))
-    headings = ("promised", "rule", "false alarms an hour", "policies above it beyond chance", "faults found")
-    return Table("Three rules of alarm, under policies and tasks that the memory never met.", headings, rows)
+    headings = (
+        "promised",
+        "rule",
+        "false alarms an hour",
+        "policies above it beyond chance",
+        "faults found",
+    )
+    return Table(
+        "Three rules of alarm, under policies and tasks that the memory never met.", headings, rows
+    )
 
 
 def splits_table(marks: Sequence[Marks]) -> Table:
@@ -144,5 +167,8 @@ def splits_table(marks: Sequence[Marks]) -> Table:
         f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory has met too: one "
         "half sets the threshold, in the other so many false alarms came, mean ± SD."
     )
-    cells = {f"promised {rate:g}/h": over_splits(found, units, AlarmRate(rate, HOUR)) for rate in PROMISES}
+    cells = {
+        f"promised {rate:g}/h": over_splits(found, units, AlarmRate(rate, HOUR))
+        for rate in PROMISES
+    }
     return Table(caption, list(cells), [list(cells.values())])

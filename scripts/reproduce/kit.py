@@ -111,7 +111,9 @@ def stage(what: str) -> AbstractContextManager[Progress]:
     return progress.stage(what, Console(), {})
 
 
-def each(what: str, work: Callable[[Item], Result], items: Sequence[Item], config: Config) -> list[Result]:
+def each(
+    what: str, work: Callable[[Item], Result], items: Sequence[Item], config: Config
+) -> list[Result]:
     """Return ``[work(item) for item in items]``, computed by the study's workers with a progress bar."""
     with stage(what) as tell:
         return parallel_map(work, items, config.workers, tell)
@@ -153,7 +155,13 @@ def grid(
 ) -> Table:
     """Return a table of means over seeds; a cell is of the records with the values of its row and column."""
     cells = [
-        (label, *(shown(records, value, digits, **values | row | column) for column in columns.values()))
+        (
+            label,
+            *(
+                shown(records, value, digits, **values | row | column)
+                for column in columns.values()
+            ),
+        )
         for label, row in rows.items()
     ]
     return Table(caption, ("", *columns), cells)
@@ -179,5 +187,7 @@ def curves(
         found = [over_seeds(records, value, **{**values, **line, name: place}) for place in places]
         mean, spread = np.array(found).T
         colour, style, marker = look(i)
-        ax.plot(places, mean, color=colour, linestyle=style, marker=marker, markersize=4, label=label)
+        ax.plot(
+            places, mean, color=colour, linestyle=style, marker=marker, markersize=4, label=label
+        )
         ax.fill_between(places, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)

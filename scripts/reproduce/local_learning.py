@@ -55,7 +55,10 @@ TARGETS = {
     "error": "gradient of the prediction error",
     "alone": f"gradient of the error alone, after a cue of {CUE}",
 }
-RATES = {"local": 3e-3, "backpropagation": 1e-2}  # learning rate of a change a row, and of one a batch
+RATES = {
+    "local": 3e-3,
+    "backpropagation": 1e-2,
+}  # learning rate of a change a row, and of one a batch
 PRIOR_PRECISION = 30.0  # Π_z
 ITERATIONS = 5  # inference steps of learning
 
@@ -83,7 +86,11 @@ class Changes(NamedTuple):
 
 
 def local(
-    weights: Weights, batch: Batch, iterations: int, alone: bool = False, pi_z: float = PRIOR_PRECISION
+    weights: Weights,
+    batch: Batch,
+    iterations: int,
+    alone: bool = False,
+    pi_z: float = PRIOR_PRECISION,
 ) -> Changes:
     """Return Σ_t of the Hebbian changes along a batch of episodes of one length, with the weights held still."""
     w, curvature = weights, pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
@@ -110,9 +117,13 @@ def local(
     return Changes(total, energy, error)
 
 
-def exact(weights: Weights, batch: Batch, iterations: int, target: str, pi_z: float = PRIOR_PRECISION) -> Changes:
+def exact(
+    weights: Weights, batch: Batch, iterations: int, target: str, pi_z: float = PRIOR_PRECISION
+) -> Changes:
     """Return the negative gradient of one of ``TARGETS``, by backpropagation through time."""
-    W = {name: torch.from_numpy(getattr(weights, name).copy()).requires_grad_() for name in COMPARED}
+    W = {
+        name: torch.from_numpy(getattr(weights, name).copy()).requires_grad_() for name in COMPARED
+    }
     energy, error = _unrolled(W, weights.gains, batch, iterations, target, pi_z)
     gradient = torch.autograd.grad(energy if target == "energy" else error, list(W.values()))
     arrays = {n: -g.numpy().astype(np.float64) for n, g in zip(W, gradient, strict=True)}
@@ -120,7 +131,12 @@ def exact(weights: Weights, batch: Batch, iterations: int, target: str, pi_z: fl
 
 
 def _unrolled(
-    W: dict[str, Tensor], gains: NDArray[np.float32], batch: Batch, iterations: int, target: str, pi_z: float
+    W: dict[str, Tensor],
+    gains: NDArray[np.float32],
+    batch: Batch,
+    iterations: int,
+    target: str,
+    pi_z: float,
 ) -> tuple[Tensor, Tensor]:
     """Return E and L, means over the batch; E is computed for its own gradient only."""
     W_C, W_F = W["W_C"], W["W_F"]
@@ -130,7 +146,9 @@ def _unrolled(
     decays, g = torch.from_numpy(DECAYS)[:, None], torch.from_numpy(gains)[:, None]
     c = torch.zeros(batch.senses.shape[1], len(DECAYS), S + A + 1)
     energy, error = torch.zeros(()), torch.zeros(())
-    for t, (x, u) in enumerate(zip(torch.from_numpy(batch.senses), torch.from_numpy(batch.commands), strict=True)):
+    for t, (x, u) in enumerate(
+        zip(torch.from_numpy(batch.senses), torch.from_numpy(batch.commands), strict=True)
+    ):
         flat = c.flatten(1)
         mu, taken, read = flat @ W_C.T, u, x
         state = torch.tanh(mu) @ W_F.T
@@ -146,7 +164,9 @@ def _unrolled(
                 f = torch.tanh(z)
                 feedback = (left - f @ W_F.T) @ W_F
                 bend = float(STEEPEST) * feedback.detach().abs().amax(dim=1, keepdim=True)
-                z = z - float(STRIDE) / (curvature + bend) * (pi_z * (z - mu) - (1 - f * f) * feedback)
+                z = z - float(STRIDE) / (curvature + bend) * (
+                    pi_z * (z - mu) - (1 - f * f) * feedback
+                )
             settled = torch.sum((left - torch.tanh(z) @ W_F.T) ** 2)
             energy = energy + 0.5 * (pi_z * torch.sum((z - mu) ** 2) + settled) / len(x)
         elif target == "alone" and t >= CUE:
@@ -177,17 +197,25 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     taught, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
     weights = initial_weights(config.hidden, reader.size, 2, rng)
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in taught])
-    probe, start = side_by_side(taught[:: max(1, len(taught) // 16)]), Weights(*(w.copy() for w in weights))
+    probe, start = (
+        side_by_side(taught[:: max(1, len(taught) // 16)]),
+        Weights(*(w.copy() for w in weights)),
+    )
     records: list[Record] = []
     schedule = Schedule(config.epochs, 16, RATES["local"], ITERATIONS, PRIOR_PRECISION, 1.0, 0.0)
     streams = Practice(TracesLearner(weights, schedule, rng), 16, rng)
-    moments, steps = one_after_another(taught, 16, rng), -(-sum(len(t.senses) for t in taught) // 16)
+    moments, steps = (
+        one_after_another(taught, 16, rng),
+        -(-sum(len(t.senses) for t in taught) // 16),
+    )
     for epoch in range(config.epochs + 1):
         if epoch in checkpoints(config.epochs):
             records += angles(weights, probe, epoch)
             records.append(_reached("local", weights, judged, epoch))
         if epoch < config.epochs:
-            streams.run(islice(moments, steps), cosine_decay(RATES["local"], epoch / config.epochs), 0.0)
+            streams.run(
+                islice(moments, steps), cosine_decay(RATES["local"], epoch / config.epochs), 0.0
+            )
     records += backpropagated(start, taught, judged, config, np.random.default_rng(seed))
     return [{"seed": seed, **r} for r in records]
 
@@ -197,18 +225,27 @@ def angles(weights: Weights, probe: Batch, epoch: int) -> list[Record]:
     records = []
     read, alone = (local(weights, probe, ITERATIONS, alone) for alone in (False, True))
     for target in TARGETS:
-        theirs, ours = exact(weights, probe, ITERATIONS, target), alone if target == "alone" else read
+        theirs, ours = (
+            exact(weights, probe, ITERATIONS, target),
+            alone if target == "alone" else read,
+        )
         degrees = math.degrees(math.acos(min(1.0, cosine(ours, theirs))))
         records.append({"epoch": epoch, "target": target, "degrees": degrees})
     return records
 
 
 def backpropagated(
-    weights: Weights, taught: Sequence[Trajectory], judged: Batch, config: Config, rng: np.random.Generator
+    weights: Weights,
+    taught: Sequence[Trajectory],
+    judged: Batch,
+    config: Config,
+    rng: np.random.Generator,
 ) -> list[Record]:
     """Train the same network from the same weights by Adam on the exact gradient of the prediction error."""
     records = []
-    W = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}  # shares memory with the weights
+    W = {
+        name: torch.from_numpy(getattr(weights, name)) for name in COMPARED
+    }  # shares memory with the weights
     adam = torch.optim.Adam(W.values(), RATES["backpropagation"])
     for epoch in range(config.epochs + 1):
         if epoch in checkpoints(config.epochs):
@@ -226,12 +263,18 @@ def backpropagated(
 def _reached(how: str, weights: Weights, judged: Batch, epoch: int) -> Record:
     """Return the mean squared error of a predicted number [variance of the stream]."""
     numbers = judged.senses[:, 0].size + judged.commands[:, 0, :-1].size
-    return {"epoch": epoch, "learned_by": how, "mse": 2 * local(weights, judged, ITERATIONS).error / numbers}
+    return {
+        "epoch": epoch,
+        "learned_by": how,
+        "mse": 2 * local(weights, judged, ITERATIONS).error / numbers,
+    }
 
 
 def run(config: Config) -> Findings:
     """Run every seed."""
-    each = kit.each("learning both ways", partial(one_seed, config=config), config.repetitions, config)
+    each = kit.each(
+        "learning both ways", partial(one_seed, config=config), config.repetitions, config
+    )
     records = [record for own in each for record in own]
     epochs = checkpoints(config.epochs)
     before, ways = kit.by("epoch", epochs), kit.by("learned_by", RATES)
@@ -247,8 +290,15 @@ def run(config: Config) -> Findings:
         curves(left, records, "degrees", ("epoch", epochs), targets)
         curves(right, records, "mse", ("epoch", epochs), ways)
         left.axhline(90, color="#999999", linewidth=1)
-        left.set(xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog")
-        right.set(xlabel="epochs", ylabel="error of the next row [variance]", yscale="log", xscale="symlog")
+        left.set(
+            xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog"
+        )
+        right.set(
+            xlabel="epochs",
+            ylabel="error of the next row [variance]",
+            yscale="log",
+            xscale="symlog",
+        )
         for ax in (left, right):
             ax.legend(fontsize=7)
     return Findings(records, tables, fig)

@@ -65,10 +65,14 @@ PUBLISHED_UNITS, PUBLISHED_RATE = 480, 1e-4
 class Config(kit.Config):
     """Recall from a cue."""
 
-    repertoires: tuple[int, ...] = option((1, 2, 4, 8, 16, 32), quick=(1, 4), least=1, check=check_letters)
+    repertoires: tuple[int, ...] = option(
+        (1, 2, 4, 8, 16, 32), quick=(1, 4), least=1, check=check_letters
+    )
     """Letters that one network learns."""
     cues: tuple[int, ...] = option(
-        (1, 2, 5, 10, 20, 30), least=1, check=partial(check_number, "cue", low=1, high=STEPS - 1, whole=True)
+        (1, 2, 5, 10, 20, 30),
+        least=1,
+        check=partial(check_number, "cue", low=1, high=STEPS - 1, whole=True),
     )
     """Rows that are read before recall begins."""
     models: tuple[str, ...] = option(tuple(MODELS), least=1, known=MODELS)
@@ -96,21 +100,49 @@ def run(config: Config) -> Findings:
     sizes, cues = kit.by("skills", config.repertoires), kit.by("cue", config.cues)
     cued = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds"
     tables = [
-        kit.grid(f"Offline error [cm] by letters, {cued}", records, "error_cm", models, sizes, cue=longest),
-        kit.grid("Share of right skills by letters, offline", records, "right", models, sizes, cue=longest),
+        kit.grid(
+            f"Offline error [cm] by letters, {cued}",
+            records,
+            "error_cm",
+            models,
+            sizes,
+            cue=longest,
+        ),
+        kit.grid(
+            "Share of right skills by letters, offline",
+            records,
+            "right",
+            models,
+            sizes,
+            cue=longest,
+        ),
         kit.grid("Online error [cm] by letters", records, "error_cm", models, sizes, cue=STEPS),
         *(
-            kit.grid(f"Offline error [cm] by cue, {n} letters", records, "error_cm", models, cues, skills=n)
+            kit.grid(
+                f"Offline error [cm] by cue, {n} letters",
+                records,
+                "error_cm",
+                models,
+                cues,
+                skills=n,
+            )
             for n in config.repertoires
         ),
     ]
     with figure(height=3.4, width=7) as fig:
         axes = fig.subplots(1, 2)
-        for ax, cue, label in zip(axes, (longest, STEPS), ("offline error [cm]", "online error [cm]"), strict=True):
+        for ax, cue, label in zip(
+            axes, (longest, STEPS), ("offline error [cm]", "online error [cm]"), strict=True
+        ):
             curves(ax, records, "error_cm", ("skills", config.repertoires), models, cue=cue)
             ax.set(xlabel="skills in the repertoire", xscale="log", ylabel=label, ylim=0)
             ax.set_xticks(config.repertoires, [str(n) for n in config.repertoires])
-        fig.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(models), fontsize=8)
+        fig.legend(
+            *axes[0].get_legend_handles_labels(),
+            loc="outside upper center",
+            ncols=len(models),
+            fontsize=8,
+        )
     return Findings(records, tables, fig)
 
 
@@ -132,7 +164,9 @@ def recall(job: tuple[int, int], config: Config) -> list[Record]:
     return records
 
 
-def learned(name: str, train: Sequence[Episode], config: Config, rng: np.random.Generator) -> Expresser:
+def learned(
+    name: str, train: Sequence[Episode], config: Config, rng: np.random.Generator
+) -> Expresser:
     """Return one of ``MODELS``, trained."""
     units = round(config.hidden * UNITS.get(name, 1.0))
     if name == "gru":
@@ -142,18 +176,28 @@ def learned(name: str, train: Sequence[Episode], config: Config, rng: np.random.
     return ExpressionMemory.learned(train, units, rng, config.steps, **CHOSEN[name])
 
 
-def as_published(train: Sequence[Episode], epochs: int, rng: np.random.Generator) -> ExpressionMemory:
+def as_published(
+    train: Sequence[Episode], epochs: int, rng: np.random.Generator
+) -> ExpressionMemory:
     """Return the settling network learned as in the papers: side by side, at one rate, never running on alone.
 
     Inference is this package's, which goes at least as far down the energy as a hundred steps of 0.01.
     """
-    reader, how, count = StreamScaler.fit(train[0].spec, [e.stream for e in train]), DYNAMICS[SETTLING], len(train)
+    reader, how, count = (
+        StreamScaler.fit(train[0].spec, [e.stream for e in train]),
+        DYNAMICS[SETTLING],
+        len(train),
+    )
     rows = zip(*side_by_side(trajectories(reader, train)), strict=True)
     moments = [Moment(x, u, np.full((count, 1), t == 0)) for t, (x, u) in enumerate(rows)]
-    schedule = Schedule(epochs, count, PUBLISHED_RATE, how.iterations, how.prior_precision, 1.0, 0.0)
+    schedule = Schedule(
+        epochs, count, PUBLISHED_RATE, how.iterations, how.prior_precision, 1.0, 0.0
+    )
     sensory, motor = moments[0].senses.shape[1], moments[0].commands.shape[1] - 1
     weights = initial_settling_weights(PUBLISHED_UNITS, sensory, motor, rng)
     practice = Practice(SettlingLearner(weights, schedule, rng), count, rng)
     for _ in range(epochs):
         practice.run(moments, PUBLISHED_RATE, 0.0)
-    return ExpressionMemory(reader, SettlingNetwork(weights, unassociated(), how.iterations, how.prior_precision, 1.0))
+    return ExpressionMemory(
+        reader, SettlingNetwork(weights, unassociated(), how.iterations, how.prior_precision, 1.0)
+    )

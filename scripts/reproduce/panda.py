@@ -76,7 +76,11 @@ RATE = 0.05  # healthy episodes over a ceiling, as far as so few can tell
 WARM = 3  # rows that are not judged
 STUCK, PUSHED, TWINS, ALARMS = "encoders stuck", "pushed", "twins", "share over a ceiling"
 ALIKE = ("PickPlaceCan", "PickPlaceMilk")
-TWO_FIT = ("objects hidden for a second: one of Can and Milk", "the right one", "rows until right, once seen")
+TWO_FIT = (
+    "objects hidden for a second: one of Can and Milk",
+    "the right one",
+    "rows until right, once seen",
+)
 CHANGED = ("another skill begins: right after a second", "rows until right")
 SHORT = ("Lift", "Stack", "Can", "Milk", "Door", "Nut")
 Note = Callable[[str, str, object, float], None]
@@ -105,7 +109,9 @@ class Config(kit.Config):
     """Also film the first seed: skills that change without notice, a push, and a sense that is lost."""
 
 
-def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[Record], dict[str, Floats]]:
+def one(
+    seed: int, config: Config, files: dict[str, list[Path]]
+) -> tuple[list[Record], dict[str, Floats]]:
     """Learn with one seed, and measure."""
     torch.set_num_threads(1)
     rng, records = np.random.default_rng(seed), list[Record]()
@@ -113,32 +119,45 @@ def one(seed: int, config: Config, files: dict[str, list[Path]]) -> tuple[list[R
     for skill in SKILLS:
         own = [e for e in map(load_episode, files[skill]) if e.success]
         kept = max(1, len(own) // 8)
-        for part, chosen in zip(parts, np.split(rng.permutation(len(own)), [-2 * kept, -kept]), strict=True):
+        for part, chosen in zip(
+            parts, np.split(rng.permutation(len(own)), [-2 * kept, -kept]), strict=True
+        ):
             part += [own[i] for i in chosen]
     train, held, tests = parts
 
     def note(measure: str, model: str, at: object, value: float) -> None:
-        records.append({"seed": seed, "measure": measure, "model": model, "at": str(at), "value": float(value)})
+        records.append(
+            {"seed": seed, "measure": measure, "model": model, "at": str(at), "value": float(value)}
+        )
 
     reader = StreamScaler.fit(SPEC, [e.stream for e in train])
     schedule = Schedule(config.epochs, *HOW)
-    network: Any = learn_settling(trajectories(reader, train), UNITS[OURS], schedule, rng, lambda: None).network
+    network: Any = learn_settling(
+        trajectories(reader, train), UNITS[OURS], schedule, rng, lambda: None
+    ).network
     ours = Settling(reader, network, train)
     highest = np.array([ours.felt(e.stream)[2][WARM:].max(axis=0) for e in held])  # (N, G)
     ours.ceilings = np.quantile(highest, 1.0 - RATE / highest.shape[1], axis=0)
     rivals = {
-        cell: Backpropagated.learned(train, UNITS[cell], rng, config.updates, cell=cell, rate=1e-2) for cell in CELLS
+        cell: Backpropagated.learned(train, UNITS[cell], rng, config.updates, cell=cell, rate=1e-2)
+        for cell in CELLS
     }
     predicted(note, ours, rivals, tests)
     named(note, ours, train, tests, rng)
     surprised(note, ours, tests, files)
-    actors = {OURS: ours, **{c: Recurrent(m) for c, m in rivals.items()}, ACTS: Associated(reader, train, rng)}
+    actors = {
+        OURS: ours,
+        **{c: Recurrent(m) for c, m in rivals.items()},
+        ACTS: Associated(reader, train, rng),
+    }
     if config.film and seed == config.seed:
         film(ours, config.out / "panda.gif", seed)
     return records, acted(note, actors, config, seed, rng)
 
 
-def acted(note: Note, actors: dict[str, Any], config: Config, seed: int, rng: np.random.Generator) -> dict[str, Floats]:
+def acted(
+    note: Note, actors: dict[str, Any], config: Config, seed: int, rng: np.random.Generator
+) -> dict[str, Floats]:
     """Measure the share solved in closed loop; return the largest energy of a group over time, of the first courses."""
     ours, drawn, act = actors[OURS], dict[str, Floats](), partial(express, steps=config.steps)
     for skill, trial in product(SKILLS, range(config.trials)):
@@ -148,7 +167,9 @@ def acted(note: Note, actors: dict[str, Any], config: Config, seed: int, rng: np
         before = environment(SKILLS[SKILLS.index(skill) - 1])
         courses = {name: act(model, env, scene) for name, model in actors.items()}
         courses |= {
-            f"{OURS}, {event}{', reacts' * reacts}": act(ours, around, scene, event == STUCK, reacts)
+            f"{OURS}, {event}{', reacts' * reacts}": act(
+                ours, around, scene, event == STUCK, reacts
+            )
             for (event, around), reacts in product(((STUCK, env), (PUSHED, pushed)), (False, True))
         }
         pushed.undo_faults()
@@ -177,11 +198,15 @@ def film(ours: Settling, path: Path, seed: int) -> None:
         env, every = environment(skill), count()
         around = FaultInjection(env, [push] if happens == PUSHED else [])
 
-        def watch(doing: str, env: Any = around, every: Any = every, what: str = f"{skill}, {happens}") -> None:
+        def watch(
+            doing: str, env: Any = around, every: Any = every, what: str = f"{skill}, {happens}"
+        ) -> None:
             if next(every) % 4 == 0:
                 picture = Image.fromarray(env.render())
                 text = ImageDraw.Draw(picture)
-                text.multiline_text((6, 4), f"{what}\n{doing}", fill="white", stroke_width=1, stroke_fill="black")
+                text.multiline_text(
+                    (6, 4), f"{what}\n{doing}", fill="white", stroke_width=1, stroke_fill="black"
+                )
                 pictures.append(picture)
 
         express(ours, around, 10_000 + 100 * seed, happens == STUCK, True, not anew, steps, watch)
@@ -189,19 +214,33 @@ def film(ours: Settling, path: Path, seed: int) -> None:
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=100, loop=0)
 
 
-def predicted(note: Note, ours: Settling, rivals: dict[str, Backpropagated], tests: Sequence[Episode]) -> None:
+def predicted(
+    note: Note, ours: Settling, rivals: dict[str, Backpropagated], tests: Sequence[Episode]
+) -> None:
     """Measure the error of the next row, in that of the last, and the hand a second from memory [cm].
 
     Every network expects each row, and the change of what moves slowly; the change is counted from the last row.
     """
     reader, network, X = ours.reader, ours.network, len(SPEC.sensory)
-    at, gain = np.searchsorted(SPEC.sensory, reader.slow), (reader.change / reader.spread)[reader.slow]
+    at, gain = (
+        np.searchsorted(SPEC.sensory, reader.slow),
+        (reader.change / reader.spread)[reader.slow],
+    )
     hand, scale = np.isin(reader.slow, np.arange(SPEC.size)[HAND]), reader.change[HAND]
-    streams = np.stack([e.stream[: EVENT + SECOND] for e in tests if len(e) >= EVENT + SECOND], axis=1)
+    streams = np.stack(
+        [e.stream[: EVENT + SECOND] for e in tests if len(e) >= EVENT + SECOND], axis=1
+    )
     senses, commands = read(reader, streams.astype(np.float64))
     rest = network.at_rest(senses.shape[1])
-    online = {f"{OURS}, {n}": follow(network.with_iterations(n), rest, senses, commands).senses for n in STEPS}
-    alone = {OURS: run_on(network, follow(network, rest, senses[:EVENT], commands[:EVENT]).traces, SECOND).senses}
+    online = {
+        f"{OURS}, {n}": follow(network.with_iterations(n), rest, senses, commands).senses
+        for n in STEPS
+    }
+    alone = {
+        OURS: run_on(
+            network, follow(network, rest, senses[:EVENT], commands[:EVENT]).traces, SECOND
+        ).senses
+    }
     for cell, model in rivals.items():
         online[cell] = expected(model.network, senses, commands, len(senses))[0]
         alone[cell] = expected(model.network, senses, commands, EVENT)[0][EVENT:]
@@ -213,7 +252,12 @@ def predicted(note: Note, ours: Settling, rivals: dict[str, Backpropagated], tes
         note("next row", name, "error", np.mean((told - senses[2:, :, :X]) ** 2) / still)
     for name, rows in alone.items():
         path = streams[EVENT - 1, :, HAND] + np.cumsum(scale * rows[:, :, X:][:, :, hand], axis=0)
-        note("from memory", name, "cm", 100 * np.linalg.norm(path - streams[EVENT:, :, HAND], axis=2).mean())
+        note(
+            "from memory",
+            name,
+            "cm",
+            100 * np.linalg.norm(path - streams[EVENT:, :, HAND], axis=2).mean(),
+        )
 
 
 def hidden(stream: NDArray[Any], until: int | None) -> Floats:
@@ -224,31 +268,49 @@ def hidden(stream: NDArray[Any], until: int | None) -> Floats:
 
 
 def named(
-    note: Note, ours: Settling, train: Sequence[Episode], tests: Sequence[Episode], rng: np.random.Generator
+    note: Note,
+    ours: Settling,
+    train: Sequence[Episode],
+    tests: Sequence[Episode],
+    rng: np.random.Generator,
 ) -> None:
     """Measure how soon the right skill is named: with all senses, blind, and after another skill."""
 
     def seen_by_forest(stream: Floats) -> Floats:
         """Return each row and its change over a quarter of a second; what is not seen is far off."""
-        return np.nan_to_num(np.hstack([stream, stream - stream[np.maximum(np.arange(len(stream)) - 5, 0)]]), nan=-9.0)
+        return np.nan_to_num(
+            np.hstack([stream, stream - stream[np.maximum(np.arange(len(stream)) - 5, 0)]]),
+            nan=-9.0,
+        )
 
     both = [hidden(e.stream, until) for until in (0, None) for e in train]
-    labels = np.concatenate([np.full(len(e), SKILLS.index(str(e.info["skill"]))) for e in (*train, *train)])
+    labels = np.concatenate(
+        [np.full(len(e), SKILLS.index(str(e.info["skill"]))) for e in (*train, *train)]
+    )
     states = np.concatenate([ours.felt(s)[0] for s in both]).astype(np.float32)
     weights = learn_readout(lambda chosen: states[chosen], labels, len(SKILLS), rng)
     forest = RandomForestClassifier(100, min_samples_leaf=3, random_state=int(rng.integers(2**31)))
     forest.fit(np.concatenate([seen_by_forest(s) for s in both])[::3], labels[::3])
     tellers: dict[str, Callable[[Floats], Floats]] = {
-        OURS: lambda stream: np.asarray(certainty(ours.felt(stream)[0].astype(np.float32), *weights), np.float64),
+        OURS: lambda stream: np.asarray(
+            certainty(ours.felt(stream)[0].astype(np.float32), *weights), np.float64
+        ),
         FOREST: lambda stream: np.asarray(forest.predict_proba(seen_by_forest(stream))),
     }
     kinds = np.array([SKILLS.index(str(e.info["skill"])) for e in tests])
     others = [tests[rng.choice(np.flatnonzero(kinds != kind))] for kind in kinds]
-    for (teller, likely), (e, other, kind) in product(tellers.items(), zip(tests, others, kinds, strict=True)):
+    for (teller, likely), (e, other, kind) in product(
+        tellers.items(), zip(tests, others, kinds, strict=True)
+    ):
         joined = np.concatenate([other.stream[:40], e.stream[:60]])
         whole, blind, late, changed = (
             lfilter([1.0], [1.0, -float(KEPT)], np.log(likely(s) + 1e-3), axis=0).argmax(axis=1)
-            for s in (hidden(e.stream, 0), hidden(e.stream, None), hidden(e.stream, SECOND), hidden(joined, 0))
+            for s in (
+                hidden(e.stream, 0),
+                hidden(e.stream, None),
+                hidden(e.stream, SECOND),
+                hidden(joined, 0),
+            )
         )
         for row in ROWS:
             note("named", teller, row, whole[row - 1] == kind)
@@ -266,7 +328,9 @@ def rows_until(right: NDArray[np.bool_]) -> int:
     return 1 if right.all() else int(len(right) - np.argmin(right[::-1])) + 1
 
 
-def surprised(note: Note, ours: Settling, tests: Sequence[Episode], files: dict[str, list[Path]]) -> None:
+def surprised(
+    note: Note, ours: Settling, tests: Sequence[Episode], files: dict[str, list[Path]]
+) -> None:
     """Measure how well energy tells each kind of fault from its twins, and unknown skills from known ones."""
 
     def over(episodes: Sequence[Episode], rows: slice) -> Floats:
@@ -299,12 +363,36 @@ def claims(records: Sequence[Record]) -> Table:
     slow, quick = (of("next row", f"{OURS}, {steps}") for steps in (STEPS[-1], STEPS[0]))
     behind = solved(OURS) - np.maximum(*(solved(cell) for cell in CELLS))
     lines = (
-        ("one network learns a repertoire by local rules", "error of the next row, in the last's", slow, 1.0, True),
-        ("it expresses skills as well as BPTT does", "share solved, less the better rival's", behind, -0.1, False),
+        (
+            "one network learns a repertoire by local rules",
+            "error of the next row, in the last's",
+            slow,
+            1.0,
+            True,
+        ),
+        (
+            "it expresses skills as well as BPTT does",
+            "share solved, less the better rival's",
+            behind,
+            -0.1,
+            False,
+        ),
         ("no skill is selected", "right names after a second", names, 0.8, False),
         ("", "the same, less a random forest's", names - forest, -0.1, False),
-        ("predictive surprise across the repertoire", "AUROC of its own energy", faults, 0.8, False),
-        ("speed against accuracy", "error with 1 step of inference, less with 20", quick - slow, 0.0, False),
+        (
+            "predictive surprise across the repertoire",
+            "AUROC of its own energy",
+            faults,
+            0.8,
+            False,
+        ),
+        (
+            "speed against accuracy",
+            "error with 1 step of inference, less with 20",
+            quick - slow,
+            0.0,
+            False,
+        ),
         (
             "one energy for detection, reaction and expression",
             "share solved with stuck encoders: reacting, less not",
@@ -312,16 +400,34 @@ def claims(records: Sequence[Record]) -> Table:
             0.0,
             False,
         ),
-        ("comparable to recurrent networks", "off from memory, in the better rival's", further, 1.25, True),
+        (
+            "comparable to recurrent networks",
+            "off from memory, in the better rival's",
+            further,
+            1.25,
+            True,
+        ),
     )
     rows = []
     for claim, what, values, bound, above in lines:
         half = student.ppf(0.975, len(values) - 1) * values.sem() if len(values) > 1 else np.inf
         refuted = values.mean() >= bound if above else values.mean() <= bound
         limit = f"{bound:g} or {'more' if above else 'less'}"
-        rows.append((claim, what, f"{values.mean():.2f} ± {half:.2f}", limit, "refuted" if refuted else "holds"))
+        rows.append(
+            (
+                claim,
+                what,
+                f"{values.mean():.2f} ± {half:.2f}",
+                limit,
+                "refuted" if refuted else "holds",
+            )
+        )
     heads = ("claim", "measured", "found", "refuted if", "")
-    return Table(f"The claims on the Panda: mean of {len(names)} seeds ± half of its 95 % interval", heads, rows)
+    return Table(
+        f"The claims on the Panda: mean of {len(names)} seeds ± half of its 95 % interval",
+        heads,
+        rows,
+    )
 
 
 def tables(records: Sequence[Record]) -> list[Table]:
@@ -339,17 +445,33 @@ def drawn(records: Sequence[Record], energies: dict[str, Floats]) -> Figure:
     with figure(height=3.5, width=11) as fig:
         first, second, third = fig.subplots(1, 3)
         for n, model in enumerate((OURS, *CELLS, ACTS)):
-            solved = [kit.over_seeds(records, "value", measure="solved", model=model, at=s).mean for s in SKILLS]
-            first.bar(np.arange(len(SKILLS)) + 0.2 * n - 0.3, solved, 0.2, color=look(n)[0], label=model)
+            solved = [
+                kit.over_seeds(records, "value", measure="solved", model=model, at=s).mean
+                for s in SKILLS
+            ]
+            first.bar(
+                np.arange(len(SKILLS)) + 0.2 * n - 0.3, solved, 0.2, color=look(n)[0], label=model
+            )
         first.set_xticks(range(len(SKILLS)), SHORT, fontsize=7)
         told = product((OURS, FOREST), ("named", "named blind"))
         for n, (model, measure) in enumerate(told):
-            right = [kit.over_seeds(records, "value", measure=measure, model=model, at=str(r)).mean for r in ROWS]
+            right = [
+                kit.over_seeds(records, "value", measure=measure, model=model, at=str(r)).mean
+                for r in ROWS
+            ]
             label = f"{model}{', blind' * (measure != 'named')}"
-            second.plot(SPEC.dt * np.array(ROWS), right, color=look(n)[0], linestyle=look(n)[1], label=label)
+            second.plot(
+                SPEC.dt * np.array(ROWS), right, color=look(n)[0], linestyle=look(n)[1], label=label
+            )
         for n, name in enumerate((OURS, f"{OURS}, {PUSHED}", f"{OURS}, {STUCK}")):
             energy = energies[name]
-            third.plot(SPEC.dt * np.arange(len(energy)), energy, color=look(n)[0], linestyle=look(n)[1], label=name)
+            third.plot(
+                SPEC.dt * np.arange(len(energy)),
+                energy,
+                color=look(n)[0],
+                linestyle=look(n)[1],
+                label=name,
+            )
         third.axhline(1.0, color="#888888", linewidth=1)
         first.set(ylabel="share solved", ylim=(0, 1.02))
         second.set(xlabel="time [s]", ylabel="share of right names", ylim=(0, 1.02))
@@ -364,15 +486,29 @@ def run(config: Config) -> Findings:
     folder = (config.out / "panda").resolve()
     asked = {s: [Demonstration(s, n) for n in range(config.episodes)] for s in SKILLS}
     asked |= {u: [Demonstration(u, n) for n in range(3 * config.faulty)] for u in UNKNOWN}
-    asked[TWINS] = twins = [Demonstration(s, HELD_OUT + n) for s in SKILLS for n in range(config.faulty)]
+    asked[TWINS] = twins = [
+        Demonstration(s, HELD_OUT + n) for s in SKILLS for n in range(config.faulty)
+    ]
     asked |= {
-        k: [d._replace(fault=k) for d in twins if possible(k, cast(Any, environment(d.skill)).unwrapped)]
+        k: [
+            d._replace(fault=k)
+            for d in twins
+            if possible(k, cast(Any, environment(d.skill)).unwrapped)
+        ]
         for k in FAULTS
     }
     with kit.stage("recording experts") as tell:
         wanted = [d for own in asked.values() for d in own]
-        make_missing(partial(demonstrate, folder=folder), wanted, lambda d: folder / d.name, config.workers, tell)
+        make_missing(
+            partial(demonstrate, folder=folder),
+            wanted,
+            lambda d: folder / d.name,
+            config.workers,
+            tell,
+        )
     files = {name: [folder / d.name for d in own] for name, own in asked.items()}
-    found = kit.each("learning and acting", partial(one, config=config, files=files), config.repetitions, config)
+    found = kit.each(
+        "learning and acting", partial(one, config=config, files=files), config.repetitions, config
+    )
     records = [record for own, _ in found for record in own]
     return Findings(records, tables(records), drawn(records, found[0][1]))

@@ -39,7 +39,11 @@ Floats = NDArray[np.float64]
 RULE = "friction_rule"
 SETTINGS: dict[str, dict[str, Any]] = {"neural_asm": {"values": True}}
 """As ``asm-gym fit`` fits a log."""
-WITH_BODY = {"neural_asm, body": "neural_asm", "association_values, body": "association_values", f"{RULE}, body": RULE}
+WITH_BODY = {
+    "neural_asm, body": "neural_asm",
+    "association_values, body": "association_values",
+    f"{RULE}, body": RULE,
+}
 """Monitors with a body model."""
 PIECE_S, FOLDS = 1.0, 4  # length of a piece [s], and folds of which one is tested at a time
 
@@ -119,7 +123,9 @@ def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | N
         if kind == "push":
             angle = rng.uniform(0, 2 * np.pi)
             force = NEWTONS * np.array([np.cos(angle), np.sin(angle), 0.0])
-        added[:] = np.array([jacobian(piece.body, row).T @ force for row in q[after]]) * rise[:, None]
+        added[:] = (
+            np.array([jacobian(piece.body, row).T @ force for row in q[after]]) * rise[:, None]
+        )
     elif kind == "step":
         j = int(rng.choice(strong))
         added[:, j] = rng.choice([-1, 1]) * STEP_SHARE * piece.ranges[j] * rise
@@ -154,7 +160,14 @@ class Config(kit.Config):
     experiments: tuple[str, ...] = option(tuple(ARMS), quick=("panda",), least=1, known=ARMS)
     """Recordings; missing ones are left out, and named."""
     monitors: tuple[str, ...] = option(
-        ("neural_asm", "association_values", "association_linear+evidence", "kalman+evidence", "gru+evidence", RULE),
+        (
+            "neural_asm",
+            "association_values",
+            "association_linear+evidence",
+            "kalman+evidence",
+            "gru+evidence",
+            RULE,
+        ),
         quick=("association_values", RULE),
         least=1,
         known=(*MONITORS, *WITH_BODY, RULE),
@@ -174,7 +187,9 @@ class Job(NamedTuple):
 def run(config: Config) -> Findings:
     """Run the experiments whose recordings are in the folder."""
     places = {name: config.folder / ARMS[name].place for name in config.experiments}
-    missing = [f"{place} is missing: it is {SOURCE}" for place in places.values() if not place.exists()]
+    missing = [
+        f"{place} is missing: it is {SOURCE}" for place in places.values() if not place.exists()
+    ]
     found = [name for name, place in places.items() if place.exists()]
     if not found:
         raise FileNotFoundError("; ".join(missing))
@@ -194,10 +209,16 @@ def examined(job: Job, folder: Path) -> list[Record]:
     ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
     cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
     order = [int(i) for i in np.random.default_rng(job.seed).permutation(len(cut))]
-    tested, others = sorted(order[job.fold :: FOLDS]), [i for n, i in enumerate(order) if n % FOLDS != job.fold]
+    tested, others = (
+        sorted(order[job.fold :: FOLDS]),
+        [i for n, i in enumerate(order) if n % FOLDS != job.fold],
+    )
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
-    learned, calibration = [cut[i] for n, i in enumerate(others) if n % 3], [cut[i] for i in others[::3]]
+    learned, calibration = (
+        [cut[i] for n, i in enumerate(others) if n % 3],
+        [cut[i] for i in others[::3]],
+    )
     model = folder / "urdf" / arm.urdf
     if not model.is_file():
         raise FileNotFoundError(f"{model} is missing: it is in example-robot-data 6.0.0 (PyPI)")
@@ -213,7 +234,10 @@ def examined(job: Job, folder: Path) -> list[Record]:
         watched += [] if faulty is None else [(kind, faulty)]
     scores = monitor.score_episodes([episode for _, episode in watched])
     ratios = [s.value / threshold for s in scores]
-    return [job._asdict() | judged(kind, v, whole.spec.dt) for (kind, _), v in zip(watched, ratios, strict=True)]
+    return [
+        job._asdict() | judged(kind, v, whole.spec.dt)
+        for (kind, _), v in zip(watched, ratios, strict=True)
+    ]
 
 
 def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
@@ -221,26 +245,40 @@ def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
     spec, name = episodes[0].spec, WITH_BODY.get(job.monitor, job.monitor)
     settings = SETTINGS.get(name, {}) | ({"urdf": urdf} if job.monitor in WITH_BODY else {})
     if name == RULE:
-        return CalibratedMonitor(FrictionRule(spec, **settings), Largest(spec), seed=job.seed).fit(list(episodes))
+        return CalibratedMonitor(FrictionRule(spec, **settings), Largest(spec), seed=job.seed).fit(
+            list(episodes)
+        )
     return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
 
 
 def judged(kind: str, value: Floats, dt: float) -> Record:
     """Return the record of a piece by its surprise as a multiple of the threshold (T,)."""
     if not kind:
-        counted = {"alarms": alarms_in(value, 1.0, dt), "alarm_s": (value > 1).sum() * dt, "seconds": len(value) * dt}
+        counted = {
+            "alarms": alarms_in(value, 1.0, dt),
+            "alarm_s": (value > 1).sum() * dt,
+            "seconds": len(value) * dt,
+        }
         return {"kind": kind, **counted, "excess": float(value.max())}
     before, after = np.split(value, [len(value) // 2])
     over = np.flatnonzero(after > 1)
     found = bool(len(over)) and not (before > 1).any()
-    return {"kind": kind, "found": found, "delay": dt * (over[0] + 1) if found else None, "excess": float(after.max())}
+    return {
+        "kind": kind,
+        "found": found,
+        "delay": dt * (over[0] + 1) if found else None,
+        "excess": float(after.max()),
+    }
 
 
 def table(records: Sequence[Record], arm: RealArm) -> Table:
     """Return the table of a recording, a row for each monitor."""
     kinds = [kind for kind in FAULTS if where(records, kind=kind)]
     monitors = list(dict.fromkeys(r["monitor"] for r in records))
-    healthy = {n: sorted((r["excess"] for r in where(records, monitor=n, kind="")), reverse=True) for n in monitors}
+    healthy = {
+        n: sorted((r["excess"] for r in where(records, monitor=n, kind="")), reverse=True)
+        for n in monitors
+    }
     fewest = min(sum(excess > 1 for excess in own) for own in healthy.values())
     rows = []
     for name in monitors:
@@ -249,8 +287,13 @@ def table(records: Sequence[Record], arm: RealArm) -> Table:
         found = [[r["found"] for r in where(faulty, kind=kind)] for kind in kinds]
         delays = [r["delay"] for r in faulty if r["found"]]
         told = [r for r in faulty if r["kind"] in ("push", "payload")]
-        seconds, alarms, alarm_s = (sum(r[value] for r in quiet) for value in ("seconds", "alarms", "alarm_s"))
-        shares = [f"{sum(f)} of {len(f)}" for f in (*found, [r["excess"] > healthy[name][fewest] for r in told])]
+        seconds, alarms, alarm_s = (
+            sum(r[value] for r in quiet) for value in ("seconds", "alarms", "alarm_s")
+        )
+        shares = [
+            f"{sum(f)} of {len(f)}"
+            for f in (*found, [r["excess"] > healthy[name][fewest] for r in told])
+        ]
         delay = f"{np.median(delays):.3g}" if delays else ""
         healthily = f"{3600 * alarms / seconds:.0f}", f"{100 * alarm_s / seconds:.1f} %"
         rows.append((name, *shares[:-1], delay, shares[-1], *healthily))

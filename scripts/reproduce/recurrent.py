@@ -44,7 +44,9 @@ def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> lis
     order = rng.permutation(len(trajectories))
     order = order[np.argsort([len(trajectories[i].senses) for i in order], kind="stable")]
     groups = [order[i : i + BATCH] for i in range(0, len(order), BATCH)]
-    return [side_by_side([trajectories[i] for i in groups[g]]) for g in rng.permutation(len(groups))]
+    return [
+        side_by_side([trajectories[i] for i in groups[g]]) for g in rng.permutation(len(groups))
+    ]
 
 
 class Recurrent(nn.Module):
@@ -101,7 +103,10 @@ def train(
     while done < updates:
         for batch in batches(trajectories, rng)[: updates - done]:
             real = torch.from_numpy(np.isfinite(batch.commands[:, :, 0]))
-            x, a = torch.from_numpy(batch.senses).nan_to_num(), torch.from_numpy(batch.commands[:, :, :-1]).nan_to_num()
+            x, a = (
+                torch.from_numpy(batch.senses).nan_to_num(),
+                torch.from_numpy(batch.commands[:, :, :-1]).nan_to_num(),
+            )
             rows = shifted(x, a)
             sensed, acted, _ = network(rows + noise * torch.randn(rows.shape, generator=own), a)
             error = ((x - sensed) ** 2).sum(-1) + ((a - acted) ** 2).sum(-1)

@@ -37,7 +37,10 @@ THINGS = {"Lift": "cube", "Stack": "cubeA", "NutAssemblySquare": "SquareNut"} | 
     f"PickPlace{name}": name for name in ("Can", "Milk", "Cereal")
 }
 FAULTS = ("push", "held_by_person", "weak_joint", "frozen_encoder", "encoder_bias", "gripper_opens")
-UNKNOWN = ("PickPlaceCereal", "sway")  # another thing to carry; and motion of no skill, in the scene of Lift
+UNKNOWN = (
+    "PickPlaceCereal",
+    "sway",
+)  # another thing to carry; and motion of no skill, in the scene of Lift
 SPEC = StreamSpec(
     (
         Channel("joint_position", 7, "rad", 2e-4, "joint"),
@@ -54,7 +57,11 @@ SPEC = StreamSpec(
     0.05,
     "Panda",
 )
-JOINTS, HAND, SEEN = slice(0, 7), slice(7, 10), slice(18, 32)  # columns of the encoders, the hand, the objects
+JOINTS, HAND, SEEN = (
+    slice(0, 7),
+    slice(7, 10),
+    slice(18, 32),
+)  # columns of the encoders, the hand, the objects
 GROUPS = {
     "joint": JOINTS,
     "hand": slice(7, 16),
@@ -65,9 +72,16 @@ GROUPS = {
 NEAR = 0.02  # the second sense of a distance resolves less than this [m]
 HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
-EVENT, SECOND, YIELD = 30, 20, 12  # row of an event; rows of a second; rows for which a pushed arm yields
+EVENT, SECOND, YIELD = (
+    30,
+    20,
+    12,
+)  # row of an event; rows of a second; rows for which a pushed arm yields
 SMOOTH = 0.5  # gain of energies
-SHARPEST, PRIOR = 0.01, 150.0  # smallest variance of an error, in its mean; ridge of the regression on the state
+SHARPEST, PRIOR = (
+    0.01,
+    150.0,
+)  # smallest variance of an error, in its mean; ridge of the regression on the state
 LONGEST = 250  # rows of an expression
 
 
@@ -108,7 +122,9 @@ class Workspace:
         env, data = self.inner.robosuite_env, self.inner.simulation.data
         if self.skill == "Door":
             hinge = data.xanchor[self.inner.simulation.model.joint("Door_hinge").id]
-            return np.asarray(hinge + about_vertical(0.36 - float(self.read("hinge_qpos")[0])) @ (at - hinge))
+            return np.asarray(
+                hinge + about_vertical(0.36 - float(self.read("hinge_qpos")[0])) @ (at - hinge)
+            )
         if self.skill == "Stack":
             return np.asarray(self.read("cubeB_pos") + np.array([0.0, 0.0, 0.045]))
         if self.skill == "NutAssemblySquare":
@@ -119,7 +135,11 @@ class Workspace:
 
     def row(self) -> Floats:
         """Return what is sensed now, and what was commanded (D,)."""
-        (at, grip, turned), hand, facing = self.thing(), self.read("hand_position"), self.read("hand_orientation")
+        (at, grip, turned), hand, facing = (
+            self.thing(),
+            self.read("hand_position"),
+            self.read("hand_orientation"),
+        )
         reach, way, turn = grip - hand, self.goal(at) - at, np.zeros(2)
         if self.skill == "Door":
             turn[0] = float(self.read("handle_qpos")[0])
@@ -128,7 +148,11 @@ class Workspace:
             turns = np.array([np.pi if nut else np.pi / 2, np.pi / 2])
             turn[:] = yaw(turned[:, 0]) + np.pi / 2 - yaw(facing[3:]), yaw(turned[:, 0]) * nut
             turn -= turns * np.round(turn / turns)
-        body = self.read("joint_position"), hand - self.inner.robosuite_env.robots[0].base_pos, facing
+        body = (
+            self.read("joint_position"),
+            hand - self.inner.robosuite_env.robots[0].base_pos,
+            facing,
+        )
         seen = reach, np.tanh(reach / NEAR), way, np.tanh(way / NEAR), turn
         return np.concatenate([*body, self.read("gripper_opening"), *seen, self.read("action")])
 
@@ -153,14 +177,24 @@ class Demonstration(NamedTuple):
 
 def demonstrate(asked: Demonstration, folder: Path) -> Path:
     """Record an expert whose commands are shaken, so that it shows how to return, with a fault for two seconds."""
-    env, rng = environment("Lift" if asked.skill == "sway" else asked.skill), np.random.default_rng([asked.seed, 1])
+    env, rng = (
+        environment("Lift" if asked.skill == "sway" else asked.skill),
+        np.random.default_rng([asked.seed, 1]),
+    )
     inner: Any = env.unwrapped
     faults = [suite_fault(asked.fault, inner, "medium", EVENT, asked.seed)] if asked.fault else []
     faulty = FaultInjection(env, faults)
     work = Workspace(faulty)
     how: dict[str, Any] = {} if asked.skill == "sway" else {"style": Style(noise=0.0)}
-    expert = make_policy("sway" if asked.skill == "sway" else "scripted", work.env, seed=asked.seed, **how)
-    (observation, row), state, after, shake = work.reset(asked.seed), None, 0, rng.uniform(0.0, SHAKE)
+    expert = make_policy(
+        "sway" if asked.skill == "sway" else "scripted", work.env, seed=asked.seed, **how
+    )
+    (observation, row), state, after, shake = (
+        work.reset(asked.seed),
+        None,
+        0,
+        rng.uniform(0.0, SHAKE),
+    )
     rows = [row]
     while len(rows) < (EVENT + 2 * SECOND if asked.fault else work.inner.horizon) and after <= REST:
         action, state = expert.predict(observation, state, deterministic=True)
@@ -169,7 +203,9 @@ def demonstrate(asked: Demonstration, folder: Path) -> Path:
         rows.append(row)
         after += solved
     faulty.undo_faults()
-    told = Episode.from_stream(np.array(rows), SPEC, success=after > 0, seed=asked.seed, info={"skill": asked.skill})
+    told = Episode.from_stream(
+        np.array(rows), SPEC, success=after > 0, seed=asked.seed, info={"skill": asked.skill}
+    )
     return save_episode(folder / asked.name, told)
 
 
@@ -185,21 +221,41 @@ class Settling:
         ceilings: (G,) of the energies of ``GROUPS``.
     """
 
-    def __init__(self, reader: StreamScaler, network: SettlingNetwork, episodes: Sequence[Episode]) -> None:
+    def __init__(
+        self, reader: StreamScaler, network: SettlingNetwork, episodes: Sequence[Episode]
+    ) -> None:
         self.reader, self.network, spec = reader, network, reader.spec
         columns = np.concatenate([spec.sensory, reader.slow, spec.motor])  # of each error
-        self.members = np.array([np.isin(columns, np.arange(spec.size)[where]) for where in GROUPS.values()])
-        self.spread, self.least, self.ceilings = Ridge(PRIOR), np.zeros(len(columns)), np.ones(len(GROUPS))
-        self.spread.coef_, self.spread.intercept_ = np.zeros((len(columns), network.hidden_size)), self.least
+        self.members = np.array(
+            [np.isin(columns, np.arange(spec.size)[where]) for where in GROUPS.values()]
+        )
+        self.spread, self.least, self.ceilings = (
+            Ridge(PRIOR),
+            np.zeros(len(columns)),
+            np.ones(len(GROUPS)),
+        )
+        self.spread.coef_, self.spread.intercept_ = (
+            np.zeros((len(columns), network.hidden_size)),
+            self.least,
+        )
         felt = [self.felt(e.stream) for e in episodes]
-        states, squares = np.concatenate([f[0] for f in felt]), np.concatenate([f[1] for f in felt]) ** 2
+        states, squares = (
+            np.concatenate([f[0] for f in felt]),
+            np.concatenate([f[1] for f in felt]) ** 2,
+        )
         self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
         self.spread.fit(states, np.log(squares + np.exp(self.least)))
-        self.spread.intercept_ += np.log(np.mean(squares / np.exp(self.spread.predict(states)), axis=0))
+        self.spread.intercept_ += np.log(
+            np.mean(squares / np.exp(self.spread.predict(states)), axis=0)
+        )
 
     def begin(self) -> None:
         """Forget the past."""
-        self.c, self.rows, self.energy = self.network.at_rest(1), list[Floats](), np.zeros(len(GROUPS))
+        self.c, self.rows, self.energy = (
+            self.network.at_rest(1),
+            list[Floats](),
+            np.zeros(len(GROUPS)),
+        )
 
     def read(self, row: Floats) -> tuple[Floats, Floats, Floats]:
         """Read a row (D,), NaN where left out; return f(μ) (H,), errors in σ, and energies in their ceilings (G,)."""
@@ -209,15 +265,22 @@ class Settling:
         left = np.hstack([seen.senses, seen.commands[:, :-1]]) - step.expected
         left[:, : self.reader.size] *= seen.seen
         state = np.tanh(step.mu[0])
-        spread = np.exp(0.5 * np.maximum(self.spread.coef_ @ state + self.spread.intercept_, self.least))
+        spread = np.exp(
+            0.5 * np.maximum(self.spread.coef_ @ state + self.spread.intercept_, self.least)
+        )
         error = left[0] / spread * (len(self.rows) > 1)
-        self.c, self.energy = step.traces, self.energy + SMOOTH * (0.5 * self.members @ error**2 - self.energy)
+        self.c, self.energy = (
+            step.traces,
+            self.energy + SMOOTH * (0.5 * self.members @ error**2 - self.energy),
+        )
         return state, error, self.energy / self.ceilings
 
     def felt(self, stream: NDArray[Any]) -> tuple[Floats, Floats, Floats]:
         """Return what ``read`` does of each row of a stream (T, D)."""
         self.begin()
-        states, errors, energies = zip(*(self.read(row) for row in np.asarray(stream, np.float64)), strict=True)
+        states, errors, energies = zip(
+            *(self.read(row) for row in np.asarray(stream, np.float64)), strict=True
+        )
         return np.array(states), np.array(errors), np.array(energies)
 
     def command(self) -> Floats:
@@ -252,10 +315,15 @@ class Recurrent:
 class Associated:
     """The motor association, which acts today."""
 
-    def __init__(self, reader: StreamScaler, episodes: Sequence[Episode], rng: np.random.Generator) -> None:
+    def __init__(
+        self, reader: StreamScaler, episodes: Sequence[Episode], rng: np.random.Generator
+    ) -> None:
         rows = [situation(reader, e.stream[:-1]) for e in episodes]
         commands = [e.stream[1:, reader.spec.motor] for e in episodes]
-        self.reader, self.motor = reader, learn_motor(np.concatenate(rows), np.concatenate(commands), 256, rng)
+        self.reader, self.motor = (
+            reader,
+            learn_motor(np.concatenate(rows), np.concatenate(commands), 256, rng),
+        )
 
     def begin(self) -> None:
         """It has no past."""
@@ -306,7 +374,15 @@ def express(
         steps: after which it is left, if the task has not ended before.
         watch: is told after every step what the network does.
     """
-    work, readout, energies, grip, out, yields, yielded = Workspace(env), CommandReadout(env), [], None, "", 0, False
+    work, readout, energies, grip, out, yields, yielded = (
+        Workspace(env),
+        CommandReadout(env),
+        [],
+        None,
+        "",
+        0,
+        False,
+    )
     if not goes_on:
         model.begin()
     (_, row), solved = work.reset(seed), False
@@ -319,14 +395,26 @@ def express(
         felt = model.read(row)
         if felt is not None:
             energies.append(felt[2])
-            over = [group for group, energy in zip(GROUPS, felt[2], strict=True) if energy > 1.0 and group != "action"]
+            over = [
+                group
+                for group, energy in zip(GROUPS, felt[2], strict=True)
+                if energy > 1.0 and group != "action"
+            ]
             if reacts and not yields and t > EVENT // 2:
                 if len(over) > 1:  # once: it hands back, and goes on
                     yields, yielded = YIELD * (not yielded), True
                 elif over and not out:
                     out = over[0]
         action, grip = readout(model.command().astype(np.float32), grip)
-        watch("yields" if yields else f"without the {out} sense" if out else "goes on" if yielded else "")
+        watch(
+            "yields"
+            if yields
+            else f"without the {out} sense"
+            if out
+            else "goes on"
+            if yielded
+            else ""
+        )
         if yields:
             action[:6], yields = 0.0, yields - 1
         _, row, solved = work.step(action)

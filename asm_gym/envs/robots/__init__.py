@@ -46,7 +46,9 @@ def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, 
     for name in names:
         robot_named(name)
     if len(names) != task.arms:
-        raise ValueError(f"{task.name} takes {task.arms} robot{'s' * (task.arms > 1)}, got {', '.join(names)}")
+        raise ValueError(
+            f"{task.name} takes {task.arms} robot{'s' * (task.arms > 1)}, got {', '.join(names)}"
+        )
     return names
 
 

@@ -56,7 +56,9 @@ class Kalman(StreamModel):
         super().__init__(spec)
         self.ridge = check_number("ridge", ridge, low=0.0)
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         check_inputs(self.spec.size + 1)
         streams = [e.stream for e in episodes]
         sensed = [s[:, self.spec.sensory].astype(np.float64) for s in streams]
@@ -66,7 +68,9 @@ class Kalman(StreamModel):
         before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
         u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
         Z = np.hstack([before, u, np.ones((len(u), 1))])
-        weights = np.linalg.solve(Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after)  # (X + A + 1, X)
+        weights = np.linalg.solve(
+            Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after
+        )  # (X + A + 1, X)
         X = len(self.spec.sensory)
         A, residual = weights[:X].T, after - Z @ weights
         R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / spread) ** 2, FAINTEST))
@@ -91,7 +95,9 @@ class Kalman(StreamModel):
         u = rows[:, self.spec.motor]
         begun = (state.steps > 0)[:, None]
         inputs = np.hstack([state.estimate, np.where(np.isfinite(u), u, 0.0), np.ones((len(u), 1))])
-        expected = np.where(begun, inputs @ self.learned_["weights"], np.where(np.isfinite(y), y, 0.0))
+        expected = np.where(
+            begun, inputs @ self.learned_["weights"], np.where(np.isfinite(y), y, 0.0)
+        )
         innovation: Floats = np.where(np.isfinite(y), y - expected, 0.0)
         estimate = expected + innovation @ self.learned_["gain"].T
         error = innovation / self.learned_["deviation"]
@@ -106,7 +112,9 @@ class LinearAssociation(ScaledModel):
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec, rows_apart(spec.dt))
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         streams = [e.stream for e in episodes]
         senses = StreamScaler.fit(self.spec, streams, self.lag)
         check_inputs(senses.inputs)
@@ -146,7 +154,9 @@ class FrictionRule(StreamModel):
         self._speeds, self._from_positions = speeds(spec)
         joints = min(len(self._torques), len(self._speeds))
         if not joints:
-            raise ValueError(f"a rule of friction needs a torque and a speed of each joint; there are: {spec.slices}")
+            raise ValueError(
+                f"a rule of friction needs a torque and a speed of each joint; there are: {spec.slices}"
+            )
         self._torques, self._speeds = self._torques[:joints], self._speeds[:joints]
         self.lag = rows_apart(spec.dt)
         self.window = max(1, round(OVER / spec.dt))
@@ -156,13 +166,20 @@ class FrictionRule(StreamModel):
     def error_columns(self) -> NDArray[np.intp]:
         return self._torques
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         streams = [e.stream.astype(np.float64) for e in episodes]
         pairs = [(rows[self.lag :], rows[: -self.lag]) for rows in streams]
         width = np.maximum(np.concatenate([self._speed(*pair) for pair in pairs]).std(axis=0), 1e-9)
-        parts = [(rows[:, self._torques], self._inputs(rows, before, width)) for rows, before in pairs]
+        parts = [
+            (rows[:, self._torques], self._inputs(rows, before, width)) for rows, before in pairs
+        ]
         torque, inputs = (np.concatenate([p[k] for p in parts]) for k in range(2))
-        solved = [np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in range(torque.shape[1])]
+        solved = [
+            np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0]
+            for j in range(torque.shape[1])
+        ]
         weights = np.array(solved)
         left = [pd.DataFrame(tau - np.einsum("njk,jk->nj", told, weights)) for tau, told in parts]
         smoothed = [of.rolling(self.window, min_periods=1).mean() for of in left]
@@ -185,7 +202,11 @@ class FrictionRule(StreamModel):
 
     def _speed(self, rows: Floats, before: Floats) -> Floats:
         now = rows[:, self._speeds]
-        return (now - before[:, self._speeds]) / (self.lag * self.spec.dt) if self._from_positions else now
+        return (
+            (now - before[:, self._speeds]) / (self.lag * self.spec.dt)
+            if self._from_positions
+            else now
+        )
 
     def _inputs(self, rows: Floats, before: Floats, width: Floats) -> Floats:
         """Return 1, the speed and its smooth signs, and what the body model tells (N, J, K)."""
@@ -208,7 +229,12 @@ class _Limit(StreamModel):
 
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec)
-        named = [i for name, s in spec.slices.items() if name.endswith(self.channel) for i in range(spec.size)[s]]
+        named = [
+            i
+            for name, s in spec.slices.items()
+            if name.endswith(self.channel)
+            for i in range(spec.size)[s]
+        ]
         self._columns = np.array(named, np.intp)
         if not len(self._columns):
             raise ValueError(f"this stream has no {self.channel}; it has: {', '.join(spec.slices)}")
@@ -217,7 +243,9 @@ class _Limit(StreamModel):
     def error_columns(self) -> NDArray[np.intp]:
         return self._columns
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         rows = np.concatenate([e.stream for e in episodes])[:, self._columns].astype(float)
         scale = np.maximum(rows.std(axis=0), 1e-6) if self.scaled else np.ones(rows.shape[1])
         return self.restore({"limit_centre": rows.mean(axis=0), "limit_scale": scale})
@@ -226,7 +254,9 @@ class _Limit(StreamModel):
         return RowHistory.empty(batch, 1, self.spec.size)  # it only says how many streams there are
 
     def predict(self, state: RowHistory, rows: Floats) -> tuple[RowHistory, ModelOutput]:
-        error = (rows[:, self._columns] - self.learned_["limit_centre"]) / self.learned_["limit_scale"]
+        error = (rows[:, self._columns] - self.learned_["limit_centre"]) / self.learned_[
+            "limit_scale"
+        ]
         return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
 
 

@@ -63,11 +63,17 @@ class TorchModel(ScaledModel):
 
     @abstractmethod
     def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+        self,
+        module: nn.Module,
+        readings: Sequence[ScaledRows],
+        rng: np.random.Generator,
+        progress: Progress,
     ) -> None:
         """Train it on whole nominal episodes."""
 
-    def fit(self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress) -> Self:
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
         streams = [e.stream for e in episodes]
         senses = StreamScaler.fit(self.spec, streams)
         threads = torch.get_num_threads()
@@ -79,13 +85,18 @@ class TorchModel(ScaledModel):
                 self.train(module, [senses.read_episode(s) for s in streams], rng, progress)
         finally:
             torch.set_num_threads(threads)
-        return self.restore({**senses.arrays, **{name: t.numpy() for name, t in module.state_dict().items()}})
+        return self.restore(
+            {**senses.arrays, **{name: t.numpy() for name, t in module.state_dict().items()}}
+        )
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler.of(self.spec, learned)
         with torch.random.fork_rng(devices=[]):
             module = self.module(senses)
-        state = {name: torch.from_numpy(np.array(learned[name], np.float32)) for name in module.state_dict()}
+        state = {
+            name: torch.from_numpy(np.array(learned[name], np.float32))
+            for name in module.state_dict()
+        }
         try:
             module.load_state_dict(state)
         except RuntimeError as error:
@@ -109,7 +120,9 @@ def train_on_episodes(
     kept = episodes // FRESH
     trained, fresh = order[kept:], order[:kept] if kept else order
     optimiser = torch.optim.Adam(module.parameters(), 1e-3)
-    plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(optimiser, factor=SLOWER, patience=PATIENCE)
+    plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(
+        optimiser, factor=SLOWER, patience=PATIENCE
+    )
     least, best = math.inf, copy.deepcopy(module.state_dict())
     for epoch in range(EPOCHS):
         progress(epoch, EPOCHS)
@@ -132,7 +145,9 @@ def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.opt
     return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
 
 
-def descend(loss: Tensor, optimiser: torch.optim.Optimizer, schedule: Any = None, clip: float = 1.0) -> None:
+def descend(
+    loss: Tensor, optimiser: torch.optim.Optimizer, schedule: Any = None, clip: float = 1.0
+) -> None:
     """Update once, with the gradient cut off at ``clip``."""
     optimiser.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
@@ -161,7 +176,9 @@ class _GRUModule(nn.Module):
         self.cell = nn.GRU(senses + commands, hidden, batch_first=True)
         self.out = nn.Linear(hidden, 2 * changes)
 
-    def forward(self, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, inputs: Tensor, hidden: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         states, _ = self.cell(inputs, hidden)
         mean, log_variance = self.out(states).chunk(2, dim=-1)
         return mean, log_variance.clamp(-12.0, 8.0), states
@@ -178,24 +195,39 @@ class GRU(TorchModel):
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
 
     def module(self, senses: StreamScaler) -> nn.Module:
-        return _GRUModule(senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size)
+        return _GRUModule(
+            senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size
+        )
 
     def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+        self,
+        module: nn.Module,
+        readings: Sequence[ScaledRows],
+        rng: np.random.Generator,
+        progress: Progress,
     ) -> None:
-        inputs = [np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings]
+        inputs = [
+            np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings
+        ]
 
         def loss(chosen: NDArray[np.intp], training: bool) -> Tensor:
             x, real = padded([inputs[i] for i in chosen])
             mean, log_variance, _ = module(x)
-            off = (padded([readings[i].changes for i in chosen])[0] - mean) * torch.exp(-0.5 * log_variance)
-            huber = nn.functional.huber_loss(off, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR)
+            off = (padded([readings[i].changes for i in chosen])[0] - mean) * torch.exp(
+                -0.5 * log_variance
+            )
+            huber = nn.functional.huber_loss(
+                off, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR
+            )
             return ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
 
         train_on_episodes(module, loss, len(readings), rng, progress)
 
     def start(self, batch: int) -> _GRUState:
-        hidden, rows = np.zeros((batch, self.hidden_size), np.float32), np.zeros((batch, self.spec.size))
+        hidden, rows = (
+            np.zeros((batch, self.hidden_size), np.float32),
+            np.zeros((batch, self.spec.size)),
+        )
         last = self.senses_.read(rows, rows, rows).senses
         return _GRUState(hidden, last, super().start(batch))
 
@@ -231,7 +263,11 @@ class LogpZO(TorchModel):
         return nn.Sequential(*layers, nn.Linear(self.width, size))
 
     def train(
-        self, module: nn.Module, readings: Sequence[ScaledRows], rng: np.random.Generator, progress: Progress
+        self,
+        module: nn.Module,
+        readings: Sequence[ScaledRows],
+        rng: np.random.Generator,
+        progress: Progress,
     ) -> None:
         optimiser, schedule = adam(module, self.updates)
         rows = np.concatenate([_features(r) for r in readings])
@@ -242,7 +278,9 @@ class LogpZO(TorchModel):
             flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
             descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
 
-    def predict(self, state: RowHistory, rows: NDArray[np.float64]) -> tuple[RowHistory, ModelOutput]:
+    def predict(
+        self, state: RowHistory, rows: NDArray[np.float64]
+    ) -> tuple[RowHistory, ModelOutput]:
         state, reading, _ = read_next(self.senses_, state, rows)
         x = torch.as_tensor(_features(reading))  # (B, N), which the flow makes z
         for stage in range(STAGES):

@@ -44,7 +44,10 @@ LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)  # what leads, lesson by lesson of a
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
 NOISE = 0.02, 0.2  # range of s, up to about the exploration of a half-trained agent [action units]
-SPEED, WEIGHT = (0.5, 1.5), (0.7, 1.4)  # speed of the expert, relative to its usual one; factor of an object's mass
+SPEED, WEIGHT = (
+    (0.5, 1.5),
+    (0.7, 1.4),
+)  # speed of the expert, relative to its usual one; factor of an object's mass
 PAUSE, PAUSED = 0.01, (5, 60)  # probability per step that the arm stops, and for how many steps
 DRIFT, DRIFTED, DRIFTING = 0.015, (5, 60), (0.05, 1.0)
 """Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
@@ -55,10 +58,16 @@ CHANGED, LIMITS = 0.05, (0.05, 1.0)
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
-AROUND = (-0.25, -0.4, -0.12), (0.25, 0.4, 0.25)  # range of places, relative to where the hand begins [m]
+AROUND = (
+    (-0.25, -0.4, -0.12),
+    (0.25, 0.4, 0.25),
+)  # range of places, relative to where the hand begins [m]
 TURNED = 0.2, 0.2, 0.8  # greatest turn of the hand about the axes of the world [rad]
 PACE = 0.45  # speed of the hand [action units]
-ARRIVED, GIVEN_UP = 0.02, 60  # the hand goes on to the next place this near to one [m], or after so many steps
+ARRIVED, GIVEN_UP = (
+    0.02,
+    60,
+)  # the hand goes on to the next place this near to one [m], or after so many steps
 
 
 class Lesson(NamedTuple):
@@ -75,7 +84,9 @@ class Lesson(NamedTuple):
     weight: float = 1.0  # of the task's object, relative to what is usual
     drift: float = 0.0  # probability per step that the arm drifts for a while
     press: float = 0.0  # probability per step that it presses what it holds for a while
-    limit: float = 0.0  # probability per step that the limit of the hand's speed changes; 0 for no limit
+    limit: float = (
+        0.0  # probability per step that the limit of the hand's speed changes; 0 for no limit
+    )
 
     @property
     def trial(self) -> Trial:
@@ -88,7 +99,9 @@ class Lesson(NamedTuple):
         return self.trial.label.path
 
 
-def curriculum(tasks: Sequence[str], episodes: int, seed: int, reaching: bool = False) -> list[Lesson]:
+def curriculum(
+    tasks: Sequence[str], episodes: int, seed: int, reaching: bool = False
+) -> list[Lesson]:
     """Return ``episodes`` of each task; all follow from ``seed``, and fewer are the first of more.
 
     One lesson more for each three is at a limited speed. ``reaching``: the hand reaches for places where noise alone
@@ -99,9 +112,15 @@ def curriculum(tasks: Sequence[str], episodes: int, seed: int, reaching: bool = 
     leading = [REACHING if reaching and lead == ALONE else lead for lead in LEADING]
     for task in tasks:
         for number, drawn in enumerate(role_seeds(seed, task, "babble", episodes)):
-            lessons.append(_lesson(task, number, drawn, LED if held_out(number) else leading[number % len(leading)]))
+            lessons.append(
+                _lesson(
+                    task, number, drawn, LED if held_out(number) else leading[number % len(leading)]
+                )
+            )
         for number, drawn in zip(beside, role_seeds(seed, task, "limit", len(beside)), strict=True):
-            lessons.append(_lesson(task, number, drawn, leading[number % len(leading)])._replace(limit=CHANGED))
+            lessons.append(
+                _lesson(task, number, drawn, leading[number % len(leading)])._replace(limit=CHANGED)
+            )
     for task in tasks if reaching else ():
         for number, drawn in zip(beside, role_seeds(seed, task, "press", len(beside)), strict=True):
             driven = _lesson(task, number, drawn, DRIVEN)
@@ -133,12 +152,16 @@ class Babbler(StatefulPolicy):
         if lesson.guide == REACHING:
             self._guide = Reaching(env, lesson.seed, lesson.speed)
         elif lesson.guide:
-            self._guide = make_policy(lesson.guide, env, seed=lesson.seed, style=Style(speed=lesson.speed))
+            self._guide = make_policy(
+                lesson.guide, env, seed=lesson.seed, style=Style(speed=lesson.speed)
+            )
         self._arm: Any = env.unwrapped
         self._lesson, self._rng = lesson, np.random.default_rng([lesson.seed, 1])
         self._limits = np.random.default_rng([lesson.seed, 4])
         self._noise = self._rng.standard_normal(env.action_space.shape or ())
-        self._grip = np.isin(np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ())))
+        self._grip = np.isin(
+            np.arange(len(self._noise)), list(getattr(env.unwrapped, "gripper_actions", ()))
+        )
         self._noisy_grip = bool(self._rng.random() < 0.5)
         self._left, self._course, self._grasp, self._held = 0, np.zeros_like(self._noise), 1.0, 0
 
@@ -151,7 +174,9 @@ class Babbler(StatefulPolicy):
         speed = float(np.exp(self._limits.uniform(*np.log(LIMITS))))
         self._arm.contact_limits = ContactLimits(hand_speed=speed, stays=False)
 
-    def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[NDArray[np.float32], Any]:
+    def act(
+        self, observation: Any, state: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Any]:
         """Return the next action (A,)."""
         lesson, rng = self._lesson, self._rng
         if self._limits.random() < lesson.limit:
@@ -214,13 +239,19 @@ class Reaching(StatefulPolicy):
     """A policy of one arm under OSC_POSE that reaches for one place after another."""
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float = 1.0) -> None:
-        self._read, self._rng, self._speed = ObservationReader(env), np.random.default_rng([seed, 2]), PACE * speed
+        self._read, self._rng, self._speed = (
+            ObservationReader(env),
+            np.random.default_rng([seed, 2]),
+            PACE * speed,
+        )
 
     def begin(self, observation: Any) -> Aim:
         hand = self._read.hand(observation)
         return self._next(hand.at, hand.turned)
 
-    def act(self, observation: Any, state: Aim, deterministic: bool) -> tuple[NDArray[np.float32], Aim]:
+    def act(
+        self, observation: Any, state: Aim, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Aim]:
         """Return the next action (7,)."""
         hand = self._read.hand(observation)
         if not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
@@ -231,7 +262,9 @@ class Reaching(StatefulPolicy):
     def _next(self, began: Vector, upright: Vector) -> Aim:
         place = began + self._rng.uniform(*AROUND)
         turn = Rotation.from_rotvec(self._rng.uniform(-1.0, 1.0, 3) * TURNED).as_matrix()
-        return Aim(began, upright, place, turn @ upright, float(self._rng.choice([OPEN, CLOSE])), GIVEN_UP)
+        return Aim(
+            began, upright, place, turn @ upright, float(self._rng.choice([OPEN, CLOSE])), GIVEN_UP
+        )
 
 
 def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
@@ -239,8 +272,11 @@ def record_lesson(lesson: Lesson, config: RolloutConfig, folder: Path) -> Path:
     trial, config = lesson.trial, replace(config, policy=partial(Babbler, lesson=lesson))
     base: Any = environment(trial.env_id, config.settings).unwrapped
     if lesson.weight != 1.0 and movable(base):
-        trial = replace(trial, faults=(ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),))
+        trial = replace(
+            trial, faults=(ObjectMass(factor=lesson.weight, onset=0, seed=lesson.seed),)
+        )
     about = {"skill": lesson.task, "lesson": lesson._asdict()}
     return save_episode(
-        folder / lesson.path, replace(record_stream(trial, config), faults=np.zeros(0, np.bool_), info=about)
+        folder / lesson.path,
+        replace(record_stream(trial, config), faults=np.zeros(0, np.bool_), info=about),
     )

@@ -50,7 +50,8 @@ class Exam(NamedTuple):
         scenes = seeds[:SCENES]
         faults = [(kind, severity) for kind in kinds for severity in SEVERITIES]
         return nominal_trials(task.id, "nominal", seeds) + [
-            faulty_trial(task.id, *fault, scenes[n % len(scenes)], task.horizon) for n, fault in enumerate(faults)
+            faulty_trial(task.id, *fault, scenes[n % len(scenes)], task.horizon)
+            for n, fault in enumerate(faults)
         ]
 
 
@@ -71,13 +72,20 @@ class Marks(NamedTuple):
     name: str
     solved: list[ScoredEpisode]  # healthy
     failed: list[ScoredEpisode]
-    metrics: DetectionMetrics  # on visible faults, but for scenes in which the policy crashes by itself
+    metrics: (
+        DetectionMetrics  # on visible faults, but for scenes in which the policy crashes by itself
+    )
 
     def at(self, threshold: float) -> Marks:
         """Return the result at another threshold."""
         parts = self.solved, self.failed, self.metrics.faulty
         solved, failed, faulty = ([t.at(threshold) for t in traces] for traces in parts)
-        return Marks(self.name, solved, failed, DetectionMetrics(self.name, faulty, solved, self.metrics.window_s))
+        return Marks(
+            self.name,
+            solved,
+            failed,
+            DetectionMetrics(self.name, faulty, solved, self.metrics.window_s),
+        )
 
     def adapted(self, per_hour: float) -> Marks:
         """Return the result under a threshold that follows the policy; faults are judged by its last value."""
@@ -103,7 +111,9 @@ def usual_force(recordings: Sequence[Episode]) -> float:
     return float(np.median(known)) if known else np.inf
 
 
-def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], window: float, usual: float) -> Marks:
+def examine(
+    memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], window: float, usual: float
+) -> Marks:
     """Score the nominal and faulty recordings of an exam, detected within a ``window`` [s] of the onset.
 
     ``usual`` is the usual greatest force of the task's expert [N]; that of an agent that often crashes is no reference.
@@ -111,9 +121,15 @@ def examine(memory: CalibratedMonitor, name: str, recordings: Sequence[Episode],
     traces = traces_of(name, memory, recordings, memory.threshold)
     crashed = {e.labelled.seed for e in recordings if CRASH * usual < usual_force([e]) < np.inf}
     twins = [r for r in recordings if r.labelled.role == "nominal"]
-    faulty = [r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in crashed]
+    faulty = [
+        r for r in recordings if r.labelled.role == "faulty" and r.labelled.seed not in crashed
+    ]
     seen = visible_kinds(detectability_of(twins, faulty, window))
-    visible = [t for t in traces if t.onset is not None and t.seed not in crashed and seen[t.kind, t.severity]]
+    visible = [
+        t
+        for t in traces
+        if t.onset is not None and t.seed not in crashed and seen[t.kind, t.severity]
+    ]
     nominal = [t for t in traces if t.kind == NOMINAL]
     solved, failed = ([t for t in nominal if t.outcome.success is want] for want in (True, False))
     return Marks(name, solved, failed, DetectionMetrics(name, visible, solved, window))
@@ -127,7 +143,9 @@ COLUMNS: dict[str, Callable[[Marks], str]] = {
     "stops/h": lambda m: f"{hourly_alarms(m.solved, STOP).value:.0f}" if m.solved else "",
     "failed, alarm": lambda m: count(false_alarms(m.failed)) if m.failed else "",
     "AUROC": lambda m: f"{m.metrics.auroc:.3f}" if m.metrics.faulty else "",
-    "found": lambda m: f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else "",
+    "found": lambda m: (
+        f"{percent(m.metrics.detected)} of {m.metrics.detected.n}" if m.metrics.faulty else ""
+    ),
     "median [ms]": lambda m: milliseconds(m.metrics.delays.median_ms) if m.metrics.faulty else "",
 }
 
@@ -155,33 +173,49 @@ def together(marks: Sequence[Marks]) -> tuple[list[ScoredEpisode], list[ScoredEp
     return [t for m in marks for t in m.solved], [t for m in marks for t in m.metrics.faulty]
 
 
-def promises_table(marks: Sequence[Marks], thresholds: Mapping[float, float], window: float) -> Table:
+def promises_table(
+    marks: Sequence[Marks], thresholds: Mapping[float, float], window: float
+) -> Table:
     """Return a row for each promise: its threshold, alarms that came, and faults found within ``window`` [s]."""
     solved, faults = together(marks)
     severities = {f"{' and '.join(SEVERITIES)} found": SEVERITIES, "mild found": ("mild",)}
-    shown = {n: which for n, which in severities.items() if any(t.severity in which for t in faults)}
+    shown = {
+        n: which for n, which in severities.items() if any(t.severity in which for t in faults)
+    }
     rows = []
     for promised, threshold in thresholds.items():
         healthy, faulty = together([m.at(threshold) for m in marks])
         excused = (f"{hourly_alarms(healthy, event).value:.1f}" for event in (KNOCK, STOP))
         own = ([t for t in faulty if t.severity in which] for which in shown.values())
-        found = (f"{percent(DetectionMetrics('', ts, [], window).detected)} of {len(ts)}" for ts in own)
+        found = (
+            f"{percent(DetectionMetrics('', ts, [], window).detected)} of {len(ts)}" for ts in own
+        )
         rows.append(
-            (f"{promised:g}", f"{threshold:.3g}", kept_rate(hourly_alarms(healthy), promised), *excused, *found)
+            (
+                f"{promised:g}",
+                f"{threshold:.3g}",
+                kept_rate(hourly_alarms(healthy), promised),
+                *excused,
+                *found,
+            )
         )
     caption = (
         f"By promise: alarms per hour in the {hourly_alarms(solved).hours:.2f} healthy hours of these exams, with 95 % "
         "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the promise. Found: "
         f"faults that an ideal observer could see, within {window:g} s."
     )
-    return Table(caption, ("promised", "threshold", "false alarms", "knocks", "stops", *shown), rows)
+    return Table(
+        caption, ("promised", "threshold", "false alarms", "knocks", "stops", *shown), rows
+    )
 
 
 def summary(marks: Sequence[Marks]) -> str:
     """Return one line: alarms, and faults found, in all exams together."""
     solved, _ = together(marks)
     fault, knock, stop = (hourly_alarms(solved, event) for event in ("", KNOCK, STOP))
-    found = Share(sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks))
+    found = Share(
+        sum(m.metrics.detected.k for m in marks), sum(m.metrics.detected.n for m in marks)
+    )
     return (
         f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops an hour in {fault.hours:.2f} healthy "
         f"hours, {count(found)} faults found."

@@ -36,7 +36,9 @@ class Gentle(NamedTuple):
     torque: float  # external, on a joint [N m]; it shows what cancels in the force, such as an arm that hits itself
 
 
-KNOWN = Gentle(30.0, 15.0)  # learned in any case: an arm whose experts touch little meets contact all the same
+KNOWN = Gentle(
+    30.0, 15.0
+)  # learned in any case: an arm whose experts touch little meets contact all the same
 
 
 def held_out(number: int) -> bool:
@@ -48,7 +50,9 @@ class Lessons(NamedTuple):
     """Healthy recordings of babbling."""
 
     fit: list[Episode]  # to learn from
-    calibration: list[Episode]  # held-out lessons in which the expert alone solved its task, without crashes
+    calibration: list[
+        Episode
+    ]  # held-out lessons in which the expert alone solved its task, without crashes
     whole: list[Episode]  # the same with crashes
 
 
@@ -61,7 +65,9 @@ def healthy(recordings: Sequence[Episode]) -> Lessons:
     peaks: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
     for episode in recordings:
         if _undisturbed(episode):
-            peaks[episode.labelled.task].append((peak_force(episode), float(peak_torques(episode).max())))
+            peaks[episode.labelled.task].append(
+                (peak_force(episode), float(peak_torques(episode).max()))
+            )
     missing = {e.labelled.task for e in recordings} - set(peaks)
     if missing:
         raise ValueError(
@@ -112,7 +118,9 @@ def harmless(episodes: Sequence[Episode]) -> list[Episode]:
 
 def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
     """Return the stretches of an episode in which nothing presses harder, those of at least ``SHORTEST`` steps."""
-    forces = episode.contact_force if len(episode.contact_force) else np.zeros(len(episode), np.float32)
+    forces = (
+        episode.contact_force if len(episode.contact_force) else np.zeros(len(episode), np.float32)
+    )
     rows = len(episode) // len(forces)  # of the stream, in a step
     torques = peak_torques(episode).reshape(-1, rows).max(axis=1)
     hit = ~((forces <= limit.force) & (torques <= limit.torque))
@@ -128,11 +136,15 @@ def gentle_pieces(episode: Episode, limit: Gentle) -> list[Episode]:
 
 def learn_body(lessons: Lessons, spec: StreamSpec, seed: int, progress: Progress) -> NeuralASM:
     """Return a memory fitted on healthy lessons, without a threshold."""
-    memory = NeuralASM(spec, hidden_size=HIDDEN, epochs=PASSES, habituates=False, excuses=True, seed=seed)
+    memory = NeuralASM(
+        spec, hidden_size=HIDDEN, epochs=PASSES, habituates=False, excuses=True, seed=seed
+    )
     return memory.fit(lessons.fit, progress).rounded()
 
 
-def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float) -> NeuralASM:
+def calibrate_body(
+    memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode], per_hour: float
+) -> NeuralASM:
     """Set ceilings and threshold for so many false alarms per hour of healthy episodes, crashes included.
 
     By the hours of each task, where all have the hours that it takes. The forces of healthy motion are those without
@@ -142,8 +154,14 @@ def calibrate_body(memory: NeuralASM, lessons: Lessons, hours: Sequence[Episode]
     by_task: defaultdict[str, list[Episode]] = defaultdict(list)
     for episode in whole:
         by_task[episode.labelled.task].append(episode)
-    tasks = [episode.labelled.task for episode in whole] if all(map(asked.possible, by_task.values())) else []
+    tasks = (
+        [episode.labelled.task for episode in whole]
+        if all(map(asked.possible, by_task.values()))
+        else []
+    )
     memory.calibrate(whole, false_alarms_per_hour=per_hour, each=tasks)
-    memory.healthy_ = healthy_forces([episode.stream for episode in lessons.calibration], memory.spec)
+    memory.healthy_ = healthy_forces(
+        [episode.stream for episode in lessons.calibration], memory.spec
+    )
     memory.pace_ = HandSpeedMap.by_task(hours or lessons.calibration, memory.spec)
     return memory
