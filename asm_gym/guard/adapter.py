@@ -10,26 +10,25 @@ All else is the guard's: it judges the rows, and decides what is commanded.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.guard.report import RowReport
+from asm_gym.guard.robot_facts import NOTHING
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SensedRows:
+class SensedRows(NamedTuple):
     """One newest row of each of n robots, and what else is known of them."""
 
     rows: NDArray[np.float32]
     """(n, D) rows of the stream; NaN where a number is missing."""
     load: NDArray[np.float64] | None = None
     """(n, 2 + F) what the arms felt in physics substeps; None where nothing feels."""
-    failures: Mapping[int, str] = field(default_factory=dict)
+    failures: Mapping[int, str] = NOTHING
     """What failed while the rows were sensed, by robot."""
-    infos: Mapping[str, Any] = field(default_factory=dict)
+    infos: Mapping[str, Any] = {}  # noqa: RUF012  (never written to)
     """What the environment said; empty where nothing."""
 
 

@@ -28,7 +28,7 @@ class FittedMonitor:
 
     monitor: Monitor
     threshold: float
-    parts: tuple[Any, ...]  # what ``fit`` replaces, compared by identity
+    parts: tuple[Any, Any, Any]  # the monitor, and what ``fit`` replaces, compared by identity
 
     @classmethod
     def of(cls, monitor: Monitor, spec: StreamSpec) -> Self:
@@ -38,21 +38,19 @@ class FittedMonitor:
     @property
     def stale(self) -> bool:
         """Whether it was fitted since."""
-        return not _same(_parts(self.monitor), self.parts)
+        parts = _parts(self.monitor)
+        return parts[1] is not self.parts[1] or parts[2] is not self.parts[2]
 
     def differs(self, other: FittedMonitor) -> bool:
         """Return whether it is another monitor, or was fitted or calibrated in between."""
-        return self.threshold != other.threshold or not _same(self.parts, other.parts)
+        same = all(a is b for a, b in zip(self.parts, other.parts, strict=True))
+        return self.threshold != other.threshold or not same
 
 
-def _parts(monitor: Monitor) -> tuple[Any, ...]:
+def _parts(monitor: Monitor) -> tuple[Any, Any, Any]:
     if isinstance(monitor, NeuralASM):
         return monitor, monitor.model.completion_, monitor.model.senses_
-    return monitor, getattr(monitor, "diagnosis_", None)
-
-
-def _same(parts: tuple[Any, ...], others: tuple[Any, ...]) -> bool:
-    return len(parts) == len(others) and all(a is b for a, b in zip(parts, others, strict=True))
+    return monitor, getattr(monitor, "diagnosis_", None), None
 
 
 def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -> float:

@@ -40,7 +40,7 @@ from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, motion_arrays, 
 from asm_gym.guard.report import KNOCKED, Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from, unexplained
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
-from asm_gym.guard.robot_table import POLICY, REFLEX, Mask, RobotTable, cleared
+from asm_gym.guard.robot_table import POLICY, REFLEX, Mask, RobotTable, cleared, copied
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator, ValidatedRows
 from asm_gym.monitors import ExpectsActions, Monitor, Surprise
@@ -161,7 +161,11 @@ class Guard:
         self._no_load = no_load(facts.count, facts.felt_size)
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._everyone = ~self._nobody
-        self._marked = False  # records say of a row that it failed, was refused, or must be decided
+        self._all_active = True  # what the records say
+        self._ends_step = False
+        self._marked = (
+            False  # there is something to say of the row: it failed, or is to be decided about
+        )
         self._unreported: Mapping[int, str] = (
             NOTHING  # what failed when the command was chosen, by robot
         )
@@ -296,10 +300,11 @@ class Guard:
         for robot, failure in row.failures.items():
             self._warn(robot, failure, "which counts as an alarm")
         if to_decide:
+            self._marked = True
             self._decide(row)
-        self._follow(row, bool(to_decide))
+        self._follow(row)
         report = self._report(row)
-        self._clear_marks(bool(to_decide))
+        self._clear_marks()
         return report
 
     def _take_up(
@@ -310,8 +315,12 @@ class Guard:
         rows = np.array(sensed.rows, np.float32)  # a copy, in which stale senses are left out
         self.table.rows = rows
         self.table.infos = sensed.infos
-        records["active"] = True if active is None else active
-        records["ends_step"] = ends_step
+        if active is not None or not self._all_active:
+            records["active"] = True if active is None else active
+            self._all_active = bool(records["active"].all())
+        if ends_step != self._ends_step:
+            records["ends_step"] = ends_step
+            self._ends_step = ends_step
         row = Row(
             rows=rows,
             load=self._no_load if sensed.load is None else sensed.load,
@@ -331,10 +340,10 @@ class Guard:
         """Take up what failed before the rows are looked at: choosing the command, sensing, or a monitor refitted."""
         records = self.table.records
         refused = records["refused"] & ~records["out_of_range"]
-        row.unreported = {
-            robot: why for robot, why in self._unreported.items() if not refused[robot]
-        }
-        self._unreported, choosing = NOTHING, self._unreported
+        choosing = self._unreported
+        row.unreported = {robot: why for robot, why in choosing.items() if not refused[robot]}
+        self._unreported = NOTHING
+        self._marked = True
         stale = STALE if self.fitted.stale else ""
         for robot in np.flatnonzero(records["active"]).tolist():
             commanding = choosing.get(robot, "") if refused[robot] else ""
@@ -375,6 +384,8 @@ class Guard:
         row.rows = validated.rows
         row.lost = validated.lost
         row.contradictions = validated.contradictions
+        if row.lost or self._validator.repairs:
+            self._marked = True
         for robot, failure in validated.failures.items():
             self._fail(row, robot, failure)
         for robot, failure in self._observer.observe(
@@ -494,13 +505,13 @@ class Guard:
 
     # ------------------------------------------------------------------ report
 
-    def _follow(self, row: Row, decided: bool) -> None:
+    def _follow(self, row: Row) -> None:
         """Let what acts next take account of the row: holding actions, expected actions, contact limits."""
         if row.ends_step:
             self._commander.holding.sense(row.rows)
         if self._observer.expected is not None:
             self._commander.expect(self._observer.expected)
-        if decided or not self._limits.steady:
+        if self._marked or not self._limits.steady:
             records = self.table.records
             policy = records["active"] & ~records["overridden"]
             pressed = policy & records["presses"]
@@ -508,18 +519,22 @@ class Guard:
 
     def _report(self, row: Row) -> RowReport:
         """Return what became of the row; there is nothing to say of robots whose rows do not count."""
-        robots = self.table.records.copy()
-        if not all(robots["active"].tolist()):
-            robots[~robots["active"]] = cleared(robots[~robots["active"]])
+        robots = copied(self.table.records)
+        if not self._all_active:
+            silent = ~robots["active"]
+            robots = robots.copy()
+            robots[silent] = cleared(robots[silent])
+        if not self._marked:  # nothing but healthy rows
+            return RowReport(robots, row.attribution)
         repairs = {robot: repair.names for robot, repair in self._validator.repairs.items()}
         failures = dict(row.unreported)
         for robot, failure in row.failures.items():
             failures[robot] = joined(failures.get(robot, ""), failure)
         return RowReport(robots, row.attribution, row.outcomes, failures, repairs, row.lost)
 
-    def _clear_marks(self, decided: bool) -> None:
+    def _clear_marks(self) -> None:
         """Clear what records say of one row alone."""
-        if decided or self._marked:
+        if self._marked:
             for name in ("failed", "refused", "out_of_range", "must_decide"):
                 self.table.records[name] = False
             self._marked = False

