@@ -28,7 +28,7 @@ class SensedRows(NamedTuple):
     """(n, 2 + F) what the arms felt in physics substeps; None where nothing feels."""
     failures: Mapping[int, str] = NOTHING
     """What failed while the rows were sensed, by robot."""
-    infos: Mapping[str, Any] = {}  # noqa: RUF012  (never written to)
+    infos: Mapping[str, Any] = {}
     """What the environment said; empty where nothing."""
 
 
