@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import FeltMotion, Motion
@@ -226,14 +226,21 @@ def clip_actions(
     more = False
     for n in range(len(robots)):
         robot = robots[n]
-        finite = True
-        absurd = False
-        for i in range(proposed.shape[1]):
-            action = proposed[n, i]
-            executed[n, i] = min(max(action, bounds[0, i]), bounds[1, i])
-            finite = finite and np.isfinite(action)
-            absurd = absurd or executed[n, i] < likely[0, i] or executed[n, i] > likely[1, i]
-        robot.out_of_range = finite and absurd and robot.state != REFLEX
-        robot.refused = (not finite or absurd) and robot.state != REFLEX
-        more = more or not finite or robot.refused or robot.state == REFLEX or idle[n]
+        usable = clip_action(robot, proposed[n], bounds, likely, executed[n])
+        more = more or not usable or robot.state == REFLEX or idle[n]
     return more
+
+
+@inner
+def clip_action(robot: Any, proposed: Any, bounds: Any, likely: Any, executed: Any) -> bool:
+    """Write one action (A,) within its bounds, and mark it; return whether it can be executed."""
+    finite = True
+    absurd = False
+    for i in range(len(proposed)):
+        executed[i] = min(max(proposed[i], bounds[0, i]), bounds[1, i])
+        finite = finite and np.isfinite(proposed[i])
+        absurd = absurd or executed[i] < likely[0, i] or executed[i] > likely[1, i]
+    acts = robot.state != REFLEX
+    robot.out_of_range = acts and finite and absurd
+    robot.refused = acts and (absurd or not finite)
+    return finite and not absurd

@@ -32,7 +32,7 @@ from asm_gym.guard.contact_state import contact_columns, measure_contacts, no_lo
 from asm_gym.guard.diagnostician import Diagnostician
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.fitted_monitor import STALE, FittedMonitor, diagnosis_of
-from asm_gym.guard.judged_rows import STOPPED, apply_alarm_rule, judge_rows
+from asm_gym.guard.judged_rows import STOPPED, GuardArrays, apply_alarm_rule, judge_rows
 from asm_gym.guard.observer import Observer, joined, unjudged
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.preview import Preview, preview_chunk
@@ -144,20 +144,18 @@ class Guard:
         limits = limits_of(options.contact_limits, monitor, facts.task)
         self._limits = EpisodeLimits(facts, limits, acts=name != "monitor" and facts.rest.size > 0)
 
-        self._contact_columns = contact_columns(facts.felt_channels, spec)
-        self._motion_arrays = motion_arrays(motion, facts)
-        self._judged = np.zeros(facts.count, JUDGED)
-        self._bound = bind(
-            self.table.records,
-            self._validator.recent.arrays,
-            self._validator.hands.geometry,
-            self._validator.hands.state,
-            self._contact_columns,
-            self._motion_arrays,
-            self._judged,
-            spec.dt,
-            float(self._arbiter.most_impulse),
+        self._arrays = GuardArrays(
+            robots=self.table.records,
+            recent=self._validator.recent.arrays,
+            hand_geometry=self._validator.hands.geometry,
+            hand_state=self._validator.hands.state,
+            contact_columns=contact_columns(facts.felt_channels, spec),
+            motion=motion_arrays(motion, facts),
+            judged=np.zeros(facts.count, JUDGED),
+            dt=spec.dt,
+            most_impulse=float(self._arbiter.most_impulse),
         )
+        self._bound = bind(self._arrays)
         self._no_load = no_load(facts.count, facts.felt_size)
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._everyone = ~self._nobody
@@ -389,30 +387,26 @@ class Guard:
         for robot, failure in validated.failures.items():
             self._fail(row, robot, failure)
         for robot, failure in self._observer.observe(
-            row.rows, self._judged, row.attribution
+            row.rows, self._arrays.judged, row.attribution
         ).items():
             self._fail(row, robot, failure)
         self._leave_out_repaired(row)
+        arrays = self._arrays
         measure_contacts(
-            records,
-            row.rows,
-            row.load,
-            self._contact_columns,
-            self._spec.dt,
-            float(self._arbiter.most_impulse),
+            records, row.rows, row.load, arrays.contact_columns, arrays.dt, arrays.most_impulse
         )
         if self.terms.of_user:
             records["must_decide"] |= self.terms.any_of_user(self.table)
         records["must_decide"][list(self._validator.repairs)] = True
-        to_decide = apply_alarm_rule(records, self._judged, row.attribution)
-        record_motion(records, row.rows, row.executed, self._motion_arrays)
+        to_decide = apply_alarm_rule(records, self._arrays.judged, row.attribution)
+        record_motion(records, row.rows, row.executed, self._arrays.motion)
         return int(to_decide)
 
     def _leave_out_repaired(self, row: Row) -> None:
         """Leave out of the surprise what is completed, or changes from what was."""
         for robot, repair in self._validator.repairs.items():
             own = slice(robot, robot + 1)
-            judged = self._judged[own]
+            judged = self._arrays.judged[own]
             surprise = Surprise(
                 judged["surprise"], row.attribution[own], raw=judged["raw_surprise"]
             )
@@ -427,7 +421,7 @@ class Guard:
 
     def _decide(self, row: Row) -> None:
         """Decide about the robots that are marked."""
-        for robot, failure in unjudged(self._judged).items():
+        for robot, failure in unjudged(self._arrays.judged).items():
             self._fail(row, robot, failure)
             self._warn(robot, failure, "which counts as an alarm")
         row.terms = self.terms.masks(self.table)

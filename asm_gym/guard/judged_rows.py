@@ -10,15 +10,17 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK, benign_event, over_threshold
 from asm_gym.guard.arbiter import MOSTLY_AFTER
-from asm_gym.guard.contact_state import measure_contacts
-from asm_gym.guard.reflexes import record_motion
+from asm_gym.guard.contact_state import ContactColumns, measure_contacts
+from asm_gym.guard.recent_rows import RowArrays
+from asm_gym.guard.reflexes import MotionArrays, record_motion
 from asm_gym.guard.robot_table import POLICY, REFLEX
 from asm_gym.guard.row_validation import validate_rows
 from asm_gym.monitors.row_kernel import observe_rows
@@ -27,6 +29,20 @@ KNOCKED = EVENTS.index(KNOCK)
 STOPPED = (
     -1
 )  # in the place of how many robots there are to decide about: the rows are to be repaired first
+
+
+class GuardArrays(NamedTuple):
+    """What compiled code keeps of n robots, by the parts of the guard."""
+
+    robots: NDArray[Any]  # (n,) of ``ROBOT``
+    recent: RowArrays
+    hand_geometry: NDArray[Any]  # (n, arms) of ``HAND_GEOMETRY``
+    hand_state: NDArray[Any]  # (n, arms) of ``HAND_STATE``
+    contact_columns: ContactColumns
+    motion: MotionArrays
+    judged: NDArray[Any]  # (n,) of ``JUDGED``, written with each row
+    dt: float  # period of the rows [s]
+    most_impulse: float  # that an arm may press with in an episode [N s]
 
 
 @partial(compiled, calls=("memory", "detection", "monitors", "."))
@@ -46,15 +62,14 @@ def judge_rows(
     Returns:
         How many robots there are to decide about, or ``STOPPED``.
     """
-    robots, recent, hand_geometry, hand_state, columns, motion, judged, dt, most_impulse = (
-        guard.parts
-    )
-    if validate_rows(robots, rows, recent, hand_geometry, hand_state):
+    (arrays,) = guard.parts
+    robots = arrays.robots
+    if validate_rows(robots, rows, arrays.recent, arrays.hand_geometry, arrays.hand_state):
         return STOPPED
-    observe_rows(memory, rows.astype(np.float64), judged, attribution)
-    measure_contacts(robots, rows, load, columns, dt, most_impulse)
-    to_decide = apply_alarm_rule(robots, judged, attribution)
-    record_motion(robots, rows, executed, motion)
+    observe_rows(memory, rows.astype(np.float64), arrays.judged, attribution)
+    measure_contacts(robots, rows, load, arrays.contact_columns, arrays.dt, arrays.most_impulse)
+    to_decide = apply_alarm_rule(robots, arrays.judged, attribution)
+    record_motion(robots, rows, executed, arrays.motion)
     return to_decide
 
 

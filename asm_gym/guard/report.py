@@ -34,6 +34,11 @@ class Outcome:
     decision: Decision = field(default_factory=Decision)  # what it has led to
 
     @property
+    def transition(self) -> str:
+        """What has led to the state; empty for no change."""
+        return self.decision.transition
+
+    @property
     def reason(self) -> str:
         """The alarm term that gives the reason; empty where there is no alarm."""
         return self.terms[0] if self.terms else ""
@@ -94,16 +99,12 @@ class AsmInfo(TypedDict, total=False):
     state: str  # who acts next
     intervened: bool  # another than the policy acted, in some row
     gave_up: bool  # the episode ends
-    transition: (
-        str  # what has led to the state, or how the policy goes on in alarm; empty for no change
-    )
+    transition: str  # what led to the state, or how the policy goes on in alarm; or empty
     failure: str  # "policy: …", "stream: …", "monitor: …", "completion: …", "reflex: …", or empty
     cause: dict[str, Any]  # family, part, probability of the family, probabilities of all
     response: str  # what is done about it under "graded"
     case: str  # the row of the table of responses that says so
-    severity: dict[
-        str, Any
-    ]  # see ``severity_info``; None for what is not known, so that a report equals itself
+    severity: dict[str, Any]  # see ``severity_info``; None for what is not known
     executed_action: Any  # (A,) after the limit of the hand's speed; None before the first step
     slowed: float  # largest share that the speed limit took from a number of the action
     attribution: dict[str, float]  # what each number adds to the largest surprise
@@ -127,34 +128,32 @@ def asm_info(
         executed: (A,) the action that was done last; None before the first step.
         step: what the wrapper knows of the step: ``alarms``, ``slowed``, ``preview``, ``ceiling``, ``level``.
     """
-    records = [row.robots[robot] for row in rows]
     last = rows[-1]
-    surprises = np.array([record["surprise"] for record in records])
+    now = last.robots[robot]
+    surprises = np.array([row.robots["surprise"][robot] for row in rows])
     most_surprising = rows[int(surprises.argmax())]
     outcomes = [row.outcomes.get(robot, NO_OUTCOME) for row in rows]
-    explained = [outcome.response for outcome in outcomes if outcome.response.why]
-    response = explained[-1] if explained else NO_RESPONSE
-    transitions = [
-        outcome.decision.transition for outcome in outcomes if outcome.decision.transition
-    ]
-    terms = in_order_of_priority(name for outcome in outcomes for name in outcome.terms)
-    severity = severity_info(last.robots[robot])
+    responses = [outcome.response for outcome in outcomes if outcome.response.why]
+    response = _last(responses, NO_RESPONSE)
+    terms = in_order_of_priority([name for outcome in outcomes for name in outcome.terms])
     info: AsmInfo = {
         "surprise": float(surprises.max()),
-        "threshold": float(records[-1]["threshold"]),
-        "alarm": any(bool(record["alarm"]) for record in records),
+        "threshold": float(now["threshold"]),
+        "alarm": _any(rows, "alarm", robot),
         "reason": terms[0] if terms else "",
         "terms": terms,
-        "event": EVENTS[max(int(record["event"]) for record in records)],
-        "state": STATES[records[-1]["state"]],
-        "intervened": any(bool(record["overridden"]) for record in records),
-        "gave_up": any(bool(row.gave_up[robot]) for row in rows),
-        "transition": transitions[-1] if transitions else "",
+        "event": EVENTS[max(row.robots["event"][robot] for row in rows)],
+        "state": STATES[now["state"]],
+        "intervened": _any(rows, "overridden", robot),
+        "gave_up": bool(now["state"] == ENDED),
+        "transition": _last([outcome.transition for outcome in outcomes if outcome.transition], ""),
         "failure": joined(*(row.failures.get(robot, "") for row in rows)),
         "cause": deepcopy(response.cause),
         "response": response.name,
         "case": response.case,
-        "severity": {name: value if value == value else None for name, value in severity.items()},
+        "severity": {
+            name: None if value != value else value for name, value in severity_info(now).items()
+        },
         "executed_action": deepcopy(executed),
         "attribution": dict(
             zip(spec.labels, most_surprising.attribution[robot].tolist(), strict=True)
@@ -167,7 +166,17 @@ def asm_info(
     return info
 
 
-def in_order_of_priority(names: Any) -> tuple[str, ...]:
+def _any(rows: Sequence[RowReport], field: str, robot: int) -> bool:
+    """Return whether a field of a robot's record holds in any of the rows."""
+    return any(bool(row.robots[field][robot]) for row in rows)
+
+
+def _last(values: Sequence[Any], otherwise: Any) -> Any:
+    """Return the last of several values; ``otherwise`` without one."""
+    return values[-1] if values else otherwise
+
+
+def in_order_of_priority(names: Sequence[str]) -> tuple[str, ...]:
     """Return names of alarm terms, each once, the one that gives the reason first."""
 
     def priority(name: str) -> float:
