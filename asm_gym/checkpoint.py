@@ -79,9 +79,8 @@ def write_checkpoint(
     about = {"format": FORMAT, "version": VERSION, "kind": kind, **header, "arrays": declared}
     text = json.dumps(about, allow_nan=False)
     with written_whole(path) as file, zipfile.ZipFile(file, "w") as archive:
-        archive.writestr(
-            zipfile.ZipInfo(HEADER), text
-        )  # dated 1980: the same content has the same bytes at any time
+        # dated 1980: the same content has the same bytes at any time
+        archive.writestr(zipfile.ZipInfo(HEADER), text)
         for name, array in held.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 _npy.write_array(member, array, allow_pickle=False)

@@ -94,9 +94,8 @@ def must_compile(function: Any) -> bool:
     cache = _cache_of(function)
     if cache is None or function.signatures:
         return False
-    processor = (
-        cpu_target.target_context.codegen().magic_tuple()
-    )  # code that another one compiled is none
+    # code that another one compiled is none
+    processor = cpu_target.target_context.codegen().magic_tuple()
     return not any(processor in key for key in cache._load_index())
 
 

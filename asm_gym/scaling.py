@@ -209,7 +209,8 @@ def _least_change(
     Otherwise a channel that moves by one of its steps in a thousand rows would surprise at each step.
     """
     shown = [s[:MOST_SHOWN] for s in streams[: max(1, MOST_SHOWN // max(1, len(streams[0])))]]
+    # (N, D)
     rounded = [
         [resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown
-    ]  # (N, D)
+    ]
     return np.sqrt(2.0) * np.maximum(noise / 2, np.max(rounded, axis=0) / np.sqrt(12.0))

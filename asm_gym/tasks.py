@@ -83,9 +83,8 @@ TASKS = {
 }
 """Every task by its name."""
 
-OWN: Registry[EnvSpec] = Registry(
-    "task", "asm_gym.tasks:OWN"
-)  # tasks of ``register_task``, by name
+# tasks of ``register_task``, by name
+OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")
 
 
 def register_task(

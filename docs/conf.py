@@ -26,10 +26,11 @@ extensions = [
     "sphinx.ext.napoleon",
 ]
 exclude_patterns = ["_build"]
+# docstrings are plain text first, reStructuredText second
 suppress_warnings = [
     "ref.python",
     "docutils",
-]  # docstrings are plain text first, reStructuredText second
+]
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4

@@ -152,9 +152,8 @@ def learn(args: Args, console: Console) -> NeuralASM:
         files = make_missing(
             make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress
         )
-    lessons = healthy(
-        [load_episode(file) for file in sorted(files)]
-    )  # in whichever order tasks were named
+    # in whichever order tasks were named
+    lessons = healthy([load_episode(file) for file in sorted(files)])
     seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy(task)) for task in args.shown}
     trials = [
         trial

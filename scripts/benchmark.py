@@ -97,9 +97,8 @@ def measure_monitor(args: Args, console: Console) -> Table:
         StreamSpec((*senses, Channel("action", 7, group=MOTOR)), dt=0.05),
         np.random.default_rng(args.seed),
     )
-    learned = [
-        Episode.from_stream(rng.normal(size=(60, spec.size)), spec) for _ in range(60)
-    ]  # enough for all parts
+    # enough for all parts
+    learned = [Episode.from_stream(rng.normal(size=(60, spec.size)), spec) for _ in range(60)]
     memory = NeuralASM(spec, epochs=1).fit(learned)
     gru = make_monitor("gru+evidence", spec, hidden_size=256).fit(learned[:8])
 
@@ -171,9 +170,8 @@ def measure_safety(args: Args, console: Console) -> Table:
 
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
         bare, inner = _made(args.task, rate), _made(args.task, rate)
-        memory = body_memory(inner, StreamSource(inner).spec).with_threshold(
-            1e300
-        )  # no step is overridden
+        # no step is overridden
+        memory = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)
         guarded = NeuralASMSafety(inner, memory)
         compare(name, 1, bare, guarded)
         bare.close()

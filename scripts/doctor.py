@@ -84,9 +84,8 @@ def package(name: str) -> Check:
         and Version(version).major >= 26
         and Version(metadata.version("numpy")).major < 2
     ):
-        return Check(
-            name, f"{version}, but needs NumPy 2", "pip install 'pyarrow<26'"
-        )  # pip does not know
+        # pip does not know
+        return Check(name, f"{version}, but needs NumPy 2", "pip install 'pyarrow<26'")
     if wanted.contains(version, prereleases=True):
         return Check(name, version)
     return Check(

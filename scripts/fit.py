@@ -42,10 +42,11 @@ from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
 SILENCE_S = 2.0  # a live source without a row for this long has ended [s]
+# longest pieces of a live recording [s], and how many more there are than the promise needs
 PIECE_S, SPARE = (
     5.0,
     4,
-)  # longest pieces of a live recording [s], and how many more there are than the promise needs
+)
 ANY_EPISODE = 0.5  # a rate that one episode can promise: a promise by the hour needs hours
 CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are not learned from
 QUICK_EPISODES, QUICK_EPOCHS = 20, 5  # most episodes and passes with ``--quick``

@@ -27,9 +27,8 @@ from asm_gym.data.episode import load_episode
 from asm_gym.files import UNFINISHED
 from asm_gym.scripts import cli
 
-FULL = (
-    20 * 1024
-)  # no file can grow larger in a run whose disk is full [bytes]; less than an episode takes
+# no file can grow larger in a run whose disk is full [bytes]; less than an episode takes
+FULL = 20 * 1024
 
 EVALUATE = """evaluate --tasks Lift --monitors kalman --faults push --severities strong
     --fit-episodes 2 --calibration-episodes 5 --nominal-episodes 1 --faulty-episodes 1

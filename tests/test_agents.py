@@ -57,9 +57,8 @@ def test_an_environment_that_is_not_ours_is_learned_and_watched():
         env.reset()
     asm = NeuralASM(env.stream_spec, hidden_size=32, association_size=64, epochs=20)
     asm.fit(env.episodes[:30]).calibrate(env.episodes[30:50], false_alarm_rate=0.1)
-    guarded = NeuralASMSafety(
-        env, asm, on_alarm="hold", action_means="velocity"
-    )  # damped joints rest without torque
+    # damped joints rest without torque
+    guarded = NeuralASMSafety(env, asm, on_alarm="hold", action_means="velocity")
     data = env.unwrapped.data
     alarms = [any(i["cost"] for i in play(guarded, seed)) for seed in range(100, 110)]
     assert sum(alarms) <= 2

@@ -49,9 +49,8 @@ def test_precision_recovers_noise_that_depends_on_context(rows, monkeypatch):
     W_S, b_S = learn_precision(f, error.astype(np.float32), rng)
     learned = log_variance(f, W_S, b_S, unbounded(2))
     np.testing.assert_allclose(learned.mean(axis=0), truth.mean(axis=0), atol=0.1)
-    assert (
-        np.sqrt(np.mean((learned - truth) ** 2)) < 0.15
-    )  # against 1.15 and 0.8 for the best constant
+    # against 1.15 and 0.8 for the best constant
+    assert np.sqrt(np.mean((learned - truth) ** 2)) < 0.15
 
 
 def test_no_group_predicts_itself():
@@ -136,9 +135,8 @@ def test_doubt_is_learned_from_how_errors_grow_with_leverage():
     steady, slope, most = learn_doubt(errors.astype(np.float32), far)
     np.testing.assert_allclose(1 / steady - 1, truth, rtol=0.5, atol=0.02)
     np.testing.assert_allclose(steady + slope * np.median(far, axis=0), 1.0, rtol=1e-4)
-    np.testing.assert_array_equal(
-        most, far.max(axis=0)
-    )  # a fault that takes the body further is excused no more
+    # a fault that takes the body further is excused no more
+    np.testing.assert_array_equal(most, far.max(axis=0))
 
 
 def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():

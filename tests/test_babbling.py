@@ -321,9 +321,8 @@ def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path)
     assert len(written) == 2 * 24
     assert main(["--quick", "--workers", "1", "--out", str(folder)]) == 0
     assert {f: f.stat().st_mtime_ns for f in folder.rglob("*.npz")} == written
-    assert (
-        main(["--quick", "--workers", "1", "--robot", "Sawyer", "--out", str(folder)]) == 2
-    )  # it is another's
+    # it is another's
+    assert main(["--quick", "--workers", "1", "--robot", "Sawyer", "--out", str(folder)]) == 2
 
 
 def test_an_exam_pairs_every_fault_with_a_healthy_twin():
@@ -358,9 +357,8 @@ def test_alarms_are_counted_by_event_and_faults_at_any_threshold():
     marks = Marks("Lift", solved, [], DetectionMetrics("Lift", [trace(3.5, onset=1)], solved, 1.0))
     assert summary([marks]).endswith("in 1.00 healthy hours, 0 of 1 faults found.")
     assert summary([marks.at(3.2)]).endswith("1 of 1 faults found.")
-    calm = marks._replace(solved=[trace(1.0)] * 100).adapted(
-        20.0
-    )  # surprises less often than it may
+    # surprises less often than it may
+    calm = marks._replace(solved=[trace(1.0)] * 100).adapted(20.0)
     assert summary([calm]).endswith("1 of 1 faults found.")
     louder = marks._replace(solved=[trace(5.0)] * 100)
     adapted = louder.adapted(5.0)
@@ -398,8 +396,7 @@ def test_a_fault_begins_in_the_row_of_its_step_where_a_step_has_several(rows):
     )
     assert onset_row(jump) == 12 * rows
     assert onset_row(twin) is None
-    assert (
-        onset_row(replace(jump, contact_force=np.zeros(0, np.float32))) == 12
-    )  # nobody says otherwise
+    # nobody says otherwise
+    assert onset_row(replace(jump, contact_force=np.zeros(0, np.float32))) == 12
     (seen,) = detectability_of([twin], [jump], window_s=0.05)
     assert seen.delay == pytest.approx(0.05)

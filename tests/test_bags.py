@@ -78,9 +78,8 @@ def test_a_bag_is_a_table_at_the_rate_of_its_joints(plugin, tmp_path):
     column = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}
     np.testing.assert_array_equal(column["joint_states.position[j1]"], 2 * np.arange(ROWS))
     np.testing.assert_array_equal(column["joint_states.velocity[j2]"], -4 * np.arange(ROWS))
-    np.testing.assert_array_equal(
-        column["wrist.force[x]"], 6 * np.arange(ROWS)
-    )  # what it said last
+    # what it said last
+    np.testing.assert_array_equal(column["wrist.force[x]"], 6 * np.arange(ROWS))
     assert episode.spec.dt == pytest.approx(1 / RATE)
     assert len(episode.spec.motor) == 1
 

@@ -262,9 +262,8 @@ def test_fit_takes_a_body_model_and_says_which_joints_it_saw(tmp_path, capsys):
         for n, c in recorded(60).items()
         for k, v in enumerate(c.T if c.ndim > 1 else [c])
     }
-    columns["finger_position"] = 0.02 * np.sin(
-        3 * columns["time_0"]
-    )  # of a gripper that tells no speed
+    # of a gripper that tells no speed
+    columns["finger_position"] = 0.02 * np.sin(3 * columns["time_0"])
     pd.DataFrame(columns).rename(columns={"time_0": "time"}).to_csv(
         tmp_path / "log.csv", index=False
     )

@@ -37,18 +37,16 @@ def test_a_promise_by_the_hour_is_kept_saved_and_loaded(monitor, tmp_path):
     asm = monitor.calibrate(NOMINAL, false_alarms_per_hour=3.0)
     assert HOUR == 1.0
     maxima = np.sort([s.value.max() for s in asm.score_episodes(NOMINAL)])
-    assert asm.threshold == pytest.approx(
-        episode_threshold(maxima, 3.0 / 120)
-    )  # three of 120 are few: by their tail
+    # three of 120 are few: by their tail
+    assert asm.threshold == pytest.approx(episode_threshold(maxima, 3.0 / 120))
     assert asm.promise[:2] == (120, pytest.approx(3.0))
     assert asm.promise.modelled
     assert (asm.promise.per, asm.promise.hours) == ("hour", pytest.approx(1.0))
     asm.save(tmp_path / "by_hour.asm")
     again = load_monitor(tmp_path / "by_hour.asm")
     assert (again.threshold, again.promise) == (asm.threshold, asm.promise)
-    assert (
-        again.threshold_at(false_alarms_per_hour=6.0) == maxima[-6]
-    )  # five may exceed it: 5 + 1 <= 6 * 1 h
+    # five may exceed it: 5 + 1 <= 6 * 1 h
+    assert again.threshold_at(false_alarms_per_hour=6.0) == maxima[-6]
     assert again.threshold_at(0.05) == asm.threshold_at(false_alarm_rate=0.05)
     assert monitor.calibrate(NOMINAL, 0.05).promise.per == "episode"
 

@@ -107,9 +107,8 @@ def test_hostile_checkpoints_are_refused_with_a_reason(how, message, tmp_path):
 def test_what_claims_to_be_larger_than_its_file_is_refused_before_it_is_read(tmp_path, monkeypatch):
     bomb = packed(tmp_path / "x.npz", compression=zipfile.ZIP_DEFLATED, a=npy(np.zeros(10**6)))
     assert bomb.stat().st_size < 20_000
-    monkeypatch.setattr(
-        zipfile.ZipFile, "read", None
-    )  # calling it would be a TypeError, which nothing here catches
+    # calling it would be a TypeError, which nothing here catches
+    monkeypatch.setattr(zipfile.ZipFile, "read", None)
     with pytest.raises(ValueError, match="its members claim 8000"):
         read_arrays(bomb)
     with pytest.raises(ValueError, match="compressed"):

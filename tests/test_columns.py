@@ -201,9 +201,8 @@ def test_clocks_that_disagree_are_said_and_the_user_chooses():
     with pytest.warns(LogWarning, match="'time' and 'stamp' disagree, 50 and 49"):
         Episode.from_table(HEALTHY | {"stamp": 1.02 * T + 7})
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "error", LogWarning
-        )  # one of them jitters, as a clock of arrival does
+        # one of them jitters, as a clock of arrival does
+        warnings.simplefilter("error", LogWarning)
         Episode.from_table(
             HEALTHY | {"recv_time": T + 0.004 * np.random.default_rng(1).random(ROWS)}
         )
@@ -303,9 +302,10 @@ def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_i
     said = capsys.readouterr().err
     assert "1.csv: the memory reads channels that are not there: torque" in said
     assert f"or {other}" in said
+    # at its rate
     pd.DataFrame(HEALTHY | {"time": 3 * HEALTHY["time"]}).to_csv(
         tmp_path / "b" / "2.csv", index=False
-    )  # at its rate
+    )
     logs = read_logs(tmp_path / "b", LogLayout(like=other))
     assert [log.name for log in logs] == ["1.csv"]
     how = [

@@ -63,9 +63,8 @@ def test_a_sense_is_repaired_until_it_is_well_again():
             seen = repair.suspect(np.array([0]))
         expected = 0.3 if 20 <= t < 22 else 0.0
         assert abs(seen[0] - row[0] - expected) < 0.05, t
-        np.testing.assert_array_equal(
-            seen[1:], row[1:]
-        )  # whatever else is sensed is handed on to the bit
+        # whatever else is sensed is handed on to the bit
+        np.testing.assert_array_equal(seen[1:], row[1:])
         assert repair.names == (("encoder[0]",) if 22 <= t < 79 else ()), t
     repair.rows.begin(np.ones(1, bool))
     assert not repair.names

@@ -73,9 +73,8 @@ def test_one_fit_serves_the_score_of_the_authors_and_the_evidence(kalman):
     np.testing.assert_array_equal(evidence.score(episode).value, fitted.score(episode).value)
     assert kalman.detection.name == "mahalanobis"
     assert kalman.threshold > 0
-    assert json.dumps(kalman.get_params()) == json.dumps(
-        fitted.get_params()
-    )  # runs keep fitted monitors by these
+    # runs keep fitted monitors by these
+    assert json.dumps(kalman.get_params()) == json.dumps(fitted.get_params())
 
 
 def test_a_file_that_was_calibrated_for_one_detection_has_no_threshold_under_another(

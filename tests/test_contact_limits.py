@@ -184,9 +184,8 @@ def test_no_part_of_a_hand_goes_faster_than_its_limit_under_any_controller(contr
             action[: 3 * (turns and controller.endswith("POSE"))] = 0.0
         env.step(action)
     env.close()
-    assert (
-        0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)
-    )  # that one pulls between substeps
+    # that one pulls between substeps
+    assert 0.1 < max(speeds) < (0.3 if controller == "IK_POSE" else 0.2)
 
 
 def test_a_stretched_arm_that_has_more_behind_its_hand_goes_slower_where_no_healthy_hand_was(lift):
@@ -265,12 +264,10 @@ def test_pace_is_that_of_healthy_hands_by_place_and_direction_and_else_the_usual
     assert most(-0.4, 0, 0, 0, 0, 0) == pytest.approx(0.15 / 0.4)  # another direction
     assert most(0.4, 0, 0, 0, 0, 0, place=here + 0.3) == pytest.approx(0.15 / 0.4)  # another place
     assert most(0, 0, -0.3, 0, 0, 0) == pytest.approx(0.15 / 0.3)  # downwards no faster than usual
-    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(
-        0.15 / 0.3
-    )  # with whatever is behind it
-    assert (
-        most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2
-    )  # not so where no healthy hand went down
+    # with whatever is behind it
+    assert most(0, 0, -0.3, 0, 0, 0, momentum=30.0) == pytest.approx(0.15 / 0.3)
+    # not so where no healthy hand went down
+    assert most(0, 0, -0.3, 0, 0, 0, place=here - 0.1, momentum=30.0) < 0.2
     assert ContactLimits().share(0, here, np.array([0.3, 0, 0, 0, 0, 0]), 0.3) == 0.5
     assert HandSpeedMap.learned([stream], StreamSpec((Channel("position", 9, "m"),), 0.05)) is None
     for bad in (

@@ -165,10 +165,11 @@ def test_every_requirement_of_an_extra_is_known_by_the_name_it_is_imported_under
 
     def names(requirements):
         found = [re.match(r"[\w.-]+", line).group() for line in requirements]
+        # gymnasium brings the one, and the other brings what another extra names
         ours = (
             "cloudpickle",
             "asm-gym",
-        )  # gymnasium brings the one, and the other brings what another extra names
+        )
         return {imported_as.get(n, n.replace("-", "_")) for n in found if n not in ours}
 
     assert names(project["dependencies"]) == set(CORE)

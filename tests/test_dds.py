@@ -129,9 +129,8 @@ def test_a_row_holds_the_newest_of_other_topics_and_nothing_of_one_that_fell_sil
 
 def test_publishers_of_other_joints_on_one_topic_make_one_row(publish):
     def finger(k: int) -> JointState:
-        return JointState(
-            Header(Time(0, 0), ""), ["finger"], [7.0], [1.0, 2.0], []
-        )  # two velocities are whose?
+        # two velocities are whose?
+        return JointState(Header(Time(0, 0), ""), ["finger"], [7.0], [1.0, 2.0], [])
 
     publish("/joint_states", finger)
     publish("/joint_states", joints)

@@ -156,17 +156,15 @@ def test_a_fresh_episode_exceeds_the_threshold_as_rarely_as_promised(n, rate):
     rng, trials = np.random.default_rng(n), 20_000
     draws = rng.exponential(size=(trials, n + 1))
     rank = np.array([d[-1] > conformal_threshold(d[:-1], rate) for d in draws])
-    exact = (n + 1 - np.ceil((n + 1) * (1 - rate) - 1e-9)) / (
-        n + 1
-    )  # the rank of the fresh one is uniform
+    # the rank of the fresh one is uniform
+    exact = (n + 1 - np.ceil((n + 1) * (1 - rate) - 1e-9)) / (n + 1)
     assert exact <= rate
     assert rank.mean() == pytest.approx(exact, abs=4 * np.sqrt(exact * (1 - exact) / trials))
 
 
 def test_the_tail_of_few_maxima_is_that_of_hill_and_weissman():
-    maxima = np.concatenate(
-        [np.linspace(1.0, 4.0, 90), 4.0 * np.exp(np.arange(1, 11) / 10.0)]
-    )  # 10 of 100 above 4
+    # 10 of 100 above 4
+    maxima = np.concatenate([np.linspace(1.0, 4.0, 90), 4.0 * np.exp(np.arange(1, 11) / 10.0)])
     hill = np.mean(np.arange(1, 11) / 10.0)
     expected = 4.0 * (10 / 1.0) ** (hill * (1 + 0.6 / np.sqrt(10)))  # one of 100, as 0.01 allows
     assert episode_threshold(maxima, 0.01) == pytest.approx(expected)

@@ -34,19 +34,19 @@ from asm_gym.tasks import OWN
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
+# by a build of the site
 MADE = (
     DOCS / "_build",
     DOCS / "reference" / "api",
     DOCS / "reference" / "commands.md",
-)  # by a build of the site
+)
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md")),
     *(p for p in sorted(DOCS.rglob("*.md")) if not any(p.is_relative_to(made) for made in MADE)),
 ]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
-EXAMPLES = sorted(
-    p for p in (DOCS / "examples").glob("*.py") if p.stem != "ros2_stop"
-)  # which tests/test_ros2_stop.py runs
+# which tests/test_ros2_stop.py runs
+EXAMPLES = sorted(p for p in (DOCS / "examples").glob("*.py") if p.stem != "ros2_stop")
 
 FENCE = re.compile(r"^```([\w{}-]*)\n(.*?)^```\s*$", re.M | re.S)
 CODE = re.compile(r"`[^`\n]*`")

@@ -131,9 +131,8 @@ def test_packages_of_every_install_are_needed_and_those_of_an_extra_are_not(
     )
     assert found["robosuite"].remedy == extras.INSTALL_ROBOSUITE
     assert doctor.main([]) == 1
-    assert (
-        extras.INSTALL_ROBOSUITE in capsys.readouterr().out
-    )  # in one line, however narrow the terminal is
+    # in one line, however narrow the terminal is
+    assert extras.INSTALL_ROBOSUITE in capsys.readouterr().out
 
 
 def test_a_machine_that_keeps_no_compiled_code_is_told_which_variable_names_a_folder(

@@ -122,9 +122,8 @@ def test_time_matching_compares_each_fault_with_the_same_steps_of_nominal_episod
         a_trace([90, 1, 1, 90]),
     ]
     nominal.append(a_trace([90, 90, 90, 90], task="Door"))
-    assert Wins([faulty], nominal, 0.2).auroc() == pytest.approx(
-        1 - (1 + 0.5) / 4
-    )  # 8 above, 7 tied
+    # 8 above, 7 tied
+    assert Wins([faulty], nominal, 0.2).auroc() == pytest.approx(1 - (1 + 0.5) / 4)
     assert math.isnan(Wins([faulty], [a_trace([99])], 1.0).auroc())  # it ended before the onset
     assert math.isnan(Wins([a_trace([0, 9], onset=2)], nominal, 0.2).auroc())
 
@@ -156,9 +155,8 @@ def test_alarms_an_hour_count_only_the_time_before_the_fault_and_one_a_minute():
     assert found == (3, pytest.approx(136 / 3600))
     excused = {"knock": np.full(60, 99.0)}
     assert hourly_alarms([a_trace(np.ones(60), excused=excused)], "knock").k == 1
-    assert (
-        hourly_alarms([a_trace(np.full(60, 20), excused=excused)], "knock").k == 0
-    )  # a fault is no knock beside it
+    # a fault is no knock beside it
+    assert hourly_alarms([a_trace(np.full(60, 20), excused=excused)], "knock").k == 0
     assert math.isnan(hourly_alarms([a_trace([1, 1], onset=0)]).value)
 
 
@@ -176,11 +174,12 @@ def test_a_summary_reads_detection_from_watched_episodes_and_outcomes_from_each_
     nominal, push = by_condition(traces, window_s=0.2)
     assert (nominal.name, len(nominal.watched), nominal.delays) == ("nominal", 2, Delays())
     assert (false_alarms(nominal.watched), nominal.detected) == (Share(1, 2), Share(0, 0))
+    # the third alarm is late
     assert (push.name, len(push.watched), push.detected) == (
         "push",
         3,
         Share(1, 3),
-    )  # the third alarm is late
+    )
     assert push.delays == Delays(math.inf, math.inf)
     assert push.auroc == pytest.approx(1 / 6)  # maxima 20, 1, 1 against 3, 30
     alone, held = push.outcomes
@@ -402,9 +401,8 @@ def test_more_faults_of_the_same_scenes_do_not_narrow_the_interval():
         ).found[FIVE]
         widths.append(interval(0.5, drawn).high - interval(0.5, drawn).low)
     assert widths[1] == pytest.approx(widths[0], rel=0.05)
-    assert widths[0] == pytest.approx(
-        4 * np.sqrt(0.25 / 60), rel=0.25
-    )  # ± 2 standard errors of 60 scenes
+    # ± 2 standard errors of 60 scenes
+    assert widths[0] == pytest.approx(4 * np.sqrt(0.25 / 60), rel=0.25)
 
 
 def test_resamples_agree_with_the_results_that_they_are_about():
@@ -413,9 +411,8 @@ def test_resamples_agree_with_the_results_that_they_are_about():
     found = DetectionMetrics("asm", faulty, nominal, 0.5, calibration)
     assert np.mean(found.draws.auroc) == pytest.approx(found.auroc, abs=0.02)
     assert np.mean(found.draws.found[FIVE]) == pytest.approx(found.found[FIVE].value, abs=0.03)
-    up = [
-        peaked(3.0, s, onset=5, before=2.0) for s in range(4)
-    ]  # an alarm that was up already is no detection
+    # an alarm that was up already is no detection
+    up = [peaked(3.0, s, onset=5, before=2.0) for s in range(4)]
     assert not resample(up, nominal, calibration, 0.5, draws=20).found[FIVE].any()
 
 

@@ -79,10 +79,11 @@ def test_a_joint_that_was_seen_on_its_way_is_at_its_stop_and_one_that_jumps_ther
         assert {
             event for event, _ in excused([changed(0, far), changed(0, 0.98), changed(0, 0.99)])
         } == {""}
+    # nobody saw it
     assert excused([changed(0, 0.5), changed(0, np.nan), changed(0, 0.98)])[-1] == (
         "stop",
         EXCUSED,
-    )  # nobody saw it
+    )
     other = changed(0, 0.98)
     other[1] = -1.98
     assert excused([changed(1, -1.9), other])[-1] == ("stop", EXCUSED)  # each joint by itself

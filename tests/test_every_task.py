@@ -67,9 +67,8 @@ def test_a_task_keeps_the_contract(name, elsewhere):
     env = gym.make(TASKS[name].id, horizon=400)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warnings.filterwarnings(
-            "ignore", "Setting the shape", DeprecationWarning, "robosuite"
-        )  # by NumPy 2.5
+        # by NumPy 2.5
+        warnings.filterwarnings("ignore", "Setting the shape", DeprecationWarning, "robosuite")
         check_env(env.unwrapped, skip_render_check=True, skip_close_check=True)
         check_env_sb3(env.unwrapped, skip_render_check=True)
     env.reset(seed=3)
@@ -98,9 +97,8 @@ def test_objects_are_where_robosuite_says(name):
         observation = env.step(0.3 * np.ones(env.action_space.shape, np.float32))[0]
     theirs = env.robosuite_env
     theirs._get_observations(force_update=True)
-    expected = theirs._get_observations(
-        force_update=True
-    )  # relative poses lag behind absolute ones by one update
+    # relative poses lag behind absolute ones by one update
+    expected = theirs._get_observations(force_update=True)
     shown = [n for n in expected if n in observation]
     assert shown
     for n in shown:

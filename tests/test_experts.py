@@ -82,9 +82,8 @@ def test_fingers_close_along_the_nearest_side_of_a_cube(degrees):
     np.testing.assert_allclose(target[:, 2], [0, 0, -1])
     assert np.linalg.det(target) == pytest.approx(1.0)
     assert np.abs(cube.T @ target[:, 1]).max() == pytest.approx(1.0)
-    assert (
-        hand[:, 1] @ target[:, 1] >= np.cos(np.pi / 4) - 1e-9
-    )  # never turned further than half a quarter
+    # never turned further than half a quarter
+    assert hand[:, 1] @ target[:, 1] >= np.cos(np.pi / 4) - 1e-9
 
 
 @pytest.mark.parametrize(

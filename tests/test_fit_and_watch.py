@@ -191,9 +191,8 @@ def test_logs_of_different_columns_are_one_line_each(tmp_path, capsys):
         np.savetxt(
             tmp_path / f"{n}.csv", table, "%.5f", ",", header=f"time,q_1,{name}", comments=""
         )
-    assert (
-        main(["inspect", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
-    )  # for fit refuses them
+    # for fit refuses them
+    assert main(["inspect", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().out
     assert "1.csv has other columns than 0.csv: q_2, q_3" in said
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "m.asm")]) == 2
@@ -505,7 +504,6 @@ def test_a_long_log_is_learned_from_between_its_marked_rows(tmp_path, capsys):
     )
     assert main([*fit, "--split", "1"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert (
-        "Learned from 54 episodes: 2700 rows" in said
-    )  # half of 44 pieces before the mark, 64 after it
+    # half of 44 pieces before the mark, 64 after it
+    assert "Learned from 54 episodes: 2700 rows" in said
     assert "with a fault" not in said

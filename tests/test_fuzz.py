@@ -124,10 +124,23 @@ def test_a_wrapper_is_made_or_refused(make, names, data):
 
 
 # Those that are checked before a simulator is made, which takes seconds.
+# fmt: skip
 EARLY = (
-    "task", "robot", "render_mode", "observation", "render_size", "control_freq", "horizon", "stream",
-    "stream_freq", "sensor_noise", "terminate_on_success", "controller", "reward_shaping", "camera",
-)  # fmt: skip
+    "task",
+    "robot",
+    "render_mode",
+    "observation",
+    "render_size",
+    "control_freq",
+    "horizon",
+    "stream",
+    "stream_freq",
+    "sensor_noise",
+    "terminate_on_success",
+    "controller",
+    "reward_shaping",
+    "camera",
+)
 
 
 @settings(quickly, max_examples=300)

@@ -152,9 +152,8 @@ class Guard(RuleBasedStateMachine):
 
 TestGuard = Guard.TestCase
 TestGuard.settings = runs(40, 30)
-quiet = pytest.mark.filterwarnings(
-    "ignore::UserWarning"
-)  # the wrapper says whom it does not believe
+# the wrapper says whom it does not believe
+quiet = pytest.mark.filterwarnings("ignore::UserWarning")
 TestGuard.pytestmark = [quiet]
 
 

@@ -113,9 +113,8 @@ def test_a_policy_that_uses_one_buffer_changes_nothing_that_was_said_or_kept():
         buffer[:] = [0.1 * t, 0.0, 1.0 if t < 4 else -1.0]
         said.append(guarded.step(buffer)[4]["asm"]["executed_action"])
     np.testing.assert_allclose([s[0] for s in said], [0, 0.1, 0.2, 0.3, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(
-        [s[2] for s in said], 1.0
-    )  # the grip of before the alarm, whatever came into the buffer
+    # the grip of before the alarm, whatever came into the buffer
+    np.testing.assert_allclose([s[2] for s in said], 1.0)
 
 
 # ---------------------------------------------------------------- a monitor that changes

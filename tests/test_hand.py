@@ -102,9 +102,8 @@ def test_an_encoder_that_is_five_thousandths_off_is_named_and_its_angle_found_by
     assert at < 36
     assert cause.part == f"encoder[{joint}]"
     missing = np.zeros(spec.size, bool)
-    assert all(
-        check.read(row, missing).part == cause.part for row in stream[40:45]
-    )  # said again until somebody completes it
+    # said again until somebody completes it
+    assert all(check.read(row, missing).part == cause.part for row in stream[40:45])
     missing[cause.columns] = True
     assert check.read(stream[50], missing) is None  # that explains it
     assert check.hands.accused(0)[cause.columns].all()

@@ -152,9 +152,8 @@ def test_an_arm_that_is_held_resists_a_push_comes_back_and_yields_to_more_than_i
     farthest, after = pushed(controller, 40.0)
     assert farthest < 0.1
     assert after < 0.005
-    assert (
-        pushed(controller, 4 * YIELDS_AT)[1] > 0.1
-    )  # it gives way, and stays where it was pushed to
+    # it gives way, and stays where it was pushed to
+    assert pushed(controller, 4 * YIELDS_AT)[1] > 0.1
 
 
 def test_a_flag_left_behind_is_forgotten_by_reset_and_used_up_by_a_step(lift):
@@ -191,9 +190,8 @@ def test_in_many_environments_those_that_are_held_stay_and_the_others_go_on(many
     streams = np.stack(
         [env.step(np.ones((2, 7), np.float32))[4]["stream"][:, at] for _ in range(25)]
     )
-    moved = np.abs(streams[-1] - streams[3]).max(
-        axis=1
-    )  # since it was held; motors at their limits overshoot first
+    # since it was held; motors at their limits overshoot first
+    moved = np.abs(streams[-1] - streams[3]).max(axis=1)
     assert moved[1] < 0.05
     assert moved[0] > 0.2
     env.close()

@@ -58,9 +58,8 @@ def modules() -> dict[str, ast.Module]:
 
 def imports(name: str, tree: ast.Module) -> Iterator[str]:
     """Full dotted names that a module imports, wherever the statement stands; ``from a import b`` gives ``a.b``."""
-    package = name.split(".")[
-        :-1
-    ]  # ``asm_gym.envs.__init__`` lies in ``asm_gym.envs`` as ``asm_gym.envs.x`` does
+    # ``asm_gym.envs.__init__`` lies in ``asm_gym.envs`` as ``asm_gym.envs.x`` does
+    package = name.split(".")[:-1]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -73,9 +73,8 @@ def test_stable_baselines_learns_and_meets_every_cost(kind: str):
 
 def test_torchrl_collects_and_meets_every_cost():
     collectors = needs("torchrl.collectors")
-    kind = (
-        getattr(collectors, "Collector", None) or collectors.SyncDataCollector
-    )  # the name of before
+    # the name of before
+    kind = getattr(collectors, "Collector", None) or collectors.SyncDataCollector
     collector = kind(with_cost, None, frames_per_batch=64, total_frames=STEPS)
     assert sum(float(batch["next", "cost"].sum()) for batch in collector) == COST
     collector.shutdown()

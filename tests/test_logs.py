@@ -413,9 +413,8 @@ def test_a_last_row_that_was_cut_off_is_left_out_and_that_is_said(end, tmp_path)
     with pytest.warns(LogWarning, match="its last line was cut off, and is left out"):
         columns = read_text(path)
     np.testing.assert_array_equal(columns["time"], [0, 1])
-    whole = written(
-        tmp_path / "y.csv", "time,a,b\n0,1,2\n1,1,2\n2,1,2"
-    )  # many write no last end of line
+    # many write no last end of line
+    whole = written(tmp_path / "y.csv", "time,a,b\n0,1,2\n1,1,2\n2,1,2")
     assert len(read_text(whole)["time"]) == 3
 
 

@@ -21,9 +21,8 @@ def test_rounding_moves_a_weight_by_half_a_step_at_most_and_packing_by_nothing(s
     after = rounded(before)
     step = np.abs(before["V"]).max(axis=1, keepdims=True) / 127 * 1.002
     assert (np.abs(after["V"] - before["V"]) <= np.where(after["V"] == before["V"], 0, step)).all()
-    assert (
-        np.mean(np.abs(after["V"] - before["V"]) <= step / 2) > 0.98
-    )  # but the faintest, which must stay
+    # but the faintest, which must stay
+    assert np.mean(np.abs(after["V"] - before["V"]) <= step / 2) > 0.98
     np.testing.assert_array_equal(after["V"] == 0, before["V"] == 0)
     np.testing.assert_array_equal(after["D"], before["D"])
     kept = packed(after)

@@ -97,10 +97,11 @@ def test_nobody_goes_on_against_what_blocks_the_arm(family, fault, case, monkeyp
     while len(said) < 125 and not (said and said[-1]["gave_up"]):
         said.append(env.step(ACT)[4]["asm"])
     first = next((t for t, s in enumerate(said) if s["case"] == case), None)
+    # not at once
     assert {s["case"] for s in said[60:80]} == {
         "",
         "actuator" if family == "joint" else family,
-    }  # not at once
+    }
     assert first is not None
     assert (first >= 60 + 25) == case.startswith("lasting")
     assert any(s["intervened"] for s in said) or not case.startswith("lasting")

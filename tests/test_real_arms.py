@@ -68,9 +68,8 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
 
 def test_a_push_does_the_work_of_its_force_at_the_outermost_link():
     a, b = 0.3, 0.9
-    moved = jacobian(
-        TWO_LINKS, np.array([a, b])
-    )  # about y: x and z of the end of the first link, where the second is
+    # about y: x and z of the end of the first link, where the second is
+    moved = jacobian(TWO_LINKS, np.array([a, b]))
     np.testing.assert_allclose(
         moved[:, 0], 0.4 * np.array([-np.sin(a), 0.0, -np.cos(a)]), atol=1e-12
     )

@@ -105,10 +105,11 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     table = promises_table(marks, {1.0: 4.5, 5.0: 1.5}, 1.0)
     assert "1.00 healthy hours" in table.caption
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
+    # peaks 5 and 6; peaks 2 to 6
     assert [row[2].split()[0] for row in table.rows] == [
         "2.0",
         "5.0",
-    ]  # peaks 5 and 6; peaks 2 to 6
+    ]
     assert [row[-2:] for row in table.rows] == [
         ("50 % of 2", "0 % of 1"),
         ("100 % of 2", "100 % of 1"),
@@ -122,9 +123,8 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
 
 def test_promises_over_halves_come_true_where_all_hours_are_alike():
     rng = np.random.default_rng(0)
-    solved = [
-        replace(ten_minutes(n, 0.0), surprise=rng.exponential(size=600)) for n in range(240)
-    ]  # 40 hours
+    # 40 hours
+    solved = [replace(ten_minutes(n, 0.0), surprise=rng.exponential(size=600)) for n in range(240)]
     faults = [ten_minutes(0, 99.0, 200, "strong"), ten_minutes(1, 0.5, 200, "strong")]
     table = hours.splits_table(
         [Marks("scripted", solved, [], DetectionMetrics("", faults, solved, 1.0))]
@@ -150,6 +150,5 @@ def test_an_e_detector_alarms_no_more_often_than_promised_and_lets_weak_evidence
         fresh.follow(5.0)  # such as one block in 150 reaches
     assert np.diff(thresholds)[: int(np.argmax(np.array(thresholds) < 5.0))].max() < 0
     assert min(thresholds) < 5.0  # the alarm comes, though no episode alone would raise it
-    assert thresholds[0] > np.quantile(
-        peaks, 1 - 1 / 50
-    )  # what the hourly threshold of this promise is
+    # what the hourly threshold of this promise is
+    assert thresholds[0] > np.quantile(peaks, 1 - 1 / 50)

@@ -139,9 +139,8 @@ def test_external_torque_is_the_force_on_a_body_seen_from_the_joints():
     stream = env.step(np.zeros(7, np.float32))[4]["stream"]
     mujoco.mj_jac(model, data, jacobian, None, data.xipos[body], body)
     torque = stream[env.unwrapped.stream_spec.slices["external_torque"]]
-    np.testing.assert_allclose(
-        torque, (jacobian.T @ force)[:7], atol=0.15
-    )  # joint friction is external too, 0.1 N m
+    # joint friction is external too, 0.1 N m
+    np.testing.assert_allclose(torque, (jacobian.T @ force)[:7], atol=0.15)
     env.close()
 
 

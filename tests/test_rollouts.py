@@ -41,10 +41,11 @@ def streams(**how):
 
 def test_an_object_and_a_factory_give_the_same_episodes_with_any_number_of_workers():
     expected = streams(policy=Damp(), workers=1)
+    # where info has no stream, observation and action are it
     assert expected[0].shape == (
         200,
         3 + 1,
-    )  # where info has no stream, observation and action are it
+    )
     for policy in (Damp(), Damp, lambda env: Damp()):
         for workers in (1, 2):
             for a, b in zip(expected, streams(policy=policy, workers=workers), strict=True):

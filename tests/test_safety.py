@@ -166,10 +166,11 @@ def test_a_reflex_that_acts_too_long_gives_up_and_ends_the_episode():
     assert [o[2] for o in outs] == [False] * 6 + [True]
     with pytest.raises(gym.error.ResetNeeded):
         env.step(ACT)
+    # a new episode has its own patience
     outs = [
         env.reset(seed=0),
         *(env.step(ACT) for _ in range(4)),
-    ]  # a new episode has its own patience
+    ]
     assert not outs[-1][2]
 
 
@@ -262,9 +263,8 @@ def test_recall_does_what_the_memory_expects_and_needs_one_that_expects():
 
     env = NeuralASMSafety(FakeEnv(), Expecting([2]), on_alarm="recall", release_after=2)
     run(env, 6)
-    np.testing.assert_allclose(
-        env.unwrapped.actions[3], 0.3, rtol=1e-6
-    )  # as expected after the row that alarmed
+    # as expected after the row that alarmed
+    np.testing.assert_allclose(env.unwrapped.actions[3], 0.3, rtol=1e-6)
     np.testing.assert_allclose(env.unwrapped.actions[4], 0.4, rtol=1e-6)
     np.testing.assert_array_equal(env.unwrapped.actions[5], ACT)
     with pytest.raises(ValueError, match="CueMonitor does not"):
@@ -301,11 +301,12 @@ def test_a_reflex_takes_over_within_a_control_step():
     np.testing.assert_array_equal(second["asm"]["executed_action"], [0, 0, 0, 0, 0, 0, 1])
     assert np.argmax(second["asm"]["surprises"]) == 2
     rows = [env.step(action)[4] for _ in range(3)]
+    # two control steps of quiet
     assert [r["asm"]["intervened"] for r in rows] == [
         True,
         True,
         False,
-    ]  # two control steps of quiet
+    ]
     assert not env.unwrapped.row_hooks
     env.close()
 
@@ -402,9 +403,8 @@ def test_surprise_of_the_reflex_itself_is_not_the_policys():
         FakeEnv(), ScriptedMonitor({5: 2.0, 6: 1000.0}), release_after=3, adaptive_threshold=HOW
     )
     episode(env)
-    assert episode(env)["threshold"] == pytest.approx(
-        np.exp(0.45)
-    )  # by the 2; 1000 is above the ceiling
+    # by the 2; 1000 is above the ceiling
+    assert episode(env)["threshold"] == pytest.approx(np.exp(0.45))
 
 
 def test_a_confirmed_alarm_and_one_above_the_ceiling_teach_nothing():
@@ -445,9 +445,8 @@ def test_many_environments_share_a_threshold_and_keep_it_to_the_end_of_their_epi
     thresholds = np.array(thresholds)
     np.testing.assert_allclose(thresholds[0], [1.0, 1.0])
     once = np.exp(0.45)
-    np.testing.assert_allclose(
-        thresholds[7], [once, 1.0]
-    )  # the first has begun anew, the second is under way
+    # the first has begun anew, the second is under way
+    np.testing.assert_allclose(thresholds[7], [once, 1.0])
     np.testing.assert_allclose(thresholds[12], [once, once**2])
     assert infos["asm"]["level"].shape == infos["asm"]["ceiling"].shape == (2,)
     np.testing.assert_allclose(env.threshold, thresholds[-1])

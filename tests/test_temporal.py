@@ -189,9 +189,8 @@ def test_a_missing_sense_is_inferred_from_the_others():
         step = net.follow(
             net.at_rest(1), np.ones((1, 1), np.float32), r[:1], np.array([[1.0, 0.0]], np.float32)
         )
-        assert (
-            step.traces.reshape(len(DECAYS), 3)[0, 1] * r[0, 1] > 0
-        )  # the fastest trace is the row itself
+        # the fastest trace is the row itself
+        assert step.traces.reshape(len(DECAYS), 3)[0, 1] * r[0, 1] > 0
 
 
 def phases(count: int) -> list[Trajectory]:

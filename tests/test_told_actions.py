@@ -316,9 +316,8 @@ def test_senses_that_repeat_bit_for_bit_are_missing_and_the_arm_is_held(share):
             assert not info["cost"]
         elif share == 1.0:
             assert info["asm"]["intervened"] == (t > 11)
-        assert (
-            t != 11 or not share or info["asm"]["reason"] in ("failure", "missing")
-        )  # half of all is too much
+        # half of all is too much
+        assert t != 11 or not share or info["asm"]["reason"] in ("failure", "missing")
     assert bool(info["asm"]["state"] == "policy") == (not share)
     env.close()
 

@@ -64,9 +64,8 @@ def test_the_buffer_holds_the_demonstrations_and_which_of_them_were_cut_short(en
     np.testing.assert_allclose(
         buffer.next_observations[:5, 0], (episode.observations[1:] - mean) / scale, rtol=1e-5
     )
-    np.testing.assert_allclose(
-        buffer.actions[:5, 0], episode.actions / 2, rtol=1e-5
-    )  # of the pendulum's ±2 N m
+    # of the pendulum's ±2 N m
+    np.testing.assert_allclose(buffer.actions[:5, 0], episode.actions / 2, rtol=1e-5)
     assert buffer.timeouts[:5, 0].tolist() == [0, 0, 0, 0, 1]
     assert not buffer.sample(64).dones.any()
 
@@ -108,9 +107,8 @@ def test_what_was_cloned_is_not_lost_while_it_is_improved(tmp_path):
     few = ["--demonstrations", "60", "--cloning-updates", "4000", "--final-episodes", "20"]
     judged = ["--steps", "400", "--evaluate-every", "200", "--evaluation-episodes", "4"]
     assert main(["train", "Lift", *few, *judged, "--out", str(tmp_path)]) == 0
-    assert (
-        json.loads((tmp_path / "result.json").read_text())["success"] >= 0.5
-    )  # 0 where SAC destroys the clone
+    # 0 where SAC destroys the clone
+    assert json.loads((tmp_path / "result.json").read_text())["success"] >= 0.5
 
 
 def test_the_command_clones_an_expert(tmp_path):

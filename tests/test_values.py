@@ -147,9 +147,8 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     shown, asked = np.concatenate(z[:-1]).astype(np.float64), z[-1].astype(np.float64)
     inverse = np.linalg.inv(shown.T @ shown + 1e-3 * len(shown) * np.eye(shown.shape[1]))
     h, usual = (np.einsum("ni,ij,nj->n", rows, inverse, rows) for rows in (asked, shown))
-    root = np.sqrt(
-        np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual)))
-    )  # a tenth of a second is 10 rows
+    # a tenth of a second is 10 rows
+    root = np.sqrt(np.maximum(1.0, (1.0 + 10 * h) / (1.0 + 10 * np.median(usual))))
     one = Surprise(np.ones(1), np.full((1, 6), 1 / 6))
     state, found = values.monitor.initial_state(1), []
     for row in cut[25].stream.astype(np.float64):

@@ -207,9 +207,8 @@ def test_what_makes_no_sense_is_refused(lift):
         VectorNeuralASMSafety(many, monitor(), on_alarm="freeze")
     with pytest.raises(ValueError, match="give its name"):
         VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(lift))
-    VectorNeuralASMSafety(
-        many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5))
-    )  # has no memory
+    # has no memory
+    VectorNeuralASMSafety(many, monitor(), on_alarm=Hold(FakeEnv(), safe_action=np.full(3, 0.5)))
     with pytest.raises(ValueError, match="release_after"):
         VectorNeuralASMSafety(many, monitor(), release_after=0)
     with pytest.raises(ValueError, match="DISABLED, got SAME_STEP"):

@@ -144,9 +144,8 @@ def test_a_watch_that_is_killed_runs_its_hook_all_the_same(memory: Path, tmp_pat
         watch.stdin.write(f"{row}\n")
         watch.stdin.flush()
         time.sleep(0.02)
-    wait_for(
-        lambda: told.exists() and bool(told.read_text())
-    )  # silence is told of once rows were judged
+    # silence is told of once rows were judged
+    wait_for(lambda: told.exists() and bool(told.read_text()))
     watch.kill()
     watch.wait()
     wait_for(lambda: told.read_text().count("\n") == 2)

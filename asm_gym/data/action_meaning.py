@@ -33,19 +33,21 @@ LATEST = 3  # rows after which a command may be seen to act, at most
 ENOUGH, FEWEST = 20_000, 50  # rows that are looked at; that can tell
 CERTAIN = 5.0  # standard errors that a coefficient must differ from 0 by
 TELLS = 0.05  # share of what else is not known of a change that the action must explain
+# share -c sd(x)/(b sd(u)) from which the state moves towards an action, and below which by it
 TOWARDS, BY = (
     0.3,
     0.1,
-)  # share -c sd(x)/(b sd(u)) from which the state moves towards an action, and below which by it
+)
 FOLLOWS = 0.8  # correlation of a state with its target
 COASTS = 0.95  # a, from which a state moves on by itself
 ALIKE = 0.9  # senses that an action explains nearly as well as the best; of these its own is taken
 RATE = 0.9  # correlation of a sense with the change of another whose rate it is
+# slopes of targets in the unit of the sense, in radians, and in degrees
 OWN = (
     1.0,
     np.pi / 180,
     180 / np.pi,
-)  # slopes of targets in the unit of the sense, in radians, and in degrees
+)
 NEAR = 0.05  # a slope or an offset this close to its own, by share, is that
 
 Floats = NDArray[np.float64]
@@ -56,9 +58,8 @@ class ActionMeaning:
     """What the A numbers of an action mean, and for which a robot stays: slope x[sense] + offset."""
 
     means: tuple[str, ...]  # each of ``MEANINGS``, or ``KEPT``, or ``UNKNOWN``
-    senses: tuple[
-        int, ...
-    ]  # the column of the stream that a target is told by; -1 where none is known
+    # the column of the stream that a target is told by; -1 where none is known
+    senses: tuple[int, ...]
     slopes: tuple[float, ...]
     offsets: tuple[float, ...]
 
@@ -186,9 +187,8 @@ def _rates(spec: StreamSpec, windows: Floats) -> set[int]:
     both = both - both.mean(axis=0) if len(both) else both
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(both.T @ both) / np.sqrt(np.outer(*[(both**2).sum(axis=0)] * 2))
-    alike = np.nan_to_num(
-        alike[: now.shape[1], now.shape[1] :]
-    )  # (S, S) of the change of each, and of each
+    # (S, S) of the change of each, and of each
+    alike = np.nan_to_num(alike[: now.shape[1], now.shape[1] :])
     np.fill_diagonal(alike, 0.0)
     return named | set(spec.sensory[alike.max(axis=0, initial=0.0) > RATE])
 

@@ -28,9 +28,8 @@ def read_parquet(path: Path) -> Columns:
 def read_array(path: Path, columns: Sequence[str] = ()) -> Columns:
     """Return the array of a ``.npy`` file, (T,) or (T, k), as columns of these names, or as the column ``value``."""
     try:
-        array = np.array(
-            np.load(path, mmap_mode="r", allow_pickle=False)
-        )  # a file shorter than it declares is refused
+        # a file shorter than it declares is refused
+        array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
     except ValueError as error:  # whose remedy is unsafe
         raise ValueError("it is damaged, or no array of numbers") from error
     if array.dtype.names and array.ndim == 1:

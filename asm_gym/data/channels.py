@@ -43,9 +43,8 @@ class Recorded(NamedTuple):
 
     stream: NDArray[np.float32]  # (T, D)
     spec: StreamSpec
-    faults: NDArray[
-        np.bool_
-    ]  # (T,) where a label says that something is wrong; (0,) where the table has no label
+    # (T,) where a label says that something is wrong; (0,) where the table has no label
+    faults: NDArray[np.bool_]
 
 
 class ColumnPlan:

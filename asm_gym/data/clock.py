@@ -33,21 +33,23 @@ SLOWEST_WITHOUT_UNIT = (
     2.0  # step from which on a clock without a unit is not believed to count seconds
 )
 UNITS = {1.0: "s", 1e-3: "ms", 1e-6: "us", 1e-9: "ns"}
+# [s]; Excel and MATLAB count days, from 1982 on so many, in steps so short
 DAY, LEAST_DATE, BRIEF = (
     86400.0,
     3e4,
     1e-4,
-)  # [s]; Excel and MATLAB count days, from 1982 on so many, in steps so short
+)
 MOST_DOUBLED = (
     0.02  # share of rows that may have the stamp of the one before: they were written twice
 )
 DISAGREE = 0.01  # how far two clocks may be off each other, as a share, before that is said
 ALIKE = 0.2  # how far two clocks, or a clock and a memory, may be off, as a share, and tell each other's unit
 
+# rows from which on velocities tell the unit, and how well they must explain positions
 FEWEST, ALIKE_MOTION = (
     8,
     0.9,
-)  # rows from which on velocities tell the unit, and how well they must explain positions
+)
 
 _PAIR = re.compile(
     r"(?P<of>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nsecs?|ns|usecs?|us|micros)\]?", re.I
@@ -332,9 +334,8 @@ def _rising(table: Mapping[str, NDArray[Any]], coarse: Sequence[Clock]) -> Clock
         unit = _named_unit(name) or (
             _epoch(float(values[0])) if values[0] >= EPOCHS[1][0] else None
         )
-        unit = (
-            1.0 if unit is None and unnamed and (values != np.rint(values)).any() else unit
-        )  # an index of seconds
+        # an index of seconds
+        unit = 1.0 if unit is None and unnamed and (values != np.rint(values)).any() else unit
         for whole in (float(np.ptp(clock.seconds(table))) for clock in coarse):
             span = float(values[-1]) - float(values[0])
             unit = unit or next(

@@ -47,10 +47,11 @@ from asm_gym.spec import StreamSpec
 Floats = NDArray[np.float64]
 
 READ = ("sense", "command")
+# roles by behaviour that the elements of a channel do not get alone
 KEPT_TOGETHER = (
     "constant",
     "counter",
-)  # roles by behaviour that the elements of a channel do not get alone
+)
 BACK = "; name it among --channels to read it"
 MIXED = 0.5  # share of numbers from which on a column with words is one of numbers
 

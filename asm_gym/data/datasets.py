@@ -34,18 +34,20 @@ from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 
 METADATA, ARRAYS = "metadata.json", "main_data.hdf5"  # files of a dataset's folder ``data``
+# files that this package has written there, the last one until 1.0
 OWN_FILES = (
     ARRAYS,
     METADATA,
     "SHA256SUMS",
-)  # files that this package has written there, the last one until 1.0
+)
 SPARE_BYTES = 10_000_000  # beside the arrays of a data set, that a disk must have
 INFO = Path("meta") / "info.json"
 
+# features that are read begin so; pictures are left out
 SENSED, COMMANDED = (
     "observation.",
     "action",
-)  # features that are read begin so; pictures are left out
+)
 
 
 def require_minari() -> None:
@@ -204,9 +206,10 @@ def _find_dataset(path: Path) -> Path:
     if (path / METADATA).is_file():
         return path
     found = [f for f in sorted(path.rglob(METADATA)) if f.parent.name == "data"]
+    # left by a kill
     below = [
         f.parent for f in found if not any(p.startswith(".") for p in f.relative_to(path).parts)
-    ]  # left by a kill
+    ]
     if not below:
         raise FileNotFoundError(f"no Minari dataset at or below {path}")
     if len(below) > 1:
@@ -334,11 +337,12 @@ def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
             found = {name: as_array(columns[name][rows]) for name in read}
             made = {k: v for name in read for k, v in _split(name, found[name], read[name])}
             stamps = {"timestamp": columns["timestamp"][rows]} if "timestamp" in columns else {}
+            # frames that were lost are known by the stamps alone
             yield (
                 stamps | made,
                 rate,
                 success,
-            )  # frames that were lost are known by the stamps alone
+            )
 
 
 def _names(feature: dict[str, Any]) -> list[str]:

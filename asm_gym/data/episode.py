@@ -42,9 +42,8 @@ class EpisodeLabel:
     severity: str = ""
     seed: int = 0  # of the environment and of the policy. Episodes that share it are twins
     onset: int | None = None  # the first step with the fault or variation
-    affected_channels: frozenset[str] = field(
-        default=frozenset(), compare=False
-    )  # where it shows first, as measured
+    # where it shows first, as measured
+    affected_channels: frozenset[str] = field(default=frozenset(), compare=False)
 
     @property
     def path(self) -> Path:

@@ -94,9 +94,8 @@ def _by_clock(table: Columns, clock: Clock) -> dict[str, Any]:
     times, dt = timing.times, timing.dt
     if dt is None:
         raise ValueError("one row")
-    lost = spans(
-        np.isnan(evenly(np.ones((len(times), 1)), times, dt)[:, 0])
-    )  # as fit and watch read them
+    # as fit and watch read them
+    lost = spans(np.isnan(evenly(np.ones((len(times), 1)), times, dt)[:, 0]))
     gaps = times[0] + dt * np.array(
         [(start - 1, stop) for start, stop in lost], np.float64
     ).reshape(-1, 2)

@@ -106,10 +106,11 @@ def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log
             ):
                 note(f"not read, as the first log lacks it: {', '.join(more)[:120]}; {LIKE}")
             episode = Episode(found.stream, found.spec, success=source.success, faults=found.faults)
+        # others are read as it
         layout, one = (
             replace(layout, spec=layout.spec or episode.spec),
             one or source.file,
-        )  # others are read as it
+        )
         yield Log(source.name, episode)
 
 

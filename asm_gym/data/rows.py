@@ -132,10 +132,11 @@ class RowReader:
         self._header: list[str] | None = (
             None  # of CSV, as a file's: a name that comes again has a number
         )
+        # names with a number, and without
         self._header_line, self._doubled = (
             "",
             list[tuple[str, str]](),
-        )  # names with a number, and without
+        )
         self._plan: ColumnPlan | None = None  # of rows by name
         self._named: Named = {}  # columns that name others
         self._joint = ""  # column that says whose numbers a row holds
@@ -143,10 +144,11 @@ class RowReader:
             str, Any
         ] = {}  # of the joints that came, where a row is one of a joint
         self._publishers = Publishers(silence)
+        # when the newest line came, and the first that lacks columns
         self._now, self._since = (
             0.0,
             math.inf,
-        )  # when the newest line came, and the first that lacks columns
+        )
         self._lacking: ValueError | None = None  # what all publishers lack up to now
         self._clock: Clock | None = None
         self._first: float | None = None  # number of a clock whose unit is not known yet

@@ -194,9 +194,8 @@ def _joined(table: Columns) -> Columns:
     if (
         len(masks) > 1 and np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY
     ):  # a row has one of them
-        columns = Counter(
-            mask.tobytes() for mask in filled.values()
-        )  # as live: rows are those of the most numbers
+        # as live: rows are those of the most numbers
+        columns = Counter(mask.tobytes() for mask in filled.values())
         rows, most = (
             max(masks.values(), key=lambda mask: (columns[mask.tobytes()], np.count_nonzero(mask))),
             1.0,
@@ -212,9 +211,8 @@ def _joined(table: Columns) -> Columns:
     held = pd.DataFrame(
         {n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()}
     )[rows]
-    start = int(
-        held.notna().to_numpy().argmax(axis=0).max()
-    )  # before that the slower ones said nothing
+    # before that the slower ones said nothing
+    start = int(held.notna().to_numpy().argmax(axis=0).max())
     return {
         n: (held[n].to_numpy() if n in slower else values[rows])[start:]
         for n, values in table.items()

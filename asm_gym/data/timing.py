@@ -28,10 +28,11 @@ JITTER = (
     0.35  # by what share of a step a stamp may be off, and its row still be the one that was due
 )
 DRIFT = 0.011  # how far a clock may be off the rate that is read, as a share, and no row be moved for it
+# rows were lost where MOSTLY steps are NEARLY whole multiples of the median; else jitter
 NEARLY, MOSTLY = (
     0.15,
     0.95,
-)  # rows were lost where MOSTLY steps are NEARLY whole multiples of the median; else jitter
+)
 MOST_CUTS = 0.02  # share of rows at which time may go back or leap, and the log be cut there
 FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in it is known
 MOST_LOST = (
@@ -53,9 +54,8 @@ class Timing(NamedTuple):
 
     clock: Clock
     times: Floats  # (N,) of the rows that are kept [s]
-    kept: NDArray[
-        np.intp
-    ]  # (N,) which rows of the log these are: one of several with the same time
+    # (N,) which rows of the log these are: one of several with the same time
+    kept: NDArray[np.intp]
     dt: float | None  # from row to row in the mean [s]; None of a single row
 
 
@@ -104,9 +104,8 @@ def period(times: Floats) -> float | None:
         mean = float(steps[near].sum() / counts[near].sum())
     else:
         mean = float(steps[steps <= FAR * median].mean())
-    return float(
-        f"{mean:.6g}"
-    )  # stamps jitter, and rates that differ by rounding would be two rates
+    # stamps jitter, and rates that differ by rounding would be two rates
+    return float(f"{mean:.6g}")
 
 
 def evenly(rows: Floats, times: Floats, dt: float) -> Floats:

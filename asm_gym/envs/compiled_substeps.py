@@ -198,9 +198,8 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
             if goals.held[a] == 0:
                 limits.state[BRAKED] += slow_down(views, arms, limits, work, a)
         _step2(views.model, views.data)
-        sample(
-            views, nominal, arms, k, samples
-        )  # the place for all that is measured in every substep
+        # the place for all that is measured in every substep
+        sample(views, nominal, arms, k, samples)
         feel(arms.joints, limits, goals.held, k, samples)
 
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 JOINTS = 7  # the most joints an arm may have; shorter arms leave the rest unused
-FELT = (
-    JOINTS + 3
-)  # numbers that limits apply to: external torque of the joints, then force at the wrist
+# numbers that limits apply to: external torque of the joints, then force at the wrist
+FELT = JOINTS + 3
 OSC_POSE, JOINT_POSITION = 0, 1
 UNKNOWN_CHANGE, JOINT_ANGLES, HAND_POSE = range(3)  # what the inputs of an arm change
 

@@ -183,9 +183,8 @@ class RobosuiteEnv(SteppedEnv):
         self.felt_channels = tuple(
             c for c in channels if c.name.endswith(("external_torque", "wrist_force"))
         )
-        self.observation_layout = (
-            self._senses.sizes
-        )  # the observation's parts in order, and how many numbers each has
+        # the observation's parts in order, and how many numbers each has
+        self.observation_layout = self._senses.sizes
         self.observation_space = self.laid_out_space = self._senses.space()
 
     @property

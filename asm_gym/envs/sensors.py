@@ -120,9 +120,8 @@ class Proprioception:
                 channels.append(Channel(name, *about, resolution=sensor.resolution, stops=ends))
                 where += [(names.index(sensor.source), int(k)) for k in at]
         self.channels = tuple(channels)
-        self.where = np.array(
-            where, np.int64
-        )  # (P, 2) of each number its source and its index there
+        # (P, 2) of each number its source and its index there
+        self.where = np.array(where, np.int64)
 
 
 def _indices(
@@ -225,9 +224,8 @@ class Senses:
         row = sense(
             np.concatenate([*self._object_poses, action], dtype=np.float64), self._noise, rng
         )
-        sound = (
-            bool(np.isfinite(row).all()) if faults else None
-        )  # a fault that reads NaN is no fault of the simulation
+        # a fault that reads NaN is no fault of the simulation
+        sound = bool(np.isfinite(row).all()) if faults else None
         for corrupt in faults:
             corrupt(row)
         stream, seen = (

@@ -52,9 +52,8 @@ class Simulation:
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
         robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self.parts]))
-        self.nominal = NominalDynamics(
-            self.model, self.views, robots
-        )  # the robots' own model of their dynamics
+        # the robots' own model of their dynamics
+        self.nominal = NominalDynamics(self.model, self.views, robots)
         n = len(self.parts)
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
         self.speed_limits = np.full(n, np.inf)
@@ -95,9 +94,8 @@ class Simulation:
         self._add_up(1)
 
     def _take_up_controllers(self) -> None:
-        self.compiled = all(
-            is_compilable(part) for part in self.parts
-        )  # whether control runs compiled
+        # whether control runs compiled
+        self.compiled = all(is_compilable(part) for part in self.parts)
         self.arms = describe(self.parts, self.model)
         self.controllers = [controller_of(part) for part in self.parts]
         """Robosuite's, of each arm."""

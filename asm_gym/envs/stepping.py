@@ -27,9 +27,8 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
     """An environment whose control steps can be watched and changed from within."""
 
     simulation: Simulation  # physics, controllers and sensors of the loaded model
-    felt_channels: tuple[
-        Channel, ...
-    ]  # channels that contact limits apply to, of one arm after another
+    # channels that contact limits apply to, of one arm after another
+    felt_channels: tuple[Channel, ...]
     _action: NDArray[np.float32]
     _actions: Actions
     _objects: ObjectSensors

@@ -60,9 +60,8 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
         self.threads = min(wanted, self.num_envs)
         parts = np.array_split(np.arange(self.num_envs), self.threads)
-        self._here, *others = (
-            part.tolist() for part in parts
-        )  # numbers of the members of each thread
+        # numbers of the members of each thread
+        self._here, *others = (part.tolist() for part in parts)
         self._elsewhere: list[tuple[SimpleQueue[Any], Thread, list[int]]] = []
         for members in others:
             asked: SimpleQueue[Any] = SimpleQueue()

@@ -156,10 +156,11 @@ class BenchmarkResult:
     detectability: Sequence[Detectability]  # of every faulty episode
     rate: float  # false-alarm rate at which monitors are judged
     window_s: float  # an alarm within this time of the onset is a detection [s]
+    # numbers of nominal episodes in which the policy failed, and crashed
     left_out: tuple[int, int] = (
         0,
         0,
-    )  # numbers of nominal episodes in which the policy failed, and crashed
+    )
 
     @property
     def promise(self) -> AlarmRate:

@@ -174,11 +174,12 @@ def _limits(traces: Sequence[ScoredEpisode]) -> tuple[float, float]:
     ), ceiling
 
 
+# panels side by side; channels drawn; points of a curve
 ACROSS, MOST_PANELS, MOST_POINTS = (
     4,
     60,
     4000,
-)  # panels side by side; channels drawn; points of a curve
+)
 
 LOG_COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 """By the role of a channel; one that never moves is grey."""

@@ -31,9 +31,8 @@ Kind = tuple[str, str]  # kind and severity of a fault
 class Delays(NamedTuple):
     """Detection delays; a miss counts as infinitely late."""
 
-    median_ms: float = (
-        math.inf
-    )  # half of all faults were detected within this; inf where fewer were
+    # half of all faults were detected within this; inf where fewer were
+    median_ms: float = math.inf
     p95_ms: float = math.inf
 
     @classmethod

@@ -30,9 +30,8 @@ class Calibration:
     """The thresholds of a monitor, and the scores that they were set on."""
 
     thresholds: Mapping[AlarmRate, float] = field(default_factory=dict)
-    maxima: Floats = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (n,) the greatest surprise of each episode
+    # (n,) the greatest surprise of each episode
+    maxima: Floats = field(default_factory=lambda: np.zeros(0))
     blocks: Blocks | None = None  # the maxima by the hour; None if not calibrated by the hour
 
     def resampled(self, rng: np.random.Generator) -> dict[AlarmRate, float]:
@@ -52,9 +51,8 @@ class Draws(NamedTuple):
     """Results of one monitor in each of R resamples."""
 
     auroc: Floats  # (R,) over matched steps, the mean over kinds
-    found: Mapping[
-        AlarmRate, Floats
-    ]  # (R,) share of faults detected within the window, by the promised rate
+    # (R,) share of faults detected within the window, by the promised rate
+    found: Mapping[AlarmRate, Floats]
 
 
 def interval(value: float, draws: Floats) -> Estimate:
@@ -72,10 +70,11 @@ class Wins:
         self, faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
     ) -> None:
         shape, kinds = (len(faulty), len(nominal)), dict[tuple[str, str], int]()
+        # (F, N) 1 where a fault surprised more, ½ in ties
         self.won, self.comparable = (
             np.zeros(shape),
             np.zeros(shape),
-        )  # (F, N) 1 where a fault surprised more, ½ in ties
+        )
         self.kind = np.array(
             [kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int
         )

@@ -58,9 +58,8 @@ class ScoredEpisode:
         ""  # with the greatest share of surprise at ``first_alarm``; empty without an alarm
     )
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
-    excused: Mapping[str, Floats] = field(
-        default_factory=dict
-    )  # (T,) surprise that a knock, or a stop, excused
+    # (T,) surprise that a knock, or a stop, excused
+    excused: Mapping[str, Floats] = field(default_factory=dict)
     attribution: Floats | None = (
         None  # (T, D) shares of the channels in the surprise, for figures alone
     )

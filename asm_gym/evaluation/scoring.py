@@ -38,13 +38,11 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 class Recordings(NamedTuple):
     """The recordings of a run."""
 
-    roles: dict[
-        str, list[Episode]
-    ]  # without failed nominal episodes, and without scenes in which the robot crashes
+    # without failed nominal episodes, and without scenes in which the robot crashes
+    roles: dict[str, list[Episode]]
     left_out: tuple[int, int]  # numbers of nominal episodes that failed, and of scenes with a crash
-    twins: list[
-        Episode
-    ]  # all of the role nominal: a faulty episode equals its twin until the onset
+    # all of the role nominal: a faulty episode equals its twin until the onset
+    twins: list[Episode]
 
     @classmethod
     def of(cls, recordings: Sequence[Episode]) -> Recordings:

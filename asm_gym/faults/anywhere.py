@@ -163,9 +163,8 @@ def faults_anywhere(
     name, place = next(
         (n, span) for n, span in spec.slices.items() if span.start <= struck < span.stop
     )
-    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(
-        np.float64
-    )  # (A,)
+    # (A,)
+    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(np.float64)
     axis = int(rng.integers(len(halves)))
     element, spread, half = struck - place.start, float(sigma[struck]), float(halves[axis])
     drawn = Target(name, element, spread, axis, half, tuple(spec.slices))

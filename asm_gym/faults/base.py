@@ -149,10 +149,11 @@ class JointFault(Fault):
     """One that acts on a ``joint``, counted from the base, 0 first; a second arm's go on after the first one's."""
 
     joint: int = 3
+    # those in which it shows first
     channels: ClassVar[tuple[str, ...]] = (
         "joint_position",
         "joint_velocity",
-    )  # those in which it shows first
+    )
 
     def check(self, env: RobosuiteEnv) -> None:
         check_number(

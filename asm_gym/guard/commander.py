@@ -34,9 +34,8 @@ class Command:
     actions: Floats32  # (n, A) finite, in the action space
     brakes: Mask  # (n,) the robot stays, whatever the action is
     overridden: Mask  # (n,) something else than the policy's action is done
-    failures: Mapping[int, str] = field(
-        default_factory=dict
-    )  # what failed when it was chosen, by robot
+    # what failed when it was chosen, by robot
+    failures: Mapping[int, str] = field(default_factory=dict)
 
 
 class Commander:

@@ -59,12 +59,10 @@ class Row:
     ends_step: bool
     attribution: NDArray[np.float64]  # (n, D)
     failures: dict[int, str] = field(default_factory=dict)  # by robot
-    unreported: Mapping[int, str] = field(
-        default_factory=dict
-    )  # what failed without a consequence, by robot
-    lost: Mapping[int, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # numbers that are not finite, by robot
+    # what failed without a consequence, by robot
+    unreported: Mapping[int, str] = field(default_factory=dict)
+    # numbers that are not finite, by robot
+    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     contradictions: Mapping[int, Any] = field(default_factory=dict)  # by robot
     terms: Mapping[str, Mask] = field(default_factory=dict)  # where each alarm term holds (n,)
     outcomes: dict[int, Outcome] = field(default_factory=dict)  # by robot

@@ -26,9 +26,8 @@ from asm_gym.guard.row_validation import validate_rows
 from asm_gym.monitors.row_kernel import observe_rows
 
 KNOCKED = EVENTS.index(KNOCK)
-STOPPED = (
-    -1
-)  # in the place of how many robots there are to decide about: the rows are to be repaired first
+# in the place of how many robots there are to decide about: the rows are to be repaired first
+STOPPED = -1
 
 
 class GuardArrays(NamedTuple):

@@ -35,20 +35,16 @@ class ReleaseRule:
     """When control is handed back, and when the episode ends, counted in rows; infinite for never."""
 
     release_after: int = 10  # calm rows after which control is handed back
-    max_override: float = (
-        math.inf
-    )  # rows of a reflex, those before a hand-back after which the alarm was soon back too
+    # rows of a reflex, those before a hand-back after which the alarm was soon back too
+    max_override: float = math.inf
     try_after: float = math.inf  # rows until a trial; after each trial that fails, twice as many
     free_after: int = 5  # rows without contact after which it is over; after each that was too early, twice as many
-    strikes: float = (
-        math.inf
-    )  # how often the policy may pass a contact limit before the episode ends
-    impulse: float = (
-        math.inf
-    )  # how much the arm may press in an episode, beyond healthy motion [N s]
-    go_on: float = (
-        math.inf
-    )  # rows in alarm for which the policy may go on in an episode; at later alarms it is held
+    # how often the policy may pass a contact limit before the episode ends
+    strikes: float = math.inf
+    # how much the arm may press in an episode, beyond healthy motion [N s]
+    impulse: float = math.inf
+    # rows in alarm for which the policy may go on in an episode; at later alarms it is held
+    go_on: float = math.inf
 
 
 @dataclass(frozen=True)

@@ -29,10 +29,11 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import Array, activate, inner_kernel, kernel, outward
 
+# log σ² of 0.25 % of a channel's spread, and of 55 spreads
 SMALLEST, LARGEST = (
     np.float32(-12.0),
     np.float32(8.0),
-)  # log σ² of 0.25 % of a channel's spread, and of 55 spreads
+)
 
 
 class Association(NamedTuple):
@@ -136,11 +137,12 @@ def unbounded(size: int) -> Array:
 def leverage(a: Array, R: Array, Q: Array, groups: NDArray[np.intp], first: int) -> Array:
     """Return l (B, X) of inputs (B, I), of which the X changes begin at ``first``; ``groups`` (X,) are numbered."""
     B, X, past = len(a), len(groups), a.shape[1] - len(groups)
+    # squares of a group, at its number
     b, z, squares = (
         np.empty_like(a),
         np.empty_like(a),
         np.empty(X, a.dtype),
-    )  # squares of a group, at its number
+    )
     tail = np.empty((B, X), a.dtype)
     for n in range(B):  # numba takes seconds to compile an assignment to a slice
         for i in range(past):

@@ -40,15 +40,17 @@ from asm_gym.memory.linear import inverse_of, learn_from_past, learn_linear
 
 FEEDBACK_GAIN = 1e-3  # initial gain of B
 DECAY = 0.3  # share of its step size by which a synapse of U or B decays
+# largest number of batches, and of passes over the rows; rows of a batch
 UPDATES, PASSES, BATCH = (
     20_000,
     40,
     256,
-)  # largest number of batches, and of passes over the rows; rows of a batch
+)
+# step size, and share of the updates in which it rises; after that it falls along a cosine
 RATE, WARM_UP = (
     5e-3,
     0.1,
-)  # step size, and share of the updates in which it rises; after that it falls along a cosine
+)
 TICKS = 20  # progress reports of one learning of the hidden units
 ROWS_PER_INPUT = 12  # with fewer rows for each input, the senses are not predicted from each other
 TRACKING = np.float32(0.01)  # weight of the newest batch in the running spread σ of each error
@@ -59,16 +61,18 @@ SMALLEST_SPREAD = np.float32(1e-4)  # below this single precision is noise
 EXTREME = 0.0005  # share of nominal rows below the limits of log σ², and above
 LARGEST_RATIO = 30.0  # clips ε²/σ² (5.5 σ), so that one contact does not undo a thousand steps
 PRECISION_EPOCHS, PRECISION_RATE = 20, 1e-3
+# rows of a batch, and most batches in an epoch; then they are larger
 PRECISION_BATCH, PRECISION_BATCHES = (
     64,
     250,
-)  # rows of a batch, and most batches in an epoch; then they are larger
+)
 DOUBTS = 0.0, *(10.0 ** np.arange(-2.0, 0.6, 0.25))  # τ to choose from
+# of the t distribution, steps to its spread, and rows to choose τ by
 FREEDOM, SCALINGS, MOST_DOUBTED = (
     4,
     10,
     30_000,
-)  # of the t distribution, steps to its spread, and rows to choose τ by
+)
 ALL_TICKS = (THIRDS + 1) * TICKS + PRECISION_EPOCHS  # progress reports of ``learn_association``
 
 

@@ -34,9 +34,8 @@ TRACES, SETTLING = "traces", "settling"
 class Dynamics(NamedTuple):
     """A kind of temporal network."""
 
-    shapes: Callable[
-        [int, int, int], dict[str, tuple[int, ...]]
-    ]  # of its synapses by name, for H, S and A
+    # of its synapses by name, for H, S and A
+    shapes: Callable[[int, int, int], dict[str, tuple[int, ...]]]
     weights: Callable[..., Any]  # all synapses together
     network: Callable[..., TemporalNetwork]
     learn: Learn

@@ -26,10 +26,11 @@ Tick = Callable[[], None]
 """Reports progress."""
 
 LONGEST_CUE = 30  # a stream reads fewer rows than this before it may run on alone
+# largest number of batches without and with running on alone
 UPDATES, RECALL_UPDATES = (
     10_000,
     50_000,
-)  # largest number of batches without and with running on alone
+)
 REFERENCE_WIDTH = (
     256  # hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
 )
@@ -190,9 +191,8 @@ class Practice:
         self.learner, self.rng = learner, rng
         self.state = learner.at_rest(size)
         self.cue = np.full((size, 1), LONGEST_CUE)
-        self._steps = np.zeros(
-            (size, 1), np.intp
-        )  # rows since the episode began, or since the stream began
+        # rows since the episode began, or since the stream began
+        self._steps = np.zeros((size, 1), np.intp)
         self._alone = np.zeros((size, 1), np.bool_)
 
     def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:

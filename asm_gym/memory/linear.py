@@ -116,9 +116,8 @@ def learn_linear(a: Array, groups: NDArray[np.intp], changes: slice) -> NDArray[
     for penalty in PENALTIES:
         error = fresh[:, changes] - along(fresh, conditional(shown, penalty, groups, changes))
         left.append(np.maximum(np.mean(error**2, axis=0), EXACT))
-    best = np.argmin(
-        np.array(left)[::-1], axis=0
-    )  # (X,) counted from the end: of equals the largest
+    # (X,) counted from the end: of equals the largest
+    best = np.argmin(np.array(left)[::-1], axis=0)
     everything, D = moments(a), np.zeros((len(groups), a.shape[1]))
     for n, penalty in enumerate(PENALTIES[::-1]):
         if np.any(best == n):

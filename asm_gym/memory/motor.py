@@ -30,11 +30,12 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_shapes
 
+# largest number of batches, and of passes over the rows; rows of a batch
 UPDATES, PASSES, BATCH = (
     12_000,
     100,
     256,
-)  # largest number of batches, and of passes over the rows; rows of a batch
+)
 RATE, FORGETTING = 3e-3, 0.3  # step size, and λ
 FINE = 8.0  # κ of relative positions of objects, where a centimetre decides
 PLACED = (

@@ -68,9 +68,8 @@ def learn_readout(
         np.zeros(count, np.float32),
     )
     weights, bias = Synapse(W_K), Synapse(b_K)
-    rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(
-        np.float32
-    )  # (K,) n
+    # (K,) n
+    rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)
     for n, rows in zip(range(UPDATES), shuffled(len(skill), BATCH, rng), strict=False):
         f = np.ascontiguousarray(rates(rows), np.float32)
         error = np.eye(count, dtype=np.float32)[skill[rows]] - certainty(f, W_K, b_K)

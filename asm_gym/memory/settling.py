@@ -34,10 +34,11 @@ from asm_gym.memory.learning import (
 )
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
 
+# smallest initial weight of a unit on its own last state, and the gain from all others
 LEAST, FAINT = (
     0.9,
     0.1,
-)  # smallest initial weight of a unit on its own last state, and the gain from all others
+)
 
 
 class SettlingWeights(NamedTuple):

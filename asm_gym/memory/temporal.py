@@ -23,9 +23,8 @@ from asm_gym.memory.learning import Schedule, Tick, Trajectory
 
 Rows = NDArray[np.float64]
 
-UNSURE = np.float32(
-    0.1
-)  # weight of an error while only one earlier row is known, and with it no speed
+# weight of an error while only one earlier row is known, and with it no speed
+UNSURE = np.float32(0.1)
 
 
 class RowHistory(NamedTuple):
@@ -64,9 +63,8 @@ class RowHistory(NamedTuple):
 class MemoryState(NamedTuple):
     """State of the memory, one entry a stream; never changed in place."""
 
-    traces: NDArray[
-        np.float32
-    ]  # (B, I) c, of what was sensed and done; or the state z that settled on it
+    # (B, I) c, of what was sensed and done; or the state z that settled on it
+    traces: NDArray[np.float32]
     expected: NDArray[np.float32]  # (B, H) f(μ), of the state that was expected then
     history: RowHistory
     skill: NDArray[np.float32]  # (B, K) L, evidence for each skill; K is 0 where none has a name

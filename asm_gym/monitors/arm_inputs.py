@@ -56,10 +56,11 @@ class Derived(NamedTuple):
             )
         if urdf:
             links = BodyModel.of(urdf, [spec.labels[i] for i in angles])
+        # (S, X), (J, X)
         of_speed, of_angle = (
             (spec.sensory == moving[:, None]),
             (spec.sensory == angles[:, None]),
-        )  # (S, X), (J, X)
+        )
         if links is None:
             pairs = np.array(np.triu_indices(2 * J), np.intp)
             single = np.vstack([of_angle, of_angle])

@@ -84,9 +84,8 @@ class BodyModel:
         )
 
         def unexplained(model: Self) -> float:
-            inputs = np.stack(
-                [*model.torques(q, speed, acceleration), *friction], axis=-1
-            )  # (N, J, 5)
+            # (N, J, 5)
+            inputs = np.stack([*model.torques(q, speed, acceleration), *friction], axis=-1)
             solved = [
                 np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0]
                 for j in range(torque.shape[1])

@@ -32,10 +32,11 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("asm_gym.monitors")
 
+# one in so many episodes sets ceilings, the first that leaves enough for the threshold
 ONE_IN = (
     3,
     10,
-)  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
+)
 AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 MOST_NAMED = 6  # channels that a message names

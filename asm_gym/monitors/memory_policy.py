@@ -55,9 +55,8 @@ class CommandReadout:
         low, high = self._space.low, self._space.high
         action = np.clip(np.nan_to_num(expected), low, high).astype(np.float32)
         g = self._grip
-        share = ((action - low)[g] / (high - low)[g]).astype(
-            np.float64
-        )  # (G,) 1 where the upper end is certain
+        # (G,) 1 where the upper end is certain
+        share = ((action - low)[g] / (high - low)[g]).astype(np.float64)
         before = before or Grip(share > 0.5, np.zeros(len(share)))
         other = np.where(before.high, 1.0 - share, share)
         evidence = np.exp(-self._dt / FORGETS) * before.evidence + self._dt * other

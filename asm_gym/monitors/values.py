@@ -36,10 +36,11 @@ from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
 SCALARS = "usual", "balance", "power"
+# maxima that p rests on before any, and spread of their logarithms
 PRIOR_COUNT, PRIOR_SPREADS = (
     4,
     (0.3, 0.15),
-)  # maxima that p rests on before any, and spread of their logarithms
+)
 MOST_POWER = 3.0
 PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
 
@@ -48,9 +49,8 @@ class Values(NamedTuple):
     """The monitor of values, and how it counts beside that of changes."""
 
     monitor: CalibratedMonitor  # of values alone
-    leverage: NDArray[np.float64] = np.zeros(
-        (0, 0)
-    )  # zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs
+    # zᵀ leverage z is τ h / (1 + τ h̃); empty for very many inputs
+    leverage: NDArray[np.float64] = np.zeros((0, 0))
     usual: float = 1.0  # 1 / (1 + τ h̃)
     balance: float = 1.0  # b, before ``calibrate``
     power: float = 2.0  # p, before ``calibrate``: changes are judged by squares

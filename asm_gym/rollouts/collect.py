@@ -225,9 +225,8 @@ def collect(
 
 def record_episode(seed: int, spec: EnvSpec, config: RolloutConfig) -> Episode:
     """Record the episode of ``seed``."""
-    gym.registry.setdefault(
-        spec.id, spec
-    )  # another process lacks what the user registered in this one
+    # another process lacks what the user registered in this one
+    gym.registry.setdefault(spec.id, spec)
     trial = Trial(spec.id, seed)
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
@@ -276,9 +275,8 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     asm = [info["asm"] for info in infos]
     rows = len(asm[0]["surprises"])  # of each control step
     fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
-    attribution = np.repeat(
-        [list(a["attribution"].values()) for a in asm], rows, axis=0
-    )  # the step's greatest
+    # the step's greatest
+    attribution = np.repeat([list(a["attribution"].values()) for a in asm], rows, axis=0)
     trace = ScoredEpisode(
         kind=trial.kind,
         severity=trial.severity,

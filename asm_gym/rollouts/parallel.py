@@ -109,9 +109,8 @@ def _loky(workers: int) -> Iterator[Any]:
             f"a worker process was killed, perhaps for want of memory: {error}"
         ) from error
     except BaseException:
-        executor.shutdown(
-            wait=True, kill_workers=True
-        )  # after an error or a Ctrl-C nothing runs on
+        # after an error or a Ctrl-C nothing runs on
+        executor.shutdown(wait=True, kill_workers=True)
         raise
 
 

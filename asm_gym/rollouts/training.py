@@ -32,10 +32,11 @@ ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
 ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
 CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
 BATCH, LOG_STD = 256, -3.5  # of cloning, and the actor's log standard deviation before tanh
+# learning rates of cloning, before and while the agent learns from its steps
 CLONING_RATE, ANCHOR_RATE = (
     1e-3,
     3e-4,
-)  # learning rates of cloning, before and while the agent learns from its steps
+)
 
 Floats = NDArray[np.float32]
 

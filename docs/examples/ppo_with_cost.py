@@ -23,9 +23,8 @@ def guarded():
 
 
 agent = PPO("MlpPolicy", gym.make(ARM, horizon=50), n_steps=100, batch_size=50, seed=0)
-episodes = collect(
-    ARM, policy=agent, episodes=40, workers=1, horizon=50
-)  # how it explores while nothing is wrong
+# how it explores while nothing is wrong
+episodes = collect(ARM, policy=agent, episodes=40, workers=1, horizon=50)
 monitor = (
     make_monitor("kalman", episodes[0].spec)
     .fit(episodes[:20])
@@ -33,8 +32,7 @@ monitor = (
 )
 
 agent.set_env(make_vec_env(guarded, 1))
-safety = (
-    SafetyCallback()
-)  # safety/alarms, safety/cost, safety/overridden, safety/surprise, safety/slowed
+# safety/alarms, safety/cost, safety/overridden, safety/surprise, safety/slowed
+safety = SafetyCallback()
 agent.learn(400, callback=safety)
 print(f"steps in alarm by episode: {[episode['cost'] for episode in safety.ended]}")

@@ -102,9 +102,8 @@ class Expert(StatefulPolicy):
         self.np_random = np.random.default_rng(seed)
         self.read = ObservationReader(env)
         size = int(np.prod(env.action_space.shape or ()))
-        self.moves = np.setdiff1d(
-            np.arange(size), inner.gripper_actions
-        )  # indices of the action that move arms
+        # indices of the action that move arms
+        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)
         self._careful = set(inner.robots) != {"Panda"}
         """Plans have the Panda's pace; other arms drift further from their course."""
         self._gain = 3.0 if self._careful else 2.0

@@ -34,9 +34,8 @@ class CarryTask(NamedTuple):
 
     name: str  # of the object, as observations call it
     grip: Vector  # (3,) where to hold it, in its own frame [m]
-    closing: (
-        Vector | None
-    )  # (3,) along which of its own axes the fingers close; None where every direction does
+    # (3,) along which of its own axes the fingers close; None where every direction does
+    closing: Vector | None
     turns: float  # after how much of a turn about the vertical the grasp is the same again [rad]
     clearance: float  # how far above its grip to come from [m]
     place: Vector  # (3,) where its origin is to go [m]
@@ -268,9 +267,8 @@ class NutAssemblyExpert(CarryExpert):
     def next_task(self, observation: Any) -> CarryTask | None:
         """Return a nut that is not around its peg; None where all are."""
         env = self.robosuite
-        aside = (
-            np.pi / 2 if self._careful else 0.5
-        )  # a Panda's elbow reaches its stop sooner than others'
+        # a Panda's elbow reaches its stop sooner than others'
+        aside = np.pi / 2 if self._careful else 0.5
         for i, nut in enumerate(env.nuts):
             if env.single_object_mode and i != env.nut_id:
                 continue

@@ -63,9 +63,8 @@ class DoorExpert(Expert):
         handle = model.geom("Door_handle").id
         frame = data.geom_xmat[handle].reshape(3, 3)
         middle, pivot, axis = data.geom_xpos[handle], data.xanchor[latch], data.xaxis[latch]
-        outwards = frame[:, 0] * np.sign(
-            frame[:, 0] @ (middle - pivot)
-        )  # along the handle, away from the pivot
+        # along the handle, away from the pivot
+        outwards = frame[:, 0] * np.sign(frame[:, 0] @ (middle - pivot))
         sign = -float(np.sign(np.cross(axis, middle - pivot)[2]))
         grip = middle + (0.025 + along) * outwards
         normal = frame[:, 1] * np.sign(frame[:, 1] @ (middle - pivot))

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
+# what one unit of action moves the hand's set-point by, in robosuite's OSC_POSE
 METRES, RADIANS = (
     0.05,
     0.5,
-)  # what one unit of action moves the hand's set-point by, in robosuite's OSC_POSE
+)
 
 
 class Pose(NamedTuple):

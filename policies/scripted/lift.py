@@ -31,9 +31,8 @@ class LiftExpert(Expert):
 
     def begin(self, observation: Any) -> State:
         style, rng = self.style, self.np_random
-        deep = (
-            0.0 if self._careful else 0.005
-        )  # fingers of other arms are longer, and come down on the table
+        # fingers of other arms are longer, and come down on the table
+        deep = 0.0 if self._careful else 0.005
         speed = style.pace(self.pace, rng)
         plan = _Plan(
             hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
@@ -77,9 +76,8 @@ class LiftExpert(Expert):
                 target = target + over_first(scene.hand.at, cube.at)
         else:
             target = state.anchor + (plan.goal if phase == LIFT else 0.0)
-        side = (
-            flattest_side(cube.turned) if phase <= DESCEND else None
-        )  # a cube looks the same every quarter turn
+        # a cube looks the same every quarter turn
+        side = flattest_side(cube.turned) if phase <= DESCEND else None
         aligned = gripping(scene.hand.turned, side, np.pi / 2)
         return np.append(
             move(scene.hand, target, aligned, state.speed), OPEN if phase <= DESCEND else CLOSE

@@ -22,11 +22,12 @@ from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import harm, kit
 from asm_gym.tasks import env_id
 
+# actions that are announced; how often; how long before a blow is early enough [s]
 CHUNK, EVERY, AHEAD_S = (
     16,
     8,
     0.2,
-)  # actions that are announced; how often; how long before a blow is early enough [s]
+)
 
 
 @dataclass(frozen=True)

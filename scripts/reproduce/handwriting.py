@@ -29,9 +29,8 @@ NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 STEPS = 60
 DT = 1.0 / STEPS  # control period [s]: a letter takes 1 s at normal speed
 NOISE = 0.02  # standard deviation of the pen's sensed position [cm]; letters are about 5 cm large
-MU = (
-    -1.75
-)  # mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset
+# mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset
+MU = -1.75
 WOBBLE = 0.04  # variation of a stroke between writings, as a share of its length and in radians of its direction
 STROKES = (2.0, -math.pi, -2.5, -0.02, 0.25), (5.0, math.pi, 2.5, 0.02, 0.4)
 """Bounds of what is drawn of a stroke, as ``Letter`` holds it; its onset goes on by 0.19 s."""
@@ -50,9 +49,8 @@ class Letter(NamedTuple):
     """A skill: overlapping strokes."""
 
     name: str
-    strokes: NDArray[
-        np.float64
-    ]  # (S, 5) of each its length [cm], direction and turn [rad], onset [s], and σ
+    # (S, 5) of each its length [cm], direction and turn [rad], onset [s], and σ
+    strokes: NDArray[np.float64]
 
 
 check_letters = partial(check_number, "letters", low=1, high=len(NAMES), whole=True)
@@ -87,9 +85,8 @@ def written(
     strokes[:, 0] *= 1 + length
     strokes[:, 1:4] += np.stack([direction, turn, 0.1 * onset], axis=1)
     steps = round(STEPS / speed)
-    time = (
-        (np.arange(FINE * steps) + 0.5) * DT * speed / FINE
-    )  # the position is the integral, not a sum of samples
+    # the position is the integral, not a sum of samples
+    time = (np.arange(FINE * steps) + 0.5) * DT * speed / FINE
     v = speed * velocity(Letter(letter.name, strokes), time).reshape(steps, FINE, 2).mean(axis=1)
     position = np.cumsum(v, axis=0) * DT + NOISE * rng.standard_normal((steps, 2))
     return Episode.from_stream(np.hstack([position, v]), PEN, info={"skill": letter.name})

@@ -46,10 +46,11 @@ GUARDS: dict[str, dict[str, Any] | None] = {
 }
 """Settings of the wrapper by name; None for no wrapper."""
 TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile policies
+# not met by the Panda's memory; healthy policies alone
 UNKNOWN = (
     "PickPlaceMilk",
     "NutAssemblyRound",
-)  # not met by the Panda's memory; healthy policies alone
+)
 AGENTS = ("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac")
 HEALTHY = (*((task, "scripted") for task in (*TASKS, *UNKNOWN)), *AGENTS)
 """Tasks and policies that do no harm on purpose."""

@@ -104,9 +104,8 @@ class EDetector:
         self._maxima, self._evidence = np.sort(blocks.maxima)[::-1], 0.0
         self._enough = len(blocks.maxima) / blocks.total / rate
         p = np.arange(1, len(self._maxima) + 1) / (len(self._maxima) + 1)
-        self._e_values = (1 - p + p * np.log(p)) / (
-            p * np.log(p) ** 2
-        )  # of what 0, 1, … maxima exceed
+        # of what 0, 1, … maxima exceed
+        self._e_values = (1 - p + p * np.log(p)) / (p * np.log(p) ** 2)
 
     @property
     def value(self) -> float:

@@ -55,10 +55,11 @@ TARGETS = {
     "error": "gradient of the prediction error",
     "alone": f"gradient of the error alone, after a cue of {CUE}",
 }
+# learning rate of a change a row, and of one a batch
 RATES = {
     "local": 3e-3,
     "backpropagation": 1e-2,
-}  # learning rate of a change a row, and of one a batch
+}
 PRIOR_PRECISION = 30.0  # Π_z
 ITERATIONS = 5  # inference steps of learning
 
@@ -243,9 +244,8 @@ def backpropagated(
 ) -> list[Record]:
     """Train the same network from the same weights by Adam on the exact gradient of the prediction error."""
     records = []
-    W = {
-        name: torch.from_numpy(getattr(weights, name)) for name in COMPARED
-    }  # shares memory with the weights
+    # shares memory with the weights
+    W = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}
     adam = torch.optim.Adam(W.values(), RATES["backpropagation"])
     for epoch in range(config.epochs + 1):
         if epoch in checkpoints(config.epochs):

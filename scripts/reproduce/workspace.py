@@ -37,10 +37,11 @@ THINGS = {"Lift": "cube", "Stack": "cubeA", "NutAssemblySquare": "SquareNut"} | 
     f"PickPlace{name}": name for name in ("Can", "Milk", "Cereal")
 }
 FAULTS = ("push", "held_by_person", "weak_joint", "frozen_encoder", "encoder_bias", "gripper_opens")
+# another thing to carry; and motion of no skill, in the scene of Lift
 UNKNOWN = (
     "PickPlaceCereal",
     "sway",
-)  # another thing to carry; and motion of no skill, in the scene of Lift
+)
 SPEC = StreamSpec(
     (
         Channel("joint_position", 7, "rad", 2e-4, "joint"),
@@ -57,11 +58,12 @@ SPEC = StreamSpec(
     0.05,
     "Panda",
 )
+# columns of the encoders, the hand, the objects
 JOINTS, HAND, SEEN = (
     slice(0, 7),
     slice(7, 10),
     slice(18, 32),
-)  # columns of the encoders, the hand, the objects
+)
 GROUPS = {
     "joint": JOINTS,
     "hand": slice(7, 16),
@@ -72,16 +74,18 @@ GROUPS = {
 NEAR = 0.02  # the second sense of a distance resolves less than this [m]
 HANDLE = np.array([0.054, 0.0, 0.0])  # of the nut, in its own frame [m]
 SHAKE, REST = 0.25, 12  # most noise on what experts command; rows recorded after success
+# row of an event; rows of a second; rows for which a pushed arm yields
 EVENT, SECOND, YIELD = (
     30,
     20,
     12,
-)  # row of an event; rows of a second; rows for which a pushed arm yields
+)
 SMOOTH = 0.5  # gain of energies
+# smallest variance of an error, in its mean; ridge of the regression on the state
 SHARPEST, PRIOR = (
     0.01,
     150.0,
-)  # smallest variance of an error, in its mean; ridge of the regression on the state
+)
 LONGEST = 250  # rows of an expression
 
 

@@ -68,9 +68,8 @@ class Kalman(StreamModel):
         before, after = (np.concatenate([x[k : len(x) - 1 + k] for x in xs]) for k in (0, 1))
         u = np.concatenate([s[1:, self.spec.motor] for s in streams]).astype(np.float64)
         Z = np.hstack([before, u, np.ones((len(u), 1))])
-        weights = np.linalg.solve(
-            Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after
-        )  # (X + A + 1, X)
+        # (X + A + 1, X)
+        weights = np.linalg.solve(Z.T @ Z + self.ridge * len(Z) * np.eye(Z.shape[1]), Z.T @ after)
         X = len(self.spec.sensory)
         A, residual = weights[:X].T, after - Z @ weights
         R = np.diag(np.maximum((self.spec.noise[self.spec.sensory] / spread) ** 2, FAINTEST))

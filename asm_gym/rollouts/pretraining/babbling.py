@@ -44,10 +44,11 @@ LEADING = (LED, DRIVEN, ALONE, LED, DRIVEN)  # what leads, lesson by lesson of a
 SMOOTHNESS = (0.0, 0.5, 0.9, 0.97)
 """ρ: from the noise by which agents explore to pushing on in one direction, as half-trained ones do."""
 NOISE = 0.02, 0.2  # range of s, up to about the exploration of a half-trained agent [action units]
+# speed of the expert, relative to its usual one; factor of an object's mass
 SPEED, WEIGHT = (
     (0.5, 1.5),
     (0.7, 1.4),
-)  # speed of the expert, relative to its usual one; factor of an object's mass
+)
 PAUSE, PAUSED = 0.01, (5, 60)  # probability per step that the arm stops, and for how many steps
 DRIFT, DRIFTED, DRIFTING = 0.015, (5, 60), (0.05, 1.0)
 """Probability per step of a disturbed lesson that the arm drifts, steps, and command [action units]."""
@@ -58,16 +59,18 @@ CHANGED, LIMITS = 0.05, (0.05, 1.0)
 LOOSENED, LOOSE = 0.05, 0.05
 """Probability per step of a disturbed lesson that the grip's command changes, and its least share of the guide's."""
 
+# range of places, relative to where the hand begins [m]
 AROUND = (
     (-0.25, -0.4, -0.12),
     (0.25, 0.4, 0.25),
-)  # range of places, relative to where the hand begins [m]
+)
 TURNED = 0.2, 0.2, 0.8  # greatest turn of the hand about the axes of the world [rad]
 PACE = 0.45  # speed of the hand [action units]
+# the hand goes on to the next place this near to one [m], or after so many steps
 ARRIVED, GIVEN_UP = (
     0.02,
     60,
-)  # the hand goes on to the next place this near to one [m], or after so many steps
+)
 
 
 class Lesson(NamedTuple):

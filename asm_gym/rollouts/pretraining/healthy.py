@@ -36,9 +36,8 @@ class Gentle(NamedTuple):
     torque: float  # external, on a joint [N m]; it shows what cancels in the force, such as an arm that hits itself
 
 
-KNOWN = Gentle(
-    30.0, 15.0
-)  # learned in any case: an arm whose experts touch little meets contact all the same
+# learned in any case: an arm whose experts touch little meets contact all the same
+KNOWN = Gentle(30.0, 15.0)
 
 
 def held_out(number: int) -> bool:
@@ -50,9 +49,8 @@ class Lessons(NamedTuple):
     """Healthy recordings of babbling."""
 
     fit: list[Episode]  # to learn from
-    calibration: list[
-        Episode
-    ]  # held-out lessons in which the expert alone solved its task, without crashes
+    # held-out lessons in which the expert alone solved its task, without crashes
+    calibration: list[Episode]
     whole: list[Episode]  # the same with crashes
 
 
