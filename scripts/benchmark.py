@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium.vector import VectorEnv
 from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 from rich.console import Console
@@ -157,31 +158,59 @@ def speeds(name: object, members: int, seconds: dict[str, NDArray[np.float64]]) 
     return str(name), *numbers, *(ratio(other, ours).text(digits=2) for other in others)
 
 
-def measure_safety(args: Args, console: Console) -> Table:
-    """Compare steps under the guard with the same steps without it: one environment at 20 and 100 Hz, and vectors."""
-    rows, turns = [], max(1, args.steps // SECOND)
+def observing_steps(env: Any, memory: NeuralASM, count: int) -> Callable[[Any], None]:
+    """Return a step of ``count`` environments whose rows a memory observes: no guard can cost less."""
+    state = memory.initial_state(count)
 
-    def compare(name: object, count: int, bare: Any, guarded: Any) -> None:
-        rivals = {}
-        for each, env in (("guarded", guarded), ("bare", bare)):
+    def step(action: Any) -> None:
+        nonlocal state
+        info = env.step(action)[-1]
+        rows = np.asarray(info.get("streams", info["stream"])).reshape(-1, count, memory.spec.size)
+        for row in rows:
+            state, _ = memory.observe(state, row)
+
+    return step
+
+
+def measure_safety(args: Args, console: Console) -> Table:
+    """Compare guarded steps with bare ones, and with those whose rows the memory observes without a guard."""
+    rows = []
+    turns = max(1, args.steps // SECOND)
+
+    def compare(name: str, count: int, bare: Any, inner: Any) -> None:
+        many = isinstance(inner, VectorEnv)
+        spec = inner.get_attr("stream_spec")[0] if many else StreamSource(inner).spec
+        memory = body_memory(inner, spec).with_threshold(1e300)  # no step is overridden
+        guard: Any = VectorNeuralASMSafety if many else NeuralASMSafety
+        guarded = guard(inner, memory)
+        steps = {
+            "guarded": guarded.step,
+            "memory alone": observing_steps(bare, memory, count),
+            "bare": bare.step,
+        }
+        action = np.zeros(bare.action_space.shape, np.float32)
+        for env in (guarded, bare):
             env.reset(seed=args.seed)
-            rivals[each] = stepping(env.step, repeat(np.zeros(env.action_space.shape, np.float32)))
+        rivals = {each: stepping(step, repeat(action)) for each, step in steps.items()}
         rows.append(speeds(name, count, take_turns(rivals, turns, args.seed, console)))
 
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
         bare, inner = _made(args.task, rate), _made(args.task, rate)
-        # no step is overridden
-        memory = body_memory(inner, StreamSource(inner).spec).with_threshold(1e300)
-        guarded = NeuralASMSafety(inner, memory)
-        compare(name, 1, bare, guarded)
+        compare(name, 1, bare, inner)
         bare.close()
-        guarded.close()
+        inner.close()
     envs = [[_made(args.task) for _ in range(max(args.members))] for _ in range(2)]
     alone, watched = (vectors_of(own, args.members) for own in envs)
     for n, within in watched.items():
-        memory = body_memory(within, within.get_attr("stream_spec")[0]).with_threshold(1e300)
-        compare(f"vector of {n}", n, alone[n], VectorNeuralASMSafety(within, memory))
-    headings = "", "guarded", "bare", "guarded / bare"
+        compare(f"vector of {n}", n, alone[n], within)
+    headings = (
+        "",
+        "guarded",
+        "memory alone",
+        "bare",
+        "guarded / memory alone",
+        "guarded / bare",
+    )
     return Table(f"Control steps of {args.task} a second, shipped memory", headings, rows)
 
 

@@ -124,7 +124,6 @@ def test_a_wrapper_is_made_or_refused(make, names, data):
 
 
 # Those that are checked before a simulator is made, which takes seconds.
-# fmt: skip
 EARLY = (
     "task",
     "robot",

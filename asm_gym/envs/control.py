@@ -272,19 +272,28 @@ def track(views: Views, arms: Arms, goals: Goals, work: Work, a: int) -> None:
 @partial(inner, inlined=True)
 def fastest_point(views: Views, arms: Arms, a: int) -> float:
     """Return the greatest speed of hand and links of arm ``a``, as far as each ``REACHES`` [m/s]."""
-    site, com, most = views.site_xpos[arms.site[a]], views.subtree_com[arms.root[a]], 0.0
-    for n in range(arms.links.shape[1]):
-        b = arms.links[a, n]
-        if b < 0:
+    origin = views.subtree_com[arms.root[a]]  # at which MuJoCo's velocities of bodies are
+    hand = arms.links[a, 0]
+    fastest = point_speed(views.cvel[hand], views.site_xpos[arms.site[a]], origin)
+    for n in range(1, arms.links.shape[1]):
+        link = arms.links[a, n]
+        if link < 0:
             break
-        v, place, moving, turning = views.cvel[b], site if n == 0 else views.xpos[b], 0.0, 0.0
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            speed = v[3 + i] + v[j] * (place[k] - com[k]) - v[k] * (place[j] - com[j])
-            moving += speed * speed
-            turning += v[i] * v[i]
-        most = max(most, np.sqrt(moving) + REACHES * np.sqrt(turning))
-    return most
+        fastest = max(fastest, point_speed(views.cvel[link], views.xpos[link], origin))
+    return fastest
+
+
+@inner
+def point_speed(velocity: Floats, place: Floats, origin: Floats) -> float:
+    """Return how fast the furthest point about a place (3,) may go, by its body's velocity (6,) at an origin (3,)."""
+    x = place[0] - origin[0]
+    y = place[1] - origin[1]
+    z = place[2] - origin[2]
+    vx = velocity[3] + velocity[1] * z - velocity[2] * y
+    vy = velocity[4] + velocity[2] * x - velocity[0] * z
+    vz = velocity[5] + velocity[0] * y - velocity[1] * x
+    turning = velocity[0] * velocity[0] + velocity[1] * velocity[1] + velocity[2] * velocity[2]
+    return np.sqrt(vx * vx + vy * vy + vz * vz) + REACHES * np.sqrt(turning)
 
 
 @partial(inner, inlined=True)

@@ -131,26 +131,42 @@ class AlarmTerms:
         self.terms = dict(sorted(ALARM_TERMS.items(), key=lambda item: item[1].priority))
         self.held_rows = dict.fromkeys(self.terms, 0)
         self.of_user = tuple(name for name in self.terms if name not in ALARM_TERMS.own)
+        self._of_row: dict[str, Mask] = {}  # of the user's own terms
+
+    def ask_users(self, robots: RobotTable) -> str:
+        """Evaluate the user's own terms at a row, whose masks are kept; return what failed, as an alarm must not."""
+        self._of_row = {}
+        for name in self.of_user:
+            try:
+                self._of_row[name] = self._checked(name, robots)
+            except Exception as error:
+                return f"alarm term {name}: {error!r}"
+        return ""
+
+    def any_of_user(self) -> Mask | bool:
+        """Return (n,) where any of the user's own terms holds at the row."""
+        return np.logical_or.reduce(list(self._of_row.values()), initial=False)
 
     def masks(self, robots: RobotTable) -> dict[str, Mask]:
         """Return where each term holds (n,), by name, in the order of priority."""
-        return {name: self._mask(name, robots) for name in self.terms}
-
-    def any_of_user(self, robots: RobotTable) -> Mask:
-        """Return (n,) where any of the user's own terms holds."""
-        return np.logical_or.reduce([self._mask(name, robots) for name in self.of_user])
+        active = robots.records["active"]
+        built_in = {
+            name: term.holds(robots) for name, term in self.terms.items() if name in ALARM_TERMS.own
+        }
+        masks = built_in | self._of_row
+        return {name: masks[name] & active for name in self.terms if name in masks}
 
     def count(self, names: tuple[str, ...]) -> None:
         """Count a row of a robot in which these terms hold."""
         for name in names:
             self.held_rows[name] += 1
 
-    def _mask(self, name: str, robots: RobotTable) -> Mask:
+    def _checked(self, name: str, robots: RobotTable) -> Mask:
         mask = np.asarray(self.terms[name].holds(robots))
         shape = (len(robots.records),)
         if mask.shape != shape or mask.dtype != np.bool_:
-            raise TypeError(f"alarm term {name} must return a mask {shape}, got {short_repr(mask)}")
-        return mask & robots.records["active"]
+            raise TypeError(f"it must return a mask {shape}, got {short_repr(mask)}")
+        return mask
 
     def __str__(self) -> str:
         """Return a line for each term: priority, name, rows in which it held, response, where it holds."""

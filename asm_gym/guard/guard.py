@@ -40,7 +40,15 @@ from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, motion_arrays, 
 from asm_gym.guard.report import KNOCKED, Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from, unexplained
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
-from asm_gym.guard.robot_table import POLICY, REFLEX, Mask, RobotTable, cleared, copied
+from asm_gym.guard.robot_table import (
+    POLICY,
+    REFLEX,
+    Mask,
+    RobotTable,
+    cleared,
+    copied,
+    damaged,
+)
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator, ValidatedRows
 from asm_gym.monitors import ExpectsActions, Monitor, Surprise
@@ -394,11 +402,18 @@ class Guard:
             records, row.rows, row.load, arrays.contact_columns, arrays.dt, arrays.most_impulse
         )
         if self.terms.of_user:
-            records["must_decide"] |= self.terms.any_of_user(self.table)
+            self._ask_users(row)
         records["must_decide"][list(self._validator.repairs)] = True
         to_decide = apply_alarm_rule(records, self._arrays.judged, row.attribution)
         record_motion(records, row.rows, row.executed, self._arrays.motion)
         return int(to_decide)
+
+    def _ask_users(self, row: Row) -> None:
+        """Mark the robots for which an alarm term of the user's own holds, or all where one fails."""
+        failure = self.terms.ask_users(self.table)
+        self.table.records["must_decide"] |= self.terms.any_of_user()
+        for robot in range(self._facts.count if failure else 0):
+            self._fail(row, robot, failure)
 
     def _leave_out_repaired(self, row: Row) -> None:
         """Leave out of the surprise what is completed, or changes from what was."""
@@ -419,11 +434,13 @@ class Guard:
 
     def _decide(self, row: Row) -> None:
         """Decide about the robots that are marked."""
-        for robot, failure in unjudged(self._arrays.judged).items():
-            self._fail(row, robot, failure)
-            self._warn(robot, failure, "which counts as an alarm")
+        records = self.table.records
+        for failures in (unjudged(self._arrays.judged), damaged(records)):
+            for robot, failure in failures.items():
+                self._fail(row, robot, failure)
+                self._warn(robot, failure, "which counts as an alarm")
         row.terms = self.terms.masks(self.table)
-        for robot in np.flatnonzero(self.table.records["must_decide"]).tolist():
+        for robot in np.flatnonzero(records["must_decide"]).tolist():
             row.outcomes[robot] = self._decide_about(robot, row)
         self._forget_evidence(row)
         self._validator.drop_repairs()

@@ -119,7 +119,8 @@ def take_up_surprise(robot: Any, judged: Any, attribution: Any) -> None:
     robot.surprise = judged.surprise
     robot.raw_surprise = judged.raw_surprise
     robot.excuse = judged.excuse
-    if robot.failed or not judged.surprise > -np.inf:  # NaN too
+    counted = robot.pressed_impulse + robot.leaning_time + robot.threshold
+    if robot.failed or not judged.surprise > -np.inf or not np.isfinite(counted):  # NaN too
         robot.failed = True
         robot.surprise = np.inf
         attribution[:] = 0.0

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.spec import StreamSpec
+from asm_gym.validation import check_choice
 
 MOST_WRISTS = 8  # wrists of a robot whose hands are weighed
 
@@ -99,6 +100,7 @@ ROBOT = np.dtype(
 )
 
 KEPT = "threshold", "policy_rows", "policy_alarms"  # fields that an episode hands on to the next
+FINITE = "threshold", "pressed_impulse", "leaning_time"  # fields that are always finite numbers
 
 Mask = NDArray[np.bool_]
 
@@ -134,7 +136,8 @@ class RobotTable:
         return self.records.view(np.recarray)[index]
 
     def channel(self, name: str) -> NDArray[np.float32]:
-        """Return the numbers (n, k) of a channel of the rows. Raises KeyError for an unknown name."""
+        """Return the numbers (n, k) of a channel of the rows. Raises ValueError for an unknown name."""
+        check_choice("channel", name, self.spec.slices)
         return self.rows[:, self.spec.slices[name]]
 
     def info(self, name: str, otherwise: float = np.nan) -> NDArray[np.float64]:
@@ -155,6 +158,15 @@ class RobotTable:
                 f"{i:5}  {STATES[robot['state']]:6}  {surprise}  {contact}  {bool(robot['alarm'])}"
             )
         return "\n".join(lines)
+
+
+def damaged(records: NDArray[Any]) -> dict[int, str]:
+    """Return which field of a record is no finite number though it must be, by robot."""
+    failures: dict[int, str] = {}
+    for name in FINITE:
+        for robot in np.flatnonzero(~np.isfinite(records[name])).tolist():
+            failures[robot] = f"guard: {name} is {records[name][robot]}"
+    return failures
 
 
 def copied(records: NDArray[Any]) -> NDArray[Any]:
