@@ -25,14 +25,13 @@ class ContactEstimator:
 
     def __init__(self, completion: Completion) -> None:
         spec = completion.spec
-        shows = [
-            "external_torque" in channel.name or channel.group == "wrench"
-            for channel in spec.channels
-            for _ in range(channel.size)
-        ]
+        shows = np.zeros(spec.size, bool)
+        for channel in spec.channels:
+            if "external_torque" in channel.name or channel.group == "wrench":
+                shows[spec.slices[channel.name]] = True
         self._completion = completion
         self._dt = spec.dt
-        self._filling = completion.filling(np.array(shows, bool))
+        self._filling = completion.filling(shows)
         self._torques = np.isin(
             self._filling.columns, columns_ending(spec.channels, "external_torque")
         )
@@ -62,5 +61,4 @@ class ContactEstimator:
         still = np.ptp(rows[:, self._joints], axis=0) < STILL * self._dt * len(rows)
         if not joint:
             return bool(pressed.any() and still.all())
-        own = [name == joint for name in self._names]
-        return bool((pressed & still)[own].any())
+        return any((pressed & still)[self._names == joint])

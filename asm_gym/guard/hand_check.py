@@ -182,7 +182,7 @@ class HandCheck:
         self._gain = float(geometry["gain"][0])
         self._cases: dict[int, _OpenCase] = {}
         # Compiled or loaded here, so that the first contradiction does not wait for it.
-        self._explain(0, state["rows"][0, 0], self._suspects >= 0)
+        self._explain(0, state["rows"][0, 0], np.ones(len(self._suspects), bool))
 
     def begin(self, which: Mask) -> None:
         """Forget what was named of the robots of ``which`` (n,): new episodes begin."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import inner
+from asm_gym.guard.robot_table import Mask
 from asm_gym.spec import StreamSpec
 
 IMPOSSIBLE = 40.0  # once in e⁴⁰ rows
@@ -22,7 +23,6 @@ LEAST_CHANCE = 1e-6  # of a sense without resolution, whose numbers are of singl
 MOST_CHANCE = 0.5  # senses that repeat more often tell nothing
 MOST_REPEAT = 0.5  # share of the senses with noise
 
-Mask = NDArray[np.bool_]
 Floats32 = NDArray[np.float32]
 
 
@@ -79,10 +79,7 @@ def make_room(recent: Any) -> int:
     rows = recent.rows
     kept = rows.shape[1] // 2
     if recent.end[0] == rows.shape[1]:
-        for n in range(len(rows)):
-            for k in range(kept):
-                for i in range(rows.shape[2]):
-                    rows[n, k, i] = rows[n, kept + k, i]
+        rows[:, :kept] = rows[:, kept:]
         recent.end[0] = kept
     recent.end[0] += 1
     return recent.end[0] - 1
@@ -91,17 +88,11 @@ def make_room(recent: Any) -> int:
 @inner
 def leave_out_stale(row: Any, recent: Any, robot: int) -> None:
     """Write NaN into a row (D,) in the place of the senses that are stale."""
-    noisy = recent.noisy
     readings = recent.readings[robot]
-    repeated = 0
-    unlikely = 0.0
-    for k in range(len(noisy)):
-        if row[noisy[k]] == readings[k]:
-            repeated += 1
-            unlikely += recent.unlikely[k]
-    stale = unlikely > IMPOSSIBLE and repeated > MOST_REPEAT * len(noisy)
-    for k in range(len(noisy)):
-        reading = row[noisy[k]]
-        if stale and reading == readings[k]:
-            row[noisy[k]] = np.nan
-        readings[k] = reading
+    sensed = row[recent.noisy]
+    repeats = sensed == readings
+    readings[:] = sensed
+    if np.sum(repeats * recent.unlikely) <= IMPOSSIBLE:
+        return
+    if np.sum(repeats) > MOST_REPEAT * len(sensed):
+        row[recent.noisy[repeats]] = np.nan

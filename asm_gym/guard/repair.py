@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.hand_check import HandCheck
+from asm_gym.guard.robot_table import Mask
 from asm_gym.memory.completion import Completion
 
 WELL_AFTER_S = 1.0  # a sense is well again once it has said what was expected for so long [s]
@@ -28,10 +29,6 @@ TRUST_S = (
 LONGEST_S = 20.0  # no sense is completed for longer than this [s]
 MOST_MISSING = 0.5  # where more than this share of the senses is missing, what is left tells too little of them
 FARTHEST = 6.0  # no completed number goes further than so many of its spreads from its mean
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Row = NDArray[np.floating[Any]]
 
 
 @dataclass
@@ -62,9 +59,9 @@ class Repair:
         self,
         completion: Completion,
         robot: int,
-        before: Row | None,
+        before: Floats | None,
         read: Mask,
-        hands: Sequence[HandCheck] = (),
+        hands: Sequence[HandCheck],
     ) -> None:
         spec = completion.spec
         self._completion = completion
@@ -72,27 +69,19 @@ class Repair:
         self._hands = hands
         self._read = read
         self._spec = spec
-        self._patience = round(TRUST_S / spec.dt)
-        self._longest = round(LONGEST_S / spec.dt)
-        self._well_after = max(1, round(WELL_AFTER_S / spec.dt))
-        self._settle = (
-            2 * completion.senses.lag + 1
-        )  # rows in which changes are taken from what was not yet repaired
+        # Rows in which changes are taken from what was not yet repaired.
+        self._settle = 2 * completion.senses.lag + 1
         self.missing = np.zeros(spec.size, bool)
         self.settling = 0
-        self._returned = np.zeros(
-            spec.size, np.int64
-        )  # (D,) rows until its changes are those of the sense again
+        # (D,) rows until its changes are those of the sense again
+        self._returned = np.zeros(spec.size, np.int64)
         self._sensors: dict[str, MissingSensor] = {}
         self._unchecked = 0  # rows in which something was completed that no other sense tells of
-        self._before: Floats | None = None  # (D,) the row before, repaired
-        if before is not None:
-            self._before = np.array(before, np.float64)
-        self._good = self._before  # (D,) the last row before something was missing
-        self._raw = (
-            np.zeros(spec.size) if self._before is None else self._before
-        )  # (D,) the newest, as it was sensed
-        self._raw_before = self._raw
+        self._before = before  # (D,) the row before, repaired
+        # (D,) the last row before something was missing
+        self._good = completion.senses.mean if before is None else before
+        self._raw = self._good  # (D,) the newest, as it was sensed
+        self._raw_before = self._good
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -106,7 +95,8 @@ class Repair:
         if len(sensory) and self.missing[sensory].mean() > MOST_MISSING:
             return False
         oldest = max((sensor.age for sensor in self._sensors.values()), default=0)
-        return self._unchecked <= self._patience and oldest <= self._longest
+        dt = self._spec.dt
+        return self._unchecked <= round(TRUST_S / dt) and oldest <= round(LONGEST_S / dt)
 
     @property
     def over(self) -> bool:
@@ -119,10 +109,10 @@ class Repair:
         """(D,) the numbers that surprise nobody: they are missing, or their changes are those from completed ones."""
         return self.missing | (self._returned > 0)
 
-    def next(self, row: Row) -> NDArray[np.float32]:
+    def next(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the next row (D,) as it should be."""
         self._raw_before = self._raw
-        self._raw = np.array(row, np.float64)
+        self._raw = row.astype(np.float64)
         self.settling = max(0, self.settling - 1)
         self._returned = np.maximum(self._returned - 1, 0)
         for sensor in self._sensors.values():
@@ -180,8 +170,7 @@ class Repair:
         lifted = self._completion.lift(np.stack([before, self._raw]))
         value = self._completion.complete(self._filling, lifted)[-1]
         if self._guessed.any():
-            last = senses.mean if self._good is None else self._good
-            value = np.where(self._guessed, last[columns], value)
+            value = np.where(self._guessed, self._good[columns], value)
         mean = senses.mean[columns]
         farthest = FARTHEST * senses.spread[columns]
         repaired = self._raw.copy()
@@ -195,34 +184,33 @@ class Repair:
         """Count for how long each missing sensor has been well, and believe those that have been for long enough."""
         self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
         fine, there = self._as_expected(repaired)
-        well: list[str] = []
-        for name, own in self._completion.sensors:
-            sensor = self._sensors.get(name)
-            if sensor is None:
+        well_after = max(1, round(WELL_AFTER_S / self._spec.dt))
+        well = []
+        for name, columns in self._completion.sensors:
+            if name not in self._sensors:
                 continue
+            sensor = self._sensors[name]
+            own = np.isin(self._filling.columns, columns)
             sensor.well = sensor.well + 1 if fine[own].all() else 0
             speaks = sensor.silent and there[own].all()
-            if sensor.well >= self._well_after or speaks:
-                well.append(name)
-                self._returned[own] = self._settle
-                repaired[own] = self._raw[own]
-        for name in well:
-            del self._sensors[name]
+            if sensor.well >= well_after or speaks:
+                del self._sensors[name]
+                well.append(columns)
         if well:
+            believed = np.concatenate(well)
+            self._returned[believed] = self._settle
+            repaired[believed] = self._raw[believed]
             self._choose_filling()
 
     def _as_expected(self, repaired: Floats) -> tuple[Mask, Mask]:
-        """Return (D,) which missing numbers say what others tell of them, and which at least say something likely."""
+        """Return (M,) which missing numbers say what others tell of them, and which at least say something likely."""
         columns = self._filling.columns
         raw = self._raw[columns]
-        close = (
-            np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error
-        )  # False for what is not finite
+        # False for what is not finite
+        close = np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error
         for hand in self._hands:
             close &= ~hand.accused(self._robot)[columns]
         repeats = (raw == self._raw_before[columns]) & (self._spec.noise[columns] > 0)
-        fine = np.zeros(self._spec.size, bool)
-        fine[columns] = close & ~repeats & ~self._untold
-        there = np.zeros(self._spec.size, bool)
-        there[columns] = np.isfinite(raw) & (close | self._untold)
+        fine = close & ~repeats & ~self._untold
+        there = np.isfinite(raw) & (close | self._untold)
         return fine, there

@@ -5,34 +5,30 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.guard.hand_check import Contradiction, HandChecks, compare_hands_of
-from asm_gym.guard.recent_rows import Floats32, Mask, RecentRows, leave_out_stale, make_room
+from asm_gym.guard.recent_rows import Floats32, RecentRows, leave_out_stale, make_room
 from asm_gym.guard.repair import Repair
-from asm_gym.guard.robot_facts import RobotFacts
-from asm_gym.guard.robot_table import RobotTable
+from asm_gym.guard.robot_facts import NOTHING, RobotFacts
+from asm_gym.guard.robot_table import Mask, RobotTable
 from asm_gym.memory.completion import Completion
 from asm_gym.spec import StreamSpec
 
 LOG = logging.getLogger("asm_gym.safety")
 
 
-@dataclass(frozen=True, slots=True)
-class ValidatedRows:
+class ValidatedRows(NamedTuple):
     """The next row of each robot, as the monitor is to see it; mappings hold the robots with something to say."""
 
     rows: Floats32  # (n, D)
-    lost: Mapping[int, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # the numbers that were not finite
-    contradictions: Mapping[int, Contradiction] = field(default_factory=dict)  # of hand and joints
-    failures: Mapping[int, str] = field(default_factory=dict)  # what can no longer be relied on
+    lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
+    contradictions: Mapping[int, Contradiction] = NOTHING  # of hand and joints
+    failures: Mapping[int, str] = NOTHING  # what can no longer be relied on
 
 
 class RowValidator:
@@ -45,7 +41,6 @@ class RowValidator:
         kept: how many rows are kept of each.
 
     Attributes:
-        read: (D,) which columns the policy reads; None where senses cannot be completed.
         repairs: of the robots of which something is completed, or was a moment ago.
         hands: compares each hand with its joints.
         recent: the last rows.
@@ -56,8 +51,9 @@ class RowValidator:
     ) -> None:
         self._spec: StreamSpec = table.spec
         self._table = table
-        self._completion = None if facts.observed is None else completion
+        self._read = facts.observed
         if completion is not None and facts.observed is None:
+            completion = None
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
             reason = facts.refused.get(
                 "complete", "it is not known where they stand in the observation"
@@ -66,7 +62,7 @@ class RowValidator:
                 f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}",
                 stacklevel=5,
             )
-        self.read = None if self._completion is None else facts.observed
+        self._completion = completion
         self.hands = HandChecks(facts.count, facts.chains, self._spec)
         self.recent = RecentRows(facts.count, self._spec, kept)
         self.repairs: dict[int, Repair] = {}
@@ -89,10 +85,10 @@ class RowValidator:
         records = self._table.records
         for hand in self.hands.arms:
             hand.close_cases()
-        lost = {
-            robot: self._not_finite(rows[robot])
-            for robot in np.flatnonzero(records["lost"]).tolist()
-        }
+        lost = {}
+        for robot in np.flatnonzero(records["lost"]).tolist():
+            columns = np.flatnonzero(~np.isfinite(rows[robot]))
+            lost[robot] = tuple(self._spec.labels[column] for column in columns)
         contradicting = np.flatnonzero(records["contradicts"]).tolist()
         records["contradicts"] = False
         contradictions: dict[int, Contradiction] = {}
@@ -132,13 +128,14 @@ class RowValidator:
 
     def accounted_for(self, robot: int) -> Mask:
         """Return (D,) what is completed, or right by the hand and its joints: it explains no surprise."""
-        missing = self._missing(robot)
-        right = self.hands.right(robot)
-        return missing if right is None else missing | right
+        explained = self._missing(robot)
+        for hand in self.hands.arms:
+            explained = explained | hand.right(robot)
+        return explained
 
     def completed_names(self, robot: int) -> tuple[str, ...] | None:
         """Return the sensors of a robot that are completed; None where senses cannot be completed."""
-        if self.read is None:
+        if self._completion is None:
             return None
         repair = self.repairs.get(robot)
         return () if repair is None else repair.names
@@ -146,9 +143,6 @@ class RowValidator:
     def drop_repairs(self) -> None:
         """Forget the repairs that are over."""
         self.repairs = {robot: repair for robot, repair in self.repairs.items() if not repair.over}
-
-    def _not_finite(self, row: Floats32) -> tuple[str, ...]:
-        return tuple(self._spec.labels[column] for column in np.flatnonzero(~np.isfinite(row)))
 
     def _missing(self, robot: int) -> Mask:
         repair = self.repairs.get(robot)
@@ -175,10 +169,18 @@ class RowValidator:
     def _new_repair(self, robot: int, rows_before: int) -> Repair:
         """Return a repair of a robot from its newest row on, or from the next where that is ``rows_before`` it."""
         assert self._completion is not None
-        assert self.read is not None
+        assert self._read is not None
         last = self.last(robot)
-        before = last[-1 - rows_before] if len(last) > rows_before else None
-        return Repair(self._completion, robot, before, self.read, self.hands.arms)
+        before = None
+        if len(last) > rows_before:
+            before = last[-1 - rows_before].astype(np.float64)
+        return Repair(
+            self._completion,
+            robot,
+            before,
+            self._read,
+            self.hands.arms,
+        )
 
 
 @compiled
@@ -199,13 +201,10 @@ def validate_rows(robots: Any, rows: Any, recent: Any, hand_geometry: Any, hand_
         robot = robots[n]
         row = rows[n]
         leave_out_stale(row, recent, n)
-        finite = True
-        for i in range(len(row)):
-            recent.rows[n, end, i] = row[i]
-            finite = finite and np.isfinite(row[i])
+        recent.rows[n, end] = row
         contradicts = compare_hands_of(row, hand_geometry[n], hand_state[n])
         robot.episode_rows += 1
-        robot.lost = robot.active and not finite
+        robot.lost = robot.active and not np.isfinite(row).all()
         robot.contradicts = robot.active and contradicts
         unusual = unusual or robot.lost or robot.contradicts
     return unusual
