@@ -119,26 +119,21 @@ def measure_contacts(
         most_impulse: that an arm may press with in an episode [N s].
     """
     for n in range(len(robots)):
-        measure_contact(robots[n], rows[n], load[n], columns, dt, most_impulse)
+        robot = robots[n]
+        robot.load = load[n, 0]
+        robot.limit_passed_s = load[n, 1]
+        robot.contact_force = contact_force(robot, rows[n], load[n, 2:], columns, WEIGHED_S / dt)
+        robot.hand_speed = fastest_hand(rows[n], columns.hands)
 
+        excess = 0.0
+        if np.isfinite(robot.contact_force):
+            excess = max(robot.contact_force - FREE_FORCE, 0.0)
+        robot.pressed_impulse += excess * dt
+        lean(robot, excess, dt)
 
-@inner
-def measure_contact(
-    robot: Any, row: Any, load: Any, columns: Any, dt: float, most_impulse: float
-) -> None:
-    """Write the contact state of one robot."""
-    robot.load = load[0]
-    robot.limit_passed_s = load[1]
-    robot.contact_force = contact_force(robot, row, load[2:], columns, WEIGHED_S / dt)
-    robot.hand_speed = fastest_hand(row, columns.hands)
-
-    excess = np.fmax(robot.contact_force - FREE_FORCE, 0.0)  # 0 where nothing says
-    robot.pressed_impulse += excess * dt
-    lean(robot, excess, dt)
-
-    leans = robot.leaning_time > LEANS_S / (1.0 + SOONER * robot.strikes)
-    passed = robot.load > 1.0 or np.isfinite(robot.limit_passed_s)
-    robot.presses = passed or leans or robot.pressed_impulse > most_impulse
+        leans = robot.leaning_time > LEANS_S / (1.0 + SOONER * robot.strikes)
+        passed = robot.load > 1.0 or np.isfinite(robot.limit_passed_s)
+        robot.presses = passed or leans or robot.pressed_impulse > most_impulse
 
 
 @inner

@@ -63,12 +63,11 @@ HAND_STATE = np.dtype(
         ("mean", np.float64, HAND),  # m
         ("distance", np.float64),  # |m|; -1 where a number is missing
         ("whole_rows", np.int64),  # since a number was missing
-        ("kept_rows", np.int64),  # of ``rows``
         (
             "rows",
             np.float64,
             (WINDOW, 2 * MOST_JOINTS + HAND),
-        ),  # the last that were whole, the newest last
+        ),  # the last that were whole, the newest last; 0 before the first
         ("angles", np.float64, MOST_JOINTS),  # that were believed last [rad]
     ],
     align=True,
@@ -250,9 +249,8 @@ class HandCheck:
         if free.any() and not wrong[self._joints :].all() and np.isfinite(now).all():
             angles = self._columns[: self._joints]
             fitted, _ = self._explain(robot, now, wrong, error[angles])
-            believed = np.where(free, fitted, row[angles])
-            self._state["angles"][robot, : self._joints] = believed
-            row[angles] = believed
+            row[angles] = np.where(free, fitted, row[angles])
+            self._state["angles"][robot, : self._joints] = row[angles]
         return row
 
     def _name_sensor(
@@ -262,8 +260,8 @@ class HandCheck:
         wrong: Mask,
     ) -> Contradiction | None:
         """Return the one sensor that explains most of the last rows; None while that could be another as well."""
-        state = self._state[robot]
-        rows = state["rows"][WINDOW - state["kept_rows"] :]
+        rows = self._state["rows"][robot]
+        rows = rows[rows.any(axis=1)]
         unexplained = []
         for alone in np.eye(len(wrong), dtype=bool):
             left = [self._explain(robot, row, wrong | alone)[1] for row in rows]
@@ -312,15 +310,6 @@ class HandCheck:
         return fitted + late, float(unexplained)
 
 
-@compiled
-def compare_hands(rows: Any, geometry: Any, state: Any) -> bool:
-    """Take rows (n, D) into the states (n, arms) of all hands; return whether any contradicts its joints."""
-    some = False
-    for n in range(len(rows)):
-        some |= compare_hands_of(rows[n], geometry[n], state[n])
-    return some
-
-
 @inner
 def compare_hands_of(row: Any, geometry: Any, state: Any) -> bool:
     """Take the row (D,) of one robot into the states (arms,) of its hands."""
@@ -352,7 +341,6 @@ def shift_in(row: Any, hand: Any, seen: Any) -> bool:
     for i in range(size):
         seen.rows[-1, i] = row[hand.columns[i]]
     seen.whole_rows += 1
-    seen.kept_rows = min(seen.kept_rows + 1, WINDOW)
     return True
 
 

@@ -91,8 +91,7 @@ class Repair:
     @property
     def trusted(self) -> bool:
         """False once a sense that no other tells of is missing for long, any for very long, or too many at a time."""
-        sensory = self._spec.sensory
-        if len(sensory) and self.missing[sensory].mean() > MOST_MISSING:
+        if self.missing[self._spec.sensory].mean() > MOST_MISSING:
             return False
         oldest = max((sensor.age for sensor in self._sensors.values()), default=0)
         dt = self._spec.dt
@@ -119,8 +118,8 @@ class Repair:
             sensor.age += 1
 
         silent = ~np.isfinite(self._raw) & ~self.missing
-        silent[self._spec.motor] = False
-        if silent.any() and not silent[self._spec.sensory].all():
+        sensed = silent[self._spec.sensory]
+        if sensed.any() and not sensed.all():
             self._complete(silent, silent=True)
         repaired = self._repaired()
         if self._sensors:
@@ -134,7 +133,7 @@ class Repair:
         """Return the last row (D,) with the sensors of ``columns`` completed too; None where that leaves nothing."""
         wanted = self.missing.copy()
         wanted[columns] = True
-        if wanted[self._spec.sensory].all() or not (wanted & ~self.missing).any():
+        if wanted[self._spec.sensory].all() or np.array_equal(wanted, self.missing):
             return None
         self._complete(wanted, silent=False)
         self.settling = self._settle

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,23 +86,22 @@ class RowValidator:
         records = self._table.records
         for hand in self.hands.arms:
             hand.close_cases()
-        lost = {}
-        for robot in np.flatnonzero(records["lost"]).tolist():
-            columns = np.flatnonzero(~np.isfinite(rows[robot]))
-            lost[robot] = tuple(self._spec.labels[column] for column in columns)
-        contradicting = np.flatnonzero(records["contradicts"]).tolist()
-        records["contradicts"] = False
+        lost: dict[int, tuple[str, ...]] = {}
         contradictions: dict[int, Contradiction] = {}
         failures: dict[int, str] = {}
         validated = rows.copy()
-        for robot in sorted({*self.repairs, *lost, *contradicting}):
-            if not records["active"][robot]:
-                continue
-            if robot in contradicting:
+        unusual = records["lost"] | records["contradicts"]
+        unusual[list(self.repairs)] = True
+        for robot in np.flatnonzero(unusual & records["active"]).tolist():
+            record = records[robot]
+            if record["lost"]:
+                missing = ~np.isfinite(rows[robot])
+                lost[robot] = tuple(compress(self._spec.labels, missing))
+            if record["contradicts"]:
                 contradiction = self.hands.contradiction(robot, self._missing(robot))
+                record["contradicts"] = contradiction is not None
                 if contradiction is not None:
                     contradictions[robot] = contradiction
-                    records["contradicts"][robot] = True
             validated[robot] = self._repaired(robot, rows[robot], robot in lost)
             self.recent.replace_last(robot, validated[robot])
             repair = self.repairs.get(robot)
