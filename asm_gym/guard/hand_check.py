@@ -283,7 +283,7 @@ class HandCheck:
         robot: int,
         row: Floats,
         wrong: Mask,
-        error: Floats | None = None,
+        error: Floats | float = np.inf,
     ) -> tuple[Floats, float]:
         """Return (J,) angles, those that are wrong as the hand says, and |z|² of what is left.
 
@@ -291,13 +291,11 @@ class HandCheck:
             robot: of which the row is.
             row: its angles, speeds and hand, in the order of ``columns``.
             wrong: (J + 9,) angles, and numbers of the hand, that do not count.
-            error: (J,) standard deviations of the row's angles [rad]; None where the wrong ones tell nothing.
+            error: (J,) standard deviations of the row's angles [rad]; infinite where the wrong ones tell nothing.
         """
         joints = self._joints
         geometry = self._geometry[robot]
         free = wrong[:joints]
-        if error is None:
-            error = np.full(joints, np.inf)
         late = np.where(free, 0.0, geometry["late_s"] * row[joints : 2 * joints])
         fitted, unexplained = fit_angles(
             geometry,
@@ -305,7 +303,7 @@ class HandCheck:
             row,
             np.where(wrong[joints:], 0.0, geometry["weights"]),
             free,
-            error,
+            np.full(joints, error),
         )
         return fitted + late, float(unexplained)
 

@@ -66,7 +66,7 @@ class RecentRows:
     def last(self, robot: int, count: int) -> Floats32:
         """Return (T, D) the last rows of a robot, ``count`` of them or as many as are kept, the newest last."""
         end = int(self.arrays.end[0])
-        return self.arrays.rows[robot, end - min(count, self._kept, end) : end]
+        return self.arrays.rows[robot, end - min(count, self._kept) : end]
 
     def replace_last(self, robot: int, row: Floats32) -> None:
         """Keep another row (D,) of a robot in the place of its newest."""

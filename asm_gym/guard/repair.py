@@ -168,8 +168,7 @@ class Repair:
         before = self._raw if self._before is None else self._before
         lifted = self._completion.lift(np.stack([before, self._raw]))
         value = self._completion.complete(self._filling, lifted)[-1]
-        if self._guessed.any():
-            value = np.where(self._guessed, self._good[columns], value)
+        value = np.where(self._guessed, self._good[columns], value)
         mean = senses.mean[columns]
         farthest = FARTHEST * senses.spread[columns]
         repaired = self._raw.copy()

@@ -97,15 +97,19 @@ class RowValidator:
             if record["lost"]:
                 missing = ~np.isfinite(rows[robot])
                 lost[robot] = tuple(compress(self._spec.labels, missing))
+                if self._completion is not None and robot not in self.repairs:
+                    self.repairs[robot] = self._new_repair(robot, rows_before=1)
             if record["contradicts"]:
                 contradiction = self.hands.contradiction(robot, self._missing(robot))
                 record["contradicts"] = contradiction is not None
                 if contradiction is not None:
                     contradictions[robot] = contradiction
-            validated[robot] = self._repaired(robot, rows[robot], robot in lost)
-            self.recent.replace_last(robot, validated[robot])
             repair = self.repairs.get(robot)
-            if repair is not None and not repair.trusted:
+            if repair is None:
+                continue
+            validated[robot] = _next(repair, rows[robot])
+            self.recent.replace_last(robot, validated[robot])
+            if not repair.trusted:
                 names = ", ".join(repair.names)
                 failures[robot] = f"completion: too much is missing, or for too long: {names}"
         return ValidatedRows(validated, lost, contradictions, failures)
@@ -148,24 +152,6 @@ class RowValidator:
         repair = self.repairs.get(robot)
         return np.zeros(self._spec.size, bool) if repair is None else repair.missing
 
-    def _repaired(self, robot: int, row: Floats32, lost: bool) -> Floats32:
-        """Return a row (D,) with what is missing or at fault completed."""
-        if self._completion is None or not (lost or robot in self.repairs):
-            return row
-        if robot not in self.repairs:
-            self.repairs[robot] = self._new_repair(robot, rows_before=1)
-        repair = self.repairs[robot]
-        known = repair.names
-        try:
-            row = repair.next(row)
-        except Exception as error:
-            # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
-            warnings.warn(f"completion: {error!r}; the row counts as lost", stacklevel=2)
-            return np.full_like(row, np.nan)
-        if silent := ", ".join(name for name in repair.names if name not in known):
-            LOG.info("complete: %s says nothing any more", silent)
-        return row
-
     def _new_repair(self, robot: int, rows_before: int) -> Repair:
         """Return a repair of a robot from its newest row on, or from the next where that is ``rows_before`` it."""
         assert self._completion is not None
@@ -181,6 +167,20 @@ class RowValidator:
             self._read,
             self.hands.arms,
         )
+
+
+def _next(repair: Repair, row: Floats32) -> Floats32:
+    """Return a row (D,) with what is missing or at fault completed."""
+    known = repair.names
+    try:
+        row = repair.next(row)
+    except Exception as error:
+        # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
+        warnings.warn(f"completion: {error!r}; the row counts as lost", stacklevel=2)
+        return np.full_like(row, np.nan)
+    if silent := ", ".join(name for name in repair.names if name not in known):
+        LOG.info("complete: %s says nothing any more", silent)
+    return row
 
 
 @compiled
