@@ -50,7 +50,11 @@ class ContactEstimator:
         last = self.deviations(rows[-2:])
         return bool((np.abs(last) >= PRESSED).any())
 
-    def blocked(self, rows: Rows, joint: str = "") -> bool:
+    def blocked(
+        self,
+        rows: Rows,
+        joint: str = "",
+    ) -> bool:
         """Return whether ``joint``, such as ``joint[3]``, has been pressed in most of the rows (T, D), without turning.
 
         Without a joint: whether any has been pressed, and none has turned; an arm that pulls at a door turns some.

@@ -68,7 +68,10 @@ class ContactColumns(NamedTuple):
     hands: Columns  # (H, 3) velocities of hands, of rows alone
 
 
-def contact_columns(felt: Sequence[Channel], spec: StreamSpec) -> ContactColumns:
+def contact_columns(
+    felt: Sequence[Channel],
+    spec: StreamSpec,
+) -> ContactColumns:
     """Return the columns of the channels that arms feel within steps, and of their streams.
 
     Raises:
@@ -90,7 +93,10 @@ def contact_columns(felt: Sequence[Channel], spec: StreamSpec) -> ContactColumns
     )
 
 
-def no_load(count: int, size: int) -> Floats:
+def no_load(
+    count: int,
+    size: int,
+) -> Floats:
     """Return the load (n, 2 + F) of arms that feel nothing within a step.
 
     A load is the largest share of a contact limit in the physics substeps, when in the step a limit was passed [s], and
@@ -109,7 +115,12 @@ def severity_info(robot: Any) -> dict[str, Any]:
 
 @compiled
 def measure_contacts(
-    robots: Any, rows: Any, load: Any, columns: Any, dt: float, most_impulse: float
+    robots: Any,
+    rows: Any,
+    load: Any,
+    columns: Any,
+    dt: float,
+    most_impulse: float,
 ) -> None:
     """Write the contact state of robots (n,) by their rows (n, D) and loads (n, 2 + F).
 
@@ -137,7 +148,11 @@ def measure_contacts(
 
 
 @inner
-def lean(robot: Any, excess: float, dt: float) -> None:
+def lean(
+    robot: Any,
+    excess: float,
+    dt: float,
+) -> None:
     """Take a force ``excess`` [N] beyond the free one into the time that the arm has leant on something."""
     time = -dt
     if excess > 0.0:
@@ -148,7 +163,13 @@ def lean(robot: Any, excess: float, dt: float) -> None:
 
 
 @inner
-def contact_force(robot: Any, row: Any, felt: Any, columns: Any, steps: float) -> float:
+def contact_force(
+    robot: Any,
+    row: Any,
+    felt: Any,
+    columns: Any,
+    steps: float,
+) -> float:
     """Return the contact force on an arm [N]; not a number where nothing says.
 
     What the arm feels itself is not what a faulty sensor says of it; where it feels nothing, the row says.
@@ -162,7 +183,12 @@ def contact_force(robot: Any, row: Any, felt: Any, columns: Any, steps: float) -
 
 
 @inner
-def wrist_force(numbers: Any, wrists: Any, weighed: Any, steps: float) -> float:
+def wrist_force(
+    numbers: Any,
+    wrists: Any,
+    weighed: Any,
+    steps: float,
+) -> float:
     """Return the largest force at wrists (W, 3) less the weight of their hands [N]; NaN where one is, or without any.
 
     Args:
@@ -181,13 +207,19 @@ def wrist_force(numbers: Any, wrists: Any, weighed: Any, steps: float) -> float:
 
 
 @inner
-def joint_force(numbers: Any, torques: Any) -> float:
+def joint_force(
+    numbers: Any,
+    torques: Any,
+) -> float:
     """Return the largest external torque over its lever [N]; NaN where one is, or without any."""
     return largest(np.abs(numbers[torques])) / LEVER
 
 
 @inner
-def fastest_hand(row: Any, hands: Any) -> float:
+def fastest_hand(
+    row: Any,
+    hands: Any,
+) -> float:
     """Return the speed of the fastest hand (H, 3) [m/s]; NaN where one is, or without any."""
     speeds = np.empty(len(hands))
     for h in range(len(hands)):

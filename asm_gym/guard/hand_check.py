@@ -10,7 +10,7 @@ from their encoders can contradict nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,19 +128,30 @@ class HandChecks:
         for arm in self.arms:
             arm.begin(which)
 
-    def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
+    def contradiction(
+        self,
+        robot: int,
+        missing: Mask,
+    ) -> Contradiction | None:
         """Return what is wrong with the last row of a robot beside what is ``missing`` (D,): the first arm's."""
         named = [arm.contradiction(robot, missing) for arm in self.arms if arm.contradicts(robot)]
         return next(filter(None, named), None)
 
 
-def _can_check(chain: Chain, spec: StreamSpec) -> bool:
+def _can_check(
+    chain: Chain,
+    spec: StreamSpec,
+) -> bool:
     """Return whether the stream tells of hand and joints of an arm."""
     needs = {chain.prefix + name for name in NEEDS}
     return len(chain.axes) <= MOST_JOINTS and needs <= spec.slices.keys()
 
 
-def _describe(geometry: Any, chain: Chain, spec: StreamSpec) -> None:
+def _describe(
+    geometry: Any,
+    chain: Chain,
+    spec: StreamSpec,
+) -> None:
     """Write what is known of an arm into a record."""
     joints = len(chain.axes)
     numbers = np.arange(spec.size)
@@ -155,33 +166,25 @@ def _describe(geometry: Any, chain: Chain, spec: StreamSpec) -> None:
     geometry["gain"] = min(1.0, spec.dt / AVERAGED_S)
 
 
+@dataclass(eq=False)
 class HandCheck:
-    """Names the sensor at fault where the hand of one arm contradicts its joints.
+    """Names the sensor at fault where the hand of one arm contradicts its joints."""
 
-    Args:
-        geometry, state: (n,) of n robots, see ``HAND_GEOMETRY`` and ``HAND_STATE``.
-        spec: of their streams.
-    """
+    geometry: NDArray[Any]  # (n,) of n robots, see ``HAND_GEOMETRY``
+    state: NDArray[Any]  # (n,) see ``HAND_STATE``
+    spec: StreamSpec  # of their streams
+    _cases: dict[int, _OpenCase] = field(default_factory=dict)
 
-    def __init__(
-        self,
-        geometry: NDArray[Any],
-        state: NDArray[Any],
-        spec: StreamSpec,
-    ) -> None:
-        joints = int(geometry["joints"][0])
-        columns = geometry["columns"][0, : 2 * joints + HAND]
-        self._geometry = geometry
-        self._state = state
-        self._spec = spec
+    def __post_init__(self) -> None:
+        joints = int(self.geometry["joints"][0])
+        columns = self.geometry["columns"][0, : 2 * joints + HAND]
         self._joints = joints
         self._columns = columns
         # What may be at fault: J angles, then the numbers of the hand.
         self._suspects = np.delete(columns, np.s_[joints : 2 * joints])
-        self._gain = float(geometry["gain"][0])
-        self._cases: dict[int, _OpenCase] = {}
+        self._gain = float(self.geometry["gain"][0])
         # Compiled or loaded here, so that the first contradiction does not wait for it.
-        self._explain(0, state["rows"][0, 0], np.ones(len(self._suspects), bool))
+        self._explain(0, self.state["rows"][0, 0], np.ones(len(self._suspects), bool))
 
     def begin(self, which: Mask) -> None:
         """Forget what was named of the robots of ``which`` (n,): new episodes begin."""
@@ -189,19 +192,23 @@ class HandCheck:
 
     def contradicts(self, robot: int) -> bool:
         """Return whether the last row of a robot contradicts itself."""
-        return bool(self._state["distance"][robot] > LIMIT)
+        return bool(self.state["distance"][robot] > LIMIT)
 
     def close_cases(self) -> None:
         """Forget what was named of robots whose hands and joints agree again."""
-        distance = self._state["distance"]
+        distance = self.state["distance"]
         self.begin((distance >= 0.0) & (distance <= LIMIT))
 
-    def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
+    def contradiction(
+        self,
+        robot: int,
+        missing: Mask,
+    ) -> Contradiction | None:
         """Return what is wrong with a robot whose last row contradicts itself, beside what is ``missing`` (D,)."""
         case = self._cases.setdefault(robot, _OpenCase(np.zeros_like(missing)))
         wrong = (missing | case.accused)[self._suspects]
         if wrong.any():
-            unexplained = self._explain(robot, self._state["rows"][robot, -1], wrong)[1]
+            unexplained = self._explain(robot, self.state["rows"][robot, -1], wrong)[1]
             bounded = min(unexplained, ONE_ROW * EXPLAINED / self._gain)
             case.unexplained += self._gain * (bounded - case.unexplained)
             if case.unexplained <= EXPLAINED:
@@ -216,15 +223,15 @@ class HandCheck:
 
     def right(self, robot: int) -> Mask:
         """Return (D,) what is right by the last row: all say the same of hand and speeds, and none repeats itself."""
-        right = np.zeros(self._spec.size, bool)
-        state = self._state[robot]
+        right = np.zeros(self.spec.size, bool)
+        state = self.state[robot]
         if state["whole_rows"] < 2 or state["distance"] > LIMIT / 2:
             return right
         moving = state["rows"][-2:, : 2 * self._joints]
         before, last = moving.reshape(2, 2, self._joints)  # (angles or speeds, J)
         turned, sped_up = last - before
         speed = (last[1] + before[1]) / 2
-        moves = np.abs(turned / self._spec.dt - speed) < SAME_SPEED
+        moves = np.abs(turned / self.spec.dt - speed) < SAME_SPEED
         moves &= (turned != 0.0) | (sped_up != 0.0)
         right[self._columns[:-HAND]] = np.tile(moves, 2)
         right[self._columns[-HAND:]] = True
@@ -233,7 +240,7 @@ class HandCheck:
     def accused(self, robot: int) -> Mask:
         """Return (D,) what is not to be believed again while the contradiction lasts."""
         case = self._cases.get(robot)
-        return np.zeros(self._spec.size, bool) if case is None else case.accused
+        return np.zeros(self.spec.size, bool) if case is None else case.accused
 
     def refine(
         self,
@@ -250,7 +257,7 @@ class HandCheck:
             angles = self._columns[: self._joints]
             fitted, _ = self._explain(robot, now, wrong, error[angles])
             row[angles] = np.where(free, fitted, row[angles])
-            self._state["angles"][robot, : self._joints] = row[angles]
+            self.state["angles"][robot, : self._joints] = row[angles]
         return row
 
     def _name_sensor(
@@ -260,7 +267,7 @@ class HandCheck:
         wrong: Mask,
     ) -> Contradiction | None:
         """Return the one sensor that explains most of the last rows; None while that could be another as well."""
-        rows = self._state["rows"][robot]
+        rows = self.state["rows"][robot]
         rows = rows[rows.any(axis=1)]
         unexplained = []
         for alone in np.eye(len(wrong), dtype=bool):
@@ -273,7 +280,7 @@ class HandCheck:
             return None
         case.undecided_rows = 0
         if unexplained[best] <= EXPLAINED * len(rows):
-            for name, columns in sensors_of(self._spec):
+            for name, columns in sensors_of(self.spec):
                 if self._suspects[best] in columns:
                     return Contradiction(part=name, columns=columns)
         return Contradiction(part="", columns=NO_COLUMNS)
@@ -294,12 +301,12 @@ class HandCheck:
             error: (J,) standard deviations of the row's angles [rad]; infinite where the wrong ones tell nothing.
         """
         joints = self._joints
-        geometry = self._geometry[robot]
+        geometry = self.geometry[robot]
         free = wrong[:joints]
         late = np.where(free, 0.0, geometry["late_s"] * row[joints : 2 * joints])
         fitted, unexplained = fit_angles(
             geometry,
-            np.where(free, self._state["angles"][robot, :joints], row[:joints] - late),
+            np.where(free, self.state["angles"][robot, :joints], row[:joints] - late),
             row,
             np.where(wrong[joints:], 0.0, geometry["weights"]),
             free,
@@ -309,7 +316,11 @@ class HandCheck:
 
 
 @inner
-def compare_hands_of(row: Any, geometry: Any, state: Any) -> bool:
+def compare_hands_of(
+    row: Any,
+    geometry: Any,
+    state: Any,
+) -> bool:
     """Take the row (D,) of one robot into the states (arms,) of its hands."""
     some = False
     for arm in range(len(geometry)):
@@ -328,7 +339,11 @@ def compare_hands_of(row: Any, geometry: Any, state: Any) -> bool:
 
 
 @inner
-def shift_in(row: Any, hand: Any, seen: Any) -> bool:
+def shift_in(
+    row: Any,
+    hand: Any,
+    seen: Any,
+) -> bool:
     """Keep the numbers of an arm as the newest of its last rows, if all are finite; return whether they are."""
     size = 2 * hand.joints + HAND
     for i in range(size):
@@ -343,7 +358,10 @@ def shift_in(row: Any, hand: Any, seen: Any) -> bool:
 
 
 @inner
-def update_mean(hand: Any, seen: Any) -> None:
+def update_mean(
+    hand: Any,
+    seen: Any,
+) -> None:
     """Take the newest row into m."""
     joints = hand.joints
     newest = seen.rows[-1]

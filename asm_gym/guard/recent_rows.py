@@ -45,7 +45,12 @@ class RecentRows:
         kept: K, how many rows are kept of each at least.
     """
 
-    def __init__(self, count: int, spec: StreamSpec, kept: int) -> None:
+    def __init__(
+        self,
+        count: int,
+        spec: StreamSpec,
+        kept: int,
+    ) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             chance = np.clip(spec.resolution / (2 * np.sqrt(np.pi) * spec.noise), LEAST_CHANCE, 1.0)
         noisy = (spec.noise > 0) & (chance < MOST_CHANCE)
@@ -63,12 +68,20 @@ class RecentRows:
         """Begin new episodes in the streams of ``which`` (n,)."""
         self.arrays.readings[which] = np.nan
 
-    def last(self, robot: int, count: int) -> Floats32:
+    def last(
+        self,
+        robot: int,
+        count: int,
+    ) -> Floats32:
         """Return (T, D) the last rows of a robot, ``count`` of them or as many as are kept, the newest last."""
         end = int(self.arrays.end[0])
         return self.arrays.rows[robot, end - min(count, self._kept) : end]
 
-    def replace_last(self, robot: int, row: Floats32) -> None:
+    def replace_last(
+        self,
+        robot: int,
+        row: Floats32,
+    ) -> None:
         """Keep another row (D,) of a robot in the place of its newest."""
         self.arrays.rows[robot, self.arrays.end[0] - 1] = row
 
@@ -86,7 +99,11 @@ def make_room(recent: Any) -> int:
 
 
 @inner
-def leave_out_stale(row: Any, recent: Any, robot: int) -> None:
+def leave_out_stale(
+    row: Any,
+    recent: Any,
+    robot: int,
+) -> None:
     """Write NaN into a row (D,) in the place of the senses that are stale."""
     readings = recent.readings[robot]
     sensed = row[recent.noisy]

@@ -8,7 +8,7 @@ second.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,48 +40,32 @@ class MissingSensor:
     well: int = 0  # rows, one after the other, in which it has said what was expected
 
 
+@dataclass(eq=False)
 class Repair:
-    """Keeps the rows of one robot well, from the first row on in which a sense is not believed.
+    """Keeps the rows of one robot well, from the first row on in which a sense is not believed."""
 
-    Args:
-        completion: completes senses from others.
-        robot: which of those that ``hands`` know.
-        before: (D,) the row before; None where there is none.
-        read: (D,) which columns the policy reads, of whose completion something depends.
-        hands: tell of missing angles better than the memory, and which senses are not to be believed again yet.
+    completion: Completion  # completes senses from others
+    robot: int  # which of those that ``hands`` know
+    before: Floats | None  # (D,) the row before, repaired; None where there is none
+    read: Mask  # (D,) which columns the policy reads, of whose completion something depends
+    # Tell of missing angles better than the memory, and which senses are not to be believed again yet.
+    hands: Sequence[HandCheck]
+    # Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault.
+    settling: int = 0
+    _sensors: dict[str, MissingSensor] = field(default_factory=dict)
+    _unchecked: int = 0  # rows in which something was completed that no other sense tells of
 
-    Attributes:
-        missing: (D,) which columns are completed.
-        settling: rows until the monitor has seen nothing but repaired rows of a sense that was found at fault.
-    """
-
-    def __init__(
-        self,
-        completion: Completion,
-        robot: int,
-        before: Floats | None,
-        read: Mask,
-        hands: Sequence[HandCheck],
-    ) -> None:
-        spec = completion.spec
-        self._completion = completion
-        self._robot = robot
-        self._hands = hands
-        self._read = read
+    def __post_init__(self) -> None:
+        spec = self.completion.spec
         self._spec = spec
         # Rows in which changes are taken from what was not yet repaired.
-        self._settle = 2 * completion.senses.lag + 1
-        self.missing = np.zeros(spec.size, bool)
-        self.settling = 0
+        self._settle = 2 * self.completion.senses.lag + 1
+        self.missing = np.zeros(spec.size, bool)  # which columns are completed
         # (D,) rows until its changes are those of the sense again
         self._returned = np.zeros(spec.size, np.int64)
-        self._sensors: dict[str, MissingSensor] = {}
-        self._unchecked = 0  # rows in which something was completed that no other sense tells of
-        self._before = before  # (D,) the row before, repaired
         # (D,) the last row before something was missing
-        self._good = completion.senses.mean if before is None else before
+        self._good = self.completion.senses.mean if self.before is None else self.before
         self._raw = self._good  # (D,) the newest, as it was sensed
-        self._raw_before = self._good
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,7 +110,7 @@ class Repair:
             self._believe_again(repaired)
         if not self.missing.any():
             self._good = self._raw
-        self._before = repaired
+        self.before = repaired
         return repaired.astype(np.float32)
 
     def suspect(self, columns: NDArray[np.intp]) -> NDArray[np.float32] | None:
@@ -137,13 +121,17 @@ class Repair:
             return None
         self._complete(wanted, silent=False)
         self.settling = self._settle
-        self._before = self._repaired()
-        return self._before.astype(np.float32)
+        self.before = self._repaired()
+        return self.before.astype(np.float32)
 
-    def _complete(self, columns: Mask, silent: bool) -> None:
+    def _complete(
+        self,
+        columns: Mask,
+        silent: bool,
+    ) -> None:
         """Believe the sensors of ``columns`` (D,) no more."""
         # In an order that no hash decides, for reports are equal to the last bit.
-        for name, own in self._completion.sensors:
+        for name, own in self.completion.sensors:
             if columns[own].any():
                 known = self._sensors.get(name, MissingSensor(silent))
                 self._sensors[name] = MissingSensor(silent, age=known.age)
@@ -152,30 +140,30 @@ class Repair:
     def _choose_filling(self) -> None:
         """Take up which columns are missing, and how they are completed."""
         self.missing = np.zeros(self._spec.size, bool)
-        for name, own in self._completion.sensors:
+        for name, own in self.completion.sensors:
             self.missing[own] |= name in self._sensors
-        self._filling = self._completion.filling(self.missing)
-        spread = self._completion.senses.spread[self._filling.columns]
+        self._filling = self.completion.filling(self.missing)
+        spread = self.completion.senses.spread[self._filling.columns]
         self._untold = self._filling.error > UNTOLD * spread  # (M,)
-        self._guessed = self._untold & self._read[self._filling.columns]  # (M,)
+        self._guessed = self._untold & self.read[self._filling.columns]  # (M,)
 
     def _repaired(self) -> Floats:
         """Return the newest row (D,) with what is missing completed."""
         if not self._sensors:
             return self._raw
-        senses = self._completion.senses
+        senses = self.completion.senses
         columns = self._filling.columns
-        before = self._raw if self._before is None else self._before
-        lifted = self._completion.lift(np.stack([before, self._raw]))
-        value = self._completion.complete(self._filling, lifted)[-1]
+        before = self._raw if self.before is None else self.before
+        lifted = self.completion.lift(np.stack([before, self._raw]))
+        value = self.completion.complete(self._filling, lifted)[-1]
         value = np.where(self._guessed, self._good[columns], value)
         mean = senses.mean[columns]
         farthest = FARTHEST * senses.spread[columns]
         repaired = self._raw.copy()
         repaired[columns] = np.clip(value, mean - farthest, mean + farthest)
-        error = self._completion.error * senses.spread
-        for hand in self._hands:
-            repaired = hand.refine(self._robot, repaired, self.missing, error)
+        error = self.completion.error * senses.spread
+        for hand in self.hands:
+            repaired = hand.refine(self.robot, repaired, self.missing, error)
         return repaired
 
     def _believe_again(self, repaired: Floats) -> None:
@@ -184,7 +172,7 @@ class Repair:
         fine, there = self._as_expected(repaired)
         well_after = max(1, round(WELL_AFTER_S / self._spec.dt))
         well = []
-        for name, columns in self._completion.sensors:
+        for name, columns in self.completion.sensors:
             if name not in self._sensors:
                 continue
             sensor = self._sensors[name]
@@ -206,8 +194,8 @@ class Repair:
         raw = self._raw[columns]
         # False for what is not finite
         close = np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error
-        for hand in self._hands:
-            close &= ~hand.accused(self._robot)[columns]
+        for hand in self.hands:
+            close &= ~hand.accused(self.robot)[columns]
         repeats = (raw == self._raw_before[columns]) & (self._spec.noise[columns] > 0)
         fine = close & ~repeats & ~self._untold
         there = np.isfinite(raw) & (close | self._untold)

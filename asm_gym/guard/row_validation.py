@@ -48,7 +48,11 @@ class RowValidator:
     """
 
     def __init__(
-        self, facts: RobotFacts, table: RobotTable, completion: Completion | None, kept: int
+        self,
+        facts: RobotFacts,
+        table: RobotTable,
+        completion: Completion | None,
+        kept: int,
     ) -> None:
         self._spec: StreamSpec = table.spec
         self._table = table
@@ -118,7 +122,11 @@ class RowValidator:
         """Return (T, D) the last rows of a robot in this episode, the newest last."""
         return self.recent.last(robot, int(self._table.records["episode_rows"][robot]))
 
-    def suspect(self, robot: int, columns: NDArray[np.intp]) -> bool:
+    def suspect(
+        self,
+        robot: int,
+        columns: NDArray[np.intp],
+    ) -> bool:
         """Complete the sensors of ``columns`` from a robot's last row on; return whether that leaves any to go by."""
         if self._completion is None:
             return False
@@ -152,7 +160,11 @@ class RowValidator:
         repair = self.repairs.get(robot)
         return np.zeros(self._spec.size, bool) if repair is None else repair.missing
 
-    def _new_repair(self, robot: int, rows_before: int) -> Repair:
+    def _new_repair(
+        self,
+        robot: int,
+        rows_before: int,
+    ) -> Repair:
         """Return a repair of a robot from its newest row on, or from the next where that is ``rows_before`` it."""
         assert self._completion is not None
         assert self._read is not None
@@ -169,7 +181,10 @@ class RowValidator:
         )
 
 
-def _next(repair: Repair, row: Floats32) -> Floats32:
+def _next(
+    repair: Repair,
+    row: Floats32,
+) -> Floats32:
     """Return a row (D,) with what is missing or at fault completed."""
     known = repair.names
     try:
@@ -184,7 +199,13 @@ def _next(repair: Repair, row: Floats32) -> Floats32:
 
 
 @compiled
-def validate_rows(robots: Any, rows: Any, recent: Any, hand_geometry: Any, hand_state: Any) -> bool:
+def validate_rows(
+    robots: Any,
+    rows: Any,
+    recent: Any,
+    hand_geometry: Any,
+    hand_state: Any,
+) -> bool:
     """Keep rows (n, D), with NaN for stale senses, and mark the robots whose rows are not whole or not consistent.
 
     Args:
