@@ -5,8 +5,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from asm_gym.compilation import compiled
 from asm_gym.detection.kinematics import Chain
-from asm_gym.guard.hand_check import HandChecks, compare_hands
+from asm_gym.guard.hand_check import HandChecks, compare_hands_of
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -57,6 +58,12 @@ def rows(arm, count, seed=0):
     return found, angles
 
 
+@compiled
+def compare_hand(row, geometry, state):
+    """Compare the hands of one robot with its joints."""
+    return compare_hands_of(row, geometry, state)
+
+
 class Check:
     """One arm's hand against its joints."""
 
@@ -65,7 +72,7 @@ class Check:
         self.hands = self.all.arms[0]
 
     def read(self, row, missing):
-        some = compare_hands(row[None].astype(np.float32), self.all.geometry, self.all.state)
+        some = compare_hand(row.astype(np.float32), self.all.geometry[0], self.all.state[0])
         self.hands.close_cases()
         assert some == self.hands.contradicts(0)
         return self.hands.contradiction(0, missing) if some else None

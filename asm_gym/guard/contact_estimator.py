@@ -25,42 +25,56 @@ class ContactEstimator:
 
     def __init__(self, completion: Completion) -> None:
         spec = completion.spec
-        shows = [
-            "external_torque" in channel.name or channel.group == "wrench"
-            for channel in spec.channels
-            for _ in range(channel.size)
-        ]
+        shows = np.zeros(spec.size, bool)
+        for channel in spec.channels:
+            if "external_torque" in channel.name or channel.group == "wrench":
+                shows[spec.slices[channel.name]] = True
+        torques = columns_ending(spec.channels, "external_torque")
+        joints = columns_ending(spec.channels, "joint_position")
         self._completion = completion
-        self._dt = spec.dt
-        self._filling = completion.filling(np.array(shows, bool))
+        self._filling = completion.filling(shows)
         self._torques = np.isin(
-            self._filling.columns, columns_ending(spec.channels, "external_torque")
+            self._filling.columns,
+            torques,
         )
-        self._joints = columns_ending(spec.channels, "joint_position")
-        self._names = [
-            spec.labels[column].replace("joint_position", "joint") for column in self._joints
-        ]
+        self._joints = joints
+        self._labels = np.array(spec.labels)[joints]
 
     def deviations(self, rows: Rows) -> NDArray[np.float64]:
         """Return z (T - 1, J) of rows (T, D) but the first."""
-        expected = self._completion.complete(self._filling, self._completion.lift(rows))
-        beyond = rows[:, self._filling.columns] - expected
-        return np.asarray(beyond[1:, self._torques] / self._filling.error[self._torques])
+        filling = self._filling
+        lifted = self._completion.lift(rows)
+        expected = self._completion.complete(
+            filling,
+            lifted,
+        )
+        z = (rows[:, filling.columns] - expected) / filling.error
+        return np.asarray(z[1:, self._torques])
 
     def presses(self, rows: Rows) -> bool:
         """Return whether something presses in the last of the rows (T, D)."""
-        return bool((np.abs(self.deviations(rows[-2:])[-1]) >= PRESSED).any())
+        last = self.deviations(rows[-2:])
+        return bool((np.abs(last) >= PRESSED).any())
 
-    def blocked(self, rows: Rows, joint: str = "") -> bool:
+    def blocked(
+        self,
+        rows: Rows,
+        joint: str = "",
+    ) -> bool:
         """Return whether ``joint``, such as ``joint[3]``, has been pressed in most of the rows (T, D), without turning.
 
         Without a joint: whether any has been pressed, and none has turned; an arm that pulls at a door turns some.
         """
-        pressed = np.median(np.abs(self.deviations(rows)), axis=0) > PRESSED
-        if len(pressed) != len(self._joints):
+        deviation = np.median(
+            np.abs(self.deviations(rows)),
+            axis=0,
+        )
+        if len(deviation) != len(self._joints):
             return False
-        still = np.ptp(rows[:, self._joints], axis=0) < STILL * self._dt * len(rows)
+        pressed = deviation > PRESSED
+        turned = np.ptp(rows[:, self._joints], axis=0)
+        still = turned < STILL * self._completion.spec.dt * len(rows)
         if not joint:
             return bool(pressed.any() and still.all())
-        own = [name == joint for name in self._names]
-        return bool((pressed & still)[own].any())
+        own = self._labels == joint.replace("joint", "joint_position")
+        return bool((pressed & still & own).any())

@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.contact_estimator import ContactEstimator
 from asm_gym.guard.contact_state import FREE_FORCE
+from asm_gym.guard.recent_rows import Floats32
 from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
 from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
 from asm_gym.guard.row_evidence import RowEvidence
@@ -21,29 +23,27 @@ from asm_gym.spec import StreamSpec
 CALM_S = 1.0  # after so long without an alarm, what comes next has a cause of its own [s]
 SURE = 0.5  # a family that is less probable is unknown
 
-Floats = NDArray[np.float64]
-Rows = NDArray[np.float32]
+NO_CAUSE = Cause(
+    family="unknown",
+    part="",
+    probability=0.0,
+    probabilities={},
+    columns=NO_COLUMNS,
+)
 
 
 @dataclass
 class Incident:
     """What has been found out about one robot since it was calm."""
 
-    rows_since: dict[str, int] = field(
-        default_factory=dict
-    )  # rows since a family was first the cause
+    rows: int = 0  # of it
+    first_row: dict[str, int] = field(default_factory=dict)  # in which a case was first the cause
     touched: bool = False  # the last alarm was answered as a contact, or looked like one
     calm_rows: int = 0  # rows without an alarm
-    belief: Floats = field(
-        default_factory=lambda: np.zeros(len(FAMILIES))
-    )  # mean probability of each family
+    # Mean probability of each family.
+    belief: Floats = field(default_factory=lambda: np.zeros(len(FAMILIES)))
     diagnoses: int = 0
     newest: dict[str, Cause] = field(default_factory=dict)  # the newest diagnosis of each family
-
-    def count_row(self, alarm: bool) -> None:
-        """Count a row more since each cause was first found."""
-        self.calm_rows = 0 if alarm else self.calm_rows + 1
-        self.rows_since = {family: rows + 1 for family, rows in self.rows_since.items()}
 
     def believe(self, cause: Cause) -> Cause:
         """Return the cause by all diagnoses, the newest of which counts a tenth at least."""
@@ -63,9 +63,7 @@ class Prescription(NamedTuple):
     """What is to be done about an alarm."""
 
     response: Response
-    columns: NDArray[np.intp] = (
-        NO_COLUMNS  # (k,) of the stream to complete, where the response is ``"complete"``
-    )
+    columns: NDArray[np.intp] = NO_COLUMNS  # (k,) of the stream to complete
 
 
 class Diagnostician:
@@ -83,15 +81,18 @@ class Diagnostician:
     """
 
     def __init__(
-        self, spec: StreamSpec, diagnosis: Diagnosis | None, table: Mapping[str, str], asked: bool
+        self,
+        spec: StreamSpec,
+        diagnosis: Diagnosis | None,
+        table: Mapping[str, str],
+        asked: bool,
     ) -> None:
         self._dt = spec.dt
         self._diagnosis = diagnosis
         self._table = table
         self._asked = asked
-        self._blocked_rows = 1 + round(
-            LASTING["actuator"] / spec.dt
-        )  # by which a joint is found blocked
+        # By which a joint is found blocked.
+        self._blocked_rows = 1 + round(LASTING["actuator"] / spec.dt)
         self._contact = None
         if diagnosis is not None and columns_ending(spec.channels, "external_torque").size:
             self._contact = ContactEstimator(diagnosis.completion)
@@ -108,8 +109,9 @@ class Diagnostician:
         if incident is None:
             return NO_RESPONSE
         touched = self._touched(incident, evidence.rows)
-        incident.count_row(alarm=False)
-        if incident.calm_rows > CALM_S / self._dt and (incident.rows_since or policy_acts):
+        incident.rows += 1
+        incident.calm_rows += 1
+        if incident.calm_rows > CALM_S / self._dt and (incident.first_row or policy_acts):
             self.begin(evidence.index)
             return NO_RESPONSE
         return NO_RESPONSE._replace(touched=touched)
@@ -123,25 +125,26 @@ class Diagnostician:
             return Prescription(self._brake(incident, evidence))
 
         touched = self._touched(incident, evidence.rows)
-        incident.count_row(alarm=True)
+        incident.rows += 1
+        incident.calm_rows = 0
         presses = bool(evidence.robot.presses)
         cause = self._find_cause(incident, evidence)
         family = "unknown"
-        if cause is not None and cause.probability >= SURE:
+        if cause.probability >= SURE:
             family = cause.family
-        incident.touched = presses or (cause is not None and cause.family == "contact")
-        incident.rows_since.setdefault(PRESSING if presses else family, 0)
+        incident.touched = presses or cause.family == "contact"
+        incident.first_row.setdefault(PRESSING if presses else family, incident.rows)
 
         case, name = self._look_up(incident, family, cause, evidence)
         description = as_info(cause)
-        if cause is None or family != cause.family:
+        if family != cause.family:
             description |= {"family": family, "part": ""}
-        columns = NO_COLUMNS
-        if cause is not None and name == "complete":
-            columns = cause.columns
+        response = Response(name, description, touched, case)
         if not self._asked:
-            return Prescription(Response("", description, touched), columns)
-        return Prescription(Response(name, description, touched, case), columns)
+            response = response._replace(name="", case="")
+        if name != "complete":
+            return Prescription(response)
+        return Prescription(response, cause.columns)
 
     def instead_of_completing(self, response: Response) -> Response:
         """Return what is done where the sensors at fault cannot be completed."""
@@ -157,7 +160,11 @@ class Diagnostician:
         )
 
     def _look_up(
-        self, incident: Incident, family: str, cause: Cause | None, evidence: RowEvidence
+        self,
+        incident: Incident,
+        family: str,
+        cause: Cause,
+        evidence: RowEvidence,
     ) -> tuple[str, str]:
         """Return the row of the table that holds, and the response."""
         case = PRESSING if evidence.robot.presses else family
@@ -174,50 +181,50 @@ class Diagnostician:
                 name = self._table["unknown"]
         return case, name
 
-    def _find_cause(self, incident: Incident, evidence: RowEvidence) -> Cause | None:
+    def _find_cause(self, incident: Incident, evidence: RowEvidence) -> Cause:
         """Return the cause; a contradiction names a sensor beyond doubt, though perhaps not which."""
         failed = bool(evidence.robot.failed)
         if evidence.contradiction is not None and not failed:
-            probabilities = {name: float(name == "sensor") for name in FAMILIES}
             return Cause(
                 family="sensor",
                 part=evidence.contradiction.part,
                 probability=1.0,
-                probabilities=probabilities,
+                probabilities=dict.fromkeys(FAMILIES, 0.0) | {"sensor": 1.0},
                 columns=evidence.contradiction.columns,
             )
         rows = evidence.rows[-1 - WINDOW :]
         if failed or self._diagnosis is None or not np.isfinite(rows).all():
-            return None
+            return NO_CAUSE
         try:
             cause = self._diagnosis(rows, evidence.attribution, evidence.accounted_for)
         except Exception as error:
             # Whatever goes wrong here, an alarm is answered: by what is done about the unknown.
             warnings.warn(f"diagnosis: {error!r}; the cause counts as unknown", stacklevel=2)
-            return None
+            return NO_CAUSE
         return incident.believe(cause)
 
-    def _touched(self, incident: Incident, rows: Rows) -> bool | None:
+    def _touched(self, incident: Incident, rows: Floats32) -> bool | None:
         """Return whether what touched the body still does; None where nobody knows."""
         if not self._asked or not incident.touched or self._contact is None or len(rows) < 2:
             return None
-        if not self._contact.presses(rows[-2:]):
+        if not self._contact.presses(rows):
             return False
         lasts = self._lasts(incident, "contact") or self._lasts(incident, PRESSING)
         return None if lasts else True
 
-    def _blocked(self, family: str, cause: Cause | None, rows: Rows) -> bool:
+    def _blocked(self, family: str, cause: Cause, rows: Floats32) -> bool:
         """Return whether the joint at fault, or else the arm, is pressed and still, for as long as what lasts."""
         if self._contact is None or len(rows) < self._blocked_rows:
             return False
         joint = ""
-        if family == "actuator" and cause is not None:
+        if family == "actuator":
             joint = cause.part
         return self._contact.blocked(rows[-self._blocked_rows :], joint)
 
     def _lasts(self, incident: Incident, case: str) -> bool:
         """Return whether a case has been the cause for so long that it lasts."""
-        return incident.rows_since.get(case, 0) >= LASTING["contact"] / self._dt
+        first = incident.first_row.get(case, incident.rows)
+        return incident.rows - first >= LASTING["contact"] / self._dt
 
 
 def _certain(family: str, part: str = "") -> dict[str, Any]:
@@ -232,12 +239,12 @@ def _complete_missing(evidence: RowEvidence) -> Response:
     return Response("complete", _certain("sensor", ", ".join(evidence.completed)), case="sensor")
 
 
-def _may_go_on(name: str, cause: Cause | None, evidence: RowEvidence) -> bool:
+def _may_go_on(name: str, cause: Cause, evidence: RowEvidence) -> bool:
     """Return whether the policy may go on in alarm."""
     if evidence.fast:
         return False
     if name == "complete":  # what is left judges on, and what is completed is bounded by itself
         return True
-    sure = cause is not None and cause.probability >= SURE
-    gentle = not evidence.robot.contact_force > FREE_FORCE
-    return sure and evidence.may_go_on and evidence.feels and gentle
+    if not (evidence.may_go_on and evidence.feels and cause.probability >= SURE):
+        return False
+    return not evidence.robot.contact_force > FREE_FORCE

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.guard.robot_facts import RobotFacts
+from asm_gym.guard.robot_table import Mask
 from asm_gym.monitors import Monitor
 
 CAREFUL_SPEED = 1.0 / 3.0  # share of the speed limit that a hand has after it has pressed too hard
 CAREFUL_FORCES = 0.5  # share of the limits on forces then; only a policy that presses anew presses as hard so soon
 CAREFUL_S = 1.0  # for so long [s], counted while the policy acts
-
-Mask = NDArray[np.bool_]
 
 
 class EpisodeLimits:
@@ -44,14 +42,11 @@ class EpisodeLimits:
                 limits = replace(limits, stays=False, hand_speed=np.inf)
             careful = limits.stricter(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
 
-        self._usual = limits
-        self._careful = careful
+        self._choices = limits, careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))
-        self._steps_left = np.zeros(
-            facts.count, np.int64
-        )  # (n,) of the policy, under the careful limits
-        self.now = (self._usual,) * facts.count
-        self.steady = True
+        # (n,) of the policy, under the careful limits
+        self._steps_left = np.zeros(facts.count, np.int64)
+        self._choose()
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
@@ -66,9 +61,9 @@ class EpisodeLimits:
         self._choose()
 
     def _choose(self) -> None:
-        self.steady = self._usual is None or not self._steps_left.any()
-        limits = (self._usual, self._careful)
-        self.now = tuple(limits[int(steps > 0)] for steps in self._steps_left)
+        careful = self._steps_left > 0
+        self.steady = not careful.any()
+        self.now = tuple(self._choices[int(chosen)] for chosen in careful)
 
 
 def limits_of(

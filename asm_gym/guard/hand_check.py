@@ -10,14 +10,17 @@ from their encoders can contradict nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
+from asm_gym.detection.hand_speed import Floats
 from asm_gym.detection.kinematics import HAND, Chain, hand_at
+from asm_gym.guard.robot_facts import NO_COLUMNS
+from asm_gym.guard.robot_table import Mask
 from asm_gym.memory.completion import sensors_of
 from asm_gym.spec import StreamSpec
 
@@ -35,9 +38,6 @@ SAME_SPEED = 0.2  # the speed that is sensed of a joint is that of its angle whe
 DIFFERENCE = 1e-6  # of an angle, by which slopes are taken [rad]
 LONGEST_STEP = 0.5  # that an angle makes in an iteration [rad]
 ITERATIONS = 8
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HAND_GEOMETRY = np.dtype(
     [
@@ -63,12 +63,11 @@ HAND_STATE = np.dtype(
         ("mean", np.float64, HAND),  # m
         ("distance", np.float64),  # |m|; -1 where a number is missing
         ("whole_rows", np.int64),  # since a number was missing
-        ("kept_rows", np.int64),  # of ``rows``
         (
             "rows",
             np.float64,
             (WINDOW, 2 * MOST_JOINTS + HAND),
-        ),  # the last that were whole, the newest last
+        ),  # the last that were whole, the newest last; 0 before the first
         ("angles", np.float64, MOST_JOINTS),  # that were believed last [rad]
     ],
     align=True,
@@ -106,17 +105,28 @@ class HandChecks:
         arms: a check for each arm.
     """
 
-    def __init__(self, count: int, chains: tuple[tuple[Chain, ...], ...], spec: StreamSpec) -> None:
+    def __init__(
+        self,
+        count: int,
+        chains: tuple[tuple[Chain, ...], ...],
+        spec: StreamSpec,
+    ) -> None:
         checked = [own for own in chains if _can_check(own[0], spec)]
-        self.geometry: NDArray[Any] = np.zeros((count, len(checked)), HAND_GEOMETRY)
-        self.state: NDArray[Any] = np.zeros((count, len(checked)), HAND_STATE)
+        shape = (count, len(checked))
+        self.geometry: NDArray[Any] = np.zeros(shape, HAND_GEOMETRY)
+        self.state: NDArray[Any] = np.zeros(shape, HAND_STATE)
+        self.arms: list[HandCheck] = []
         for arm, own in enumerate(checked):
+            geometry = self.geometry[:, arm]
             for robot, chain in enumerate(own):
-                _describe(self.geometry[robot, arm], chain, spec)
-        self.arms = tuple(
-            HandCheck(self.geometry[:, arm], self.state[:, arm], spec)
-            for arm in range(len(checked))
-        )
+                _describe(geometry[robot], chain, spec)
+            self.arms.append(
+                HandCheck(
+                    geometry=geometry,
+                    state=self.state[:, arm],
+                    spec=spec,
+                )
+            )
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
@@ -124,98 +134,94 @@ class HandChecks:
         for arm in self.arms:
             arm.begin(which)
 
-    def right(self, robot: int) -> Mask | None:
-        """Return (D,) what is right by the last row of a robot; None without an arm to check."""
-        if not self.arms:
-            return None
-        return np.logical_or.reduce([arm.right(robot) for arm in self.arms])
-
-    def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
+    def contradiction(
+        self,
+        robot: int,
+        missing: Mask,
+    ) -> Contradiction | None:
         """Return what is wrong with the last row of a robot beside what is ``missing`` (D,): the first arm's."""
         named = [arm.contradiction(robot, missing) for arm in self.arms if arm.contradicts(robot)]
-        return next((contradiction for contradiction in named if contradiction is not None), None)
+        return next(filter(None, named), None)
 
 
-def _can_check(chain: Chain, spec: StreamSpec) -> bool:
+def _can_check(
+    chain: Chain,
+    spec: StreamSpec,
+) -> bool:
     """Return whether the stream tells of hand and joints of an arm."""
-    return len(chain.axes) <= MOST_JOINTS and all(
-        chain.prefix + name in spec.slices for name in NEEDS
-    )
+    needs = {chain.prefix + name for name in NEEDS}
+    return len(chain.axes) <= MOST_JOINTS and needs <= spec.slices.keys()
 
 
-def _describe(geometry: Any, chain: Chain, spec: StreamSpec) -> None:
+def _describe(
+    geometry: Any,
+    chain: Chain,
+    spec: StreamSpec,
+) -> None:
     """Write what is known of an arm into a record."""
     joints = len(chain.axes)
-    slices = [spec.slices[chain.prefix + name] for name in NEEDS]
-    columns = np.concatenate([np.arange(spec.size)[part] for part in slices])
+    numbers = np.arange(spec.size)
+    columns = np.concatenate([numbers[spec.slices[chain.prefix + name]] for name in NEEDS])
     geometry["joints"] = joints
     geometry["columns"][: len(columns)] = columns
     geometry["axes"][:joints] = chain.axes
     geometry["anchors"][:joints] = chain.anchors
     geometry["pose"] = chain.hand
     geometry["late_s"] = chain.late_s
-    geometry["weights"] = 1.0 / (chain.noise * spec.noise[columns[2 * joints :]])
+    geometry["weights"] = 1.0 / (chain.noise * spec.noise[columns[-HAND:]])
     geometry["gain"] = min(1.0, spec.dt / AVERAGED_S)
 
 
+@dataclass(eq=False)
 class HandCheck:
-    """Names the sensor at fault where the hand of one arm contradicts its joints.
+    """Names the sensor at fault where the hand of one arm contradicts its joints."""
 
-    Args:
-        geometry, state: (n,) of n robots, see ``HAND_GEOMETRY`` and ``HAND_STATE``.
-        spec: of their streams.
-    """
+    geometry: NDArray[Any]  # (n,) of n robots, see ``HAND_GEOMETRY``
+    state: NDArray[Any]  # (n,) see ``HAND_STATE``
+    spec: StreamSpec  # of their streams
+    _cases: dict[int, _OpenCase] = field(default_factory=dict)
 
-    def __init__(self, geometry: NDArray[Any], state: NDArray[Any], spec: StreamSpec) -> None:
-        joints = int(geometry["joints"][0])
-        columns = geometry["columns"][0]
-        self._geometry = geometry
-        self._state = state
-        self._size = spec.size
-        self._dt = spec.dt
-        self._columns = columns[: 2 * joints + HAND]
-        self._angles = columns[:joints]
-        self._speeds = columns[joints : 2 * joints]
-        self._hand = columns[2 * joints : 2 * joints + HAND]
-        self._gain = float(geometry["gain"][0])
-        sensors = {
-            int(c): Contradiction(part=name, columns=own)
-            for name, own in sensors_of(spec)
-            for c in own
-        }
-        self._suspects = [sensors[int(c)] for c in (*self._angles, *self._hand)]
-        self._cases: dict[int, _OpenCase] = {}
+    def __post_init__(self) -> None:
+        joints = int(self.geometry["joints"][0])
+        columns = self.geometry["columns"][0, : 2 * joints + HAND]
+        self._joints = joints
+        self._columns = columns
+        # What may be at fault: J angles, then the numbers of the hand.
+        self._suspects = np.delete(columns, np.s_[joints : 2 * joints])
+        self._gain = float(self.geometry["gain"][0])
         # Compiled or loaded here, so that the first contradiction does not wait for it.
-        self._explain(0, state["rows"][0, 0], np.ones(joints, bool), np.zeros(HAND, bool))
+        everything = np.ones(len(self._suspects), bool)
+        self._explain(0, self.state["rows"][0, 0], everything)
 
     def begin(self, which: Mask) -> None:
-        """Begin new episodes of the robots of ``which`` (n,)."""
+        """Forget what was named of the robots of ``which`` (n,): new episodes begin."""
         self._cases = {robot: case for robot, case in self._cases.items() if not which[robot]}
 
     def contradicts(self, robot: int) -> bool:
         """Return whether the last row of a robot contradicts itself."""
-        return bool(self._state["distance"][robot] > LIMIT)
+        return bool(self.state["distance"][robot] > LIMIT)
 
     def close_cases(self) -> None:
         """Forget what was named of robots whose hands and joints agree again."""
-        distance = self._state["distance"]
-        agree = (distance >= 0.0) & (distance <= LIMIT)
-        self._cases = {robot: case for robot, case in self._cases.items() if not agree[robot]}
+        distance = self.state["distance"]
+        self.begin((distance >= 0.0) & (distance <= LIMIT))
 
-    def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
+    def contradiction(
+        self,
+        robot: int,
+        missing: Mask,
+    ) -> Contradiction | None:
         """Return what is wrong with a robot whose last row contradicts itself, beside what is ``missing`` (D,)."""
-        case = self._cases.setdefault(robot, _OpenCase(np.zeros(self._size, bool)))
-        wrong = missing | case.accused
-        free = wrong[self._angles]
-        unseen = wrong[self._hand]
-        if free.any() or unseen.any():
-            unexplained = self._explain(robot, self._state["rows"][robot, -1], free, unseen)[1]
+        case = self._cases.setdefault(robot, _OpenCase(np.zeros_like(missing)))
+        wrong = (missing | case.accused)[self._suspects]
+        if wrong.any():
+            unexplained = self._explain(robot, self.state["rows"][robot, -1], wrong)[1]
             bounded = min(unexplained, ONE_ROW * EXPLAINED / self._gain)
             case.unexplained += self._gain * (bounded - case.unexplained)
             if case.unexplained <= EXPLAINED:
                 # What was named explains it still; where nothing completes that sensor, it is named again.
                 return case.named if (case.accused & ~missing).any() else None
-        named = self._name_sensor(robot, case, free, unseen)
+        named = self._name_sensor(robot, case, wrong)
         if named is not None:
             case.named = named
             case.unexplained = 0.0
@@ -224,53 +230,56 @@ class HandCheck:
 
     def right(self, robot: int) -> Mask:
         """Return (D,) what is right by the last row: all say the same of hand and speeds, and none repeats itself."""
-        right = np.zeros(self._size, bool)
-        state = self._state[robot]
-        if state["whole_rows"] < 2 or np.linalg.norm(state["mean"]) > LIMIT / 2:
+        right = np.zeros(self.spec.size, bool)
+        state = self.state[robot]
+        if state["whole_rows"] < 2 or state["distance"] > LIMIT / 2:
             return right
-        joints = len(self._angles)
-        before, last = state["rows"][-2:]
-        turned = last[:joints] - before[:joints]
-        speeds = last[joints : 2 * joints]
-        speeds_before = before[joints : 2 * joints]
-        moves = np.abs(turned / self._dt - (speeds + speeds_before) / 2) < SAME_SPEED
-        moves &= (turned != 0.0) | (speeds != speeds_before)
-        right[self._angles] = moves
-        right[self._speeds] = moves
-        right[self._hand] = True
+        moving = state["rows"][-2:, : 2 * self._joints]
+        before, last = moving.reshape(2, 2, self._joints)  # (angles or speeds, J)
+        turned, sped_up = last - before
+        speed = (last[1] + before[1]) / 2
+        moves = np.abs(turned / self.spec.dt - speed) < SAME_SPEED
+        moves &= (turned != 0.0) | (sped_up != 0.0)
+        right[self._columns[:-HAND]] = np.tile(moves, 2)
+        right[self._columns[-HAND:]] = True
         return right
 
     def accused(self, robot: int) -> Mask:
         """Return (D,) what is not to be believed again while the contradiction lasts."""
         case = self._cases.get(robot)
-        return np.zeros(self._size, bool) if case is None else case.accused
+        return np.zeros(self.spec.size, bool) if case is None else case.accused
 
-    def refine(self, robot: int, row: Floats, missing: Mask, error: Floats) -> Floats:
+    def refine(
+        self,
+        robot: int,
+        row: Floats,
+        missing: Mask,
+        error: Floats,
+    ) -> Floats:
         """Return a completed row (D,), of errors (D,), with ``missing`` angles (D,) as the hand says."""
-        free = missing[self._angles]
-        unseen = missing[self._hand]
+        wrong = missing[self._suspects]
+        free = wrong[: self._joints]
         now = row[self._columns]
-        if free.any() and not unseen.all() and np.isfinite(now).all():
-            completed = Prior(row[self._angles], error[self._angles])
-            angles, _ = self._explain(robot, now, free, unseen, completed)
-            believed = np.where(free, angles, row[self._angles])
-            self._state["angles"][robot, : len(believed)] = believed
-            row[self._angles] = believed
+        if free.any() and not wrong[self._joints :].all() and np.isfinite(now).all():
+            angles = self._columns[: self._joints]
+            fitted, _ = self._explain(robot, now, wrong, error[angles])
+            row[angles] = np.where(free, fitted, row[angles])
+            self.state["angles"][robot, : self._joints] = row[angles]
         return row
 
     def _name_sensor(
-        self, robot: int, case: _OpenCase, free: Mask, unseen: Mask
+        self,
+        robot: int,
+        case: _OpenCase,
+        wrong: Mask,
     ) -> Contradiction | None:
         """Return the one sensor that explains most of the last rows; None while that could be another as well."""
-        kept = int(self._state["kept_rows"][robot])
-        rows = self._state["rows"][robot, WINDOW - kept :]
-        unexplained = np.zeros(len(self._suspects))
-        for n in range(len(unexplained)):
-            wrong = np.append(free, unseen)
-            wrong[n] = True
-            angles = wrong[: len(free)]
-            hand = wrong[len(free) :]
-            unexplained[n] = sum(self._explain(robot, row, angles, hand)[1] for row in rows)
+        rows = self.state["rows"][robot]
+        rows = rows[rows.any(axis=1)]
+        unexplained = []
+        for alone in np.eye(len(wrong), dtype=bool):
+            left = [self._explain(robot, row, wrong | alone)[1] for row in rows]
+            unexplained.append(sum(left))
         best, next_best = np.argsort(unexplained)[:2]
         case.undecided_rows += 1
         unsure = unexplained[next_best] - unexplained[best] < SURER_BY
@@ -278,51 +287,47 @@ class HandCheck:
             return None
         case.undecided_rows = 0
         if unexplained[best] <= EXPLAINED * len(rows):
-            return self._suspects[best]
-        return Contradiction(part="", columns=np.zeros(0, np.intp))
+            for name, columns in sensors_of(self.spec):
+                if self._suspects[best] in columns:
+                    return Contradiction(part=name, columns=columns)
+        return Contradiction(part="", columns=NO_COLUMNS)
 
     def _explain(
-        self, robot: int, row: Floats, free: Mask, unseen: Mask, prior: Prior | None = None
+        self,
+        robot: int,
+        row: Floats,
+        wrong: Mask,
+        error: Floats | float = np.inf,
     ) -> tuple[Floats, float]:
-        """Return (J,) angles of which those that are ``free`` (J,) are as the hand says, and |z|² of what is left.
+        """Return (J,) angles, those that are wrong as the hand says, and |z|² of what is left.
 
         Args:
+            robot: of which the row is.
             row: its angles, speeds and hand, in the order of ``columns``.
-            unseen: (9,) numbers of the hand that do not count.
-            prior: what is known of the angles beside.
+            wrong: (J + 9,) angles, and numbers of the hand, that do not count.
+            error: (J,) standard deviations of the row's angles [rad]; infinite where the wrong ones tell nothing.
         """
-        joints = len(free)
-        angles = np.where(free, self._state["angles"][robot, :joints], row[:joints])
-        if prior is None:
-            prior = Prior(angles, np.full(joints, np.inf))
-        late = self._geometry["late_s"][robot] * np.where(free, 0.0, row[joints : 2 * joints])
-        weights = np.where(unseen, 0.0, self._geometry["weights"][robot])
-        hand = row[2 * joints : 2 * joints + HAND]
-        near = Prior(prior.angles - late, prior.error)
+        joints = self._joints
+        geometry = self.geometry[robot]
+        free = wrong[:joints]
+        late = np.where(free, 0.0, geometry["late_s"] * row[joints : 2 * joints])
         fitted, unexplained = fit_angles(
-            self._geometry[robot], angles - late, hand, weights, free, near
+            geometry,
+            np.where(free, self.state["angles"][robot, :joints], row[:joints] - late),
+            row,
+            np.where(wrong[joints:], 0.0, geometry["weights"]),
+            free,
+            np.full(joints, error),
         )
         return fitted + late, float(unexplained)
 
 
-class Prior(NamedTuple):
-    """What is known of angles beside the hand."""
-
-    angles: Floats  # (J,) [rad]
-    error: Floats  # (J,) their standard deviations [rad]; infinite where nothing is known
-
-
-@compiled
-def compare_hands(rows: Any, geometry: Any, state: Any) -> bool:
-    """Take rows (n, D) into the states (n, arms) of all hands; return whether any contradicts its joints."""
-    some = False
-    for n in range(len(rows)):
-        some |= compare_hands_of(rows[n], geometry[n], state[n])
-    return some
-
-
 @inner
-def compare_hands_of(row: Any, geometry: Any, state: Any) -> bool:
+def compare_hands_of(
+    row: Any,
+    geometry: Any,
+    state: Any,
+) -> bool:
     """Take the row (D,) of one robot into the states (arms,) of its hands."""
     some = False
     for arm in range(len(geometry)):
@@ -333,97 +338,104 @@ def compare_hands_of(row: Any, geometry: Any, state: Any) -> bool:
             seen.whole_rows = 0
             continue
         update_mean(hand, seen)
-        if seen.distance <= LIMIT:
-            for j in range(hand.joints):
-                seen.angles[j] = seen.rows[WINDOW - 1, j]
-        else:
+        if seen.distance > LIMIT:
             some = True
+        else:
+            seen.angles[:] = seen.rows[-1, :MOST_JOINTS]
     return some
 
 
 @inner
-def shift_in(row: Any, hand: Any, seen: Any) -> bool:
+def shift_in(
+    row: Any,
+    hand: Any,
+    seen: Any,
+) -> bool:
     """Keep the numbers of an arm as the newest of its last rows, if all are finite; return whether they are."""
     size = 2 * hand.joints + HAND
     for i in range(size):
         if not np.isfinite(row[hand.columns[i]]):
             return False
+    for k in range(WINDOW - 1):
+        seen.rows[k] = seen.rows[k + 1]
     for i in range(size):
-        for k in range(WINDOW - 1):
-            seen.rows[k, i] = seen.rows[k + 1, i]
-        seen.rows[WINDOW - 1, i] = row[hand.columns[i]]
+        seen.rows[-1, i] = row[hand.columns[i]]
     seen.whole_rows += 1
-    seen.kept_rows = min(seen.kept_rows + 1, WINDOW)
     return True
 
 
 @inner
-def update_mean(hand: Any, seen: Any) -> None:
+def update_mean(
+    hand: Any,
+    seen: Any,
+) -> None:
     """Take the newest row into m."""
     joints = hand.joints
-    newest = seen.rows[WINDOW - 1]
-    angles = np.empty(joints)
-    for j in range(joints):
-        angles[j] = newest[j] - hand.late_s * newest[joints + j]
-    z = np.empty(HAND)
-    length = np.sqrt(residual(angles, newest[2 * joints :], hand.weights, hand, z))
+    newest = seen.rows[-1]
+    angles = newest[:joints] - hand.late_s * newest[joints : 2 * joints]
+    z = residual(angles, newest, hand.weights, hand)
     longest = ONE_ROW * LIMIT / hand.gain
-    share = min(1.0, longest / max(length, longest))
-    total = 0.0
+    share = longest / max(np.sqrt(squared(z)), longest)
     for k in range(HAND):
         seen.mean[k] += hand.gain * (share * z[k] - seen.mean[k])
-        total += seen.mean[k] * seen.mean[k]
-    seen.distance = np.sqrt(total)
+    seen.distance = np.sqrt(squared(seen.mean))
 
 
 @inner
-def residual(angles: Any, measured: Any, weights: Any, hand: Any, z: Any) -> float:
-    """Write z (9,), what angles (J,) leave of the measured hand (9,) under weights (9,); return |z|²."""
+def residual(
+    angles: Any,
+    row: Any,
+    weights: Any,
+    hand: Any,
+) -> Any:
+    """Return z (9,): what angles (J,) leave of the hand that a row says, under weights (9,)."""
     joints = hand.joints
+    z = np.empty(HAND)
     hand_at(angles, hand.axes[:joints], hand.anchors[:joints], hand.pose, z)
-    total = 0.0
     for k in range(HAND):
-        z[k] = (measured[k] - z[k]) * weights[k]
-        total += z[k] * z[k]
+        z[k] = (row[2 * joints + k] - z[k]) * weights[k]
+    return z
+
+
+@inner
+def squared(z: Any) -> float:
+    """Return |z|²."""
+    total = 0.0
+    for number in z:
+        total += number * number
     return total
 
 
 @compiled
-def fit_angles(hand: Any, angles: Any, measured: Any, weights: Any, free: Any, prior: Any) -> Any:
+def fit_angles(
+    hand: Any,
+    angles: Any,
+    row: Any,
+    weights: Any,
+    free: Any,
+    error: Any,
+) -> Any:
     """Return angles (J,), those that are ``free`` (J,) by Gauss and Newton's method, and |z|² of what is left.
 
     Args:
         hand: a record of ``HAND_GEOMETRY``.
         angles: (J,) to begin with.
-        measured, weights: (9,) the hand, and 1/σ of its numbers, 0 for those that do not count.
-        prior: a ``Prior`` of the angles.
+        row: its angles, speeds and hand.
+        weights: (9,) 1/σ of the hand's numbers, 0 for those that do not count.
+        free: (J,) the angles to fit.
+        error: (J,) standard deviations of the row's angles [rad]; infinite where nothing is known.
     """
-    fitted = angles.copy()
-    z = np.empty(HAND)
-    moved = np.empty(HAND)
     which = np.flatnonzero(free)
-    slope = np.empty((HAND, len(which)))
+    trust = 1.0 / error[which] ** 2
+    slopes = np.empty((len(which), HAND))
     for _ in range(ITERATIONS if len(which) else 0):
-        residual(fitted, measured, weights, hand, z)
-        H = np.eye(len(which))
-        b = np.empty(len(which))
+        z = residual(angles, row, weights, hand)
         for i in range(len(which)):
-            j = which[i]
-            at = fitted[j]
-            fitted[j] = at + DIFFERENCE
-            residual(fitted, measured, weights, hand, moved)
-            fitted[j] = at
-            trust = 1.0 / prior.error[j] ** 2
-            b[i] = trust * (prior.angles[j] - at)
-            for k in range(HAND):
-                slope[k, i] = (z[k] - moved[k]) / DIFFERENCE
-                b[i] += slope[k, i] * z[k]
-            for m in range(i + 1):
-                for k in range(HAND):
-                    H[i, m] += slope[k, i] * slope[k, m]
-                H[m, i] = H[i, m]
-            H[i, i] += trust
+            turned = angles.copy()
+            turned[which[i]] += DIFFERENCE
+            slopes[i] = (z - residual(turned, row, weights, hand)) / DIFFERENCE
+        H = slopes @ slopes.T + np.diag(1.0 + trust)
+        b = slopes @ z + trust * (row[which] - angles[which])
         step = np.linalg.solve(H, b)
-        for i in range(len(which)):
-            fitted[which[i]] += min(max(step[i], -LONGEST_STEP), LONGEST_STEP)
-    return fitted, residual(fitted, measured, weights, hand, z)
+        angles[which] += np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+    return angles, squared(residual(angles, row, weights, hand))

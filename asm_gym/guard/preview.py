@@ -9,6 +9,7 @@ a chunk surprise it more in healthy chunks than in hostile ones.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,14 +17,13 @@ from numpy.typing import NDArray
 
 from asm_gym.detection.commands import PACE, PLACE, hands_of, out_of_range
 from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.hand_speed import Floats
 from asm_gym.detection.hand_speed_map import HandSpeedMap
+from asm_gym.guard.recent_rows import Floats32
 from asm_gym.validation import as_float32
 
 NO_ACTION = "no action"  # a number of it is not finite
 SLACK = 0.05  # a hand may be faster than healthy ones by so much [m/s]
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 
 class Preview(NamedTuple):
@@ -67,7 +67,14 @@ def preview_chunk(
     speed_map = _speed_map(monitor, limits)
     commands = getattr(monitor, "commands_", None)
     known = speed_map is not None or commands is not None
-    hands = Hands(row, monitor, dt, limits)
+    sensed = row.astype(np.float64)[hands_of(monitor.spec)]  # (H, 2, 3)
+    hands = Hands(
+        places=sensed[:, 0],
+        velocities=sensed[:, 1],
+        monitor=monitor,
+        dt=dt,
+        limits=limits,
+    )
     for index, action in enumerate(chunk):
         reason = ""
         if not np.isfinite(action).all():
@@ -92,46 +99,38 @@ def _speed_map(monitor: Any, limits: ContactLimits | None) -> HandSpeedMap | Non
     return HandSpeedMap.of(getattr(monitor, "pace_", {}))
 
 
+@dataclass
 class Hands:
-    """The hands of a robot, as the monitor predicts their motion.
+    """The hands of a robot, as the monitor predicts their motion."""
 
-    Args:
-        row: (D,) the last row that was sensed.
-        monitor: knows how hands move by commands, ``motion_`` (3 H + A, 3 H).
-        dt: control period [s].
-        limits: slow the hands down; None for no limits.
-    """
-
-    def __init__(
-        self, row: NDArray[np.floating[Any]], monitor: Any, dt: float, limits: ContactLimits | None
-    ) -> None:
-        sensed = row.astype(np.float64)[hands_of(monitor.spec)]  # (H, 2, 3)
-        self._places = sensed[:, 0]
-        self._velocities = sensed[:, 1]
-        self._motion = getattr(monitor, "motion_", None)
-        self._rows = max(1, round(dt / monitor.spec.dt))  # of the stream, in a control period
-        self._row_s = dt / self._rows
-        self._limits = limits
+    places: Floats  # (H, 3) [m]
+    velocities: Floats  # (H, 3) [m/s]
+    monitor: Any  # knows how hands move by commands, ``motion_`` (3 H + A, 3 H)
+    dt: float  # control period [s]
+    limits: ContactLimits | None  # slow the hands down; None for no limits
 
     def move(self, action: Floats32) -> None:
         """Predict where the hands are after an action (A,), and how fast."""
-        for _ in range(self._rows):
-            inputs = np.concatenate([self._velocities.ravel(), action])
-            self._velocities = (inputs @ self._motion).reshape(self._places.shape)
-            if self._limits is not None:
-                self._slow_down(self._limits)
-            self._places = self._places + self._row_s * self._velocities
+        rows = max(1, round(self.dt / self.monitor.spec.dt))  # of the stream, in a control period
+        for _ in range(rows):
+            inputs = np.append(self.velocities, action)
+            velocities = inputs @ self.monitor.motion_
+            self.velocities = velocities.reshape(self.places.shape)
+            if self.limits is not None:
+                self._slow_down(self.limits)
+            self.places = self.places + self.dt / rows * self.velocities
 
     def _slow_down(self, limits: ContactLimits) -> None:
-        for hand, velocity in enumerate(self._velocities):
+        for hand, velocity in enumerate(self.velocities):
             twist = np.append(velocity, np.zeros(3))
             speed = float(np.linalg.norm(velocity))
-            velocity *= min(1.0, limits.share(hand, self._places[hand], twist, speed))
+            share = limits.share(hand, self.places[hand], twist, speed)
+            velocity *= min(1.0, share)
 
     def beyond(self, speed_map: HandSpeedMap) -> str:
         """Return what no healthy hand did near the place of any: be there, or be so fast; else empty."""
-        for hand, velocity in enumerate(self._velocities):
-            fastest = speed_map.fastest_near(hand, self._places[hand])[:, :3]
+        for hand, velocity in enumerate(self.velocities):
+            fastest = speed_map.fastest_near(hand, self.places[hand])[:, :3]
             if not fastest.any():
                 return PLACE
             along, against = fastest

@@ -22,7 +22,9 @@ CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING), PRESSING, f"l
 
 GOING_ON = ("go on", "complete")  # responses to an alarm under which the policy acts
 
-RESPONSES = (*GOING_ON, "hold", "comply", "retract", "stop")
+STAYING = ("hold", "comply", "retract", "stop")  # responses under which it does not
+
+RESPONSES = (*GOING_ON, *STAYING)
 """Let the policy go on; complete the sensors at fault and go on; stay and keep the grip, yielding to more than a hold's
 force; give way to what presses; go back along the path; stay, and end the episode."""
 
@@ -81,14 +83,16 @@ def responses_from(table: Mapping[str, str] | None) -> dict[str, str]:
         ValueError: an unknown cause or response (the message lists those that exist), or one that lets the policy go on
             while the arm presses.
     """
-    if table is not None and not isinstance(table, Mapping):
+    if table is None:
+        table = {}
+    if not isinstance(table, Mapping):
         raise ValueError(f"responses must map causes to responses, got {short_repr(table)}")
-    for cause, response in (table or {}).items():
+    for cause, response in table.items():
         check_choice("cause", cause, CAUSES)
         check_choice("response", response, RESPONSES)
         if cause.endswith(PRESSING) and response in GOING_ON:
-            possible = ", ".join(name for name in RESPONSES if name not in GOING_ON)
+            possible = ", ".join(STAYING)
             raise ValueError(
                 f"{short_repr(response)} would let a pressing arm go on: {cause} takes {possible}"
             )
-    return {**DEFAULT, **(table or {})}
+    return {**DEFAULT, **table}

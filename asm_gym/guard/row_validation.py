@@ -5,34 +5,31 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from itertools import compress
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.guard.hand_check import Contradiction, HandChecks, compare_hands_of
-from asm_gym.guard.recent_rows import Floats32, Mask, RecentRows, leave_out_stale, make_room
+from asm_gym.guard.recent_rows import Floats32, RecentRows, leave_out_stale, make_room
 from asm_gym.guard.repair import Repair
-from asm_gym.guard.robot_facts import RobotFacts
-from asm_gym.guard.robot_table import RobotTable
+from asm_gym.guard.robot_facts import NOTHING, RobotFacts
+from asm_gym.guard.robot_table import Mask, RobotTable
 from asm_gym.memory.completion import Completion
 from asm_gym.spec import StreamSpec
 
 LOG = logging.getLogger("asm_gym.safety")
 
 
-@dataclass(frozen=True, slots=True)
-class ValidatedRows:
+class ValidatedRows(NamedTuple):
     """The next row of each robot, as the monitor is to see it; mappings hold the robots with something to say."""
 
     rows: Floats32  # (n, D)
-    lost: Mapping[int, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # the numbers that were not finite
-    contradictions: Mapping[int, Contradiction] = field(default_factory=dict)  # of hand and joints
-    failures: Mapping[int, str] = field(default_factory=dict)  # what can no longer be relied on
+    lost: Mapping[int, tuple[str, ...]] = NOTHING  # the numbers that were not finite
+    contradictions: Mapping[int, Contradiction] = NOTHING  # of hand and joints
+    failures: Mapping[int, str] = NOTHING  # what can no longer be relied on
 
 
 class RowValidator:
@@ -45,19 +42,23 @@ class RowValidator:
         kept: how many rows are kept of each.
 
     Attributes:
-        read: (D,) which columns the policy reads; None where senses cannot be completed.
         repairs: of the robots of which something is completed, or was a moment ago.
         hands: compares each hand with its joints.
         recent: the last rows.
     """
 
     def __init__(
-        self, facts: RobotFacts, table: RobotTable, completion: Completion | None, kept: int
+        self,
+        facts: RobotFacts,
+        table: RobotTable,
+        completion: Completion | None,
+        kept: int,
     ) -> None:
         self._spec: StreamSpec = table.spec
         self._table = table
-        self._completion = None if facts.observed is None else completion
+        self._read = facts.observed
         if completion is not None and facts.observed is None:
+            completion = None
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
             reason = facts.refused.get(
                 "complete", "it is not known where they stand in the observation"
@@ -66,7 +67,7 @@ class RowValidator:
                 f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}",
                 stacklevel=5,
             )
-        self.read = None if self._completion is None else facts.observed
+        self._completion = completion
         self.hands = HandChecks(facts.count, facts.chains, self._spec)
         self.recent = RecentRows(facts.count, self._spec, kept)
         self.repairs: dict[int, Repair] = {}
@@ -89,27 +90,30 @@ class RowValidator:
         records = self._table.records
         for hand in self.hands.arms:
             hand.close_cases()
-        lost = {
-            robot: self._not_finite(rows[robot])
-            for robot in np.flatnonzero(records["lost"]).tolist()
-        }
-        contradicting = np.flatnonzero(records["contradicts"]).tolist()
-        records["contradicts"] = False
+        lost: dict[int, tuple[str, ...]] = {}
         contradictions: dict[int, Contradiction] = {}
         failures: dict[int, str] = {}
         validated = rows.copy()
-        for robot in sorted({*self.repairs, *lost, *contradicting}):
-            if not records["active"][robot]:
-                continue
-            if robot in contradicting:
+        unusual = records["lost"] | records["contradicts"]
+        unusual[list(self.repairs)] = True
+        for robot in np.flatnonzero(unusual & records["active"]).tolist():
+            record = records[robot]
+            if record["lost"]:
+                missing = ~np.isfinite(rows[robot])
+                lost[robot] = tuple(compress(self._spec.labels, missing))
+                if self._completion is not None and robot not in self.repairs:
+                    self.repairs[robot] = self._new_repair(robot, rows_before=1)
+            if record["contradicts"]:
                 contradiction = self.hands.contradiction(robot, self._missing(robot))
+                record["contradicts"] = contradiction is not None
                 if contradiction is not None:
                     contradictions[robot] = contradiction
-                    records["contradicts"][robot] = True
-            validated[robot] = self._repaired(robot, rows[robot], robot in lost)
-            self.recent.replace_last(robot, validated[robot])
             repair = self.repairs.get(robot)
-            if repair is not None and not repair.trusted:
+            if repair is None:
+                continue
+            validated[robot] = _next(repair, rows[robot])
+            self.recent.replace_last(robot, validated[robot])
+            if not repair.trusted:
                 names = ", ".join(repair.names)
                 failures[robot] = f"completion: too much is missing, or for too long: {names}"
         return ValidatedRows(validated, lost, contradictions, failures)
@@ -118,7 +122,11 @@ class RowValidator:
         """Return (T, D) the last rows of a robot in this episode, the newest last."""
         return self.recent.last(robot, int(self._table.records["episode_rows"][robot]))
 
-    def suspect(self, robot: int, columns: NDArray[np.intp]) -> bool:
+    def suspect(
+        self,
+        robot: int,
+        columns: NDArray[np.intp],
+    ) -> bool:
         """Complete the sensors of ``columns`` from a robot's last row on; return whether that leaves any to go by."""
         if self._completion is None:
             return False
@@ -132,13 +140,14 @@ class RowValidator:
 
     def accounted_for(self, robot: int) -> Mask:
         """Return (D,) what is completed, or right by the hand and its joints: it explains no surprise."""
-        missing = self._missing(robot)
-        right = self.hands.right(robot)
-        return missing if right is None else missing | right
+        explained = self._missing(robot)
+        for hand in self.hands.arms:
+            explained = explained | hand.right(robot)
+        return explained
 
     def completed_names(self, robot: int) -> tuple[str, ...] | None:
         """Return the sensors of a robot that are completed; None where senses cannot be completed."""
-        if self.read is None:
+        if self._completion is None:
             return None
         repair = self.repairs.get(robot)
         return () if repair is None else repair.names
@@ -147,42 +156,56 @@ class RowValidator:
         """Forget the repairs that are over."""
         self.repairs = {robot: repair for robot, repair in self.repairs.items() if not repair.over}
 
-    def _not_finite(self, row: Floats32) -> tuple[str, ...]:
-        return tuple(self._spec.labels[column] for column in np.flatnonzero(~np.isfinite(row)))
-
     def _missing(self, robot: int) -> Mask:
         repair = self.repairs.get(robot)
         return np.zeros(self._spec.size, bool) if repair is None else repair.missing
 
-    def _repaired(self, robot: int, row: Floats32, lost: bool) -> Floats32:
-        """Return a row (D,) with what is missing or at fault completed."""
-        if self._completion is None or not (lost or robot in self.repairs):
-            return row
-        if robot not in self.repairs:
-            self.repairs[robot] = self._new_repair(robot, rows_before=1)
-        repair = self.repairs[robot]
-        known = repair.names
-        try:
-            row = repair.next(row)
-        except Exception as error:
-            # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
-            warnings.warn(f"completion: {error!r}; the row counts as lost", stacklevel=2)
-            return np.full_like(row, np.nan)
-        if silent := ", ".join(name for name in repair.names if name not in known):
-            LOG.info("complete: %s says nothing any more", silent)
-        return row
-
-    def _new_repair(self, robot: int, rows_before: int) -> Repair:
+    def _new_repair(
+        self,
+        robot: int,
+        rows_before: int,
+    ) -> Repair:
         """Return a repair of a robot from its newest row on, or from the next where that is ``rows_before`` it."""
         assert self._completion is not None
-        assert self.read is not None
+        assert self._read is not None
         last = self.last(robot)
-        before = last[-1 - rows_before] if len(last) > rows_before else None
-        return Repair(self._completion, robot, before, self.read, self.hands.arms)
+        before = None
+        if len(last) > rows_before:
+            before = last[-1 - rows_before].astype(np.float64)
+        return Repair(
+            self._completion,
+            robot,
+            before,
+            self._read,
+            self.hands.arms,
+        )
+
+
+def _next(
+    repair: Repair,
+    row: Floats32,
+) -> Floats32:
+    """Return a row (D,) with what is missing or at fault completed."""
+    known = repair.names
+    try:
+        row = repair.next(row)
+    except Exception as error:
+        # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
+        warnings.warn(f"completion: {error!r}; the row counts as lost", stacklevel=2)
+        return np.full_like(row, np.nan)
+    if silent := ", ".join(name for name in repair.names if name not in known):
+        LOG.info("complete: %s says nothing any more", silent)
+    return row
 
 
 @compiled
-def validate_rows(robots: Any, rows: Any, recent: Any, hand_geometry: Any, hand_state: Any) -> bool:
+def validate_rows(
+    robots: Any,
+    rows: Any,
+    recent: Any,
+    hand_geometry: Any,
+    hand_state: Any,
+) -> bool:
     """Keep rows (n, D), with NaN for stale senses, and mark the robots whose rows are not whole or not consistent.
 
     Args:
@@ -199,13 +222,10 @@ def validate_rows(robots: Any, rows: Any, recent: Any, hand_geometry: Any, hand_
         robot = robots[n]
         row = rows[n]
         leave_out_stale(row, recent, n)
-        finite = True
-        for i in range(len(row)):
-            recent.rows[n, end, i] = row[i]
-            finite = finite and np.isfinite(row[i])
+        recent.rows[n, end] = row
         contradicts = compare_hands_of(row, hand_geometry[n], hand_state[n])
         robot.episode_rows += 1
-        robot.lost = robot.active and not finite
+        robot.lost = robot.active and not np.isfinite(row).all()
         robot.contradicts = robot.active and contradicts
         unusual = unusual or robot.lost or robot.contradicts
     return unusual
