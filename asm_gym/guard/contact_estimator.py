@@ -33,10 +33,7 @@ class ContactEstimator:
         joints = columns_ending(spec.channels, "joint_position")
         self._completion = completion
         self._filling = completion.filling(shows)
-        self._torques = np.isin(
-            self._filling.columns,
-            torques,
-        )
+        self._torques = np.isin(self._filling.columns, torques)
         self._joints = joints
         self._labels = np.array(spec.labels)[joints]
 
@@ -44,10 +41,7 @@ class ContactEstimator:
         """Return z (T - 1, J) of rows (T, D) but the first."""
         filling = self._filling
         lifted = self._completion.lift(rows)
-        expected = self._completion.complete(
-            filling,
-            lifted,
-        )
+        expected = self._completion.complete(filling, lifted)
         z = (rows[:, filling.columns] - expected) / filling.error
         return np.asarray(z[1:, self._torques])
 
@@ -65,10 +59,7 @@ class ContactEstimator:
 
         Without a joint: whether any has been pressed, and none has turned; an arm that pulls at a door turns some.
         """
-        deviation = np.median(
-            np.abs(self.deviations(rows)),
-            axis=0,
-        )
+        deviation = np.median(np.abs(self.deviations(rows)), axis=0)
         if len(deviation) != len(self._joints):
             return False
         pressed = deviation > PRESSED

@@ -120,13 +120,7 @@ class HandChecks:
             geometry = self.geometry[:, arm]
             for robot, chain in enumerate(own):
                 _describe(geometry[robot], chain, spec)
-            self.arms.append(
-                HandCheck(
-                    geometry=geometry,
-                    state=self.state[:, arm],
-                    spec=spec,
-                )
-            )
+            self.arms.append(HandCheck(geometry, self.state[:, arm], spec))
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
@@ -190,8 +184,7 @@ class HandCheck:
         self._suspects = np.delete(columns, np.s_[joints : 2 * joints])
         self._gain = float(self.geometry["gain"][0])
         # Compiled or loaded here, so that the first contradiction does not wait for it.
-        everything = np.ones(len(self._suspects), bool)
-        self._explain(0, self.state["rows"][0, 0], everything)
+        self._explain(0, self.state["rows"][0, 0], np.ones(len(self._suspects), bool))
 
     def begin(self, which: Mask) -> None:
         """Forget what was named of the robots of ``which`` (n,): new episodes begin."""

@@ -79,16 +79,13 @@ class Repair:
             return False
         oldest = max((sensor.age for sensor in self._sensors.values()), default=0)
         dt = self._spec.dt
-        if self._unchecked > round(TRUST_S / dt):
-            return False
-        return oldest <= round(LONGEST_S / dt)
+        return self._unchecked <= round(TRUST_S / dt) and oldest <= round(LONGEST_S / dt)
 
     @property
     def over(self) -> bool:
         """There is nothing left to repair."""
-        if self._sensors or self.settling or self._returned.any():
-            return False
-        return self.trusted
+        busy = self._sensors or self._returned.any() or self.settling
+        return self.trusted and not busy
 
     @property
     def unjudged(self) -> Mask:
@@ -100,10 +97,7 @@ class Repair:
         self._raw_before = self._raw
         self._raw = row.astype(np.float64)
         self.settling = max(0, self.settling - 1)
-        self._returned = np.maximum(
-            self._returned - 1,
-            0,
-        )
+        self._returned = np.maximum(self._returned - 1, 0)
         for sensor in self._sensors.values():
             sensor.age += 1
 
@@ -116,7 +110,6 @@ class Repair:
             self._believe_again(repaired)
         if not self.missing.any():
             self._good = self._raw
-
         self.before = repaired
         return repaired.astype(np.float32)
 
@@ -124,9 +117,7 @@ class Repair:
         """Return the last row (D,) with the sensors of ``columns`` completed too; None where that leaves nothing."""
         wanted = self.missing.copy()
         wanted[columns] = True
-        if wanted[self._spec.sensory].all():
-            return None
-        if np.array_equal(wanted, self.missing):
+        if wanted[self._spec.sensory].all() or np.array_equal(wanted, self.missing):
             return None
         self._complete(wanted, silent=False)
         self.settling = self._settle
@@ -143,10 +134,7 @@ class Repair:
         for name, own in self.completion.sensors:
             if columns[own].any():
                 known = self._sensors.get(name, MissingSensor(silent))
-                self._sensors[name] = MissingSensor(
-                    silent=silent,
-                    age=known.age,
-                )
+                self._sensors[name] = MissingSensor(silent, age=known.age)
         self._choose_filling()
 
     def _choose_filling(self) -> None:
@@ -166,30 +154,16 @@ class Repair:
         senses = self.completion.senses
         columns = self._filling.columns
         before = self._raw if self.before is None else self.before
-        rows = np.stack([before, self._raw])
-        lifted = self.completion.lift(rows)
+        lifted = self.completion.lift(np.stack([before, self._raw]))
         value = self.completion.complete(self._filling, lifted)[-1]
-        value = np.where(
-            self._guessed,
-            self._good[columns],
-            value,
-        )
+        value = np.where(self._guessed, self._good[columns], value)
         mean = senses.mean[columns]
         farthest = FARTHEST * senses.spread[columns]
         repaired = self._raw.copy()
-        repaired[columns] = np.clip(
-            value,
-            mean - farthest,
-            mean + farthest,
-        )
+        repaired[columns] = np.clip(value, mean - farthest, mean + farthest)
         error = self.completion.error * senses.spread
         for hand in self.hands:
-            repaired = hand.refine(
-                self.robot,
-                repaired,
-                self.missing,
-                error,
-            )
+            repaired = hand.refine(self.robot, repaired, self.missing, error)
         return repaired
 
     def _believe_again(self, repaired: Floats) -> None:
