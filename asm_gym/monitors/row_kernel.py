@@ -31,48 +31,77 @@ from asm_gym.detection.repetition import (
     RepetitionWeights,
     step_repetition,
 )
-from asm_gym.memory.association import normalised_errors
+from asm_gym.memory.association import Association, normalised_errors
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
-from asm_gym.memory.traces import carry, weight_shapes
+from asm_gym.memory.traces import Weights, carry, weight_shapes
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated_monitor import MonitorState
-from asm_gym.monitors.layout import Layout, matrix, vector
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 
-__all__ = ["JUDGED", "RowKernel", "expected_errors", "layout_of", "observe_rows", "uninitialised"]
+__all__ = ["JUDGED", "RowKernel", "expected_errors", "row_weights", "observe_rows", "uninitialised"]
 
 
-def layout_of(
+class RowWeights(NamedTuple):
+    """What a memory computes with; one kind of network has weights of zero, as its memory has the other."""
+
+    traces: Weights
+    settling: SettlingWeights
+    settles: bool
+    association: Association
+    spans: NDArray[np.intp]
+    W_K: NDArray[np.float32]
+    b_K: NDArray[np.float32]
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    change: NDArray[np.float64]
+    sensory: NDArray[np.intp]
+    motor: NDArray[np.intp]
+    slow: NDArray[np.intp]
+    groups: NDArray[np.intp]
+    prior_precision: np.float32
+    sensory_precision: np.float32
+    curvature: np.float32
+    iterations: int
+
+
+def row_weights(
     network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]
-) -> Layout:
+) -> RowWeights:
     """Return what a memory computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
-    either = weight_shapes(1, 1, 1) | settling_shapes(1, 1, 1)
-    singles = {
-        name: np.zeros(shape) for name, shape in either.items()
-    }  # what the other kind of network has
-    singles |= network.weights._asdict()
-    singles |= network.association._asdict()
-    singles |= names
-    integers = {
-        "sensory": scaler.spec.sensory,
-        "motor": scaler.spec.motor,
-        "slow": scaler.slow,
-        "groups": scaler.groups,
-        "spans": network.spans,
-    }
-    arrays = {name: np.asarray(array, np.float32) for name, array in singles.items()}
-    arrays |= {name: np.asarray(array, np.float64) for name, array in scaler.arrays.items()}
-    arrays |= {name: np.asarray(array, np.int64) for name, array in integers.items()}
-    numbers = {
-        "prior_precision": network.prior_precision,
-        "sensory_precision": network.sensory_precision,
-        "curvature": network.curvature,
-        "iterations": network.iterations,
-        "settles": isinstance(network.weights, SettlingWeights),
-    }
-    return Layout.of(arrays, numbers)
+    traces: Any = map(np.zeros, weight_shapes(1, 1, 1).values())
+    settling: Any = map(np.zeros, settling_shapes(1, 1, 1).values())
+    settles = isinstance(network.weights, SettlingWeights)
+    if settles:
+        settling = network.weights
+    else:
+        traces = network.weights
+    return RowWeights(
+        traces=Weights._make(map(single, traces)),
+        settling=SettlingWeights._make(map(single, settling)),
+        settles=settles,
+        association=Association._make(map(single, network.association)),
+        spans=network.spans,
+        W_K=single(names["W_K"]),
+        b_K=single(names["b_K"]),
+        mean=np.array(scaler.mean, np.float64),
+        spread=np.array(scaler.spread, np.float64),
+        change=np.array(scaler.change, np.float64),
+        sensory=scaler.spec.sensory.copy(),
+        motor=scaler.spec.motor.copy(),
+        slow=scaler.slow,
+        groups=scaler.groups,
+        prior_precision=network.prior_precision,
+        sensory_precision=network.sensory_precision,
+        curvature=network.curvature,
+        iterations=network.iterations,
+    )
+
+
+def single(array: NDArray[Any]) -> NDArray[np.float32]:
+    """Return a writable copy, of the one type that compiled code takes."""
+    return np.array(array, np.float32, order="C")
 
 
 class RowState(NamedTuple):
@@ -93,7 +122,7 @@ class RowKernel:
     """
 
     def __init__(
-        self, memory: Layout, detection: EvidenceDetection, events: BenignEvents | None
+        self, memory: RowWeights, detection: EvidenceDetection, events: BenignEvents | None
     ) -> None:
         if must_compile(observe_rows):
             print(
@@ -143,7 +172,7 @@ class RowKernel:
 
 
 def expected_errors(
-    memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]
+    memory: RowWeights, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]
 ) -> Any:
     """Return the errors (B, X) of rows (B, D), and write the memory's state: the first half of a row by itself."""
     learned = bind(memory, True, NO_DETECTOR, NO_REPETITION, NO_SENSES)
@@ -216,12 +245,12 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
         attribution: (B, D) share of each number in the surprise, written.
     """
     learned, before, after = memory.parts
-    layout, wants_context, detector, repetition, senses = learned.parts
-    reading = read(layout, before.memory.history, after.memory.history, rows)
-    carry_on(layout, before.memory, after.memory, reading, wants_context)
-    errors, units = associate(layout, reading)
+    weights, wants_context, detector, repetition, senses = learned.parts
+    reading = read(weights, before.memory.history, after.memory.history, rows)
+    carry_on(weights, before.memory, after.memory, reading, wants_context)
+    errors, units = associate(weights, reading)
     doubt_first_rows(before.memory.history, errors)
-    name_skills(layout, before.memory, after.memory, units)
+    name_skills(weights, before.memory, after.memory, units)
 
     if detector.whitening.size:
         shares = np.empty(errors.shape)
@@ -248,12 +277,10 @@ def doubt_first_rows(history: RowHistory, errors: Any) -> None:
 
 
 @partial(inner, inlined=True)
-def name_skills(layout: Layout, before: MemoryState, after: MemoryState, units: Any) -> None:
+def name_skills(weights: RowWeights, before: MemoryState, after: MemoryState, units: Any) -> None:
     """Write the evidence for each skill, by the units (B, M) and the state."""
     if before.skill.shape[1]:
-        W_K = matrix(layout.singles, layout.at[0].W_K)
-        b_K = vector(layout.singles, layout.at[0].b_K)
-        skill = add_up(before.skill, units, after.expected, W_K, b_K)
+        skill = add_up(before.skill, units, after.expected, weights.W_K, weights.b_K)
         for n in range(len(skill)):
             copy_row(skill, after.skill, n)
 
@@ -266,7 +293,7 @@ def copy_row(rows: Any, to: Any, n: int) -> None:
 
 
 @partial(inner, inlined=True)
-def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
+def read(weights: RowWeights, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
     """Write the new history; return the rows (B, D) beside those that they are compared with."""
     lag = before.before.shape[1]
     last = np.empty_like(rows)
@@ -285,23 +312,22 @@ def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> Sc
                 after.before[n, k, i] = before.before[n, k + 1, i]
                 after.earlier[n, k, i] = before.earlier[n, k + 1, i]
 
-    at = layout.at[0]
     return read_rows(
         rows=rows,
         before=last,
         earlier=past,
-        mean=vector(layout.doubles, at.mean),
-        spread=vector(layout.doubles, at.spread),
-        change=vector(layout.doubles, at.change),
-        sensory=vector(layout.integers, at.sensory),
-        motor=vector(layout.integers, at.motor),
-        slow=vector(layout.integers, at.slow),
+        mean=weights.mean,
+        spread=weights.spread,
+        change=weights.change,
+        sensory=weights.sensory,
+        motor=weights.motor,
+        slow=weights.slow,
     )
 
 
 @partial(inner, inlined=True)
 def carry_on(
-    layout: Layout,
+    weights: RowWeights,
     before: MemoryState,
     after: MemoryState,
     reading: ScaledRows,
@@ -316,7 +342,7 @@ def carry_on(
         copy_row(before.traces, after.traces, n)
         copy_row(before.expected, after.expected, n)
     if due:
-        expected, carried = follow(layout, before.traces, reading, wants_context)  # of all streams
+        expected, carried = follow(weights, before.traces, reading, wants_context)  # of all streams
         for n in range(len(steps)):
             if steps[n] % lag == 0:
                 copy_row(carried, after.traces, n)
@@ -324,63 +350,60 @@ def carry_on(
 
 
 @partial(inner, inlined=True)
-def follow(layout: Layout, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
+def follow(weights: RowWeights, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
     """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
-    at = layout.at[0]
-    W_F = matrix(layout.singles, at.W_F)
-    if at.settles:
+    if weights.settles:
         return settle(
             z=traces,
             u=reading.commands,
             x=reading.senses,
             seen=reading.seen,
-            W_H=matrix(layout.singles, at.W_H),
-            W_U=matrix(layout.singles, at.W_U),
-            W_F=W_F,
-            b_F=vector(layout.singles, at.b_F),
-            pi_z=at.prior_precision,
-            pi_x=at.sensory_precision,
-            curvature=at.curvature,
-            iterations=at.iterations,
+            W_H=weights.settling.W_H,
+            W_U=weights.settling.W_U,
+            W_F=weights.settling.W_F,
+            b_F=weights.settling.b_F,
+            pi_z=weights.prior_precision,
+            pi_x=weights.sensory_precision,
+            curvature=weights.curvature,
+            iterations=weights.iterations,
         )
     return carry(
         c=traces,
         u=reading.commands,
         x=reading.senses,
         seen=reading.seen,
-        W_C=matrix(layout.singles, at.W_C),
-        W_F=W_F,
-        W_D=matrix(layout.singles, at.W_D),
-        gains=vector(layout.singles, at.gains),
-        pi_z=at.prior_precision,
-        pi_x=at.sensory_precision,
-        curvature=at.curvature,
-        iterations=at.iterations,
+        W_C=weights.traces.W_C,
+        W_F=weights.traces.W_F,
+        W_D=weights.traces.W_D,
+        gains=weights.traces.gains,
+        pi_z=weights.prior_precision,
+        pi_x=weights.sensory_precision,
+        curvature=weights.curvature,
+        iterations=weights.iterations,
         context=wants_context,
     )
 
 
 @partial(inner, inlined=True)
-def associate(layout: Layout, reading: ScaledRows) -> Any:
+def associate(weights: RowWeights, reading: ScaledRows) -> Any:
     """Return the errors (B, X) of what other senses predict, and the units (B, M)."""
-    at = layout.at[0]
-    singles = layout.singles
+    association = weights.association
     return normalised_errors(
         inputs=reading.inputs,
         changes=reading.changes,
         whole=reading.whole,
-        V=matrix(singles, at.V),
-        U=matrix(singles, at.U),
-        D=matrix(singles, at.D),
-        W_S=matrix(singles, at.W_S),
-        b_S=vector(singles, at.b_S),
-        span_S=matrix(singles, at.span_S),
-        remainder=vector(singles, at.remainder),
-        spans=matrix(layout.integers, at.spans),
-        R=matrix(singles, at.R),
-        Q=matrix(singles, at.Q),
-        doubt=matrix(singles, at.doubt),
-        groups=vector(layout.integers, at.groups),
+        V=association.V,
+        U=association.U,
+        D=association.D,
+        W_S=association.W_S,
+        b_S=association.b_S,
+        span_S=association.span_S,
+        remainder=association.remainder,
+        spans=weights.spans,
+        R=association.R,
+        Q=association.Q,
+        doubt=association.doubt,
+        groups=weights.groups,
         first=reading.finite.shape[1],
     )
 
