@@ -29,6 +29,7 @@ from asm_gym.detection.evidence import (
     TINY,
     Evidence,
     accumulated,
+    average,
     bounded,
     pool,
     strength,
@@ -71,9 +72,8 @@ class Detector(NamedTuple):
         cls, learned: Sequence[ModelOutput], gains: Sequence[float], bound: float, shrinkage: float
     ) -> Detector:
         """Return the detector of white errors, by those of nominal episodes that the model has learned."""
-        matrix = whitening(
-            bounded(np.concatenate([run.errors for run in learned]), bound), shrinkage
-        )
+        errors = np.concatenate([run.errors for run in learned])
+        matrix = whitening(bounded(errors, bound), shrinkage)
         ones = np.ones((len(gains), len(matrix)))
         return cls(
             whitening=matrix,
@@ -123,9 +123,8 @@ class Detector(NamedTuple):
     def _lasting(self, whitened: Floats) -> Floats:
         """Return the pooled ratios (N,) of whitened errors (N, X) that last for ever: v_i = w_i² (2 - a) / a."""
         with np.errstate(over="ignore", divide="ignore"):
-            strengths = (whitened**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[
-                :, None
-            ]  # (N, G, X)
+            scales = (2.0 - self.gains) / self.gains
+            strengths = (whitened**2)[:, None] * scales[:, None]  # (N, G, X)
             return pool(self.ratios(strengths))[0]
 
     def ratios(self, strengths: Floats) -> Floats:
@@ -173,11 +172,13 @@ def step_evidence(
     detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any
 ) -> None:
     """Write the new evidence, and each error's share (B, X) of the value."""
-    whitened = whiten(detector, output.errors)
+    whitened = np.dot(bounded(output.errors, detector.bound), detector.whitening)  # (B, X)
     ratios = np.empty(detector.ceiling.shape)
     for n in range(len(shares)):
         after.steps[n] = before.steps[n] + 1
-        add_evidence(detector, before.vector[n], after.vector[n], whitened[n])
+        for g in range(len(detector.gains)):
+            gain = detector.gains[g]
+            average(before.vector[n, g], after.vector[n, g], whitened[n], gain)
         greatest = write_ratios(detector, after.vector[n], after.steps[n], ratios)
         total = write_shares(ratios, greatest, shares[n])
 
@@ -185,28 +186,6 @@ def step_evidence(
         value = np.exp(greatest) * total ** (1.0 / POWER) / np.exp(usual)
         for i in range(shares.shape[1]):
             shares[n, i] *= value / max(total, TINY)
-
-
-@inner
-def whiten(detector: Detector, errors: Any) -> Any:
-    """Return ẽ M (B, X) of errors (B, X), with ẽ_i = e_i / √(1 + e_i²/ν²)."""
-    limited = np.empty(errors.shape)
-    for n in range(errors.shape[0]):
-        for i in range(errors.shape[1]):
-            share = errors[n, i] / detector.bound
-            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
-    whitened = np.empty(errors.shape)
-    np.dot(limited, detector.whitening, whitened)
-    return whitened
-
-
-@inner
-def add_evidence(detector: Detector, before: Any, after: Any, whitened: Any) -> None:
-    """Write w_t (G, X) = w_{t-1} + a (ẽ_t - w_{t-1})."""
-    for g in range(len(detector.gains)):
-        gain = detector.gains[g]
-        for i in range(len(whitened)):
-            after[g, i] = before[g, i] + gain * (whitened[i] - before[g, i])
 
 
 @inner
@@ -242,12 +221,12 @@ def write_shares(ratios: Any, greatest: float, shares: Any) -> float:
 @inner
 def usual_level(detector: Detector, before: Any, after: Any, context: Any) -> float:
     """Write the running mean (C,) of the context (C,); return log ŝ = min(max(w c + b, l), h)."""
+    average(before, after, context, CONTEXT_GAIN)
     size = len(context)
-    drive = detector.context_quantile[2 * size]
+    weights = detector.context_quantile
+    drive = weights[2 * size]
     for c in range(size):
-        after[c] = before[c] + CONTEXT_GAIN * (context[c] - before[c])
-        now = context[c] * detector.context_quantile[c]
-        drive += now + after[c] * detector.context_quantile[size + c]
+        drive += context[c] * weights[c] + after[c] * weights[size + c]
     return min(max(drive, detector.context_range[0]), detector.context_range[1])
 
 

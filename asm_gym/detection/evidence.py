@@ -17,12 +17,12 @@ Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.detection.base import Array, Floats
 from asm_gym.memory.linear import check_inputs, gram
 
@@ -52,15 +52,21 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
     variance = float(np.trace(covariance)) / len(covariance)
     if not variance > 0:
         variance = 1.0
-    shrunk = (1.0 - shrinkage) * covariance + shrinkage * (variance * np.eye(len(covariance)))
+    prior = variance * np.eye(len(covariance))
+    shrunk = (1.0 - shrinkage) * covariance + shrinkage * prior
     values, vectors = np.linalg.eigh(shrunk)
     return (vectors / np.sqrt(values)) @ vectors.T
 
 
+@compiled
 def bounded(errors: Array, bound: float) -> Floats:
     """Return the errors, none beyond ν = ``bound`` standard deviations."""
-    exact = np.asarray(errors, np.float64)
-    return exact / np.sqrt(1.0 + (exact / bound) ** 2)
+    limited = np.empty(errors.shape)
+    for n in range(len(errors)):
+        for i in range(errors.shape[1]):
+            share = errors[n, i] / bound
+            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
+    return limited
 
 
 class Evidence(NamedTuple):
@@ -80,22 +86,24 @@ class Evidence(NamedTuple):
         )
 
 
+@inner
+def average(before: Any, after: Any, values: Any, gain: float) -> None:
+    """Write the running mean (N,) of values (N,)."""
+    for i in range(len(values)):
+        after[i] = before[i] + gain * (values[i] - before[i])
+
+
 @compiled
 def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats, Floats]:
     """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
-    T, X = whitened.shape
-    vectors = np.zeros((T, len(gains), X))
+    rows, errors = whitened.shape
+    vectors = np.zeros((rows, len(gains), errors))
     running = np.zeros(contexts.shape)
-    for t in range(T):
+    for t in range(rows):
         before = max(t - 1, 0)  # in the first row all is still 0
         for g in range(len(gains)):
-            for i in range(X):
-                w = vectors[before, g, i]
-                vectors[t, g, i] = w + gains[g] * (whitened[t, i] - w)
-        for c in range(contexts.shape[1]):
-            running[t, c] = running[before, c] + CONTEXT_GAIN * (
-                contexts[t, c] - running[before, c]
-            )
+            average(vectors[before, g], vectors[t, g], whitened[t], gains[g])
+        average(running[before], running[t], contexts[t], CONTEXT_GAIN)
     return vectors, running
 
 

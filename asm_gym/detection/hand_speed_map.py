@@ -25,22 +25,18 @@ AnyFloats = NDArray[np.floating[Any]]
 
 # Columns of a map's cells.
 ARM_AND_PLACE = slice(0, 4)  # the arm, and the cell's place along x, y and z in cells
-FASTEST = slice(
-    4, 16
-)  # greatest speed along each axis of the twist, then against each [m/s], [rad/s]
+FASTEST = slice(4, 16)
+"""Greatest speed along each axis of the twist, then against each [m/s], [rad/s]."""
 
 FARTHEST_CELL = 100  # hands that are more cells away from the origin are not learned of
 OWN_MAP_EPISODES = 40  # of a task that has a map of its own: elsewhere others may go down fast
-FASTEST_EPISODES = (
-    0.05  # share of the episodes that visit a cell, the fastest, which do not count there
-)
-ODD_EPISODES = (
-    0.002  # and of all episodes: of hundreds, an odd one sets no speed where few others go
-)
+FASTEST_EPISODES = 0.05
+"""Share of the episodes that visit a cell, the fastest, which do not count there,"""
+ODD_EPISODES = 0.002
+"""and of all episodes: of hundreds, an odd one sets no speed where few others go."""
 
-MOMENTUM = (
-    1.5  # limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
-)
+MOMENTUM = 1.5
+"""Limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]."""
 MOMENTUM_OF_KNOWN_TASK = 1.35  # the same in a task with a map of its own [N s]
 
 
@@ -101,12 +97,8 @@ class HandSpeedMap:
             if len(streams[task]) < OWN_MAP_EPISODES:
                 streams[""] = streams.pop(task) + streams[""]
 
-        cells_by_task = {}
-        for task, own in streams.items():
-            cells = cls.learned(own, spec)
-            if cells is not None:
-                cells_by_task[task] = cells
-        return cells_by_task
+        cells = {task: cls.learned(own, spec) for task, own in streams.items()}
+        return {task: learned for task, learned in cells.items() if learned is not None}
 
     @staticmethod
     def learned(streams: Sequence[AnyFloats], spec: StreamSpec) -> NDArray[np.float32] | None:
@@ -117,7 +109,7 @@ class HandSpeedMap:
         for arm, position in enumerate(hands):
             hand = position.removesuffix("position")
             names = (position, f"{hand}velocity", f"{hand}angular_velocity")
-            if all(name in spec.slices for name in names):
+            if spec.slices.keys() >= set(names):
                 parts = [columns[spec.slices[name]] for name in names]
                 rows = _motions(streams, np.concatenate(parts))
                 cells.append(_cells_of(arm, rows, len(streams)))
@@ -134,25 +126,20 @@ class HandSpeedMap:
 
 
 def _are_cells(cells: AnyFloats) -> bool:
-    if cells.ndim != 2 or cells.size == 0:
+    if cells.ndim != 2 or cells.shape[1] != FASTEST.stop or cells.size == 0:
         return False
-    if cells.shape[1] != FASTEST.stop:
-        return False
-
     near = np.abs(cells[:, ARM_AND_PLACE]) <= FARTHEST_CELL
-    arms = cells[:, 0]
-    speeds = cells[:, FASTEST]
-    return bool(np.all(near) and np.all(arms >= 0) and np.all(speeds >= 0))
+    arms_and_speeds = np.delete(cells, (1, 2, 3), axis=1)
+    return bool(near.all() and (arms_and_speeds >= 0).all())
 
 
 def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
-    lengths = [len(stream) for stream in streams]
-    indices = np.arange(len(streams))
-    episodes = np.repeat(indices, lengths)
-    motions = np.concatenate([stream[:, columns] for stream in streams])
-    rows = np.column_stack((episodes, motions)).astype(np.float64)
-
+    motions = [
+        np.insert(np.asarray(stream[:, columns], np.float64), 0, episode, axis=1)
+        for episode, stream in enumerate(streams)
+    ]
+    rows = np.concatenate(motions)
     places = rows[:, 1:4] / CELL_SIZE
     rows[:, 1:4] = np.floor(places)
     near = np.abs(places) < FARTHEST_CELL
@@ -165,9 +152,8 @@ def _cells_of(arm: int, rows: Floats, episodes: int) -> Floats:
     # A visit is all rows of an episode in a cell.
     visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)
     twists = rows[:, 4:]
-    directions = np.hstack((twists, -twists))
     fastest = np.zeros((len(visits), 2 * AXES))
-    np.maximum.at(fastest, visit_of.ravel(), directions)
+    np.maximum.at(fastest, visit_of.ravel(), np.hstack((twists, -twists)))
 
     cells = []
     visited = visits[:, 1:]

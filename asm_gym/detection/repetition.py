@@ -27,9 +27,8 @@ from asm_gym.detection.evidence import TAIL_INDEX
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
-REPETITION_OFFSET = (
-    12.0  # one in 160,000, which among a hundred senses happens once in some thousand rows
-)
+REPETITION_OFFSET = 12.0
+"""One in 160,000, which among a hundred senses happens once in some thousand rows."""
 RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal episodes
 MOST_BEYOND = 24.0  # largest n - n_0
 UNMOVED = 0.5  # noise below this many steps of the resolution leaves a reading where it is
@@ -70,14 +69,16 @@ class Repetition(NamedTuple):
         """Return the state before the first row."""
         shape = (batch, senses)
         return cls(
-            row=np.full(shape, np.nan), again=np.zeros(shape, np.bool_), unlikely=np.zeros(shape)
+            row=np.full(shape, np.nan),
+            again=np.zeros(shape, np.bool_),
+            unlikely=np.zeros(shape),
         )
 
     def followed_by(self, rows: Floats, steps: Floats, most: Floats) -> Repetition:
         """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
-        columns = np.arange(rows.shape[1])
+        columns = np.arange(len(most))
         weights = RepetitionWeights(columns=columns, steps=steps, most=most, offset=most)
-        after = Repetition.start(len(rows), rows.shape[1])
+        after = Repetition.start(len(rows), len(most))
         step_repetition(weights, self, after, rows)
         return after
 
@@ -97,7 +98,8 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
     repeats = np.zeros((2, len(noisy)))
     for stream in streams:
         again = stream[1:] == stream[:-1]
-        for repeated, group in enumerate((~again[:-1], again[:-1])):
+        before = again[:-1]
+        for repeated, group in enumerate((~before, before)):
             chances[repeated] += group.sum(axis=0)
             repeats[repeated] += (again[1:] & group).sum(axis=0)
 
@@ -105,48 +107,44 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
     # Rest comes by the episode: where n of them never rested, the next may.
     first = np.maximum(first, 1.0 / (RESTLESS * len(streams)))
     # As rare after a repetition as after a change, unless seen to be otherwise.
-    p = np.array([first, (repeats[1] + first) / (chances[1] + 1.0)])
+    later = (repeats[1] + first) / (chances[1] + 1.0)
+    p = np.array([first, later])
 
     watched = repeats.sum(axis=0) == 0
     if noisy.any():
         watched = noisy & ~stands_still(streams) & (p[1] < RESTS)
     surprise = np.where(watched, -np.log(p), 0.0)
-    return np.concatenate([surprise, largest_offset(streams, surprise)[None]])
+    offset = largest_offset(streams, surprise)
+    return np.vstack([surprise, offset])
 
 
 def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
     """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
     ends = np.cumsum([len(stream) for stream in streams])
     enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
-    return np.array(
-        [_stands_still([stream[:, i] for stream in enough]) for i in range(streams[0].shape[1])]
-    )
+    senses = range(streams[0].shape[1])
+    steps = np.array([[resolution(stream[:, i]) for i in senses] for stream in enough])
+    noise = np.array([[noise_of(stream[:, i]) for i in senses] for stream in enough])
 
-
-def _stands_still(readings: Sequence[Stream]) -> bool:
-    """Return whether one sense's noise, in episodes (T,), is too small to change its reading."""
-    steps = [resolution(episode) for episode in readings]
-    known = [step for step in steps if step]
-    if not known or len(known) < len(steps) / 2:
-        return False
-    noise = np.median([noise_of(episode) for episode in readings])
-    return bool(noise < UNMOVED * float(np.median(known)))
+    known = (steps > 0).sum(axis=0)
+    usual_step = np.zeros(len(senses))
+    for i in np.flatnonzero(2 * known >= len(steps)):
+        usual_step[i] = np.median(steps[steps[:, i] > 0, i])
+    return np.median(noise, axis=0) < UNMOVED * usual_step
 
 
 def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
     """Return n_0 - 3 (X,): the largest n in nominal episodes (T, X), at least 12; ``surprise`` is -log p (2, X)."""
     senses = surprise.shape[1]
     steps = evidence_steps(surprise)
-    unbounded = np.full(senses, np.inf)
     offset = np.full(senses, REPETITION_OFFSET)
 
     ordered = sorted(streams, key=len, reverse=True)
     state = Repetition.start(len(ordered), senses)
     for t in range(len(ordered[0])):
         rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
-        state = Repetition._make(part[: len(rows)] for part in state).followed_by(
-            rows, steps, unbounded
-        )
+        going_on = Repetition._make(part[: len(rows)] for part in state)
+        state = going_on.followed_by(rows, steps, most=np.full(senses, np.inf))
         offset = np.maximum(offset, state.unlikely.max(axis=0))
     return offset
 
@@ -156,8 +154,8 @@ def evidence_steps(surprise: Floats) -> Floats:
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
         steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
-    watched: Floats = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
-    return np.ascontiguousarray(watched)
+    watched = np.where(p < STUCK, steps, 0.0)
+    return np.ascontiguousarray(watched.swapaxes(0, 1))
 
 
 @compiled
@@ -170,6 +168,7 @@ def step_repetition(
             reading = rows[n, weights.columns[i]]
             again = reading == before.row[n, i]
             step = weights.steps[int(before.again[n, i]), int(again), i]
+            unlikely = max(before.unlikely[n, i] + step, 0.0)
             after.row[n, i] = reading
             after.again[n, i] = again
-            after.unlikely[n, i] = min(max(before.unlikely[n, i] + step, 0.0), weights.most[i])
+            after.unlikely[n, i] = min(unlikely, weights.most[i])

@@ -104,14 +104,6 @@ def single(array: NDArray[Any]) -> NDArray[np.float32]:
     return np.array(array, np.float32, order="C")
 
 
-class RowState(NamedTuple):
-    """What a row changes of a ``MonitorState``."""
-
-    memory: MemoryState
-    detection: EvidenceState
-    events: EventState
-
-
 class RowKernel:
     """``observe`` of a memory under the detection of evidence, for the weights as they are.
 
@@ -201,16 +193,17 @@ def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
 
 
 @inner
-def state_of(arrays: Any) -> RowState:
+def state_of(arrays: Any) -> MonitorState:
     """Return the state of so many arrays, see ``arrays_of``."""
     traces, expected, skill = arrays[:3]
     history = RowHistory(arrays[3], arrays[4], arrays[5])
     evidence = Evidence(arrays[6], arrays[7], arrays[8])
     repetition = Repetition(arrays[9], arrays[10], arrays[11])
-    return RowState(
-        memory=MemoryState(traces, expected, history, skill),
+    return MonitorState(
+        model=MemoryState(traces, expected, history, skill),
         detection=EvidenceState(evidence, repetition),
-        events=EventState(arrays[12], arrays[13], arrays[14], arrays[15]),
+        excuses=EventState(arrays[12], arrays[13], arrays[14], arrays[15]),
+        values=(),
     )
 
 
@@ -246,18 +239,18 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
     """
     learned, before, after = memory.parts
     weights, wants_context, detector, repetition, senses = learned.parts
-    reading = read(weights, before.memory.history, after.memory.history, rows)
-    carry_on(weights, before.memory, after.memory, reading, wants_context)
+    reading = read(weights, before.model.history, after.model.history, rows)
+    carry_on(weights, before.model, after.model, reading, wants_context)
     errors, units = associate(weights, reading)
-    doubt_first_rows(before.memory.history, errors)
-    name_skills(weights, before.memory, after.memory, units)
+    doubt_first_rows(before.model.history, errors)
+    name_skills(weights, before.model, after.model, units)
 
     if detector.whitening.size:
         shares = np.empty(errors.shape)
-        output = ModelOutput(errors, after.memory.expected)
+        output = ModelOutput(errors, after.model.expected)
         step_evidence(detector, before.detection.evidence, after.detection.evidence, output, shares)
         step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
-        find_events(senses, before.events, after.events, rows, judged)
+        find_events(senses, before.excuses, after.excuses, rows, judged)
         unlikely = after.detection.repetition.unlikely
         judge_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
     return errors
@@ -268,12 +261,19 @@ def doubt_first_rows(history: RowHistory, errors: Any) -> None:
     """Weigh the errors (B, X) of the first rows less: nothing came before them, so that no change is known."""
     lag = history.before.shape[1]
     for n in range(len(errors)):
-        weight = np.float32(0.0)
-        if history.steps[n] >= lag:
+        weight = np.float32(1.0)
+        if history.steps[n] < lag:
+            weight = np.float32(0.0)
+        elif history.steps[n] < 2 * lag:
             weight = UNSURE
-        for i in range(errors.shape[1]):
-            if history.steps[n] < 2 * lag:
-                errors[n, i] *= weight
+        scale(errors[n], weight)
+
+
+@inner
+def scale(values: Any, factor: Any) -> None:
+    """Multiply the values (N,) by a factor."""
+    for i in range(len(values)):
+        values[i] *= factor
 
 
 @partial(inner, inlined=True)
@@ -282,14 +282,22 @@ def name_skills(weights: RowWeights, before: MemoryState, after: MemoryState, un
     if before.skill.shape[1]:
         skill = add_up(before.skill, units, after.expected, weights.W_K, weights.b_K)
         for n in range(len(skill)):
-            copy_row(skill, after.skill, n)
+            copy(skill[n], after.skill[n])
 
 
 @inner
-def copy_row(rows: Any, to: Any, n: int) -> None:
-    """Copy row ``n``; numba takes seconds to compile an assignment of rows, with its message about shapes."""
-    for i in range(rows.shape[1]):
-        to[n, i] = rows[n, i]
+def copy(values: Any, to: Any) -> None:
+    """Copy values (N,); numba takes seconds to compile an assignment of rows, with its message about shapes."""
+    for i in range(len(values)):
+        to[i] = values[i]
+
+
+@inner
+def push(before: Any, newest: Any, after: Any) -> None:
+    """Write rows (l, D): those before without the oldest, and the newest (D,)."""
+    for k in range(1, len(before)):
+        copy(before[k], after[k - 1])
+    copy(newest, after[-1])
 
 
 @partial(inner, inlined=True)
@@ -299,18 +307,16 @@ def read(weights: RowWeights, before: RowHistory, after: RowHistory, rows: Any) 
     last = np.empty_like(rows)
     past = np.empty_like(rows)
     for n in range(len(rows)):
-        after.steps[n] = before.steps[n] + 1
-        for i in range(rows.shape[1]):
-            last[n, i] = (
-                before.before[n, 0, i] if before.steps[n] >= lag else rows[n, i]
-            )  # at first nothing moves
-            past[n, i] = before.earlier[n, 0, i] if before.steps[n] >= 2 * lag else last[n, i]
-            after.before[n, lag - 1, i] = rows[n, i]
-            after.earlier[n, lag - 1, i] = last[n, i]
-        for k in range(lag - 1):
-            for i in range(rows.shape[1]):
-                after.before[n, k, i] = before.before[n, k + 1, i]
-                after.earlier[n, k, i] = before.earlier[n, k + 1, i]
+        steps = before.steps[n]
+        after.steps[n] = steps + 1
+        copy(rows[n], last[n])  # at first nothing moves
+        if steps >= lag:
+            copy(before.before[n, 0], last[n])
+        copy(last[n], past[n])
+        if steps >= 2 * lag:
+            copy(before.earlier[n, 0], past[n])
+        push(before.before[n], rows[n], after.before[n])
+        push(before.earlier[n], last[n], after.earlier[n])
 
     return read_rows(
         rows=rows,
@@ -339,14 +345,14 @@ def carry_on(
     due = False
     for n in range(len(steps)):
         due = due or steps[n] % lag == 0
-        copy_row(before.traces, after.traces, n)
-        copy_row(before.expected, after.expected, n)
+        copy(before.traces[n], after.traces[n])
+        copy(before.expected[n], after.expected[n])
     if due:
         expected, carried = follow(weights, before.traces, reading, wants_context)  # of all streams
         for n in range(len(steps)):
             if steps[n] % lag == 0:
-                copy_row(carried, after.traces, n)
-                copy_row(expected, after.expected, n)
+                copy(carried[n], after.traces[n])
+                copy(expected[n], after.expected[n])
 
 
 @partial(inner, inlined=True)
@@ -428,60 +434,59 @@ def judge_rows(
         attribution: (B, D), written.
     """
     columns = repetition.columns
-    ratios = np.empty(len(columns))
     for n in range(len(judged)):
         share = attribution[n]
-        for i in range(len(share)):
-            share[i] = 0.0
+        share.fill(0.0)
         for i in range(len(columns)):
             share[columns[i]] = shares[n, i]
-        pool_repetitions(repetition, unlikely[n], ratios, share)
+        pool_repetitions(repetition, unlikely[n], share)
         mark_missing(finite[n], share)
 
-        surprise = 0.0
-        for i in range(len(share)):
-            surprise += share[i]
+        surprise = total(share)
         judged[n].raw_surprise = surprise
         judged[n].surprise = surprise
         if judged[n].divisor != 1.0:
-            judged[n].surprise = surprise / judged[n].divisor
+            judged[n].surprise /= judged[n].divisor
             for i in range(len(share)):
                 share[i] /= judged[n].divisor
 
 
 @inner
-def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, ratios: Any, share: Any) -> None:
+def total(values: Any) -> float:
+    """Return the sum of the values (N,)."""
+    added = 0.0
+    for value in values:
+        added += value
+    return added
+
+
+@inner
+def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -> None:
     """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
-    value = 0.0
-    for i in range(len(share)):
-        value += share[i]
+    value = total(share)
     greatest = max(value, TINY)
+    ratios = np.zeros(len(unlikely))
     for i in range(len(ratios)):
-        ratios[i] = 0.0
         if unlikely[i] > 0:
             ratios[i] = np.exp(TAIL_INDEX * (unlikely[i] - repetition.offset[i]))
-        greatest = max(greatest, ratios[i])
+            greatest = max(greatest, ratios[i])
 
     own = (value / greatest) ** POWER
-    total = own
+    powers = own
     for i in range(len(ratios)):
         ratios[i] = (ratios[i] / greatest) ** POWER
-        total += ratios[i]
-    if not total > own:
+        powers += ratios[i]
+    if not powers > own:
         return
-    pooled = greatest * total ** (1.0 / POWER) / max(total, TINY)
+    pooled = greatest * powers ** (1.0 / POWER) / max(powers, TINY)
+    scale(share, pooled * own / max(value, TINY))
     for i in range(len(ratios)):
-        column = repetition.columns[i]
-        share[column] = share[column] * (pooled * own / max(value, TINY)) + pooled * ratios[i]
+        share[repetition.columns[i]] += pooled * ratios[i]
 
 
 @inner
 def mark_missing(finite: Any, share: Any) -> None:
     """Give all of the surprise, which is infinite, to the numbers that are not finite, if there are any."""
-    whole = True
-    for i in range(len(finite)):
-        whole = whole and finite[i]
-    if whole:
-        return
-    for i in range(len(finite)):
-        share[i] = 0.0 if finite[i] else np.inf
+    if not finite.all():
+        for i in range(len(finite)):
+            share[i] = 0.0 if finite[i] else np.inf
