@@ -50,7 +50,11 @@ def healthy_commands(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.
     return np.stack([every.min(axis=0), every.max(axis=0), changes.max(axis=0, initial=0.0)])
 
 
-def out_of_range(commands: Floats, before: Floats, action: Floats) -> str:
+def out_of_range(
+    commands: Floats,
+    before: Floats,
+    action: Floats,
+) -> str:
     """Return what of an action (A,), after another, no healthy one was: in range, or so small a change; else empty."""
     least, most, change = commands.astype(np.float64)
     size = change.size

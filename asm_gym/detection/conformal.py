@@ -92,7 +92,11 @@ class Tail(NamedTuple):
     exponent: float  # ξ
 
     @classmethod
-    def of(cls, maxima: Array, expected: float) -> Tail | None:
+    def of(
+        cls,
+        maxima: Array,
+        expected: float,
+    ) -> Tail | None:
         """Return the tail of maxima (n,), ``expected`` of which may exceed a threshold; None where they are counted."""
         if len(maxima) < FEWEST_IN_TAIL or expected >= ENOUGH:
             return None
@@ -137,7 +141,11 @@ class Promise(NamedTuple):
     modelled: bool = False  # the rate is that of the maxima's ``Tail``, as too few were above the threshold to count
 
     @classmethod
-    def of(cls, maxima: Array, threshold: float) -> Self:
+    def of(
+        cls,
+        maxima: Array,
+        threshold: float,
+    ) -> Self:
         """Return the promise by the episode, from the maxima (n,) of nominal ones."""
         episodes = len(maxima)
         beyond = int(rows_over(maxima, threshold).sum())
@@ -168,7 +176,12 @@ class Blocks(NamedTuple):
     group: Floats = np.zeros(0)  # (n,) number of its task; empty for one group
 
     @classmethod
-    def of(cls, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> Blocks:
+    def of(
+        cls,
+        values: Sequence[Array],
+        dt: float,
+        each: Sequence[str] = (),
+    ) -> Blocks:
         """Cut the values (T,) of whole episodes, a row each ``dt`` [s]; ``each`` names the group of every episode."""
         most = rows_of_a_minute(dt)
         names = list(dict.fromkeys(each)) or [""]
@@ -246,7 +259,11 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     return float(maxima[max(len(maxima) - 1 - allowed, 0)])
 
 
-def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:
+def hourly_promise(
+    blocks: Blocks,
+    threshold: float,
+    episodes: int,
+) -> Promise:
     """Return the promise of a threshold, in the group with most alarms; ``episodes`` were cut into the blocks."""
     if blocks.group.size:
         promises = [hourly_promise(group, threshold, episodes) for group in blocks.groups]

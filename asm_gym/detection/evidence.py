@@ -35,13 +35,11 @@ NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays bel
 HOURS_TAIL_INDEX = 0.2  # ξ_0 where hours of healthy operation set q
 HOURS_QUANTILE = 0.98  # share of their episodes
 FEWEST_EPISODES = 100  # that such a quantile needs
-TAIL_PRIOR_COUNT = (
-    10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
-)
+TAIL_PRIOR_COUNT = 10
+"""Maxima beyond q after which a number's own tail counts as much as the tail common to all."""
 SMALLEST = 1e-9  # lower bound of q
-LEAST_SHARE = (
-    1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
-)
+LEAST_SHARE = 1e-3
+"""The same as a share of the median q, for numbers that never erred in a few episodes."""
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
@@ -77,7 +75,13 @@ class Evidence(NamedTuple):
     steps: NDArray[np.int64]  # (B,) t, rows so far
 
     @classmethod
-    def start(cls, batch: int, gains: int, errors: int, context: int = 0) -> Evidence:
+    def start(
+        cls,
+        batch: int,
+        gains: int,
+        errors: int,
+        context: int = 0,
+    ) -> Evidence:
         """Return w_0 for ``batch`` streams."""
         return cls(
             vector=np.zeros((batch, gains, errors)),
@@ -87,22 +91,42 @@ class Evidence(NamedTuple):
 
 
 @inner
-def average(before: Any, after: Any, values: Any, gain: float) -> None:
+def average(
+    before: Any,
+    after: Any,
+    values: Any,
+    gain: float,
+) -> None:
     """Write the running mean (N,) of values (N,)."""
     for i in range(len(values)):
         after[i] = before[i] + gain * (values[i] - before[i])
 
 
+@inner
+def add_evidence(
+    gains: Any,
+    before: Any,
+    after: Any,
+    whitened: Any,
+) -> None:
+    """Write w_t (G, X) = w_{t-1} + a (ẽ_t - w_{t-1})."""
+    for g in range(len(gains)):
+        average(before[g], after[g], whitened, gains[g])
+
+
 @compiled
-def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats, Floats]:
+def accumulated(
+    whitened: Array,
+    contexts: Array,
+    gains: Array,
+) -> tuple[Floats, Floats]:
     """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
     rows, errors = whitened.shape
     vectors = np.zeros((rows, len(gains), errors))
     running = np.zeros(contexts.shape)
     for t in range(rows):
         before = max(t - 1, 0)  # in the first row all is still 0
-        for g in range(len(gains)):
-            average(vectors[before, g], vectors[t, g], whitened[t], gains[g])
+        add_evidence(gains, vectors[before], vectors[t], whitened[t])
         average(running[before], running[t], contexts[t], CONTEXT_GAIN)
     return vectors, running
 
@@ -110,7 +134,8 @@ def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats,
 def strength(evidence: Evidence, gains: Array) -> Floats:
     """Return v (B, G, X), the squared evidence in each error."""
     rows = evidence.steps[:, None]
-    variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * rows))  # (B, G) of each w_t,i
+    lost = (1.0 - gains) ** (2 * rows)  # (B, G)
+    variance = gains / (2.0 - gains) * (1.0 - lost)  # of each w_t,i
     return evidence.vector**2 / variance[:, :, None]
 
 

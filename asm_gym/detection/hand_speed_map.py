@@ -55,7 +55,11 @@ class HandSpeedMap:
         low: (4,) arm and place of the grid's first cell.
     """
 
-    def __init__(self, cells: AnyFloats, momentum: float = MOMENTUM) -> None:
+    def __init__(
+        self,
+        cells: AnyFloats,
+        momentum: float = MOMENTUM,
+    ) -> None:
         if not _are_cells(cells):
             raise ValueError(
                 f"pace must be rows of {FASTEST.stop} numbers, places within {FARTHEST_CELL} cells, got {cells.shape}"
@@ -76,7 +80,11 @@ class HandSpeedMap:
         self.grid[..., DOWN] = maximum_filter(downward, (1, 3, 3, 1))
 
     @classmethod
-    def of(cls, cells_by_task: Mapping[str, AnyFloats], task: str = "") -> Self | None:
+    def of(
+        cls,
+        cells_by_task: Mapping[str, AnyFloats],
+        task: str = "",
+    ) -> Self | None:
         """Return the map of a task; that of all tasks where it has none, None where there are no cells."""
         if task and task in cells_by_task:
             return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK)
@@ -117,7 +125,11 @@ class HandSpeedMap:
             return None
         return np.concatenate(cells).astype(np.float32)
 
-    def fastest_near(self, arm: int, place: Floats) -> AnyFloats:
+    def fastest_near(
+        self,
+        arm: int,
+        place: Floats,
+    ) -> AnyFloats:
         """Return (2, 6) the greatest twist near a place (3,), along the axes and against them; else 0."""
         cell = cell_near(self.grid, self.low, arm, place)
         if cell < 0:
@@ -147,7 +159,11 @@ def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     return rows[known & near.all(axis=1)]
 
 
-def _cells_of(arm: int, rows: Floats, episodes: int) -> Floats:
+def _cells_of(
+    arm: int,
+    rows: Floats,
+    episodes: int,
+) -> Floats:
     """Return the cells (N, 16) of an arm, by the motions of its hand in so many episodes."""
     # A visit is all rows of an episode in a cell.
     visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)

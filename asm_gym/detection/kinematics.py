@@ -39,7 +39,13 @@ class Chain(NamedTuple):
 
 
 @compiled
-def hand_at(angles: Any, axes: Any, anchors: Any, hand: Any, place: Any) -> None:
+def hand_at(
+    angles: Any,
+    axes: Any,
+    anchors: Any,
+    hand: Any,
+    place: Any,
+) -> None:
     """Write ``place`` (9,), see ``Chain.at``."""
     vectors = place.reshape((3, 3))
     for i in range(HAND):
@@ -51,7 +57,12 @@ def hand_at(angles: Any, axes: Any, anchors: Any, hand: Any, place: Any) -> None
 
 
 @inner
-def turn(vector: Any, axis: Any, anchor: Any, angle: float) -> None:
+def turn(
+    vector: Any,
+    axis: Any,
+    anchor: Any,
+    angle: float,
+) -> None:
     """Turn a vector (3,) about an axis a through an anchor o: o + c v + s a × v + (1 - c)(a · v) a, v from o."""
     sine = np.sin(angle)
     cosine = np.cos(angle)

@@ -65,7 +65,11 @@ class Repetition(NamedTuple):
     unlikely: Floats  # (B, X) n
 
     @classmethod
-    def start(cls, batch: int, senses: int) -> Repetition:
+    def start(
+        cls,
+        batch: int,
+        senses: int,
+    ) -> Repetition:
         """Return the state before the first row."""
         shape = (batch, senses)
         return cls(
@@ -74,7 +78,12 @@ class Repetition(NamedTuple):
             unlikely=np.zeros(shape),
         )
 
-    def followed_by(self, rows: Floats, steps: Floats, most: Floats) -> Repetition:
+    def followed_by(
+        self,
+        rows: Floats,
+        steps: Floats,
+        most: Floats,
+    ) -> Repetition:
         """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
         columns = np.arange(len(most))
         weights = RepetitionWeights(columns=columns, steps=steps, most=most, offset=most)

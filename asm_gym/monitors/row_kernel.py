@@ -40,7 +40,7 @@ from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 
-__all__ = ["JUDGED", "RowKernel", "expected_errors", "row_weights", "observe_rows", "uninitialised"]
+__all__ = ["JUDGED", "RowKernel", "expected_errors", "observe_rows", "row_weights", "uninitialised"]
 
 
 class RowWeights(NamedTuple):
@@ -154,13 +154,11 @@ class RowKernel:
         with ONE_THREAD if len(rows) > 1 else nullcontext():  # one row calls no BLAS
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
-        value = judged["surprise"].copy()
-        divisor = judged["divisor"].copy()
-        if not self._excuses:
-            return out, Surprise(value=value, attribution=attribution), divisor
-        raw = judged["raw_surprise"].copy()
-        excuse = judged["excuse"].copy()
-        return out, Surprise(value=value, attribution=attribution, raw=raw, excuse=excuse), divisor
+        surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
+        if self._excuses:
+            raw = judged["raw_surprise"].copy()
+            surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
+        return out, surprise, judged["divisor"].copy()
 
 
 def expected_errors(
@@ -202,7 +200,7 @@ def state_of(arrays: Any) -> MonitorState:
     return MonitorState(
         model=MemoryState(traces, expected, history, skill),
         detection=EvidenceState(evidence, repetition),
-        excuses=EventState(arrays[12], arrays[13], arrays[14], arrays[15]),
+        excuses=EventState(arrays[12], arrays[13]),
         values=(),
     )
 
@@ -213,7 +211,7 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
 
     Numba takes longer to look through nested named tuples that Python hands over than through arrays.
     """
-    return Bound((learned, state_of(arrays[:16]), state_of(arrays[16:])))  # type: ignore[no-untyped-call]
+    return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
 
 
 def uninitialised(state: Any) -> Any:
