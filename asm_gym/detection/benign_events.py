@@ -187,10 +187,10 @@ def exceeds(
     limit: float,
 ) -> bool:
     """Return whether a number is beyond a limit, |x_i| > limit; one that is missing or infinite is not."""
+    exceeding = False
     for i in columns:
-        if abs(row[i]) > limit and np.isfinite(row[i]):
-            return True
-    return False
+        exceeding = exceeding or (abs(row[i]) > limit and np.isfinite(row[i]))
+    return exceeding
 
 
 @inner

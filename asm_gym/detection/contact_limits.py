@@ -113,10 +113,9 @@ class ContactLimits:
         if other.stays and not self.stays:
             return other
 
-        pace = None
-        if self.pace is not None and other.pace is not None:
-            if np.array_equal(self.pace.cells, other.pace.cells):
-                pace = self.pace
+        pace = self.pace
+        if pace is None or other.pace is None or not np.array_equal(pace.cells, other.pace.cells):
+            pace = None
         strictest = {name: min(getattr(self, name), getattr(other, name)) for name in STRICTEST}
         healthy = np.minimum(self.most(felt), other.most(felt))
         return replace(self, **strictest, healthy=tuple(healthy.tolist()), pace=pace)

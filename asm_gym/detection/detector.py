@@ -33,6 +33,7 @@ from asm_gym.detection.evidence import (
     average,
     bounded,
     pool,
+    scale,
     strength,
     whitening,
     worst_case,
@@ -203,13 +204,12 @@ def step_evidence(
         after.steps[n] = before.steps[n] + 1
         add_evidence(detector.gains, before.vector[n], after.vector[n], whitened[n])
         greatest = write_ratios(detector, after.vector[n], after.steps[n], ratios)
-        total = write_shares(ratios, greatest, share)
+        powers = write_shares(ratios, greatest, share)
 
         usual = usual_level(detector, before.context[n], after.context[n], output.contexts[n])
-        value = total ** (1.0 / POWER) * np.exp(greatest) / np.exp(usual)
-        value /= max(total, TINY)
-        for i in range(len(share)):
-            share[i] *= value
+        value = powers ** (1.0 / POWER) * np.exp(greatest) / np.exp(usual)
+        value /= max(powers, TINY)
+        scale(share, value)
 
 
 @inner

@@ -103,6 +103,22 @@ def average(
 
 
 @inner
+def scale(values: Any, factor: Any) -> None:
+    """Multiply the values (N,) by a factor."""
+    for i in range(len(values)):
+        values[i] *= factor
+
+
+@inner
+def total(values: Any) -> float:
+    """Return the sum of the values (N,)."""
+    added = 0.0
+    for value in values:
+        added += value
+    return added
+
+
+@inner
 def add_evidence(
     gains: Any,
     before: Any,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Floats
-from asm_gym.detection.evidence import TAIL_INDEX
+from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, scale, total
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
@@ -91,10 +91,6 @@ class Repetition(NamedTuple):
         step_repetition(weights, self, after, rows)
         return after
 
-    def ratios(self, offset: Floats) -> Floats:
-        """Return r (B, X), with n_0 ``offset`` (X,)."""
-        return np.where(self.unlikely > 0, np.exp(TAIL_INDEX * (self.unlikely - offset)), 0.0)
-
 
 def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Floats:
     """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0 - 3.
@@ -132,14 +128,17 @@ def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
     ends = np.cumsum([len(stream) for stream in streams])
     enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
     senses = range(streams[0].shape[1])
-    steps = np.array([[resolution(stream[:, i]) for i in senses] for stream in enough])
-    noise = np.array([[noise_of(stream[:, i]) for i in senses] for stream in enough])
+    return np.array([_stands_still([stream[:, i] for stream in enough]) for i in senses])
 
-    known = (steps > 0).sum(axis=0)
-    usual_step = np.zeros(len(senses))
-    for i in np.flatnonzero(2 * known >= len(steps)):
-        usual_step[i] = np.median(steps[steps[:, i] > 0, i])
-    return np.median(noise, axis=0) < UNMOVED * usual_step
+
+def _stands_still(readings: Sequence[Stream]) -> bool:
+    """Return whether one sense's noise, in episodes (T,), is too small to change its reading."""
+    steps = [resolution(episode) for episode in readings]
+    known = [step for step in steps if step]
+    if not known or len(known) < len(steps) / 2:
+        return False
+    noise = np.median([noise_of(episode) for episode in readings])
+    return bool(noise < UNMOVED * float(np.median(known)))
 
 
 def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
@@ -181,3 +180,27 @@ def step_repetition(
             after.row[n, i] = reading
             after.again[n, i] = again
             after.unlikely[n, i] = min(unlikely, weights.most[i])
+
+
+@compiled
+def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -> None:
+    """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
+    value = total(share)
+    greatest = max(value, TINY)
+    ratios = np.zeros(len(unlikely))
+    for i in range(len(ratios)):
+        if unlikely[i] > 0:
+            ratios[i] = np.exp(TAIL_INDEX * (unlikely[i] - repetition.offset[i]))
+            greatest = max(greatest, ratios[i])
+
+    own = (value / greatest) ** POWER
+    powers = own
+    for i in range(len(ratios)):
+        ratios[i] = (ratios[i] / greatest) ** POWER
+        powers += ratios[i]
+    if not powers > own:
+        return
+    pooled = greatest * powers ** (1.0 / POWER) / max(powers, TINY)
+    scale(share, pooled * own / max(value, TINY))
+    for i in range(len(ratios)):
+        share[repetition.columns[i]] += pooled * ratios[i]

@@ -23,12 +23,13 @@ from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.detection.base import ModelOutput
 from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState, find_events
 from asm_gym.detection.detector import NO_DETECTOR, step_evidence
-from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, Evidence
+from asm_gym.detection.evidence import Evidence, scale, total
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
 from asm_gym.detection.repetition import (
     NO_REPETITION,
     Repetition,
     RepetitionWeights,
+    pool_repetitions,
     step_repetition,
 )
 from asm_gym.memory.association import Association, normalised_errors
@@ -52,7 +53,7 @@ class RowWeights(NamedTuple):
     association: Association
     spans: NDArray[np.intp]
     W_K: NDArray[np.float32]
-    b_K: NDArray[np.float32]
+    b_K: NDArray[np.float32]  # noqa: N815
     mean: NDArray[np.float64]
     spread: NDArray[np.float64]
     change: NDArray[np.float64]
@@ -267,13 +268,6 @@ def doubt_first_rows(history: RowHistory, errors: Any) -> None:
         scale(errors[n], weight)
 
 
-@inner
-def scale(values: Any, factor: Any) -> None:
-    """Multiply the values (N,) by a factor."""
-    for i in range(len(values)):
-        values[i] *= factor
-
-
 @partial(inner, inlined=True)
 def name_skills(weights: RowWeights, before: MemoryState, after: MemoryState, units: Any) -> None:
     """Write the evidence for each skill, by the units (B, M) and the state."""
@@ -447,39 +441,6 @@ def judge_rows(
             judged[n].surprise /= judged[n].divisor
             for i in range(len(share)):
                 share[i] /= judged[n].divisor
-
-
-@inner
-def total(values: Any) -> float:
-    """Return the sum of the values (N,)."""
-    added = 0.0
-    for value in values:
-        added += value
-    return added
-
-
-@inner
-def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -> None:
-    """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
-    value = total(share)
-    greatest = max(value, TINY)
-    ratios = np.zeros(len(unlikely))
-    for i in range(len(ratios)):
-        if unlikely[i] > 0:
-            ratios[i] = np.exp(TAIL_INDEX * (unlikely[i] - repetition.offset[i]))
-            greatest = max(greatest, ratios[i])
-
-    own = (value / greatest) ** POWER
-    powers = own
-    for i in range(len(ratios)):
-        ratios[i] = (ratios[i] / greatest) ** POWER
-        powers += ratios[i]
-    if not powers > own:
-        return
-    pooled = greatest * powers ** (1.0 / POWER) / max(powers, TINY)
-    scale(share, pooled * own / max(value, TINY))
-    for i in range(len(ratios)):
-        share[repetition.columns[i]] += pooled * ratios[i]
 
 
 @inner
