@@ -106,7 +106,8 @@ class Tail(NamedTuple):
         if not 0.0 < lowest < values[-1] < np.inf:
             return None
         hill = float(np.log(values[-size:] / lowest).mean())
-        return cls(size=size, lowest=lowest, exponent=hill * (1.0 + SURER / math.sqrt(size)))
+        surer = 1.0 + SURER / math.sqrt(size)
+        return cls(size=size, lowest=lowest, exponent=hill * surer)
 
     def threshold(self, expected: float) -> float:
         """Return what so many are expected to exceed."""
@@ -158,7 +159,12 @@ class Promise(NamedTuple):
         modelled = tail is not None and threshold > tail.lowest and threshold not in maxima
         if tail is not None and modelled:
             rate = tail.expected(threshold) / episodes
-        return cls(episodes=episodes, rate=rate, at_most=max(rate, at_most), modelled=modelled)
+        return cls(
+            episodes=episodes,
+            rate=rate,
+            at_most=max(rate, at_most),
+            modelled=modelled,
+        )
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""

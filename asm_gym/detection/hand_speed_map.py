@@ -69,9 +69,10 @@ class HandSpeedMap:
 
         places = cells[:, ARM_AND_PLACE].astype(np.int64)
         self.low = places.min(axis=0) - (0, 1, 1, 1)
-        shape = places.max(axis=0) - self.low + (1, 2, 2, 2)
+        offsets = places - self.low
+        shape = np.add(offsets.max(axis=0), (1, 2, 2, 2))
         grid = np.zeros((*shape, 2 * AXES), np.float32)
-        at = tuple((places - self.low).T)
+        at = tuple(offsets.T)
         np.maximum.at(grid, at, cells[:, FASTEST])
 
         # A hand may go as fast as others beside its cell; downwards, only as those at the same height.
@@ -116,7 +117,11 @@ class HandSpeedMap:
         hands = [name for name in spec.slices if name.endswith("hand_position")]
         for arm, position in enumerate(hands):
             hand = position.removesuffix("position")
-            names = (position, f"{hand}velocity", f"{hand}angular_velocity")
+            names = (
+                position,
+                f"{hand}velocity",
+                f"{hand}angular_velocity",
+            )
             if spec.slices.keys() >= set(names):
                 parts = [columns[spec.slices[name]] for name in names]
                 rows = _motions(streams, np.concatenate(parts))
@@ -142,13 +147,19 @@ def _are_cells(cells: AnyFloats) -> bool:
         return False
     near = np.abs(cells[:, ARM_AND_PLACE]) <= FARTHEST_CELL
     arms_and_speeds = np.delete(cells, (1, 2, 3), axis=1)
-    return bool(near.all() and (arms_and_speeds >= 0).all())
+    positive = arms_and_speeds >= 0
+    return bool(near.all() and positive.all())
 
 
 def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
     motions = [
-        np.insert(np.asarray(stream[:, columns], np.float64), 0, episode, axis=1)
+        np.insert(
+            np.asarray(stream[:, columns], np.float64),
+            0,
+            episode,
+            axis=1,
+        )
         for episode, stream in enumerate(streams)
     ]
     rows = np.concatenate(motions)
@@ -169,14 +180,19 @@ def _cells_of(
     visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)
     twists = rows[:, 4:]
     fastest = np.zeros((len(visits), 2 * AXES))
-    np.maximum.at(fastest, visit_of.ravel(), np.hstack((twists, -twists)))
+    directions = np.hstack((twists, -twists))
+    np.maximum.at(fastest, visit_of.ravel(), directions)
 
     cells = []
     visited = visits[:, 1:]
     for place in np.unique(visited, axis=0):
         here = np.all(visited == place, axis=1)
         ascending = np.sort(fastest[here], axis=0)
-        kept = len(ascending) - int(FASTEST_EPISODES * len(ascending) + ODD_EPISODES * episodes)
+        fastest_here = FASTEST_EPISODES * len(ascending)
+        odd = ODD_EPISODES * episodes
+        kept = len(ascending) - int(fastest_here + odd)
         if kept > 0:
-            cells.append(np.hstack((arm, place, ascending[kept - 1])))
+            speeds = ascending[kept - 1]
+            cell = np.hstack((arm, place, speeds))
+            cells.append(cell)
     return np.reshape(cells, (-1, FASTEST.stop))

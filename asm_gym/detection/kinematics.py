@@ -34,7 +34,8 @@ class Chain(NamedTuple):
     def at(self, angles: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(9,) the hand by the angles (J,) [rad]."""
         place = np.empty(HAND)
-        hand_at(np.asarray(angles, np.float64), self.axes, self.anchors, self.hand, place)
+        exact = np.asarray(angles, np.float64)
+        hand_at(exact, self.axes, self.anchors, self.hand, place)
         return place
 
 
@@ -51,9 +52,11 @@ def hand_at(
     for i in range(HAND):
         place[i] = hand[i // 3, i % 3]
     for j in range(len(angles) - 1, -1, -1):
-        turn(vectors[0], axes[j], anchors[j], angles[j])  # the place turns about the joint
-        turn(vectors[1], axes[j], ORIGIN, angles[j])  # directions turn by themselves
-        turn(vectors[2], axes[j], ORIGIN, angles[j])
+        axis = axes[j]
+        angle = angles[j]
+        turn(vectors[0], axis, anchors[j], angle)  # the place turns about the joint
+        turn(vectors[1], axis, ORIGIN, angle)  # directions turn by themselves
+        turn(vectors[2], axis, ORIGIN, angle)
 
 
 @inner
@@ -70,7 +73,9 @@ def turn(
     y = vector[1] - anchor[1]
     z = vector[2] - anchor[2]
     offset = (x, y, z)
-    along = axis[0] * x + axis[1] * y + axis[2] * z
+    along = 0.0
+    for i in range(3):
+        along += axis[i] * offset[i]
     along *= 1.0 - cosine
     for i in range(3):
         j = (i + 1) % 3

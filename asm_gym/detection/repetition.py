@@ -86,7 +86,12 @@ class Repetition(NamedTuple):
     ) -> Repetition:
         """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
         columns = np.arange(len(most))
-        weights = RepetitionWeights(columns=columns, steps=steps, most=most, offset=most)
+        weights = RepetitionWeights(
+            columns=columns,
+            steps=steps,
+            most=most,
+            offset=most,
+        )
         after = Repetition.start(len(rows), len(most))
         step_repetition(weights, self, after, rows)
         return after
@@ -104,7 +109,8 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
     for stream in streams:
         again = stream[1:] == stream[:-1]
         before = again[:-1]
-        for repeated, group in enumerate((~before, before)):
+        groups = (~before, before)
+        for repeated, group in enumerate(groups):
             chances[repeated] += group.sum(axis=0)
             repeats[repeated] += (again[1:] & group).sum(axis=0)
 
@@ -117,7 +123,8 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
 
     watched = repeats.sum(axis=0) == 0
     if noisy.any():
-        watched = noisy & ~stands_still(streams) & (p[1] < RESTS)
+        restless = later < RESTS
+        watched = noisy & ~stands_still(streams) & restless
     surprise = np.where(watched, -np.log(p), 0.0)
     offset = largest_offset(streams, surprise)
     return np.vstack([surprise, offset])
@@ -126,9 +133,13 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
 def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
     """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
     ends = np.cumsum([len(stream) for stream in streams])
-    enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
-    senses = range(streams[0].shape[1])
-    return np.array([_stands_still([stream[:, i] for stream in enough]) for i in senses])
+    last = int(np.searchsorted(ends, MOST_READ))
+    enough = streams[: last + 1]
+    still = []
+    for i in range(streams[0].shape[1]):
+        readings = [stream[:, i] for stream in enough]
+        still.append(_stands_still(readings))
+    return np.array(still)
 
 
 def _stands_still(readings: Sequence[Stream]) -> bool:
@@ -150,9 +161,13 @@ def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
     ordered = sorted(streams, key=len, reverse=True)
     state = Repetition.start(len(ordered), senses)
     for t in range(len(ordered[0])):
-        rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
+        rows = [stream[t] for stream in ordered if t < len(stream)]
         going_on = Repetition._make(part[: len(rows)] for part in state)
-        state = going_on.followed_by(rows, steps, most=np.full(senses, np.inf))
+        state = going_on.followed_by(
+            np.array(rows, np.float64),
+            steps,
+            most=np.full(senses, np.inf),
+        )
         offset = np.maximum(offset, state.unlikely.max(axis=0))
     return offset
 
@@ -161,7 +176,8 @@ def evidence_steps(surprise: Floats) -> Floats:
     """Return (2, 2, X) from -log p (2, X): what a change and a repetition add to n, after a change and a repetition."""
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
-        steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
+        changed = (1.0 - STUCK) / (1.0 - p)
+        steps = np.log([changed, STUCK / p])  # (now, before, X)
     watched = np.where(p < STUCK, steps, 0.0)
     return np.ascontiguousarray(watched.swapaxes(0, 1))
 
@@ -173,13 +189,15 @@ def step_repetition(
     """Write the state after rows (B, D)."""
     for n in range(len(rows)):
         for i in range(len(weights.columns)):
-            reading = rows[n, weights.columns[i]]
+            column = weights.columns[i]
+            reading = rows[n, column]
             again = reading == before.row[n, i]
-            step = weights.steps[int(before.again[n, i]), int(again), i]
-            unlikely = max(before.unlikely[n, i] + step, 0.0)
+            repeated = before.again[n, i]
+            step = weights.steps[int(repeated), int(again), i]
+            unlikely = before.unlikely[n, i] + step
             after.row[n, i] = reading
             after.again[n, i] = again
-            after.unlikely[n, i] = min(unlikely, weights.most[i])
+            after.unlikely[n, i] = min(max(unlikely, 0.0), weights.most[i])
 
 
 @compiled
@@ -190,7 +208,8 @@ def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -
     ratios = np.zeros(len(unlikely))
     for i in range(len(ratios)):
         if unlikely[i] > 0:
-            ratios[i] = np.exp(TAIL_INDEX * (unlikely[i] - repetition.offset[i]))
+            beyond = unlikely[i] - repetition.offset[i]
+            ratios[i] = np.exp(TAIL_INDEX * beyond)
             greatest = max(greatest, ratios[i])
 
     own = (value / greatest) ** POWER
@@ -200,7 +219,9 @@ def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -
         powers += ratios[i]
     if not powers > own:
         return
-    pooled = greatest * powers ** (1.0 / POWER) / max(powers, TINY)
+    pooled = greatest * powers ** (1.0 / POWER)
+    pooled /= max(powers, TINY)
     scale(share, pooled * own / max(value, TINY))
     for i in range(len(ratios)):
-        share[repetition.columns[i]] += pooled * ratios[i]
+        column = repetition.columns[i]
+        share[column] += pooled * ratios[i]
