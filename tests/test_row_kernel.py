@@ -9,7 +9,15 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from asm_gym.blas import ONE_THREAD
-from asm_gym.detection.evidence import CONTEXT_GAIN, TINY, Evidence, bounded, pool, strength
+from asm_gym.detection.evidence import (
+    CONTEXT_GAIN,
+    TAIL_INDEX,
+    TINY,
+    Evidence,
+    bounded,
+    pool,
+    strength,
+)
 from asm_gym.detection.evidence_detection import EvidenceState
 from asm_gym.detection.repetition import Repetition, evidence_steps
 from asm_gym.memory.energy import activate
@@ -93,7 +101,8 @@ def observed_by(asm, state, rows):
     unlikely = np.clip(before.unlikely + added, 0.0, counted[2] + 27.0)
     repetition = Repetition(now, again, unlikely)
     attribution, stuck = np.zeros(rows.shape), np.zeros(rows.shape)
-    attribution[:, senses], stuck[:, senses] = parts, repetition.ratios(counted[2] + 3.0)
+    ratios = np.where(unlikely > 0, np.exp(TAIL_INDEX * (unlikely - counted[2] - 3.0)), 0.0)
+    attribution[:, senses], stuck[:, senses] = parts, ratios
     total = attribution.sum(axis=1, keepdims=True)
     pooled = pool(np.hstack([total, stuck]))[1]
     attribution = attribution * (pooled[:, :1] / np.maximum(total, TINY)) + pooled[:, 1:]

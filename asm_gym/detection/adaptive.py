@@ -40,38 +40,33 @@ class AdaptiveThreshold:
 
     def start(self, threshold: float) -> RunningThreshold:
         """Return the running threshold that begins at a calibrated one."""
-        return RunningThreshold(self, check_number("threshold", threshold, above=0.0))
+        check_number("threshold", threshold, above=0.0)
+        return RunningThreshold(
+            settings=self, ceiling=self.ceiling * threshold, log=math.log(threshold)
+        )
 
 
+@dataclass
 class RunningThreshold:
-    """A threshold that moves at the end of every episode.
+    """A threshold that moves at the end of every episode."""
 
-    Args:
-        settings: rate and step.
-        threshold: q_1, that it begins at.
-
-    Attributes:
-        ceiling: c.
-    """
-
-    def __init__(self, settings: AdaptiveThreshold, threshold: float) -> None:
-        self._settings = settings
-        self.ceiling = settings.ceiling * threshold
-        self._log = math.log(threshold)  # of q
-        self._episodes = 0
-        self._alarms = 0
+    settings: AdaptiveThreshold
+    ceiling: float  # c
+    log: float  # of q
+    episodes: int = 0  # that counted
+    alarms: int = 0  # of these
 
     @property
     def value(self) -> float:
         """The present threshold."""
-        return min(math.exp(self._log), self.ceiling)
+        return min(math.exp(self.log), self.ceiling)
 
     @property
     def level(self) -> float:
         """Share of the counted episodes so far that had a false alarm; NaN before the first."""
-        if not self._episodes:
+        if not self.episodes:
             return math.nan
-        return self._alarms / self._episodes
+        return self.alarms / self.episodes
 
     def follow(
         self, largest: float, judged_by: float | None = None, confirmed: bool = False
@@ -82,6 +77,6 @@ class RunningThreshold:
         alarm = bool(rows_over(largest, judged_by))
         if alarm and (confirmed or rows_over(largest, self.ceiling)):
             return
-        self._episodes += 1
-        self._alarms += alarm
-        self._log += self._settings.step * (alarm - self._settings.rate)
+        self.episodes += 1
+        self.alarms += alarm
+        self.log += self.settings.step * (alarm - self.settings.rate)

@@ -36,9 +36,11 @@ MOVED_S = 0.1  # duration of its excuse [s]
 EXCUSED = 10.0  # divisor of surprise at a knock or a stop
 SLIPPED = 3.0  # divisor where fingers slide
 FADE = (1.0 - min(GAINS)) ** 2  # share of the slowest evidence left after a row
-FADING = math.ceil(
-    -math.log(EXCUSED) / math.log(FADE)
-)  # rows in which it, and the divisor, falls to a tenth
+FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))
+"""Rows in which it, and the divisor, falls to a tenth."""
+KNOCKED = 0  # columns of ``EventState.left``
+AT_STOP = 1
+SLIDING = 2
 KNOCK_EVENT = EVENTS.index(KNOCK)
 STOP_EVENT = EVENTS.index(STOP)
 
@@ -46,18 +48,20 @@ STOP_EVENT = EVENTS.index(STOP)
 class EventState(NamedTuple):
     """State of B streams; never changed in place."""
 
-    knock: NDArray[np.int64]  # (B,) rows that a knock goes on to excuse
-    stop: NDArray[np.int64]  # (B,) rows that a joint at its stop does
-    slide: NDArray[np.int64]  # (B,) rows that a sliding finger does
+    left: NDArray[
+        np.int64
+    ]  # (B, 3) rows that a knock, a joint at its stop and a sliding finger go on to excuse
     approached: NDArray[np.bool_]  # (B, J) which joints may be at their stops in the next row
 
     @classmethod
-    def start(cls, batch: int, joints: int) -> EventState:
+    def start(
+        cls,
+        batch: int,
+        joints: int,
+    ) -> EventState:
         """Return the state before the first row."""
         return cls(
-            knock=np.zeros(batch, np.int64),
-            stop=np.zeros(batch, np.int64),
-            slide=np.zeros(batch, np.int64),
+            left=np.zeros((batch, 3), np.int64),
             approached=np.ones((batch, joints), np.bool_),
         )
 
@@ -112,7 +116,11 @@ class BenignEvents:
         """Return the state before the first row of ``batch`` streams."""
         return EventState.start(batch, len(self.senses.joints))
 
-    def step(self, state: EventState, rows: Floats) -> tuple[EventState, NDArray[Any]]:
+    def step(
+        self,
+        state: EventState,
+        rows: Floats,
+    ) -> tuple[EventState, NDArray[Any]]:
         """Return the new state, and ``excuse`` and ``divisor`` of rows (B, D) in an array (B,) of ``JUDGED``."""
         after = self.start(len(rows))
         judged = np.zeros(len(rows), JUDGED)
@@ -122,11 +130,11 @@ class BenignEvents:
     def divisors(self, stream: NDArray[np.floating[Any]]) -> Floats:
         """Return the divisor of surprise (T,) in each row of a whole stream (T, D)."""
         state = self.start(1)
-        divisors = np.ones(len(stream))
-        for t, row in enumerate(np.asarray(stream, np.float64)):
+        divisors = []
+        for row in np.asarray(stream, np.float64):
             state, judged = self.step(state, row[None])
-            divisors[t] = judged["divisor"][0]
-        return divisors
+            divisors.append(judged["divisor"][0])
+        return np.array(divisors)
 
 
 def _columns(spec: StreamSpec, selects: Callable[[Channel], bool]) -> NDArray[np.intp]:
@@ -144,27 +152,40 @@ def find_events(
 ) -> None:
     """Write the new state, and ``excuse`` and ``divisor`` of rows (B, D) to ``judged`` (B,)."""
     for n in range(len(rows)):
-        knock = max(before.knock[n] - 1, 0)
-        stop = max(before.stop[n] - 1, 0)
-        slide = max(before.slide[n] - 1, 0)
+        left = after.left[n]
+        for cause in range(len(left)):
+            left[cause] = max(before.left[n, cause] - 1, 0)
         if exceeds(rows[n], senses.wrist, KNOCKING):
-            knock = senses.knock_rows
+            left[KNOCKED] = senses.knock_rows
         if reaches_stop(senses, before.approached[n], after.approached[n], rows[n]):
-            stop = FADING + 1
+            left[AT_STOP] = FADING + 1
         if exceeds(rows[n], senses.fingers, MOVING):
-            slide = senses.slide_rows
-
-        after.knock[n] = knock
-        after.stop[n] = stop
-        after.slide[n] = slide
-        judged[n].divisor = max(divisor_after(knock), divisor_after(stop))
-        if slide > 0:
-            judged[n].divisor = max(judged[n].divisor, SLIPPED)
-        judged[n].excuse = event_of(knock, stop)
+            left[SLIDING] = senses.slide_rows
+        excuse_row(left, judged[n])
 
 
 @inner
-def exceeds(row: Any, columns: Any, limit: float) -> bool:
+def excuse_row(left: Any, judged: Any) -> None:
+    """Write ``excuse`` and ``divisor`` of a row by the rows (3,) that each cause excuses."""
+    longest = max(left[KNOCKED], left[AT_STOP])
+    faded = max(FADING - longest + 1, 0)
+    judged.excuse = 0
+    judged.divisor = 1.0
+    if longest > 0:
+        judged.excuse = STOP_EVENT
+        judged.divisor = max(EXCUSED * FADE**faded, 1.0)
+    if left[KNOCKED] > 0:
+        judged.excuse = KNOCK_EVENT
+    if left[SLIDING] > 0:
+        judged.divisor = max(judged.divisor, SLIPPED)
+
+
+@inner
+def exceeds(
+    row: Any,
+    columns: Any,
+    limit: float,
+) -> bool:
     """Return whether a number is beyond a limit, |x_i| > limit; one that is missing or infinite is not."""
     exceeding = False
     for i in columns:
@@ -173,7 +194,12 @@ def exceeds(row: Any, columns: Any, limit: float) -> bool:
 
 
 @inner
-def reaches_stop(senses: EventSenses, before: Any, after: Any, row: Any) -> bool:
+def reaches_stop(
+    senses: EventSenses,
+    before: Any,
+    after: Any,
+    row: Any,
+) -> bool:
     """Write which joints (J,) may be at their stops next; return whether one that might be is at its stop.
 
     p = max(low - q, q - high) is how far a joint is past its stop: it is there from -0.03 to 0.1 rad.
@@ -190,21 +216,3 @@ def reaches_stop(senses: EventSenses, before: Any, after: Any, row: Any) -> bool
             after[j] = before[j]
             reaches = reaches or before[j]
     return reaches
-
-
-@inner
-def divisor_after(left: int) -> float:
-    """Return the divisor of a knock or a stop that excuses so many rows more: 10 (1 - a)^{2k}, at least 1."""
-    if left <= 0:
-        return 1.0
-    return max(EXCUSED * FADE ** max(FADING - left + 1, 0), 1.0)
-
-
-@inner
-def event_of(knock: int, stop: int) -> int:
-    """Return the index in ``EVENTS`` of what excuses a row, by the rows that a knock and a stop excuse."""
-    if knock > 0:
-        return KNOCK_EVENT
-    if stop > 0:
-        return STOP_EVENT
-    return 0

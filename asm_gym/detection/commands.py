@@ -27,37 +27,62 @@ def hands_of(spec: StreamSpec) -> NDArray[np.intp]:
     for name in spec.slices:
         velocity = f"{name.removesuffix('position')}velocity"
         if name.endswith("hand_position") and velocity in spec.slices:
-            hands.append([columns[spec.slices[name]], columns[spec.slices[velocity]]])
+            names = (name, velocity)
+            hands.append([columns[spec.slices[name]] for name in names])
     return np.array(hands, np.intp).reshape(-1, 2, 3)
 
 
-def learned_motion(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float64]:
+def learned_motion(
+    streams: Sequence[Floats],
+    spec: StreamSpec,
+) -> NDArray[np.float64]:
     """Return M (3 H + A, 3 H) of streams (T, D)."""
     velocities = hands_of(spec)[:, 1].ravel()
-    inputs = np.concatenate(
-        [np.hstack([stream[:-1, velocities], stream[1:, spec.motor]]) for stream in streams]
-    )
-    following = np.concatenate([stream[1:, velocities] for stream in streams])
-    solution = np.linalg.lstsq(inputs, following, rcond=None)[0]
+    inputs = []
+    following = []
+    for stream in streams:
+        before = stream[:-1, velocities]
+        inputs.append(np.hstack([before, stream[1:, spec.motor]]))
+        following.append(stream[1:, velocities])
+    solution = np.linalg.lstsq(
+        np.concatenate(inputs),
+        np.concatenate(following),
+        rcond=None,
+    )[0]
     return np.asarray(solution, np.float64)
 
 
-def healthy_commands(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float32]:
+def healthy_commands(
+    streams: Sequence[Floats],
+    spec: StreamSpec,
+) -> NDArray[np.float32]:
     """Return (3, A) the least, the most, and the greatest change in a row of what healthy streams (T, D) commanded."""
     commands = [stream[:, spec.motor] for stream in streams]
-    changes = np.concatenate([np.abs(np.diff(episode, axis=0)) for episode in commands])
+    changes = np.concatenate([np.diff(episode, axis=0) for episode in commands])
     every = np.concatenate(commands)
-    return np.stack([every.min(axis=0), every.max(axis=0), changes.max(axis=0, initial=0.0)])
+    limits = [
+        every.min(axis=0),
+        every.max(axis=0),
+        np.abs(changes).max(axis=0, initial=0.0),
+    ]
+    return np.stack(limits)
 
 
-def out_of_range(commands: Floats, before: Floats, action: Floats) -> str:
+def out_of_range(
+    commands: Floats,
+    before: Floats,
+    action: Floats,
+) -> str:
     """Return what of an action (A,), after another, no healthy one was: in range, or so small a change; else empty."""
     least, most, change = commands.astype(np.float64)
     size = change.size
     now = action[:size]
     margin = MARGIN * (most - least)
-    if ((now < least - margin) | (now > most + margin)).any():
+    too_small = now < least - margin
+    too_large = now > most + margin
+    if too_small.any() or too_large.any():
         return PLACE
-    if (np.abs(now - before[:size]) > change + margin).any():
+    changed = np.abs(now - before[:size])
+    if (changed > change + margin).any():
         return PACE
     return ""

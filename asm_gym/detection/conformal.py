@@ -35,9 +35,8 @@ from asm_gym.validation import check_number, short_repr
 
 EPISODE = "episode"  # units of a rate of false alarms
 HOUR = "hour"
-LEAST_RATE = (
-    1e-15  # rates are not taken to be smaller, as the inverse of the smallest floats is infinite
-)
+LEAST_RATE = 1e-15
+"""Rates are not taken to be smaller, as the inverse of the smallest floats is infinite."""
 CONFIDENCE = 0.95  # share of calibrations in which ``Promise.at_most`` holds
 LEAST_PER_HOUR = 1e-6  # limits of a rate
 MOST_PER_HOUR = 1e6
@@ -93,7 +92,11 @@ class Tail(NamedTuple):
     exponent: float  # ξ
 
     @classmethod
-    def of(cls, maxima: Array, expected: float) -> Tail | None:
+    def of(
+        cls,
+        maxima: Array,
+        expected: float,
+    ) -> Tail | None:
         """Return the tail of maxima (n,), ``expected`` of which may exceed a threshold; None where they are counted."""
         if len(maxima) < FEWEST_IN_TAIL or expected >= ENOUGH:
             return None
@@ -103,7 +106,8 @@ class Tail(NamedTuple):
         if not 0.0 < lowest < values[-1] < np.inf:
             return None
         hill = float(np.log(values[-size:] / lowest).mean())
-        return cls(size=size, lowest=lowest, exponent=hill * (1.0 + SURER / math.sqrt(size)))
+        surer = 1.0 + SURER / math.sqrt(size)
+        return cls(size=size, lowest=lowest, exponent=hill * surer)
 
     def threshold(self, expected: float) -> float:
         """Return what so many are expected to exceed."""
@@ -138,7 +142,11 @@ class Promise(NamedTuple):
     modelled: bool = False  # the rate is that of the maxima's ``Tail``, as too few were above the threshold to count
 
     @classmethod
-    def of(cls, maxima: Array, threshold: float) -> Self:
+    def of(
+        cls,
+        maxima: Array,
+        threshold: float,
+    ) -> Self:
         """Return the promise by the episode, from the maxima (n,) of nominal ones."""
         episodes = len(maxima)
         beyond = int(rows_over(maxima, threshold).sum())
@@ -146,18 +154,23 @@ class Promise(NamedTuple):
         if beyond < episodes:
             at_most = float(betaincinv(beyond + 1, episodes - beyond, CONFIDENCE))
 
-        tail = None
-        if threshold not in maxima:
-            tail = Tail.of(maxima, 0.0)
-        if tail is None or not threshold > tail.lowest:
-            rate = (beyond + 1) / (episodes + 1)
-            return cls(episodes=episodes, rate=rate, at_most=max(rate, at_most))
-        rate = tail.expected(threshold) / episodes
-        return cls(episodes=episodes, rate=rate, at_most=max(rate, at_most), modelled=True)
+        rate = (beyond + 1) / (episodes + 1)
+        tail = Tail.of(maxima, 0.0)
+        modelled = tail is not None and threshold > tail.lowest and threshold not in maxima
+        if tail is not None and modelled:
+            rate = tail.expected(threshold) / episodes
+        return cls(
+            episodes=episodes,
+            rate=rate,
+            at_most=max(rate, at_most),
+            modelled=modelled,
+        )
 
     def hourly(self, hours: float) -> tuple[float, float]:
         """Return ``rate`` and ``at_most`` as alarms an hour, where the episodes took so many hours."""
-        each = self.episodes / hours if self.per == EPISODE else 1.0
+        each = 1.0
+        if self.per == EPISODE:
+            each = self.episodes / hours
         return self.rate * each, self.at_most * each
 
 
@@ -169,28 +182,31 @@ class Blocks(NamedTuple):
     group: Floats = np.zeros(0)  # (n,) number of its task; empty for one group
 
     @classmethod
-    def of(cls, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> Blocks:
+    def of(
+        cls,
+        values: Sequence[Array],
+        dt: float,
+        each: Sequence[str] = (),
+    ) -> Blocks:
         """Cut the values (T,) of whole episodes, a row each ``dt`` [s]; ``each`` names the group of every episode."""
         most = rows_of_a_minute(dt)
-        names = list(dict.fromkeys(each))
-        maxima = []
-        hours = []
-        groups = []
-        for value, name in zip(values, each or [""] * len(values), strict=True):
+        names = list(dict.fromkeys(each)) or [""]
+        blocks = []
+        for value, name in zip(values, each or names * len(values), strict=True):
             for first in range(0, len(value), most):
                 block = value[first : first + most]
-                maxima.append(float(block.max()))
-                hours.append(len(block) * dt / 3600)
-                groups.append(names.index(name) if names else 0)
-        blocks = Blocks(maxima=np.array(maxima, float), hours=np.array(hours, float))
+                hours = len(block) * dt / 3600
+                blocks.append((block.max(), hours, names.index(name)))
+        columns = np.reshape(np.array(blocks, float), (-1, 3)).T
         if len(names) < 2:
-            return blocks
-        return blocks._replace(group=np.array(groups, float))
+            columns = columns[:2]
+        return cls(*columns)
 
     @classmethod
     def restored(cls, kept: Floats) -> Blocks:
         """Read an ``array``. Raises ValueError where that is no maxima and hours."""
-        if kept.ndim != 2 or len(kept) not in (2, 3) or not kept.size or not (kept[1] > 0).all():
+        shaped = kept.ndim == 2 and len(kept) in (2, 3) and kept.size
+        if not shaped or not (kept[1] > 0).all():
             raise ValueError(
                 f"blocks should be maxima and hours, (2, n) or (3, n), found {short_repr(kept)}"
             )
@@ -203,9 +219,7 @@ class Blocks(NamedTuple):
 
     @property
     def groups(self) -> list[Blocks]:
-        """The blocks of each group."""
-        if not self.group.size:
-            return [self]
+        """The blocks of each group, where they have several."""
         masks = [self.group == group for group in np.unique(self.group)]
         return [Blocks(maxima=self.maxima[mask], hours=self.hours[mask]) for mask in masks]
 
@@ -239,9 +253,8 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     The rate holds in each group. Raises ValueError where there are too few hours for it.
     """
     check_per_hour(rate)
-    groups = blocks.groups
-    if len(groups) > 1:
-        return max(hourly_threshold(group, rate) for group in groups)
+    if blocks.group.size:
+        return max(hourly_threshold(group, rate) for group in blocks.groups)
     check_hours(rate, blocks.total)
     expected = rate * blocks.total
     tail = Tail.of(blocks.maxima, expected)
@@ -252,22 +265,25 @@ def hourly_threshold(blocks: Blocks, rate: float) -> float:
     return float(maxima[max(len(maxima) - 1 - allowed, 0)])
 
 
-def hourly_promise(blocks: Blocks, threshold: float, episodes: int) -> Promise:
+def hourly_promise(
+    blocks: Blocks,
+    threshold: float,
+    episodes: int,
+) -> Promise:
     """Return the promise of a threshold, in the group with most alarms; ``episodes`` were cut into the blocks."""
-    groups = blocks.groups
-    if len(groups) > 1:
-        promises = [hourly_promise(group, threshold, episodes) for group in groups]
+    if blocks.group.size:
+        promises = [hourly_promise(group, threshold, episodes) for group in blocks.groups]
         worst = max(promises, key=lambda promise: promise.rate)
         return worst._replace(hours=blocks.total)
 
     each = Promise.of(blocks.maxima, threshold)
     count = len(blocks.maxima)
-    blocks_alarming = each.rate * (count + 1)
+    blocks_judged = count + 1  # with a fresh one
     if each.modelled:
-        blocks_alarming = each.rate * count
+        blocks_judged = count
     return Promise(
         episodes=episodes,
-        rate=blocks_alarming / blocks.total,
+        rate=each.rate * blocks_judged / blocks.total,
         at_most=each.at_most * count / blocks.total,
         per=HOUR,
         hours=blocks.total,

@@ -23,13 +23,18 @@ from asm_gym.spec import Channel, StreamSpec
 from asm_gym.validation import check_flag, check_number
 
 LIMITED = ("external_torque", "wrist_force")  # ends of the names of the channels that are limited
-HARDEST_EPISODES = (
-    0.05  # no limit makes room for this share of healthy episodes, those that pressed hardest
-)
+HARDEST_EPISODES = 0.05
+"""No limit makes room for this share of healthy episodes, those that pressed hardest."""
 HIGHEST_HEALTHY = 2.5  # healthy values count up to so many times the usual limits: 200 N, 100 N m
 
-_NO_MAP = np.zeros((0, 1, 1, 1, 12), np.float32)
-_NO_PLACE = np.zeros(4, np.int64)
+STRICTEST = ("wrist_force", "external_torque", "hand_speed")  # the smaller the stricter
+
+_NO_MAP = SpeedLimit(
+    grid=np.zeros((0, 1, 1, 1, 12), np.float32),
+    low=np.zeros(4, np.int64),
+    hand_speed=np.inf,
+    momentum=np.inf,
+)
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class ContactLimits:
     stays: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("wrist_force", "external_torque", "hand_speed"):
+        for name in STRICTEST:
             check_number(name, getattr(self, name), above=0, infinite=True)
         for value in self.healthy:
             check_number("healthy", value, low=0)
@@ -82,7 +87,11 @@ class ContactLimits:
             )
         return np.maximum(limits, self.healthy)
 
-    def stricter(self, forces: float, speed: float) -> ContactLimits:
+    def stricter(
+        self,
+        forces: float,
+        speed: float,
+    ) -> ContactLimits:
         """Return limits with a share of those on ``forces``, and at most ``speed`` [m/s]."""
         return replace(
             self,
@@ -93,38 +102,31 @@ class ContactLimits:
             pace=None,
         )
 
-    def and_those_of(self, other: ContactLimits, felt: Sequence[Channel]) -> ContactLimits:
+    def and_those_of(
+        self,
+        other: ContactLimits,
+        felt: Sequence[Channel],
+    ) -> ContactLimits:
         """Return limits as strict as the stricter of two; those for which an arm stays count alone, if one does."""
         if self.stays and not other.stays:
             return self
         if other.stays and not self.stays:
             return other
 
-        pace = None
-        if self.pace is not None and other.pace is not None:
-            same = np.array_equal(self.pace.cells, other.pace.cells)
-            pace = self.pace if same else None
+        pace = self.pace
+        if pace is None or other.pace is None or not np.array_equal(pace.cells, other.pace.cells):
+            pace = None
+        strictest = {name: min(getattr(self, name), getattr(other, name)) for name in STRICTEST}
         healthy = np.minimum(self.most(felt), other.most(felt))
-        return replace(
-            self,
-            wrist_force=min(self.wrist_force, other.wrist_force),
-            external_torque=min(self.external_torque, other.external_torque),
-            hand_speed=min(self.hand_speed, other.hand_speed),
-            healthy=tuple(healthy.tolist()),
-            pace=pace,
-        )
+        return replace(self, **strictest, healthy=tuple(healthy.tolist()), pace=pace)
 
     def speed_limit(self) -> SpeedLimit:
         """Return the limits of the hands' speed, as compiled code reads them."""
-        hand_speed = float(self.hand_speed)
+        limit = _NO_MAP._replace(hand_speed=float(self.hand_speed))
         if self.pace is None:
-            return SpeedLimit(grid=_NO_MAP, low=_NO_PLACE, hand_speed=hand_speed, momentum=np.inf)
-        return SpeedLimit(
-            grid=self.pace.grid,
-            low=self.pace.low,
-            hand_speed=hand_speed,
-            momentum=float(self.pace.momentum),
-        )
+            return limit
+        momentum = float(self.pace.momentum)
+        return limit._replace(grid=self.pace.grid, low=self.pace.low, momentum=momentum)
 
     def share(
         self, arm: int, place: Floats, twist: Floats, speed: float, momentum: float = 0.0
@@ -151,21 +153,15 @@ def healthy_forces(
     numbers = np.arange(spec.size)
     columns: list[int] = []
     for channel in felt:
-        mean = spec.slices[channel.name]
-        peak = spec.slices.get(f"{channel.name}_peak", mean)
+        peak = spec.slices.get(f"{channel.name}_peak", spec.slices[channel.name])
         columns += numbers[peak].tolist()
     largest = [np.nanmax(np.abs(stream[:, columns]), axis=0) for stream in streams]
     reached = np.array(largest, np.float64)  # (episodes, N)
 
     usual = ContactLimits().most(felt)
     loads = (reached / usual).max(axis=1)
-    kept = loads <= _highest_kept(loads)
-    highest = reached[kept].max(axis=0)
+    most = loads.max()
+    if len(loads) >= 1.0 / HARDEST_EPISODES:
+        most = np.quantile(loads, 1.0 - HARDEST_EPISODES, method="lower")
+    highest = reached[loads <= most].max(axis=0)
     return tuple(np.minimum(highest, HIGHEST_HEALTHY * usual).tolist())
-
-
-def _highest_kept(loads: Floats) -> np.float64:
-    """Return the load up to which episodes count; all of them where there are too few to leave one out."""
-    if len(loads) < 1.0 / HARDEST_EPISODES:
-        return loads.max()
-    return np.quantile(loads, 1.0 - HARDEST_EPISODES, method="lower")

@@ -29,8 +29,11 @@ from asm_gym.detection.evidence import (
     TINY,
     Evidence,
     accumulated,
+    add_evidence,
+    average,
     bounded,
     pool,
+    scale,
     strength,
     whitening,
     worst_case,
@@ -59,9 +62,8 @@ class Detector(NamedTuple):
     whitening: Floats  # (X, X) M
     ceiling: Floats  # (G, X) q
     tail: Floats  # (G, X) κ, in (0, 1]
-    context_quantile: (
-        Floats  # (2 C + 1,) weights of log ŝ on the context and its running mean, and a bias
-    )
+    context_quantile: Floats
+    """(2 C + 1,) weights of log ŝ on the context and its running mean, and a bias."""
     context_range: Floats  # (2,) limits of log ŝ
     gains: Floats  # (G,) a, each in (0, 1]
     bound: float  # ν > 0
@@ -71,9 +73,8 @@ class Detector(NamedTuple):
         cls, learned: Sequence[ModelOutput], gains: Sequence[float], bound: float, shrinkage: float
     ) -> Detector:
         """Return the detector of white errors, by those of nominal episodes that the model has learned."""
-        matrix = whitening(
-            bounded(np.concatenate([run.errors for run in learned]), bound), shrinkage
-        )
+        errors = np.concatenate([run.errors for run in learned])
+        matrix = whitening(bounded(errors, bound), shrinkage)
         ones = np.ones((len(gains), len(matrix)))
         return cls(
             whitening=matrix,
@@ -85,13 +86,21 @@ class Detector(NamedTuple):
             bound=bound,
         )
 
-    def with_worst_case(self, runs: Sequence[ModelOutput], tail_index: float) -> Detector:
+    def with_worst_case(
+        self,
+        runs: Sequence[ModelOutput],
+        tail_index: float,
+    ) -> Detector:
         """Return the detector with q and κ of nominal episodes, by ξ_0."""
         maxima = [self.strengths(run)[0].max(axis=0) for run in runs]
         ceiling, tail = worst_case(np.array(maxima), tail_index)
         return self._replace(ceiling=ceiling, tail=tail)
 
-    def habituated(self, runs: Sequence[ModelOutput], rng: np.random.Generator) -> Detector:
+    def habituated(
+        self,
+        runs: Sequence[ModelOutput],
+        rng: np.random.Generator,
+    ) -> Detector:
         """Return the detector that knows what is usual in each context of nominal episodes; the same for too few."""
         rows = sum(len(run.errors) for run in runs)
         if rows < STEPS_PER_NUMBER * (len(self.context_quantile) - 1):
@@ -102,8 +111,10 @@ class Detector(NamedTuple):
         for run in runs:
             strengths, running = self.strengths(run)
             pooled, _ = pool(self.ratios(strengths))
-            contexts.append(np.hstack([run.contexts, running])[::stride].astype(np.float32))
-            levels.append(np.log(np.maximum(pooled, FAINTEST))[::stride])
+            context = np.hstack([run.contexts, running])
+            level = np.log(np.maximum(pooled, FAINTEST))
+            contexts.append(context[::stride].astype(np.float32))
+            levels.append(level[::stride])
         quantile, limits = usual_levels(contexts, levels, rng)
         return self._replace(context_quantile=quantile, context_range=limits)
 
@@ -111,26 +122,29 @@ class Detector(NamedTuple):
     def reach(self) -> float:
         """Largest value in a context of 0: every error at ν for ever, so that |w_i| <= ν Σ_j |M_ji|."""
         most = self.bound * np.abs(self.whitening).sum(axis=0, keepdims=True)
+        usual = self.context_quantile[-1]
         with np.errstate(over="ignore"):  # a context that hides everything reaches 0
-            return float(self._lasting(most)[0] / np.exp(self.context_quantile[-1]))
+            reach = self._lasting(most)[0] / np.exp(usual)
+        return float(reach)
 
     @property
     def reach_of_errors(self) -> Floats:
         """Largest value (X,) in the context of the least surprise, one error alone at ν for ever, the others at 0."""
-        least = np.exp(min(self.context_quantile[-1], self.context_range[0]))
-        return self._lasting(self.bound * self.whitening) / least
+        usual = self.context_quantile[-1]
+        least = min(usual, self.context_range[0])
+        return self._lasting(self.bound * self.whitening) / np.exp(least)
 
     def _lasting(self, whitened: Floats) -> Floats:
         """Return the pooled ratios (N,) of whitened errors (N, X) that last for ever: v_i = w_i² (2 - a) / a."""
         with np.errstate(over="ignore", divide="ignore"):
-            strengths = (whitened**2)[:, None, :] * ((2.0 - self.gains) / self.gains)[
-                :, None
-            ]  # (N, G, X)
+            scales = (2.0 - self.gains) / self.gains
+            strengths = (whitened**2)[:, None] * scales[:, None]  # (N, G, X)
             return pool(self.ratios(strengths))[0]
 
     def ratios(self, strengths: Floats) -> Floats:
         """Return r (N, G X) of v (N, G, X)."""
-        return ((strengths / self.ceiling) ** self.tail).reshape(len(strengths), -1)
+        ratios = (strengths / self.ceiling) ** self.tail
+        return ratios.reshape(len(strengths), -1)
 
     def start(self, batch: int) -> Evidence:
         """Return evidence before the first row."""
@@ -138,12 +152,18 @@ class Detector(NamedTuple):
         context = (len(self.context_quantile) - 1) // 2
         return Evidence.start(batch, gains, errors, context)
 
-    def step(self, evidence: Evidence, errors: Array, context: Array) -> tuple[Evidence, Floats]:
+    def step(
+        self,
+        evidence: Evidence,
+        errors: Array,
+        context: Array,
+    ) -> tuple[Evidence, Floats]:
         """Return the new evidence, and each error's share (B, X) of the value; ``context`` is (B, C)."""
         after = self.start(len(errors))
         shares = np.empty(errors.shape)
         output = ModelOutput(
-            errors=np.asarray(errors, np.float64), contexts=np.asarray(context, np.float64)
+            errors=np.asarray(errors, np.float64),
+            contexts=np.asarray(context, np.float64),
         )
         step_evidence(self, evidence, after, output, shares)
         return after, shares
@@ -151,15 +171,18 @@ class Detector(NamedTuple):
     def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:
         """Return v (T, G, X), and the running mean of the contexts (T, C), of a whole episode."""
         whitened = bounded(run.errors, self.bound) @ self.whitening
-        vectors, running = accumulated(whitened, np.asarray(run.contexts, np.float64), self.gains)
-        episode = Evidence(vector=vectors, context=running, steps=np.arange(1, len(vectors) + 1))
+        contexts = np.asarray(run.contexts, np.float64)
+        vectors, running = accumulated(whitened, contexts, self.gains)
+        rows = np.arange(1, len(vectors) + 1)
+        episode = Evidence(vector=vectors, context=running, steps=rows)
         return strength(episode, self.gains), running
 
 
+_NO_ERRORS = np.zeros((0, 0))
 NO_DETECTOR = Detector(
-    whitening=np.zeros((0, 0)),
-    ceiling=np.zeros((0, 0)),
-    tail=np.zeros((0, 0)),
+    whitening=_NO_ERRORS,
+    ceiling=_NO_ERRORS,
+    tail=_NO_ERRORS,
     context_quantile=np.zeros(1),
     context_range=np.zeros(2),
     gains=np.zeros(0),
@@ -173,64 +196,55 @@ def step_evidence(
     detector: Detector, before: Evidence, after: Evidence, output: ModelOutput, shares: Any
 ) -> None:
     """Write the new evidence, and each error's share (B, X) of the value."""
-    whitened = whiten(detector, output.errors)
+    limited = bounded(output.errors, detector.bound)
+    whitened = np.dot(limited, detector.whitening)
     ratios = np.empty(detector.ceiling.shape)
     for n in range(len(shares)):
+        share = shares[n]
         after.steps[n] = before.steps[n] + 1
-        add_evidence(detector, before.vector[n], after.vector[n], whitened[n])
+        add_evidence(detector.gains, before.vector[n], after.vector[n], whitened[n])
         greatest = write_ratios(detector, after.vector[n], after.steps[n], ratios)
-        total = write_shares(ratios, greatest, shares[n])
+        powers = write_shares(ratios, greatest, share)
 
         usual = usual_level(detector, before.context[n], after.context[n], output.contexts[n])
-        value = np.exp(greatest) * total ** (1.0 / POWER) / np.exp(usual)
-        for i in range(shares.shape[1]):
-            shares[n, i] *= value / max(total, TINY)
+        value = powers ** (1.0 / POWER) * np.exp(greatest) / np.exp(usual)
+        value /= max(powers, TINY)
+        scale(share, value)
 
 
 @inner
-def whiten(detector: Detector, errors: Any) -> Any:
-    """Return ẽ M (B, X) of errors (B, X), with ẽ_i = e_i / √(1 + e_i²/ν²)."""
-    limited = np.empty(errors.shape)
-    for n in range(errors.shape[0]):
-        for i in range(errors.shape[1]):
-            share = errors[n, i] / detector.bound
-            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
-    whitened = np.empty(errors.shape)
-    np.dot(limited, detector.whitening, whitened)
-    return whitened
-
-
-@inner
-def add_evidence(detector: Detector, before: Any, after: Any, whitened: Any) -> None:
-    """Write w_t (G, X) = w_{t-1} + a (ẽ_t - w_{t-1})."""
-    for g in range(len(detector.gains)):
-        gain = detector.gains[g]
-        for i in range(len(whitened)):
-            after[g, i] = before[g, i] + gain * (whitened[i] - before[g, i])
-
-
-@inner
-def write_ratios(detector: Detector, vector: Any, steps: int, ratios: Any) -> float:
+def write_ratios(
+    detector: Detector,
+    vector: Any,
+    steps: int,
+    ratios: Any,
+) -> float:
     """Write log r (G, X) = κ log(v/q) after so many rows; return the largest."""
     greatest = LEAST
     for g in range(len(detector.gains)):
+        ceiling = detector.ceiling[g]
+        tail = detector.tail[g]
         gain = detector.gains[g]
         variance = gain / (2.0 - gain) * (1.0 - (1.0 - gain) ** (2 * steps))
-        for i in range(ratios.shape[1]):
-            w = vector[g, i]
-            ratios[g, i] = detector.tail[g, i] * np.log(w * w / (variance * detector.ceiling[g, i]))
-            greatest = max(greatest, ratios[g, i])
+        for i in range(len(tail)):
+            squared = vector[g, i] ** 2
+            ratio = tail[i] * np.log(squared / (variance * ceiling[i]))
+            ratios[g, i] = ratio
+            greatest = max(greatest, ratio)
     return greatest
 
 
 @inner
-def write_shares(ratios: Any, greatest: float, shares: Any) -> float:
+def write_shares(
+    ratios: Any,
+    greatest: float,
+    shares: Any,
+) -> float:
     """Write Σ_g (r/r_max)^p of each error (X,), from logarithms (G, X); return the sum of all."""
     total = 0.0
-    for i in range(len(shares)):
-        shares[i] = 0.0
-    for g in range(ratios.shape[0]):
-        for i in range(ratios.shape[1]):
+    shares.fill(0.0)
+    for g in range(len(ratios)):
+        for i in range(len(shares)):
             below = POWER * (ratios[g, i] - greatest)
             if not below < NEGLIGIBLE:  # NaN goes on, and is an alarm
                 part = np.exp(below)
@@ -240,15 +254,22 @@ def write_shares(ratios: Any, greatest: float, shares: Any) -> float:
 
 
 @inner
-def usual_level(detector: Detector, before: Any, after: Any, context: Any) -> float:
+def usual_level(
+    detector: Detector,
+    before: Any,
+    after: Any,
+    context: Any,
+) -> float:
     """Write the running mean (C,) of the context (C,); return log ŝ = min(max(w c + b, l), h)."""
+    average(before, after, context, CONTEXT_GAIN)
+    weights = detector.context_quantile
     size = len(context)
-    drive = detector.context_quantile[2 * size]
+    drive = weights[2 * size]
     for c in range(size):
-        after[c] = before[c] + CONTEXT_GAIN * (context[c] - before[c])
-        now = context[c] * detector.context_quantile[c]
-        drive += now + after[c] * detector.context_quantile[size + c]
-    return min(max(drive, detector.context_range[0]), detector.context_range[1])
+        now = context[c] * weights[c]
+        drive += now + after[c] * weights[size + c]
+    limits = detector.context_range
+    return min(max(drive, limits[0]), limits[1])
 
 
 def usual_levels(
@@ -259,20 +280,29 @@ def usual_levels(
     level = np.concatenate(levels)
     weights = habituate(context, level, rng)[:-1]
     drive = context @ weights
-    low, high = np.quantile(drive, (EXTREME, 1.0 - EXTREME))
-    bias = np.quantile(level - np.clip(drive, low, high), USUAL)
-    return np.append(weights, bias).astype(np.float64), np.array([low + bias, high + bias])
+    limits = np.quantile(drive, (EXTREME, 1.0 - EXTREME))
+    limited = np.clip(drive, limits[0], limits[1])
+    bias = np.quantile(level - limited, USUAL)
+    quantile = np.append(weights, bias)
+    return quantile.astype(np.float64), limits + bias
 
 
-def habituate(context: Array, level: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+def habituate(
+    context: Array,
+    level: Array,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
     """Return w, then b (C + 1,), from contexts (N, C) and log s (N,) of nominal rows."""
+    usual = np.quantile(level, USUAL)
     weights = Synapse(np.zeros(context.shape[1], np.float32))
-    bias = Synapse(np.array([np.quantile(level, USUAL)], np.float32))
+    bias = Synapse(np.array([usual], np.float32))
     updates = max(FEWEST, min(UPDATES, PASSES * len(level) // BATCH))
-    for n, rows in zip(range(updates), shuffled(len(level), BATCH, rng), strict=False):
+    batches = shuffled(len(level), BATCH, rng)
+    for n, rows in zip(range(updates), batches, strict=False):
         rate = cosine_decay(RATE, n / updates)
-        below = level[rows] < context[rows] @ weights.W + bias.W
+        inputs = context[rows]
+        below = level[rows] < inputs @ weights.W + bias.W
         pull = (USUAL - below).astype(np.float32)
-        weights.learn(pull @ context[rows] / np.float32(len(rows)), rate)
+        weights.learn(pull @ inputs / np.float32(len(rows)), rate)
         bias.learn(pull.mean(keepdims=True), rate)
     return np.concatenate([weights.W, bias.W])

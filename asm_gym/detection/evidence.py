@@ -17,12 +17,12 @@ Sources: Kessy et al. 2018 (ZCA whitening); Lange et al. 1989 (errors weighted a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled
+from asm_gym.compilation import compiled, inner
 from asm_gym.detection.base import Array, Floats
 from asm_gym.memory.linear import check_inputs, gram
 
@@ -35,13 +35,11 @@ NOMINAL_QUANTILE = 0.9  # share of nominal episodes whose maximum of v stays bel
 HOURS_TAIL_INDEX = 0.2  # ξ_0 where hours of healthy operation set q
 HOURS_QUANTILE = 0.98  # share of their episodes
 FEWEST_EPISODES = 100  # that such a quantile needs
-TAIL_PRIOR_COUNT = (
-    10  # maxima beyond q after which a number's own tail counts as much as the tail common to all
-)
+TAIL_PRIOR_COUNT = 10
+"""Maxima beyond q after which a number's own tail counts as much as the tail common to all."""
 SMALLEST = 1e-9  # lower bound of q
-LEAST_SHARE = (
-    1e-3  # the same as a share of the median q, for numbers that never erred in a few episodes
-)
+LEAST_SHARE = 1e-3
+"""The same as a share of the median q, for numbers that never erred in a few episodes."""
 
 
 def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
@@ -52,15 +50,21 @@ def whitening(errors: Array, shrinkage: float = 0.01) -> Floats:
     variance = float(np.trace(covariance)) / len(covariance)
     if not variance > 0:
         variance = 1.0
-    shrunk = (1.0 - shrinkage) * covariance + shrinkage * (variance * np.eye(len(covariance)))
+    prior = variance * np.eye(len(covariance))
+    shrunk = (1.0 - shrinkage) * covariance + shrinkage * prior
     values, vectors = np.linalg.eigh(shrunk)
     return (vectors / np.sqrt(values)) @ vectors.T
 
 
+@compiled
 def bounded(errors: Array, bound: float) -> Floats:
     """Return the errors, none beyond ν = ``bound`` standard deviations."""
-    exact = np.asarray(errors, np.float64)
-    return exact / np.sqrt(1.0 + (exact / bound) ** 2)
+    limited = np.empty(errors.shape)
+    for n in range(len(errors)):
+        for i in range(errors.shape[1]):
+            share = errors[n, i] / bound
+            limited[n, i] = errors[n, i] / np.sqrt(1.0 + share * share)
+    return limited
 
 
 class Evidence(NamedTuple):
@@ -71,7 +75,13 @@ class Evidence(NamedTuple):
     steps: NDArray[np.int64]  # (B,) t, rows so far
 
     @classmethod
-    def start(cls, batch: int, gains: int, errors: int, context: int = 0) -> Evidence:
+    def start(
+        cls,
+        batch: int,
+        gains: int,
+        errors: int,
+        context: int = 0,
+    ) -> Evidence:
         """Return w_0 for ``batch`` streams."""
         return cls(
             vector=np.zeros((batch, gains, errors)),
@@ -80,29 +90,68 @@ class Evidence(NamedTuple):
         )
 
 
+@inner
+def average(
+    before: Any,
+    after: Any,
+    values: Any,
+    gain: float,
+) -> None:
+    """Write the running mean (N,) of values (N,)."""
+    for i in range(len(values)):
+        after[i] = before[i] + gain * (values[i] - before[i])
+
+
+@inner
+def scale(values: Any, factor: Any) -> None:
+    """Multiply the values (N,) by a factor."""
+    for i in range(len(values)):
+        values[i] *= factor
+
+
+@inner
+def total(values: Any) -> float:
+    """Return the sum of the values (N,)."""
+    added = 0.0
+    for value in values:
+        added += value
+    return added
+
+
+@inner
+def add_evidence(
+    gains: Any,
+    before: Any,
+    after: Any,
+    whitened: Any,
+) -> None:
+    """Write w_t (G, X) = w_{t-1} + a (ẽ_t - w_{t-1})."""
+    for g in range(len(gains)):
+        average(before[g], after[g], whitened, gains[g])
+
+
 @compiled
-def accumulated(whitened: Array, contexts: Array, gains: Array) -> tuple[Floats, Floats]:
+def accumulated(
+    whitened: Array,
+    contexts: Array,
+    gains: Array,
+) -> tuple[Floats, Floats]:
     """Return w_t (T, G, X) of whitened errors ẽ_t (T, X), and the running mean of the contexts (T, C)."""
-    T, X = whitened.shape
-    vectors = np.zeros((T, len(gains), X))
+    rows, errors = whitened.shape
+    vectors = np.zeros((rows, len(gains), errors))
     running = np.zeros(contexts.shape)
-    for t in range(T):
+    for t in range(rows):
         before = max(t - 1, 0)  # in the first row all is still 0
-        for g in range(len(gains)):
-            for i in range(X):
-                w = vectors[before, g, i]
-                vectors[t, g, i] = w + gains[g] * (whitened[t, i] - w)
-        for c in range(contexts.shape[1]):
-            running[t, c] = running[before, c] + CONTEXT_GAIN * (
-                contexts[t, c] - running[before, c]
-            )
+        add_evidence(gains, vectors[before], vectors[t], whitened[t])
+        average(running[before], running[t], contexts[t], CONTEXT_GAIN)
     return vectors, running
 
 
 def strength(evidence: Evidence, gains: Array) -> Floats:
     """Return v (B, G, X), the squared evidence in each error."""
     rows = evidence.steps[:, None]
-    variance = gains / (2.0 - gains) * (1.0 - (1.0 - gains) ** (2 * rows))  # (B, G) of each w_t,i
+    lost = (1.0 - gains) ** (2 * rows)  # (B, G)
+    variance = gains / (2.0 - gains) * (1.0 - lost)  # of each w_t,i
     return evidence.vector**2 / variance[:, :, None]
 
 

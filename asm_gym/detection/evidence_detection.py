@@ -20,10 +20,8 @@ from asm_gym.detection.evidence import (
     HOURS_QUANTILE,
     HOURS_TAIL_INDEX,
     TAIL_INDEX,
-    TINY,
     Evidence,
     ceilings,
-    pool,
 )
 from asm_gym.detection.repetition import (
     MOST_BEYOND,
@@ -32,6 +30,7 @@ from asm_gym.detection.repetition import (
     RepetitionWeights,
     count_repetitions,
     evidence_steps,
+    pool_repetitions,
 )
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_flag, check_number, check_shapes, short_repr, typed
@@ -202,10 +201,8 @@ class EvidenceDetection:
         evidence, parts = self.fitted_detector.step(state.evidence, output.errors, output.contexts)
         repetition = state.repetition.followed_by(rows[:, senses], weights.steps, weights.most)
         shares = place(parts)
-        if repetition.unlikely.any():
-            ratios = np.zeros_like(shares)
-            ratios[:, senses] = repetition.ratios(weights.offset)
-            shares = _joined(shares, ratios)
+        for share, unlikely in zip(shares, repetition.unlikely, strict=True):
+            pool_repetitions(weights, unlikely, share)
         return EvidenceState(evidence=evidence, repetition=repetition), shares
 
     def reset(self, state: EvidenceState) -> EvidenceState:
@@ -216,10 +213,3 @@ class EvidenceDetection:
             evidence=state.evidence._replace(vector=vector),
             repetition=state.repetition._replace(unlikely=unlikely),
         )
-
-
-def _joined(shares: Floats, ratios: Floats) -> Floats:
-    """Return each number's share (B, D) of its surprise so far pooled with further ratios."""
-    value = shares.sum(axis=1, keepdims=True)
-    _, parts = pool(np.hstack([value, ratios]))
-    return shares * (parts[:, :1] / np.maximum(value, TINY)) + parts[:, 1:]

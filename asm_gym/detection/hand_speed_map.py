@@ -25,22 +25,18 @@ AnyFloats = NDArray[np.floating[Any]]
 
 # Columns of a map's cells.
 ARM_AND_PLACE = slice(0, 4)  # the arm, and the cell's place along x, y and z in cells
-FASTEST = slice(
-    4, 16
-)  # greatest speed along each axis of the twist, then against each [m/s], [rad/s]
+FASTEST = slice(4, 16)
+"""Greatest speed along each axis of the twist, then against each [m/s], [rad/s]."""
 
 FARTHEST_CELL = 100  # hands that are more cells away from the origin are not learned of
 OWN_MAP_EPISODES = 40  # of a task that has a map of its own: elsewhere others may go down fast
-FASTEST_EPISODES = (
-    0.05  # share of the episodes that visit a cell, the fastest, which do not count there
-)
-ODD_EPISODES = (
-    0.002  # and of all episodes: of hundreds, an odd one sets no speed where few others go
-)
+FASTEST_EPISODES = 0.05
+"""Share of the episodes that visit a cell, the fastest, which do not count there,"""
+ODD_EPISODES = 0.002
+"""and of all episodes: of hundreds, an odd one sets no speed where few others go."""
 
-MOMENTUM = (
-    1.5  # limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]
-)
+MOMENTUM = 1.5
+"""Limit along a hand's motion where no healthy hand was: 10 kg at the usual speed [N s]."""
 MOMENTUM_OF_KNOWN_TASK = 1.35  # the same in a task with a map of its own [N s]
 
 
@@ -59,7 +55,11 @@ class HandSpeedMap:
         low: (4,) arm and place of the grid's first cell.
     """
 
-    def __init__(self, cells: AnyFloats, momentum: float = MOMENTUM) -> None:
+    def __init__(
+        self,
+        cells: AnyFloats,
+        momentum: float = MOMENTUM,
+    ) -> None:
         if not _are_cells(cells):
             raise ValueError(
                 f"pace must be rows of {FASTEST.stop} numbers, places within {FARTHEST_CELL} cells, got {cells.shape}"
@@ -69,9 +69,10 @@ class HandSpeedMap:
 
         places = cells[:, ARM_AND_PLACE].astype(np.int64)
         self.low = places.min(axis=0) - (0, 1, 1, 1)
-        shape = places.max(axis=0) - self.low + (1, 2, 2, 2)
+        offsets = places - self.low
+        shape = np.add(offsets.max(axis=0), (1, 2, 2, 2))
         grid = np.zeros((*shape, 2 * AXES), np.float32)
-        at = tuple((places - self.low).T)
+        at = tuple(offsets.T)
         np.maximum.at(grid, at, cells[:, FASTEST])
 
         # A hand may go as fast as others beside its cell; downwards, only as those at the same height.
@@ -80,7 +81,11 @@ class HandSpeedMap:
         self.grid[..., DOWN] = maximum_filter(downward, (1, 3, 3, 1))
 
     @classmethod
-    def of(cls, cells_by_task: Mapping[str, AnyFloats], task: str = "") -> Self | None:
+    def of(
+        cls,
+        cells_by_task: Mapping[str, AnyFloats],
+        task: str = "",
+    ) -> Self | None:
         """Return the map of a task; that of all tasks where it has none, None where there are no cells."""
         if task and task in cells_by_task:
             return cls(cells_by_task[task], MOMENTUM_OF_KNOWN_TASK)
@@ -101,23 +106,26 @@ class HandSpeedMap:
             if len(streams[task]) < OWN_MAP_EPISODES:
                 streams[""] = streams.pop(task) + streams[""]
 
-        cells_by_task = {}
-        for task, own in streams.items():
-            cells = cls.learned(own, spec)
-            if cells is not None:
-                cells_by_task[task] = cells
-        return cells_by_task
+        cells = {task: cls.learned(own, spec) for task, own in streams.items()}
+        return {task: learned for task, learned in cells.items() if learned is not None}
 
     @staticmethod
-    def learned(streams: Sequence[AnyFloats], spec: StreamSpec) -> NDArray[np.float32] | None:
+    def learned(
+        streams: Sequence[AnyFloats],
+        spec: StreamSpec,
+    ) -> NDArray[np.float32] | None:
         """Return the cells (N, 16) of healthy streams (T, D); None where these do not tell how hands move."""
         cells = []
         columns = np.arange(spec.size)
         hands = [name for name in spec.slices if name.endswith("hand_position")]
         for arm, position in enumerate(hands):
             hand = position.removesuffix("position")
-            names = (position, f"{hand}velocity", f"{hand}angular_velocity")
-            if all(name in spec.slices for name in names):
+            names = (
+                position,
+                f"{hand}velocity",
+                f"{hand}angular_velocity",
+            )
+            if spec.slices.keys() >= set(names):
                 parts = [columns[spec.slices[name]] for name in names]
                 rows = _motions(streams, np.concatenate(parts))
                 cells.append(_cells_of(arm, rows, len(streams)))
@@ -125,7 +133,11 @@ class HandSpeedMap:
             return None
         return np.concatenate(cells).astype(np.float32)
 
-    def fastest_near(self, arm: int, place: Floats) -> AnyFloats:
+    def fastest_near(
+        self,
+        arm: int,
+        place: Floats,
+    ) -> AnyFloats:
         """Return (2, 6) the greatest twist near a place (3,), along the axes and against them; else 0."""
         cell = cell_near(self.grid, self.low, arm, place)
         if cell < 0:
@@ -134,25 +146,29 @@ class HandSpeedMap:
 
 
 def _are_cells(cells: AnyFloats) -> bool:
-    if cells.ndim != 2 or cells.size == 0:
+    if cells.ndim != 2 or cells.shape[1] != FASTEST.stop or cells.size == 0:
         return False
-    if cells.shape[1] != FASTEST.stop:
-        return False
-
     near = np.abs(cells[:, ARM_AND_PLACE]) <= FARTHEST_CELL
-    arms = cells[:, 0]
-    speeds = cells[:, FASTEST]
-    return bool(np.all(near) and np.all(arms >= 0) and np.all(speeds >= 0))
+    arms_and_speeds = np.delete(cells, (1, 2, 3), axis=1)
+    positive = arms_and_speeds >= 0
+    return bool(near.all() and positive.all())
 
 
-def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
+def _motions(
+    streams: Sequence[AnyFloats],
+    columns: NDArray[np.intp],
+) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
-    lengths = [len(stream) for stream in streams]
-    indices = np.arange(len(streams))
-    episodes = np.repeat(indices, lengths)
-    motions = np.concatenate([stream[:, columns] for stream in streams])
-    rows = np.column_stack((episodes, motions)).astype(np.float64)
-
+    motions = [
+        np.insert(
+            np.asarray(stream[:, columns], np.float64),
+            0,
+            episode,
+            axis=1,
+        )
+        for episode, stream in enumerate(streams)
+    ]
+    rows = np.concatenate(motions)
     places = rows[:, 1:4] / CELL_SIZE
     rows[:, 1:4] = np.floor(places)
     near = np.abs(places) < FARTHEST_CELL
@@ -160,13 +176,17 @@ def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     return rows[known & near.all(axis=1)]
 
 
-def _cells_of(arm: int, rows: Floats, episodes: int) -> Floats:
+def _cells_of(
+    arm: int,
+    rows: Floats,
+    episodes: int,
+) -> Floats:
     """Return the cells (N, 16) of an arm, by the motions of its hand in so many episodes."""
     # A visit is all rows of an episode in a cell.
     visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)
     twists = rows[:, 4:]
-    directions = np.hstack((twists, -twists))
     fastest = np.zeros((len(visits), 2 * AXES))
+    directions = np.hstack((twists, -twists))
     np.maximum.at(fastest, visit_of.ravel(), directions)
 
     cells = []
@@ -174,7 +194,11 @@ def _cells_of(arm: int, rows: Floats, episodes: int) -> Floats:
     for place in np.unique(visited, axis=0):
         here = np.all(visited == place, axis=1)
         ascending = np.sort(fastest[here], axis=0)
-        kept = len(ascending) - int(FASTEST_EPISODES * len(ascending) + ODD_EPISODES * episodes)
+        fastest_here = FASTEST_EPISODES * len(ascending)
+        odd = ODD_EPISODES * episodes
+        kept = len(ascending) - int(fastest_here + odd)
         if kept > 0:
-            cells.append(np.hstack((arm, place, ascending[kept - 1])))
+            speeds = ascending[kept - 1]
+            cell = np.hstack((arm, place, speeds))
+            cells.append(cell)
     return np.reshape(cells, (-1, FASTEST.stop))

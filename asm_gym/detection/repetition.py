@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.base import Floats
-from asm_gym.detection.evidence import TAIL_INDEX
+from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, scale, total
 from asm_gym.readings import noise_of, resolution
 
 STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
-REPETITION_OFFSET = (
-    12.0  # one in 160,000, which among a hundred senses happens once in some thousand rows
-)
+REPETITION_OFFSET = 12.0
+"""One in 160,000, which among a hundred senses happens once in some thousand rows."""
 RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal episodes
 MOST_BEYOND = 24.0  # largest n - n_0
 UNMOVED = 0.5  # noise below this many steps of the resolution leaves a reading where it is
@@ -66,27 +65,42 @@ class Repetition(NamedTuple):
     unlikely: Floats  # (B, X) n
 
     @classmethod
-    def start(cls, batch: int, senses: int) -> Repetition:
+    def start(
+        cls,
+        batch: int,
+        senses: int,
+    ) -> Repetition:
         """Return the state before the first row."""
         shape = (batch, senses)
         return cls(
-            row=np.full(shape, np.nan), again=np.zeros(shape, np.bool_), unlikely=np.zeros(shape)
+            row=np.full(shape, np.nan),
+            again=np.zeros(shape, np.bool_),
+            unlikely=np.zeros(shape),
         )
 
-    def followed_by(self, rows: Floats, steps: Floats, most: Floats) -> Repetition:
+    def followed_by(
+        self,
+        rows: Floats,
+        steps: Floats,
+        most: Floats,
+    ) -> Repetition:
         """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
-        columns = np.arange(rows.shape[1])
-        weights = RepetitionWeights(columns=columns, steps=steps, most=most, offset=most)
-        after = Repetition.start(len(rows), rows.shape[1])
+        columns = np.arange(len(most))
+        weights = RepetitionWeights(
+            columns=columns,
+            steps=steps,
+            most=most,
+            offset=most,
+        )
+        after = Repetition.start(len(rows), len(most))
         step_repetition(weights, self, after, rows)
         return after
 
-    def ratios(self, offset: Floats) -> Floats:
-        """Return r (B, X), with n_0 ``offset`` (X,)."""
-        return np.where(self.unlikely > 0, np.exp(TAIL_INDEX * (self.unlikely - offset)), 0.0)
 
-
-def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Floats:
+def count_repetitions(
+    streams: Sequence[Stream],
+    noisy: NDArray[np.bool_],
+) -> Floats:
     """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0 - 3.
 
     Args:
@@ -97,7 +111,9 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
     repeats = np.zeros((2, len(noisy)))
     for stream in streams:
         again = stream[1:] == stream[:-1]
-        for repeated, group in enumerate((~again[:-1], again[:-1])):
+        before = again[:-1]
+        groups = (~before, before)
+        for repeated, group in enumerate(groups):
             chances[repeated] += group.sum(axis=0)
             repeats[repeated] += (again[1:] & group).sum(axis=0)
 
@@ -105,22 +121,28 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
     # Rest comes by the episode: where n of them never rested, the next may.
     first = np.maximum(first, 1.0 / (RESTLESS * len(streams)))
     # As rare after a repetition as after a change, unless seen to be otherwise.
-    p = np.array([first, (repeats[1] + first) / (chances[1] + 1.0)])
+    later = (repeats[1] + first) / (chances[1] + 1.0)
+    p = np.array([first, later])
 
     watched = repeats.sum(axis=0) == 0
     if noisy.any():
-        watched = noisy & ~stands_still(streams) & (p[1] < RESTS)
+        restless = later < RESTS
+        watched = noisy & ~stands_still(streams) & restless
     surprise = np.where(watched, -np.log(p), 0.0)
-    return np.concatenate([surprise, largest_offset(streams, surprise)[None]])
+    offset = largest_offset(streams, surprise)
+    return np.vstack([surprise, offset])
 
 
 def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
     """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
     ends = np.cumsum([len(stream) for stream in streams])
-    enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
-    return np.array(
-        [_stands_still([stream[:, i] for stream in enough]) for i in range(streams[0].shape[1])]
-    )
+    last = int(np.searchsorted(ends, MOST_READ))
+    enough = streams[: last + 1]
+    still = []
+    for i in range(streams[0].shape[1]):
+        readings = [stream[:, i] for stream in enough]
+        still.append(_stands_still(readings))
+    return np.array(still)
 
 
 def _stands_still(readings: Sequence[Stream]) -> bool:
@@ -133,19 +155,24 @@ def _stands_still(readings: Sequence[Stream]) -> bool:
     return bool(noise < UNMOVED * float(np.median(known)))
 
 
-def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
+def largest_offset(
+    streams: Sequence[Stream],
+    surprise: Floats,
+) -> Floats:
     """Return n_0 - 3 (X,): the largest n in nominal episodes (T, X), at least 12; ``surprise`` is -log p (2, X)."""
     senses = surprise.shape[1]
     steps = evidence_steps(surprise)
-    unbounded = np.full(senses, np.inf)
     offset = np.full(senses, REPETITION_OFFSET)
 
     ordered = sorted(streams, key=len, reverse=True)
     state = Repetition.start(len(ordered), senses)
     for t in range(len(ordered[0])):
-        rows = np.array([stream[t] for stream in ordered if t < len(stream)], np.float64)
-        state = Repetition._make(part[: len(rows)] for part in state).followed_by(
-            rows, steps, unbounded
+        rows = [stream[t] for stream in ordered if t < len(stream)]
+        going_on = Repetition._make(part[: len(rows)] for part in state)
+        state = going_on.followed_by(
+            np.array(rows, np.float64),
+            steps,
+            most=np.full(senses, np.inf),
         )
         offset = np.maximum(offset, state.unlikely.max(axis=0))
     return offset
@@ -155,9 +182,10 @@ def evidence_steps(surprise: Floats) -> Floats:
     """Return (2, 2, X) from -log p (2, X): what a change and a repetition add to n, after a change and a repetition."""
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
-        steps = np.log([(1.0 - STUCK) / (1.0 - p), STUCK / p])  # (now, before, X)
-    watched: Floats = np.where(p < STUCK, steps, 0.0).swapaxes(0, 1)
-    return np.ascontiguousarray(watched)
+        changed = (1.0 - STUCK) / (1.0 - p)
+        steps = np.log([changed, STUCK / p])  # (now, before, X)
+    watched = np.where(p < STUCK, steps, 0.0)
+    return np.ascontiguousarray(watched.swapaxes(0, 1))
 
 
 @compiled
@@ -167,9 +195,43 @@ def step_repetition(
     """Write the state after rows (B, D)."""
     for n in range(len(rows)):
         for i in range(len(weights.columns)):
-            reading = rows[n, weights.columns[i]]
+            column = weights.columns[i]
+            reading = rows[n, column]
             again = reading == before.row[n, i]
-            step = weights.steps[int(before.again[n, i]), int(again), i]
+            repeated = before.again[n, i]
+            step = weights.steps[int(repeated), int(again), i]
+            unlikely = before.unlikely[n, i] + step
             after.row[n, i] = reading
             after.again[n, i] = again
-            after.unlikely[n, i] = min(max(before.unlikely[n, i] + step, 0.0), weights.most[i])
+            after.unlikely[n, i] = min(max(unlikely, 0.0), weights.most[i])
+
+
+@compiled
+def pool_repetitions(
+    repetition: RepetitionWeights,
+    unlikely: Any,
+    share: Any,
+) -> None:
+    """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
+    value = total(share)
+    greatest = max(value, TINY)
+    ratios = np.zeros(len(unlikely))
+    for i in range(len(ratios)):
+        if unlikely[i] > 0:
+            beyond = unlikely[i] - repetition.offset[i]
+            ratios[i] = np.exp(TAIL_INDEX * beyond)
+            greatest = max(greatest, ratios[i])
+
+    own = (value / greatest) ** POWER
+    powers = own
+    for i in range(len(ratios)):
+        ratios[i] = (ratios[i] / greatest) ** POWER
+        powers += ratios[i]
+    if not powers > own:
+        return
+    pooled = greatest * powers ** (1.0 / POWER)
+    pooled /= max(powers, TINY)
+    scale(share, pooled * own / max(value, TINY))
+    for i in range(len(ratios)):
+        column = repetition.columns[i]
+        share[column] += pooled * ratios[i]

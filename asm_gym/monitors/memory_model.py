@@ -22,8 +22,7 @@ from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.layout import Layout
-from asm_gym.monitors.row_kernel import expected_errors, layout_of, uninitialised
+from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, uninitialised
 from asm_gym.monitors.stream_model import ScaledModel
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
@@ -63,7 +62,7 @@ class MemoryModel(ScaledModel):
             schedule,
         )
         self.network_: TemporalNetwork | None = None
-        self.compiled_: Layout | None = None
+        self.compiled_: RowWeights | None = None
         self.motor_: Motor | None = None
         self.completion_: Completion | None = None
 
@@ -76,7 +75,7 @@ class MemoryModel(ScaledModel):
     def _take(self, network: TemporalNetwork) -> None:
         nameless = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
         names = {name: self.learned_[name] for name in nameless} if self.skills_ else nameless
-        self.network_, self.compiled_ = network, layout_of(network, self.senses_, names)
+        self.network_, self.compiled_ = network, row_weights(network, self.senses_, names)
 
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress

@@ -23,64 +23,86 @@ from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.detection.base import ModelOutput
 from asm_gym.detection.benign_events import NO_SENSES, BenignEvents, EventState, find_events
 from asm_gym.detection.detector import NO_DETECTOR, step_evidence
-from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, Evidence
+from asm_gym.detection.evidence import Evidence, scale, total
 from asm_gym.detection.evidence_detection import EvidenceDetection, EvidenceState
 from asm_gym.detection.repetition import (
     NO_REPETITION,
     Repetition,
     RepetitionWeights,
+    pool_repetitions,
     step_repetition,
 )
-from asm_gym.memory.association import normalised_errors
+from asm_gym.memory.association import Association, normalised_errors
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
-from asm_gym.memory.traces import carry, weight_shapes
+from asm_gym.memory.traces import Weights, carry, weight_shapes
 from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated_monitor import MonitorState
-from asm_gym.monitors.layout import Layout, matrix, vector
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 
-__all__ = ["JUDGED", "RowKernel", "expected_errors", "layout_of", "observe_rows", "uninitialised"]
+__all__ = ["JUDGED", "RowKernel", "expected_errors", "observe_rows", "row_weights", "uninitialised"]
 
 
-def layout_of(
+class RowWeights(NamedTuple):
+    """What a memory computes with; one kind of network has weights of zero, as its memory has the other."""
+
+    traces: Weights
+    settling: SettlingWeights
+    settles: bool
+    association: Association
+    spans: NDArray[np.intp]
+    W_K: NDArray[np.float32]
+    b_K: NDArray[np.float32]  # noqa: N815
+    mean: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    change: NDArray[np.float64]
+    sensory: NDArray[np.intp]
+    motor: NDArray[np.intp]
+    slow: NDArray[np.intp]
+    groups: NDArray[np.intp]
+    prior_precision: np.float32
+    sensory_precision: np.float32
+    curvature: np.float32
+    iterations: int
+
+
+def row_weights(
     network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]
-) -> Layout:
+) -> RowWeights:
     """Return what a memory computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
-    either = weight_shapes(1, 1, 1) | settling_shapes(1, 1, 1)
-    singles = {
-        name: np.zeros(shape) for name, shape in either.items()
-    }  # what the other kind of network has
-    singles |= network.weights._asdict()
-    singles |= network.association._asdict()
-    singles |= names
-    integers = {
-        "sensory": scaler.spec.sensory,
-        "motor": scaler.spec.motor,
-        "slow": scaler.slow,
-        "groups": scaler.groups,
-        "spans": network.spans,
-    }
-    arrays = {name: np.asarray(array, np.float32) for name, array in singles.items()}
-    arrays |= {name: np.asarray(array, np.float64) for name, array in scaler.arrays.items()}
-    arrays |= {name: np.asarray(array, np.int64) for name, array in integers.items()}
-    numbers = {
-        "prior_precision": network.prior_precision,
-        "sensory_precision": network.sensory_precision,
-        "curvature": network.curvature,
-        "iterations": network.iterations,
-        "settles": isinstance(network.weights, SettlingWeights),
-    }
-    return Layout.of(arrays, numbers)
+    traces: Any = map(np.zeros, weight_shapes(1, 1, 1).values())
+    settling: Any = map(np.zeros, settling_shapes(1, 1, 1).values())
+    settles = isinstance(network.weights, SettlingWeights)
+    if settles:
+        settling = network.weights
+    else:
+        traces = network.weights
+    return RowWeights(
+        traces=Weights._make(map(single, traces)),
+        settling=SettlingWeights._make(map(single, settling)),
+        settles=settles,
+        association=Association._make(map(single, network.association)),
+        spans=network.spans,
+        W_K=single(names["W_K"]),
+        b_K=single(names["b_K"]),
+        mean=np.array(scaler.mean, np.float64),
+        spread=np.array(scaler.spread, np.float64),
+        change=np.array(scaler.change, np.float64),
+        sensory=scaler.spec.sensory.copy(),
+        motor=scaler.spec.motor.copy(),
+        slow=scaler.slow,
+        groups=scaler.groups,
+        prior_precision=network.prior_precision,
+        sensory_precision=network.sensory_precision,
+        curvature=network.curvature,
+        iterations=network.iterations,
+    )
 
 
-class RowState(NamedTuple):
-    """What a row changes of a ``MonitorState``."""
-
-    memory: MemoryState
-    detection: EvidenceState
-    events: EventState
+def single(array: NDArray[Any]) -> NDArray[np.float32]:
+    """Return a writable copy, of the one type that compiled code takes."""
+    return np.array(array, np.float32, order="C")
 
 
 class RowKernel:
@@ -93,7 +115,7 @@ class RowKernel:
     """
 
     def __init__(
-        self, memory: Layout, detection: EvidenceDetection, events: BenignEvents | None
+        self, memory: RowWeights, detection: EvidenceDetection, events: BenignEvents | None
     ) -> None:
         if must_compile(observe_rows):
             print(
@@ -133,17 +155,15 @@ class RowKernel:
         with ONE_THREAD if len(rows) > 1 else nullcontext():  # one row calls no BLAS
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
-        value = judged["surprise"].copy()
-        divisor = judged["divisor"].copy()
-        if not self._excuses:
-            return out, Surprise(value=value, attribution=attribution), divisor
-        raw = judged["raw_surprise"].copy()
-        excuse = judged["excuse"].copy()
-        return out, Surprise(value=value, attribution=attribution, raw=raw, excuse=excuse), divisor
+        surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
+        if self._excuses:
+            raw = judged["raw_surprise"].copy()
+            surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
+        return out, surprise, judged["divisor"].copy()
 
 
 def expected_errors(
-    memory: Layout, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]
+    memory: RowWeights, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]
 ) -> Any:
     """Return the errors (B, X) of rows (B, D), and write the memory's state: the first half of a row by itself."""
     learned = bind(memory, True, NO_DETECTOR, NO_REPETITION, NO_SENSES)
@@ -172,16 +192,17 @@ def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
 
 
 @inner
-def state_of(arrays: Any) -> RowState:
+def state_of(arrays: Any) -> MonitorState:
     """Return the state of so many arrays, see ``arrays_of``."""
     traces, expected, skill = arrays[:3]
     history = RowHistory(arrays[3], arrays[4], arrays[5])
     evidence = Evidence(arrays[6], arrays[7], arrays[8])
     repetition = Repetition(arrays[9], arrays[10], arrays[11])
-    return RowState(
-        memory=MemoryState(traces, expected, history, skill),
+    return MonitorState(
+        model=MemoryState(traces, expected, history, skill),
         detection=EvidenceState(evidence, repetition),
-        events=EventState(arrays[12], arrays[13], arrays[14], arrays[15]),
+        excuses=EventState(arrays[12], arrays[13]),
+        values=(),
     )
 
 
@@ -191,7 +212,7 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
 
     Numba takes longer to look through nested named tuples that Python hands over than through arrays.
     """
-    return Bound((learned, state_of(arrays[:16]), state_of(arrays[16:])))  # type: ignore[no-untyped-call]
+    return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
 
 
 def uninitialised(state: Any) -> Any:
@@ -216,19 +237,19 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
         attribution: (B, D) share of each number in the surprise, written.
     """
     learned, before, after = memory.parts
-    layout, wants_context, detector, repetition, senses = learned.parts
-    reading = read(layout, before.memory.history, after.memory.history, rows)
-    carry_on(layout, before.memory, after.memory, reading, wants_context)
-    errors, units = associate(layout, reading)
-    doubt_first_rows(before.memory.history, errors)
-    name_skills(layout, before.memory, after.memory, units)
+    weights, wants_context, detector, repetition, senses = learned.parts
+    reading = read(weights, before.model.history, after.model.history, rows)
+    carry_on(weights, before.model, after.model, reading, wants_context)
+    errors, units = associate(weights, reading)
+    doubt_first_rows(before.model.history, errors)
+    name_skills(weights, before.model, after.model, units)
 
     if detector.whitening.size:
         shares = np.empty(errors.shape)
-        output = ModelOutput(errors, after.memory.expected)
+        output = ModelOutput(errors, after.model.expected)
         step_evidence(detector, before.detection.evidence, after.detection.evidence, output, shares)
         step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
-        find_events(senses, before.events, after.events, rows, judged)
+        find_events(senses, before.excuses, after.excuses, rows, judged)
         unlikely = after.detection.repetition.unlikely
         judge_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
     return errors
@@ -239,69 +260,72 @@ def doubt_first_rows(history: RowHistory, errors: Any) -> None:
     """Weigh the errors (B, X) of the first rows less: nothing came before them, so that no change is known."""
     lag = history.before.shape[1]
     for n in range(len(errors)):
-        weight = np.float32(0.0)
-        if history.steps[n] >= lag:
+        weight = np.float32(1.0)
+        if history.steps[n] < lag:
+            weight = np.float32(0.0)
+        elif history.steps[n] < 2 * lag:
             weight = UNSURE
-        for i in range(errors.shape[1]):
-            if history.steps[n] < 2 * lag:
-                errors[n, i] *= weight
+        scale(errors[n], weight)
 
 
 @partial(inner, inlined=True)
-def name_skills(layout: Layout, before: MemoryState, after: MemoryState, units: Any) -> None:
+def name_skills(weights: RowWeights, before: MemoryState, after: MemoryState, units: Any) -> None:
     """Write the evidence for each skill, by the units (B, M) and the state."""
     if before.skill.shape[1]:
-        W_K = matrix(layout.singles, layout.at[0].W_K)
-        b_K = vector(layout.singles, layout.at[0].b_K)
-        skill = add_up(before.skill, units, after.expected, W_K, b_K)
+        skill = add_up(before.skill, units, after.expected, weights.W_K, weights.b_K)
         for n in range(len(skill)):
-            copy_row(skill, after.skill, n)
+            copy(skill[n], after.skill[n])
 
 
 @inner
-def copy_row(rows: Any, to: Any, n: int) -> None:
-    """Copy row ``n``; numba takes seconds to compile an assignment of rows, with its message about shapes."""
-    for i in range(rows.shape[1]):
-        to[n, i] = rows[n, i]
+def copy(values: Any, to: Any) -> None:
+    """Copy values (N,); numba takes seconds to compile an assignment of rows, with its message about shapes."""
+    for i in range(len(values)):
+        to[i] = values[i]
+
+
+@inner
+def push(before: Any, newest: Any, after: Any) -> None:
+    """Write rows (l, D): those before without the oldest, and the newest (D,)."""
+    for k in range(1, len(before)):
+        copy(before[k], after[k - 1])
+    copy(newest, after[-1])
 
 
 @partial(inner, inlined=True)
-def read(layout: Layout, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
+def read(weights: RowWeights, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
     """Write the new history; return the rows (B, D) beside those that they are compared with."""
     lag = before.before.shape[1]
     last = np.empty_like(rows)
     past = np.empty_like(rows)
     for n in range(len(rows)):
-        after.steps[n] = before.steps[n] + 1
-        for i in range(rows.shape[1]):
-            last[n, i] = (
-                before.before[n, 0, i] if before.steps[n] >= lag else rows[n, i]
-            )  # at first nothing moves
-            past[n, i] = before.earlier[n, 0, i] if before.steps[n] >= 2 * lag else last[n, i]
-            after.before[n, lag - 1, i] = rows[n, i]
-            after.earlier[n, lag - 1, i] = last[n, i]
-        for k in range(lag - 1):
-            for i in range(rows.shape[1]):
-                after.before[n, k, i] = before.before[n, k + 1, i]
-                after.earlier[n, k, i] = before.earlier[n, k + 1, i]
+        steps = before.steps[n]
+        after.steps[n] = steps + 1
+        copy(rows[n], last[n])  # at first nothing moves
+        if steps >= lag:
+            copy(before.before[n, 0], last[n])
+        copy(last[n], past[n])
+        if steps >= 2 * lag:
+            copy(before.earlier[n, 0], past[n])
+        push(before.before[n], rows[n], after.before[n])
+        push(before.earlier[n], last[n], after.earlier[n])
 
-    at = layout.at[0]
     return read_rows(
         rows=rows,
         before=last,
         earlier=past,
-        mean=vector(layout.doubles, at.mean),
-        spread=vector(layout.doubles, at.spread),
-        change=vector(layout.doubles, at.change),
-        sensory=vector(layout.integers, at.sensory),
-        motor=vector(layout.integers, at.motor),
-        slow=vector(layout.integers, at.slow),
+        mean=weights.mean,
+        spread=weights.spread,
+        change=weights.change,
+        sensory=weights.sensory,
+        motor=weights.motor,
+        slow=weights.slow,
     )
 
 
 @partial(inner, inlined=True)
 def carry_on(
-    layout: Layout,
+    weights: RowWeights,
     before: MemoryState,
     after: MemoryState,
     reading: ScaledRows,
@@ -313,74 +337,71 @@ def carry_on(
     due = False
     for n in range(len(steps)):
         due = due or steps[n] % lag == 0
-        copy_row(before.traces, after.traces, n)
-        copy_row(before.expected, after.expected, n)
+        copy(before.traces[n], after.traces[n])
+        copy(before.expected[n], after.expected[n])
     if due:
-        expected, carried = follow(layout, before.traces, reading, wants_context)  # of all streams
+        expected, carried = follow(weights, before.traces, reading, wants_context)  # of all streams
         for n in range(len(steps)):
             if steps[n] % lag == 0:
-                copy_row(carried, after.traces, n)
-                copy_row(expected, after.expected, n)
+                copy(carried[n], after.traces[n])
+                copy(expected[n], after.expected[n])
 
 
 @partial(inner, inlined=True)
-def follow(layout: Layout, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
+def follow(weights: RowWeights, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
     """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
-    at = layout.at[0]
-    W_F = matrix(layout.singles, at.W_F)
-    if at.settles:
+    if weights.settles:
         return settle(
             z=traces,
             u=reading.commands,
             x=reading.senses,
             seen=reading.seen,
-            W_H=matrix(layout.singles, at.W_H),
-            W_U=matrix(layout.singles, at.W_U),
-            W_F=W_F,
-            b_F=vector(layout.singles, at.b_F),
-            pi_z=at.prior_precision,
-            pi_x=at.sensory_precision,
-            curvature=at.curvature,
-            iterations=at.iterations,
+            W_H=weights.settling.W_H,
+            W_U=weights.settling.W_U,
+            W_F=weights.settling.W_F,
+            b_F=weights.settling.b_F,
+            pi_z=weights.prior_precision,
+            pi_x=weights.sensory_precision,
+            curvature=weights.curvature,
+            iterations=weights.iterations,
         )
     return carry(
         c=traces,
         u=reading.commands,
         x=reading.senses,
         seen=reading.seen,
-        W_C=matrix(layout.singles, at.W_C),
-        W_F=W_F,
-        W_D=matrix(layout.singles, at.W_D),
-        gains=vector(layout.singles, at.gains),
-        pi_z=at.prior_precision,
-        pi_x=at.sensory_precision,
-        curvature=at.curvature,
-        iterations=at.iterations,
+        W_C=weights.traces.W_C,
+        W_F=weights.traces.W_F,
+        W_D=weights.traces.W_D,
+        gains=weights.traces.gains,
+        pi_z=weights.prior_precision,
+        pi_x=weights.sensory_precision,
+        curvature=weights.curvature,
+        iterations=weights.iterations,
         context=wants_context,
     )
 
 
 @partial(inner, inlined=True)
-def associate(layout: Layout, reading: ScaledRows) -> Any:
+def associate(weights: RowWeights, reading: ScaledRows) -> Any:
     """Return the errors (B, X) of what other senses predict, and the units (B, M)."""
-    at = layout.at[0]
-    singles = layout.singles
+    association = weights.association
     return normalised_errors(
         inputs=reading.inputs,
         changes=reading.changes,
         whole=reading.whole,
-        V=matrix(singles, at.V),
-        U=matrix(singles, at.U),
-        D=matrix(singles, at.D),
-        W_S=matrix(singles, at.W_S),
-        b_S=vector(singles, at.b_S),
-        span_S=matrix(singles, at.span_S),
-        remainder=vector(singles, at.remainder),
-        spans=matrix(layout.integers, at.spans),
-        R=matrix(singles, at.R),
-        Q=matrix(singles, at.Q),
-        doubt=matrix(singles, at.doubt),
-        groups=vector(layout.integers, at.groups),
+        V=association.V,
+        U=association.U,
+        D=association.D,
+        W_S=association.W_S,
+        b_S=association.b_S,
+        span_S=association.span_S,
+        remainder=association.remainder,
+        spans=weights.spans,
+        R=association.R,
+        Q=association.Q,
+        doubt=association.doubt,
+        groups=weights.groups,
         first=reading.finite.shape[1],
     )
 
@@ -405,60 +426,26 @@ def judge_rows(
         attribution: (B, D), written.
     """
     columns = repetition.columns
-    ratios = np.empty(len(columns))
     for n in range(len(judged)):
         share = attribution[n]
-        for i in range(len(share)):
-            share[i] = 0.0
+        share.fill(0.0)
         for i in range(len(columns)):
             share[columns[i]] = shares[n, i]
-        pool_repetitions(repetition, unlikely[n], ratios, share)
+        pool_repetitions(repetition, unlikely[n], share)
         mark_missing(finite[n], share)
 
-        surprise = 0.0
-        for i in range(len(share)):
-            surprise += share[i]
+        surprise = total(share)
         judged[n].raw_surprise = surprise
         judged[n].surprise = surprise
         if judged[n].divisor != 1.0:
-            judged[n].surprise = surprise / judged[n].divisor
+            judged[n].surprise /= judged[n].divisor
             for i in range(len(share)):
                 share[i] /= judged[n].divisor
 
 
 @inner
-def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, ratios: Any, share: Any) -> None:
-    """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
-    value = 0.0
-    for i in range(len(share)):
-        value += share[i]
-    greatest = max(value, TINY)
-    for i in range(len(ratios)):
-        ratios[i] = 0.0
-        if unlikely[i] > 0:
-            ratios[i] = np.exp(TAIL_INDEX * (unlikely[i] - repetition.offset[i]))
-        greatest = max(greatest, ratios[i])
-
-    own = (value / greatest) ** POWER
-    total = own
-    for i in range(len(ratios)):
-        ratios[i] = (ratios[i] / greatest) ** POWER
-        total += ratios[i]
-    if not total > own:
-        return
-    pooled = greatest * total ** (1.0 / POWER) / max(total, TINY)
-    for i in range(len(ratios)):
-        column = repetition.columns[i]
-        share[column] = share[column] * (pooled * own / max(value, TINY)) + pooled * ratios[i]
-
-
-@inner
 def mark_missing(finite: Any, share: Any) -> None:
     """Give all of the surprise, which is infinite, to the numbers that are not finite, if there are any."""
-    whole = True
-    for i in range(len(finite)):
-        whole = whole and finite[i]
-    if whole:
-        return
-    for i in range(len(finite)):
-        share[i] = 0.0 if finite[i] else np.inf
+    if not finite.all():
+        for i in range(len(finite)):
+            share[i] = 0.0 if finite[i] else np.inf
