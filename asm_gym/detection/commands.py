@@ -32,10 +32,7 @@ def hands_of(spec: StreamSpec) -> NDArray[np.intp]:
     return np.array(hands, np.intp).reshape(-1, 2, 3)
 
 
-def learned_motion(
-    streams: Sequence[Floats],
-    spec: StreamSpec,
-) -> NDArray[np.float64]:
+def learned_motion(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float64]:
     """Return M (3 H + A, 3 H) of streams (T, D)."""
     velocities = hands_of(spec)[:, 1].ravel()
     inputs = []
@@ -52,10 +49,7 @@ def learned_motion(
     return np.asarray(solution, np.float64)
 
 
-def healthy_commands(
-    streams: Sequence[Floats],
-    spec: StreamSpec,
-) -> NDArray[np.float32]:
+def healthy_commands(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float32]:
     """Return (3, A) the least, the most, and the greatest change in a row of what healthy streams (T, D) commanded."""
     commands = [stream[:, spec.motor] for stream in streams]
     changes = np.concatenate([np.diff(episode, axis=0) for episode in commands])

@@ -110,10 +110,7 @@ class HandSpeedMap:
         return {task: learned for task, learned in cells.items() if learned is not None}
 
     @staticmethod
-    def learned(
-        streams: Sequence[AnyFloats],
-        spec: StreamSpec,
-    ) -> NDArray[np.float32] | None:
+    def learned(streams: Sequence[AnyFloats], spec: StreamSpec) -> NDArray[np.float32] | None:
         """Return the cells (N, 16) of healthy streams (T, D); None where these do not tell how hands move."""
         cells = []
         columns = np.arange(spec.size)
@@ -154,10 +151,7 @@ def _are_cells(cells: AnyFloats) -> bool:
     return bool(near.all() and positive.all())
 
 
-def _motions(
-    streams: Sequence[AnyFloats],
-    columns: NDArray[np.intp],
-) -> Floats:
+def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
     motions = [
         np.insert(

@@ -97,10 +97,7 @@ class Repetition(NamedTuple):
         return after
 
 
-def count_repetitions(
-    streams: Sequence[Stream],
-    noisy: NDArray[np.bool_],
-) -> Floats:
+def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Floats:
     """Return (3, X): -log p after a change and after a repetition, 0 for senses not watched; and n_0 - 3.
 
     Args:
@@ -155,10 +152,7 @@ def _stands_still(readings: Sequence[Stream]) -> bool:
     return bool(noise < UNMOVED * float(np.median(known)))
 
 
-def largest_offset(
-    streams: Sequence[Stream],
-    surprise: Floats,
-) -> Floats:
+def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
     """Return n_0 - 3 (X,): the largest n in nominal episodes (T, X), at least 12; ``surprise`` is -log p (2, X)."""
     senses = surprise.shape[1]
     steps = evidence_steps(surprise)
@@ -207,11 +201,7 @@ def step_repetition(
 
 
 @compiled
-def pool_repetitions(
-    repetition: RepetitionWeights,
-    unlikely: Any,
-    share: Any,
-) -> None:
+def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -> None:
     """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
     value = total(share)
     greatest = max(value, TINY)
