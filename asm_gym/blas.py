@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from threading import Lock
 from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
 
-class _OneThread:
+class _OneThread(AbstractContextManager[None]):
     """Limit BLAS to one thread: several are slower at small products, and differ in the last bits of sums.
 
     Only where it has several: ``threadpoolctl.limit`` takes as long as a row.
@@ -46,3 +47,10 @@ class _OneThread:
 
 
 ONE_THREAD = _OneThread()
+
+
+def one_thread_for(rows: int) -> AbstractContextManager[None]:
+    """Return ``ONE_THREAD`` for several rows of a memory, and no limit for one row, which calls no BLAS."""
+    if rows > 1:
+        return ONE_THREAD
+    return nullcontext()

@@ -236,11 +236,13 @@ class Arbiter:
     def _count_row(self, evidence: RowEvidence, response: Response) -> None:
         """Count the row."""
         robot = evidence.robot
-        least = robot.threshold * RELEASE_BELOW if robot.overridden else robot.threshold
-        calm = robot.surprise <= least and not evidence.alarm
+        low = robot.threshold
+        if robot.overridden:
+            low *= RELEASE_BELOW
+        calm = robot.surprise <= low and not evidence.alarm
         free = response.touched is False and robot.overridden
-        robot.calm_rows = robot.calm_rows + 1 if calm else 0
-        robot.free_rows = robot.free_rows + 1 if free else 0
+        robot.calm_rows = calm * (robot.calm_rows + 1)
+        robot.free_rows = free * (robot.free_rows + 1)
         if robot.overridden:
             self._count_override(evidence)
         else:
@@ -255,7 +257,7 @@ class Arbiter:
         robot = evidence.robot
         robot.override_rows += 1
         # Where nobody knows what is sensed, no trial comes nearer.
-        robot.held_rows = robot.held_rows + 1 if math.isfinite(robot.surprise) else 0
+        robot.held_rows = math.isfinite(robot.surprise) * (robot.held_rows + 1)
         # What the arm feels when it changes over to the reflex confirms nothing yet.
         robot.confirmed |= evidence.alarm and robot.held_rows > self._rule.release_after
 
@@ -303,4 +305,6 @@ class Arbiter:
                 robot.rows_since_return = 0
                 robot.calm_rows = 0
                 robot.on_trial = transition.name == "trial"
-        return response if transition.name == "*" else transition.name
+        if transition.name == "*":
+            return response
+        return transition.name

@@ -14,14 +14,13 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.blas import ONE_THREAD
+from asm_gym.blas import one_thread_for
 from asm_gym.compilation import bind
 from asm_gym.detection.alarm_rule import EVENTS, FAULT, JUDGED
 from asm_gym.guard.adapter import SensedRows
@@ -108,71 +107,79 @@ class Guard:
     ) -> None:
         spec = monitor.spec
         diagnosis = diagnosis_of(monitor)
-        chosen = options.reaction(diagnosis is not None)
-        name = chosen if isinstance(chosen, str) else ""
-        graded = name == GRADED
-        acts = bool(policies) or name in (*REFLEXES, GRADED)
-        recalls = name == "recall"
-        if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
-            raise ValueError(
-                f"recall needs a memory that predicts actions, and {type(monitor).__name__} does not"
-            )
-
-        self.fitted = FittedMonitor.of(monitor, spec)
-        self.options = options
-        self.ends_on_alarm = name == "terminate"
-        self.terms = AlarmTerms()
-        self.table = RobotTable(facts.count, spec, self.fitted.threshold)
+        reaction = options.reaction(diagnosis is not None)
+        name = ""  # a policy of the user's own acts
+        if isinstance(reaction, str):
+            name = reaction
+        self._name = name
+        self._graded = name == GRADED
         self._facts = facts
         self._spec = spec
-        self._name = name
-        self._graded = graded
-        self._warned: set[tuple[int, str]] = set()
-        motion = FeltMotion.of(facts, spec, name) if acts and not policies else None
-        rule = options.rule(graded, facts.dt, rows_per_step) if acts else None
+        self.options = options
+        self.ends_on_alarm = name == "terminate"
+        self.fitted = FittedMonitor.of(monitor, spec)
+        self.terms = AlarmTerms()
+        self.table = RobotTable(facts.count, spec, self.fitted.threshold)
+
+        motion = None
+        rule = None
+        if policies or name in (*REFLEXES, GRADED):
+            rule = options.rule(self._graded, facts.dt, rows_per_step)
+            if not policies:
+                motion = FeltMotion.of(facts, spec, name)
+        recalls = name == "recall"
+        if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
+            kind = type(monitor).__name__
+            raise ValueError(f"recall needs a memory that predicts actions, and {kind} does not")
+        completion = None
+        if diagnosis is not None and self._graded:
+            completion = diagnosis.completion
+
+        table = responses_from(options.responses)
         self._arbiter = Arbiter(self.table, rule, options.adaptive_threshold)
-        self.running = self._arbiter.running
+        self._diagnostician = Diagnostician(spec, diagnosis, table, self._graded)
+        self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
+        self._observer = Observer(monitor, facts.count, recalls)
         self._commander = Commander(
-            facts,
-            self.table,
+            facts=facts,
+            table=self.table,
             motion=motion,
             policies=policies,
             arbiter=self._arbiter,
             warn=self._warn,
             commands=getattr(monitor, "commands_", None),
         )
-        self._diagnostician = Diagnostician(
-            spec, diagnosis, responses_from(options.responses), graded
-        )
-        completion = diagnosis.completion if diagnosis is not None and graded else None
-        self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
-        self._observer = Observer(monitor, facts.count, recalls)
         limits = limits_of(options.contact_limits, monitor, facts.task)
-        self._limits = EpisodeLimits(facts, limits, acts=name != "monitor" and facts.rest.size > 0)
+        acts = name != "monitor" and facts.rest.size > 0
+        self._limits = EpisodeLimits(facts, limits, acts)
+        self._bind(motion)
 
-        self._arrays = GuardArrays(
-            robots=self.table.records,
-            recent=self._validator.recent.arrays,
-            hand_geometry=self._validator.hands.geometry,
-            hand_state=self._validator.hands.state,
-            contact_columns=contact_columns(facts.felt_channels, spec),
-            motion=motion_arrays(motion, facts),
-            judged=np.zeros(facts.count, JUDGED),
-            dt=spec.dt,
-            most_impulse=float(self._arbiter.most_impulse),
-        )
-        self._bound = bind(self._arrays)
-        self._no_load = no_load(facts.count, facts.felt_size)
+        self.running = self._arbiter.running
+        self._warned: set[tuple[int, str]] = set()  # robots, and the part that failed
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._everyone = ~self._nobody
         self._all_active = True  # what the records say
         self._ends_step = False
-        self._marked = (
-            False  # there is something to say of the row: it failed, or is to be decided about
+        self._marked = False  # there is something to say of the row: it failed, or is to be decided
+        self._unreported: Mapping[int, str] = NOTHING  # what failed when the command was chosen
+
+    def _bind(self, motion: FeltMotion | None) -> None:
+        """Gather the arrays that compiled code works on."""
+        facts = self._facts
+        hands = self._validator.hands
+        self._no_load = no_load(facts.count, facts.felt_size)
+        self._arrays = GuardArrays(
+            robots=self.table.records,
+            recent=self._validator.recent.arrays,
+            hand_geometry=hands.geometry,
+            hand_state=hands.state,
+            contact_columns=contact_columns(facts.felt_channels, self._spec),
+            motion=motion_arrays(motion, facts),
+            judged=np.zeros(facts.count, JUDGED),
+            dt=self._spec.dt,
+            most_impulse=float(self._arbiter.most_impulse),
         )
-        self._unreported: Mapping[int, str] = (
-            NOTHING  # what failed when the command was chosen, by robot
-        )
+        self._bound = bind(self._arrays)
 
     # ------------------------------------------------------------------ what wrappers ask
 
@@ -250,10 +257,12 @@ class Guard:
         limits = self.limits[robot]
         within = np.where(np.isfinite(chunk), np.clip(chunk, facts.low, facts.high), chunk)
         slows = limits is not None and np.isfinite(limits.hand_speed) and facts.limits_contact
-        preview = preview_chunk(
-            within, row, last, self.fitted.monitor, facts.dt, limits if slows else None
-        )
-        return preview._replace(kept=chunk if self._name == "monitor" else chunk[: preview.at])
+        if not slows:
+            limits = None
+        preview = preview_chunk(within, row, last, self.fitted.monitor, facts.dt, limits)
+        if self._name == "monitor":
+            return preview._replace(kept=chunk)
+        return preview._replace(kept=chunk[: preview.at])
 
     def __str__(self) -> str:
         """Return the alarm terms, with how often each held, and the table of robots."""
@@ -269,10 +278,12 @@ class Guard:
             observe: returns the observation of a robot.
             idle: (n,) nothing is done, for an episode begins.
         """
-        reflexes = self._arbiter.response if self._graded else [self._name] * self._facts.count
-        command = self._commander.choose(
-            proposed, self._nobody if idle is None else idle, reflexes, observe
-        )
+        reflexes = self._arbiter.response
+        if not self._graded:
+            reflexes = [self._name] * self._facts.count
+        if idle is None:
+            idle = self._nobody
+        command = self._commander.choose(proposed, idle, reflexes, observe)
         self._unreported = command.failures
         return command
 
@@ -319,15 +330,20 @@ class Guard:
         rows = np.array(sensed.rows, np.float32)  # a copy, in which stale senses are left out
         self.table.rows = rows
         self.table.infos = sensed.infos
-        if active is not None or not self._all_active:
-            records["active"] = True if active is None else active
-            self._all_active = bool(records["active"].all())
+        if active is None:
+            active = self._everyone
+        if active is not self._everyone or not self._all_active:
+            records["active"] = active
+            self._all_active = bool(active.all())
         if ends_step != self._ends_step:
             records["ends_step"] = ends_step
             self._ends_step = ends_step
+        load = sensed.load
+        if load is None:
+            load = self._no_load
         row = Row(
             rows=rows,
-            load=self._no_load if sensed.load is None else sensed.load,
+            load=load,
             executed=executed,
             ends_step=ends_step,
             attribution=np.empty(rows.shape),
@@ -348,12 +364,15 @@ class Guard:
         row.unreported = {robot: why for robot, why in choosing.items() if not refused[robot]}
         self._unreported = NOTHING
         self._marked = True
-        stale = STALE if self.fitted.stale else ""
+        stale = ""
+        if self.fitted.stale:
+            stale = STALE
         for robot in np.flatnonzero(records["active"]).tolist():
-            commanding = choosing.get(robot, "") if refused[robot] else ""
-            failure = joined(commanding, sensing.get(robot, ""), stale)
-            if failure:
-                self._fail(row, robot, failure)
+            failures = [sensing.get(robot, ""), stale]
+            if refused[robot]:
+                failures.insert(0, choosing.get(robot, ""))
+            if any(failures):
+                self._fail(row, robot, joined(*failures))
 
     def _fail(self, row: Row, robot: int, failure: str) -> None:
         """Note that something failed in the row of a robot: its surprise is infinite."""
@@ -370,8 +389,7 @@ class Guard:
     def _judge_in_one_call(self, row: Row, memory: Any) -> int:
         """Judge rows by one compiled call; return how many robots there are to decide about, or ``STOPPED``."""
         start = time.perf_counter()
-        threads = ONE_THREAD if len(row.rows) > 1 else nullcontext()  # one row calls no BLAS
-        with threads:
+        with one_thread_for(len(row.rows)):
             to_decide = judge_rows(
                 self._bound, memory, row.rows, row.load, row.executed, row.attribution
             )
@@ -412,8 +430,9 @@ class Guard:
         """Mark the robots for which an alarm term of the user's own holds, or all where one fails."""
         failure = self.terms.ask_users(self.table)
         self.table.records["must_decide"] |= self.terms.any_of_user()
-        for robot in range(self._facts.count if failure else 0):
-            self._fail(row, robot, failure)
+        if failure:
+            for robot in range(self._facts.count):
+                self._fail(row, robot, failure)
 
     def _leave_out_repaired(self, row: Row) -> None:
         """Leave out of the surprise what is completed, or changes from what was."""
@@ -475,7 +494,9 @@ class Guard:
         if not evidence.alarm:
             return Outcome(response=response, decision=decision)
         robot.alarm = True
-        robot.event = KNOCKED if self._only_contact(evidence) else FAULTY
+        robot.event = FAULTY
+        if self._only_contact(evidence):
+            robot.event = KNOCKED
         return Outcome(evidence.terms, int(robot.event), response, decision)
 
     @staticmethod
@@ -524,7 +545,7 @@ class Guard:
             records = self.table.records
             policy = records["active"] & ~records["overridden"]
             pressed = policy & records["presses"]
-            self._limits.follow(policy if row.ends_step else pressed, pressed)
+            self._limits.follow(policy & (pressed | row.ends_step), pressed)
 
     def _report(self, row: Row) -> RowReport:
         """Return what became of the row; there is nothing to say of robots whose rows do not count."""

@@ -84,9 +84,9 @@ class Observer:
 
     def _spare(self) -> Any:
         """Return a state that may be written to; None where there is none."""
-        return (
-            None if self._before is self._initial or self._before is self._state else self._before
-        )
+        if self._before is self._initial or self._before is self._state:
+            return None
+        return self._before
 
     # ------------------------------------------------------------------ a row of any monitor
 
@@ -130,7 +130,9 @@ class Observer:
             return ""
         try:
             state = self._forgets.reset_evidence(self._state)
-            self._state = state if acted_on.all() else choose(acted_on, state, self._state)
+            if not acted_on.all():
+                state = choose(acted_on, state, self._state)
+            self._state = state
         except Exception as error:
             return f"monitor: {error!r}"
         return ""
@@ -152,8 +154,11 @@ class Observer:
                 f"got {value.shape} and {shares.shape}"
             )
         judged["surprise"] = value
-        judged["raw_surprise"] = value if surprise.raw is None else surprise.raw
-        judged["excuse"] = 0 if surprise.excuse is None else surprise.excuse
+        judged["raw_surprise"] = value
+        judged["excuse"] = 0
+        if surprise.raw is not None and surprise.excuse is not None:
+            judged["raw_surprise"] = surprise.raw
+            judged["excuse"] = surprise.excuse
         attribution[:] = shares
 
 

@@ -95,7 +95,9 @@ class GuardOptions:
         """
         chosen = self.on_alarm
         if chosen is None:
-            chosen = "graded" if names_causes else "hold"
+            chosen = "hold"
+            if names_causes:
+                chosen = "graded"
         if self.responses is not None and not (isinstance(chosen, str) and chosen == GRADED):
             raise ValueError(f"responses need on_alarm='graded', got on_alarm={short_repr(chosen)}")
         return chosen
@@ -117,4 +119,6 @@ class GuardOptions:
             free_after=rows_per_step * ReleaseRule.free_after,
             go_on=rows(None, GO_ON_S),
         )
-        return replace(rule, strikes=STRIKES, impulse=IMPULSE) if graded else rule
+        if graded:
+            return replace(rule, strikes=STRIKES, impulse=IMPULSE)
+        return rule

@@ -152,7 +152,7 @@ def asm_info(
         "response": response.name,
         "case": response.case,
         "severity": {
-            name: None if value != value else value for name, value in severity_info(now).items()
+            name: value if value == value else None for name, value in severity_info(now).items()
         },
         "executed_action": deepcopy(executed),
         "attribution": dict(

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from contextlib import nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.blas import ONE_THREAD
+from asm_gym.blas import one_thread_for
 from asm_gym.compilation import Bound, bind, compiled, inner, must_compile
 from asm_gym.detection.alarm_rule import JUDGED
 from asm_gym.detection.base import ModelOutput
@@ -152,7 +151,7 @@ class RowKernel:
             out = uninitialised(state._replace(values=()))
         judged = np.empty(len(rows), JUDGED)
         attribution = np.empty(rows.shape)
-        with ONE_THREAD if len(rows) > 1 else nullcontext():  # one row calls no BLAS
+        with one_thread_for(len(rows)):
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
         surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
