@@ -35,14 +35,14 @@ def robots_for(task: TaskSpec, robot: str | Sequence[str] | None) -> tuple[str, 
     Raises:
         ValueError: an unknown name, or the wrong number of names.
     """
-    if robot is None or robot == "":
+    if robot is None:
         robot = PANDA.name
     if not isinstance(robot, Sequence):
         raise ValueError(f"robot must be a name or a sequence of names, got {short_repr(robot)}")
 
     names = tuple(robot)
     if isinstance(robot, str):
-        names = (robot,) * task.arms
+        names = (robot or PANDA.name,) * task.arms
     for name in names:
         robot_named(name)
     if len(names) != task.arms:
