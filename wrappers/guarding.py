@@ -87,9 +87,11 @@ class Guarding:
         """Its name among all guards around one environment."""
         return uuid4().hex
 
-    def _watch_with(self, monitor: Monitor) -> None:
-        """Use a monitor, and make all that depends on it."""
+    def _watch_with(self, monitor: Monitor | None) -> None:
+        """Use a monitor, by default the shipped memory of the robot, and make all that depends on it."""
         options = self._options
+        if monitor is None:
+            monitor = body_memory(self.env, self._spec)
         refuse_counts(self.env, type(self).__name__, options.on_alarm)
         check_answer(monitor)
         self._check(monitor)
@@ -130,6 +132,13 @@ class Guarding:
                 "the monitor was changed, fitted or calibrated since: it is taken over as it is now"
             )
             self._watch_with(self._next_monitor)
+
+    def _following(self) -> dict[str, float]:
+        """Return what ``info["asm"]`` says of a threshold that follows the policy; nothing where none does."""
+        running = self.guard.running
+        if running is None:
+            return {}
+        return {"ceiling": running.ceiling, "level": running.level}
 
     @property
     def latency(self) -> float:

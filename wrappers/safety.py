@@ -14,12 +14,11 @@ from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
 from asm_gym.guard.preview import Preview, checked_chunk
 from asm_gym.guard.report import AsmInfo, LazyInfo, RowReport, asm_info
-from asm_gym.guard.robot_facts import NOTHING
 from asm_gym.monitors import Monitor
 from asm_gym.policies.hold import HoldsItself, why_changed
 from asm_gym.stream_source import StreamSource, stepped
 from asm_gym.validation import as_float32, short_repr
-from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, load_felt, sensed_row
+from asm_gym.wrappers.guarding import Guarding, as_action, load_felt, sensed_row
 
 Floats32 = NDArray[np.float32]
 StepResult = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
@@ -96,7 +95,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             self, _disable_deepcopy=True, **recorded
         )  # reflexes and memories are large
         gym.Wrapper.__init__(self, env)
-        self._box = env.action_space if isinstance(env.action_space, gym.spaces.Box) else None
+        self._box: gym.spaces.Box | None = None  # of actions; None where a guard cannot act in it
+        if isinstance(env.action_space, gym.spaces.Box):
+            self._box = env.action_space
         on_alarm = self._options.on_alarm
         if self._box is None and not (
             isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")
@@ -112,7 +113,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         changed = why_changed(env, "a reflex within a step")
         if self._rows_per_step > 1 and changed:
             raise ValueError(changed)
-        self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
+        self._watch_with(monitor)
         self._inner: Any = env.unwrapped
         self._holds_itself = isinstance(self._inner, HoldsItself)
         self._ended = True
@@ -161,7 +162,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         row = self._row
         if row is None:
             row = self._source.first(self._observation, self._first_info)
-        last = self._executed.ravel() if self._executed.size else self._facts.rest
+        last = self._facts.rest
+        if self._executed.size:
+            last = self._executed.ravel()
         preview = self.guard.preview(0, chunk.reshape(len(chunk), -1), row, last)
         self._preview = preview._replace(kept=chunk[: len(preview.kept)])
         self._previewed = len(chunk)
@@ -201,12 +204,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         row, failure = sensed_row(
             lambda: self._source.row(observation, self._executed, info), self._spec.size
         )
-        return SensedRows(
-            rows=row[None],
-            load=load_felt(self._facts, info),
-            failures={0: failure} if failure else NOTHING,
-            infos=info,
-        )
+        sensed = SensedRows(rows=row[None], load=load_felt(self._facts, info), infos=info)
+        if failure:
+            return sensed._replace(failures={0: failure})
+        return sensed
 
     def send_command(self, command: Command) -> bool:
         """Take up what is to be done; return whether it is something else than the policy's action."""
@@ -245,7 +246,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     def _executed_row(self) -> Floats32:
         """Return (1, A) the action that is executed; (1, 0) where actions are no numbers."""
-        return np.zeros((1, 0), np.float32) if self._box is None else self._executed.reshape(1, -1)
+        if self._box is None:
+            return np.zeros((1, 0), np.float32)
+        return self._executed.reshape(1, -1)
 
     def _command(self) -> bool:
         """Choose what is done in place of the action so far; return whether that is something else."""
@@ -259,7 +262,9 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         Rows within the step are judged meanwhile, and a hold lasts through all its parts; one that a guard outside has
         asked for goes on.
         """
-        hooks: Any = self.env.get_wrapper_attr("row_hooks") if self._rows_per_step > 1 else []
+        hooks: list[Any] = []
+        if self._rows_per_step > 1:
+            hooks = self.env.get_wrapper_attr("row_hooks")
         hooks.append(self._judge_within_step)
         inner = self._inner
         keeps_holding = self._holds_itself and inner.keeps_holding
@@ -307,22 +312,18 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
         facts = self._facts
         spec = self._spec
-        commanded = (
-            None if self._row is None else self._executed
-        )  # nothing was done before the first step
+        commanded: Any = None  # nothing was done before the first step
+        if self._row is not None:
+            commanded = self._executed
         rows = self.guard.table.rows
-        step: dict[str, Any] = {"alarms": self._alarms, "preview": self._count_down()}
-        if self.guard.running is not None:
-            step["ceiling"] = self.guard.running.ceiling
-            step["level"] = self.guard.running.level
+        step = {"alarms": self._alarms, "preview": self._count_down(), **self._following()}
 
         def describe() -> AsmInfo:
             executed = commanded
             slowed = 0.0
             if commanded is not None and self._box is not None:
-                executed = facts.executed_in(rows, commanded.reshape(1, -1))[0].reshape(
-                    commanded.shape
-                )
+                flat = commanded.reshape(1, -1)
+                executed = facts.executed_in(rows, flat).reshape(commanded.shape)
                 slowed = facts.slowed(commanded.ravel(), executed.ravel())
             return asm_info(reports, 0, spec, executed, slowed=slowed, **step)
 
@@ -332,9 +333,13 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         """Return what ``info`` says of the chunk that was previewed, an action of which is done; None without one."""
         if not self._previewed:
             return None
-        at = None if self._preview.at is None else self._preview.at - 1
+        at = self._preview.at
+        if at is not None:
+            at -= 1
         self._preview = self._preview._replace(at=at)
-        self._previewed = 0 if at == -1 else self._previewed - 1
+        self._previewed -= 1
+        if at == -1:
+            self._previewed = 0
         if not self._previewed:
             return None
         return {"at": at, "reason": self._preview.reason, "known": self._preview.known}

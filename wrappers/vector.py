@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import partial
 from typing import Any
 
@@ -21,7 +22,7 @@ from asm_gym.spec import StreamSpec, control_period
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
 from asm_gym.wrappers.env_attributes import EnvAttributes, askable
-from asm_gym.wrappers.guarding import Guarding, as_action, body_memory, load_felt, sensed_row
+from asm_gym.wrappers.guarding import Guarding, as_action, load_felt, sensed_row
 
 Floats32 = NDArray[np.float32]
 
@@ -72,8 +73,11 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._resets_itself = mode == AutoresetMode.NEXT_STEP
         self._members = askable(env)
         self._has_stream = all(self._members.call("has_wrapper_attr", "stream_spec"))
-        self._spec = self._stream_spec() if self._has_stream else self._spec_of_spaces()
-        self._watch_with(body_memory(env, self._spec) if monitor is None else monitor)
+        if self._has_stream:
+            self._spec = self._stream_spec()
+        else:
+            self._spec = self._spec_of_spaces()
+        self._watch_with(monitor)
         self._holding = False  # members were told to hold in the last step
         if self._facts.brakes:
             # Who is held is held in all steps that wrappers in between make of one.
@@ -113,7 +117,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
 
     def confirm_alarm(self, which: Mask | None = None) -> None:
         """Confirm the alarms of the environments ``which`` (n,), by default of all; see ``NeuralASMSafety``."""
-        self.guard.confirm(np.ones(self.num_envs, bool) if which is None else which)
+        if which is None:
+            which = np.ones(self.num_envs, bool)
+        self.guard.confirm(which)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -122,12 +128,12 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         ended = self._ended
         self._ended = None  # until it has worked
         # A copy: vector environments take the mask out of the options they are given.
-        self._observations, infos = self.env.reset(
-            seed=seed, options=dict(options) if options else options
-        )
+        self._observations, infos = self.env.reset(seed=seed, options=copy(options))
         if ended is None and not begun.all():
             raise gym.error.ResetNeeded("the first reset() must reset all environments")
-        self._ended = np.zeros(self.num_envs, bool) if ended is None else ended
+        if ended is None:
+            ended = np.zeros(self.num_envs, bool)
+        self._ended = ended
         if begun.all():
             self._watch_with_next()
         infos = dict(infos)
@@ -285,9 +291,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         commanded = self._commanded.copy()
         executed = self._executed.copy()
         step: dict[str, Any] = {"alarms": self._alarms.copy()}
-        if self.guard.running is not None:
-            step["ceiling"] = np.full(self.num_envs, self.guard.running.ceiling)
-            step["level"] = np.full(self.num_envs, self.guard.running.level)
+        for name, value in self._following().items():
+            step[name] = np.full(self.num_envs, value)
 
         def describe() -> dict[str, Any]:
             slowed = [facts.slowed(*pair) for pair in zip(commanded, executed, strict=True)]
@@ -311,13 +316,22 @@ def _with(batch: Any, i: int, value: Any) -> Any:
 def _replaced(infos: dict[str, Any], by: dict[str, Any], mask: Mask) -> dict[str, Any]:
     """Return infos in which the environments of ``mask`` (n,) have what ``by`` says of them, and nothing else."""
     merged: dict[str, Any] = {}
-    for key in infos.keys() | by.keys():
-        old, new = infos.get(key), by.get(key)
+    for name in infos.keys() | by.keys():
+        old: Any = infos.get(name)
+        new: Any = by.get(name)
         if isinstance(old, dict) or isinstance(new, dict):
-            merged[key] = _replaced(old or {}, new or {}, mask)
+            merged[name] = _replaced(old or {}, new or {}, mask)
             continue
-        like: Any = new if old is None else old
-        blank = np.full(like.shape, None, object) if like.dtype == object else np.zeros_like(like)
-        old, new = (blank if part is None else part for part in (old, new))
-        merged[key] = np.where(mask.reshape(-1, *[1] * (like.ndim - 1)), new, old)
+        if old is None:
+            old = _blank(new)
+        if new is None:
+            new = _blank(old)
+        merged[name] = np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     return merged
+
+
+def _blank(values: NDArray[Any]) -> NDArray[Any]:
+    """Return an array like ``values`` that says nothing."""
+    if values.dtype == object:
+        return np.full(values.shape, None, object)
+    return np.zeros_like(values)
