@@ -50,7 +50,7 @@ from asm_gym.guard.robot_table import (
 )
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator, ValidatedRows
-from asm_gym.monitors import ExpectsActions, Monitor, Surprise
+from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
 
 FAULTY = EVENTS.index(FAULT)
@@ -127,10 +127,6 @@ class Guard:
             rule = options.rule(self._graded, facts.dt, rows_per_step)
             if not policies:
                 motion = FeltMotion.of(facts, spec, name)
-        recalls = name == "recall"
-        if recalls and not (isinstance(monitor, ExpectsActions) and spec.motor.size):
-            kind = type(monitor).__name__
-            raise ValueError(f"recall needs a memory that predicts actions, and {kind} does not")
         completion = None
         if diagnosis is not None and self._graded:
             completion = diagnosis.completion
@@ -139,7 +135,7 @@ class Guard:
         self._arbiter = Arbiter(self.table, rule, options.adaptive_threshold)
         self._diagnostician = Diagnostician(spec, diagnosis, table, self._graded)
         self._validator = RowValidator(facts, self.table, completion, self._diagnostician.rows)
-        self._observer = Observer(monitor, facts.count, recalls)
+        self._observer = Observer(monitor, facts.count, recalls=name == "recall")
         self._commander = Commander(
             facts=facts,
             table=self.table,

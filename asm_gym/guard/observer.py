@@ -28,6 +28,9 @@ class Observer:
     Attributes:
         latency: how long the monitor took for the last rows [s].
         expected: (n, A) what is likely to be commanded next; None where nobody asks.
+
+    Raises:
+        ValueError: ``recalls`` with a monitor that expects no action.
     """
 
     def __init__(self, monitor: Monitor, count: int, recalls: bool) -> None:
@@ -36,7 +39,14 @@ class Observer:
         self._size = monitor.spec.size
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
-        self._expects = monitor if isinstance(monitor, ExpectsActions) and recalls else None
+        self._expects: ExpectsActions | None = None
+        if recalls:
+            if not isinstance(monitor, ExpectsActions) or not monitor.spec.motor.size:
+                kind = type(monitor).__name__
+                raise ValueError(
+                    f"recall needs a memory that predicts actions, and {kind} does not"
+                )
+            self._expects = monitor
         self._neural = monitor if isinstance(monitor, NeuralASM) else None
         self._steps: list[_CompiledStep] = []  # the last two, which take turns
         self.latency = 0.0
