@@ -146,8 +146,7 @@ class Guard:
             commands=getattr(monitor, "commands_", None),
         )
         limits = limits_of(options.contact_limits, monitor, facts.task)
-        acts = name != "monitor" and facts.rest.size > 0
-        self._limits = EpisodeLimits(facts, limits, acts)
+        self._limits = EpisodeLimits(facts, limits, acts=name != "monitor" and facts.rest.size > 0)
         self._bind(motion)
 
         self.running = self._arbiter.running
