@@ -1,5 +1,7 @@
 """Limits on what an arm may feel and how fast its hand may go: on the arm, side by side, and learned."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,8 +10,10 @@ from asm_gym import Episode, collect
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
 from asm_gym.detection.hand_speed_map import MOMENTUM, HandSpeedMap
+from asm_gym.envs.robots import ROBOTS, robot_named
 from asm_gym.envs.speed_limit import BESIDE
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import NeuralASM, make_monitor
 from asm_gym.monitors.registry import load_monitor
 from asm_gym.policies import make_policy
@@ -162,8 +166,17 @@ def test_a_memory_knows_what_its_calibration_felt_like_and_a_guard_takes_it(tmp_
     loaded = load_monitor(tmp_path / "limit.asm")
     assert loaded.healthy_ == monitor.healthy_
     np.testing.assert_equal(loaded.pace_, monitor.pace_)
-    assert limits_of("memory", loaded).pace is not None
-    assert limits_of("memory", NeuralASM.pretrained("panda")).hand_speed == 0.15
+    facts = RobotFacts.unknown(monitor.spec)
+    assert limits_of("memory", loaded, facts).pace is not None
+    assert limits_of("memory", NeuralASM.pretrained("panda"), facts).hand_speed == 0.15
+
+
+def test_a_guard_takes_the_limits_of_its_arm(lift, monkeypatch):
+    gentle = replace(robot_named("Panda"), contact_limits=ContactLimits(wrist_force=30.0))
+    monkeypatch.setitem(ROBOTS, "Panda", gentle)
+    env = NeuralASMSafety(lift, NeuralASM.pretrained("panda"))
+    env.reset(seed=0)
+    assert env.unwrapped.contact_limits.wrist_force == 30.0
 
 
 @pytest.mark.parametrize("controller", ["OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "IK_POSE"])

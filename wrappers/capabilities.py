@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeaning, ActionMeans
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.kinematics import Chain
 from asm_gym.guard.robot_facts import RobotFacts, TurningAction
 from asm_gym.policies.hold import Staying, gripper_columns, nearest_to_zero, staying, why_changed
@@ -70,6 +71,7 @@ def robots_of(
         task=task_name(attributes),
         chains=hand_chains(attributes),
         felt_channels=felt_channels(attributes),
+        contact_limits=usual_contact_limits(attributes),
         limits_contact=limits_contact(attributes),
         observed=observed,
         turning_action=turning_action(attributes),
@@ -188,6 +190,11 @@ def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
 def felt_channels(attributes: EnvAttributes) -> tuple[Channel, ...]:
     """Return what the arms feel in physics substeps: ``felt_channels``; nothing without it."""
     return attributes.first("felt_channels", ())
+
+
+def usual_contact_limits(attributes: EnvAttributes) -> ContactLimits:
+    """Return the contact limits of the arms: ``usual_contact_limits``; the defaults without it."""
+    return attributes.first("usual_contact_limits") or ContactLimits()
 
 
 def limits_contact(attributes: EnvAttributes) -> bool:

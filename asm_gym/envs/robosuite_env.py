@@ -9,11 +9,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.arms import PHYSICS_FREQ, chains_of
 from asm_gym.envs.rendering import OffscreenRenderer
-from asm_gym.envs.robots import mend_robots, robots_for
+from asm_gym.envs.robots import mend_robots, robot_named, robots_for
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
@@ -186,6 +187,14 @@ class RobosuiteEnv(SteppedEnv):
         # the observation's parts in order, and how many numbers each has
         self.observation_layout = self._senses.sizes
         self.observation_space = self.laid_out_space = self._senses.space()
+
+    @property
+    def usual_contact_limits(self) -> ContactLimits:
+        """The strictest contact limits of the arms, by ``asm_gym.envs.robots``."""
+        first, *others = (robot_named(name).contact_limits for name in self.robots)
+        for limits in others:
+            first = first.and_those_of(limits, self.felt_channels)
+        return first
 
     @property
     def stream_freq(self) -> int:

@@ -67,12 +67,13 @@ class EpisodeLimits:
 
 
 def limits_of(
-    contact_limits: ContactLimits | str | None, monitor: Monitor, task: str = ""
+    contact_limits: ContactLimits | str | None, monitor: Monitor, facts: RobotFacts
 ) -> ContactLimits | None:
-    """Return the limits themselves, or those that the monitor's healthy range makes of the usual ones in a task."""
+    """Return the limits themselves, or those that the monitor's healthy range makes of the arms' usual ones."""
     if contact_limits is None or isinstance(contact_limits, ContactLimits):
         return contact_limits
-    return ContactLimits(
+    return replace(
+        facts.contact_limits,
         healthy=getattr(monitor, "healthy_", ()),
-        pace=HandSpeedMap.of(getattr(monitor, "pace_", {}), task),
+        pace=HandSpeedMap.of(getattr(monitor, "pace_", {}), facts.task),
     )

@@ -145,7 +145,7 @@ class Guard:
             warn=self._warn,
             commands=getattr(monitor, "commands_", None),
         )
-        limits = limits_of(options.contact_limits, monitor, facts.task)
+        limits = limits_of(options.contact_limits, monitor, facts)
         self._limits = EpisodeLimits(facts, limits, acts=name != "monitor" and facts.rest.size > 0)
         self._bind(motion)
 

@@ -5,6 +5,6 @@ The fingers of robosuite's model are too weak to lift what they hold, so no memo
 
 from __future__ import annotations
 
-from asm_gym.envs.robots.robot_model import RobotModel
+from asm_gym.envs.robots.robot_model import PERSON_AND_TABLE, RobotModel
 
-JACO = RobotModel(name="Jaco")
+JACO = RobotModel(name="Jaco", contact_limits=PERSON_AND_TABLE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from asm_gym.envs.robots.robot_model import RobotModel
+from asm_gym.envs.robots.robot_model import PERSON_AND_TABLE, RobotModel
 
 
 def free_first_joint(model: Any, prefix: str) -> None:
@@ -20,6 +20,7 @@ def free_first_joint(model: Any, prefix: str) -> None:
 
 SAWYER = RobotModel(
     name="Sawyer",
+    contact_limits=PERSON_AND_TABLE,
     has_inverse_kinematics=True,
     mend=free_first_joint,
 )
