@@ -61,7 +61,7 @@ class RobotFacts:
     task: str = ""  # name of the task; empty where unknown
     chains: tuple[tuple[Chain, ...], ...] = ()  # kinematics of each arm, in each of n robots
     felt_channels: tuple[Channel, ...] = ()  # felt in physics substeps; empty where nothing is
-    contact_limits: ContactLimits = ContactLimits()  # of these arms, by their maker or their model
+    contact_limits: ContactLimits = field(default_factory=ContactLimits)  # of these arms
     limits_contact: bool = False  # each substep compares what is felt with contact limits
     observed: NDArray[np.bool_] | None = None  # (D,) columns in the observation; None: unknown
     turning_action: TurningAction | None = None  # None where no action turns the joints
