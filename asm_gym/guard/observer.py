@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import Bound
 from asm_gym.guard.robot_table import Mask
 from asm_gym.monitors import ExpectsActions, ForgetsEvidence, Monitor, NeuralASM, Surprise
-from asm_gym.monitors.row_kernel import RowKernel, uninitialised
+from asm_gym.monitors.row_kernel import RowKernel, unwritten
 
 Floats32 = NDArray[np.float32]
 
@@ -80,7 +80,7 @@ class Observer:
                 return step.bound
         new = self._spare()
         if new is None:
-            new = uninitialised(self._state)
+            new = unwritten(self._state)
         step = _CompiledStep(kernel, self._state, new)
         self._steps = [*self._steps[-1:], step]
         return step.bound

@@ -40,7 +40,7 @@ from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.calibrated_monitor import MonitorState
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 
-__all__ = ["JUDGED", "RowKernel", "expected_errors", "observe_rows", "row_weights", "uninitialised"]
+__all__ = ["JUDGED", "RowKernel", "expected_errors", "observe_rows", "row_weights", "unwritten"]
 
 
 class RowWeights(NamedTuple):
@@ -148,16 +148,18 @@ class RowKernel:
         The new state is written to ``out``, where that is given, a state of as many streams.
         """
         if out is None:
-            out = uninitialised(state._replace(values=()))
+            out = unwritten(state)
         judged = np.empty(len(rows), JUDGED)
         attribution = np.empty(rows.shape)
         with one_thread_for(len(rows)):
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
-        surprise = Surprise(value=judged["surprise"].copy(), attribution=attribution)
+        raw = None
+        excuse = None
         if self._excuses:
             raw = judged["raw_surprise"].copy()
-            surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
+            excuse = judged["excuse"].copy()
+        surprise = Surprise(judged["surprise"].copy(), attribution, raw=raw, excuse=excuse)
         return out, surprise, judged["divisor"].copy()
 
 
@@ -212,6 +214,13 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
     Numba takes longer to look through nested named tuples that Python hands over than through arrays.
     """
     return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
+
+
+def unwritten(state: MonitorState) -> MonitorState:
+    """Return a state of as many streams, whose arrays are yet to be written."""
+    arrays = [np.empty(array.shape, array.dtype) for array in arrays_of(state)]
+    make: Any = state_of
+    return make.py_func(arrays)  # as Python runs it
 
 
 def uninitialised(state: Any) -> Any:
