@@ -374,7 +374,7 @@ def update_mean(
     seen.distance = np.sqrt(squared(seen.mean))
 
 
-@inner
+@compiled
 def residual(
     angles: Any,
     row: Any,
@@ -399,20 +399,19 @@ def squared(z: Any) -> float:
     return total
 
 
-@compiled
 def fit_angles(
     hand: Any,
-    angles: Any,
-    row: Any,
-    weights: Any,
-    free: Any,
-    error: Any,
-) -> Any:
+    angles: Floats,
+    row: Floats,
+    weights: Floats,
+    free: Mask,
+    error: Floats,
+) -> tuple[Floats, float]:
     """Return angles (J,), those that are ``free`` (J,) by Gauss and Newton's method, and |z|² of what is left.
 
     Args:
         hand: a record of ``HAND_GEOMETRY``.
-        angles: (J,) to begin with.
+        angles: (J,) to begin with; written to.
         row: its angles, speeds and hand.
         weights: (9,) 1/σ of the hand's numbers, 0 for those that do not count.
         free: (J,) the angles to fit.
@@ -421,14 +420,17 @@ def fit_angles(
     which = np.flatnonzero(free)
     trust = 1.0 / error[which] ** 2
     slopes = np.empty((len(which), HAND))
-    for _ in range(ITERATIONS if len(which) else 0):
-        z = residual(angles, row, weights, hand)
-        for i in range(len(which)):
+    z = residual(angles, row, weights, hand)
+    for _ in range(ITERATIONS):
+        for i, joint in enumerate(which):
             turned = angles.copy()
-            turned[which[i]] += DIFFERENCE
+            turned[joint] += DIFFERENCE
             slopes[i] = (z - residual(turned, row, weights, hand)) / DIFFERENCE
         H = slopes @ slopes.T + np.diag(1.0 + trust)
         b = slopes @ z + trust * (row[which] - angles[which])
-        step = np.linalg.solve(H, b)
-        angles[which] += np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-    return angles, squared(residual(angles, row, weights, hand))
+        step = np.clip(np.linalg.solve(H, b), -LONGEST_STEP, LONGEST_STEP)
+        angles[which] += step
+        z = residual(angles, row, weights, hand)
+        if np.abs(step).max(initial=0.0) < DIFFERENCE:
+            break
+    return angles, float(z @ z)
