@@ -133,7 +133,8 @@ def read_asked(
 ) -> None:
     """Write the twist that the action asks of arm ``a``'s hand."""
     twist = motions.twists[ASKED]
-    twist[:] = 0.0
+    for axis in range(6):
+        twist[axis] = 0.0
     for i in range(arms.inputs[a]):
         number = arms.first[a] + i
         speed = arms.speeds[a, i] * (action[number] - rest[number])
@@ -147,7 +148,8 @@ def read_asked(
 def read_present(views: Views, arms: Arms, a: int, motions: Motions) -> None:
     """Write the twist that arm ``a``'s hand has now."""
     twist = motions.twists[PRESENT]
-    twist[:] = 0.0
+    for axis in range(6):
+        twist[axis] = 0.0
     for i in range(arms.joints[a]):
         dof = arms.dofs[a, i]
         add_joint(motions.jacobian, dof, views.qvel[dof], twist)

@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.detection.hand_speed import Floats
-from asm_gym.guard.hand_check import squared
 from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.guard.robot_table import MOST_WRISTS
 from asm_gym.spec import Channel, StreamSpec
@@ -43,19 +41,8 @@ BLOW = 2900.0
 
 FASTEST_HEALTHY = 0.35  # no healthy hand is faster [m/s]
 
+Floats = NDArray[np.float64]
 Columns = NDArray[np.intp]
-
-
-SEVERITY = {
-    "load": "load",
-    "presses": "presses",
-    "force": "contact_force",
-    "impulse": "pressed_impulse",
-    "speed": "hand_speed",
-    "held": "held",
-    "left_s": "limit_passed_s",
-}
-"""What ``info["asm"]["severity"]`` says, and the field of a robot's record that holds it."""
 
 
 class ContactColumns(NamedTuple):
@@ -68,10 +55,7 @@ class ContactColumns(NamedTuple):
     hands: Columns  # (H, 3) velocities of hands, of rows alone
 
 
-def contact_columns(
-    felt: Sequence[Channel],
-    spec: StreamSpec,
-) -> ContactColumns:
+def contact_columns(felt: Sequence[Channel], spec: StreamSpec) -> ContactColumns:
     """Return the columns of the channels that arms feel within steps, and of their streams.
 
     Raises:
@@ -93,10 +77,7 @@ def contact_columns(
     )
 
 
-def no_load(
-    count: int,
-    size: int,
-) -> Floats:
+def no_load(count: int, size: int) -> Floats:
     """Return the load (n, 2 + F) of arms that feel nothing within a step.
 
     A load is the largest share of a contact limit in the physics substeps, when in the step a limit was passed [s], and
@@ -107,20 +88,22 @@ def no_load(
 
 def severity_info(robot: Any) -> dict[str, Any]:
     """Return what ``info["asm"]["severity"]`` says of a robot, by its record."""
-    severity = {name: robot[field].item() for name, field in SEVERITY.items()}
-    # Of the blow if the hand met something stiff now [N].
-    severity["predicted_force"] = BLOW * severity["speed"]
-    return severity
+    speed = float(robot["hand_speed"])
+    return {
+        "load": float(robot["load"]),
+        "presses": bool(robot["presses"]),
+        "force": float(robot["contact_force"]),
+        "impulse": float(robot["pressed_impulse"]),
+        "speed": speed,
+        "predicted_force": BLOW * speed,  # of the blow if the hand met something stiff now [N]
+        "held": bool(robot["held"]),
+        "left_s": float(robot["limit_passed_s"]),
+    }
 
 
 @compiled
 def measure_contacts(
-    robots: Any,
-    rows: Any,
-    load: Any,
-    columns: Any,
-    dt: float,
-    most_impulse: float,
+    robots: Any, rows: Any, load: Any, columns: Any, dt: float, most_impulse: float
 ) -> None:
     """Write the contact state of robots (n,) by their rows (n, D) and loads (n, 2 + F).
 
@@ -130,29 +113,32 @@ def measure_contacts(
         most_impulse: that an arm may press with in an episode [N s].
     """
     for n in range(len(robots)):
-        robot = robots[n]
-        robot.load = load[n, 0]
-        robot.limit_passed_s = load[n, 1]
-        robot.contact_force = contact_force(robot, rows[n], load[n, 2:], columns, WEIGHED_S / dt)
-        robot.hand_speed = fastest_hand(rows[n], columns.hands)
-
-        excess = 0.0
-        if np.isfinite(robot.contact_force):
-            excess = max(robot.contact_force - FREE_FORCE, 0.0)
-        robot.pressed_impulse += excess * dt
-        lean(robot, excess, dt)
-
-        leans = robot.leaning_time > LEANS_S / (1.0 + SOONER * robot.strikes)
-        passed = robot.load > 1.0 or np.isfinite(robot.limit_passed_s)
-        robot.presses = passed or leans or robot.pressed_impulse > most_impulse
+        measure_contact(robots[n], rows[n], load[n], columns, dt, most_impulse)
 
 
 @inner
-def lean(
-    robot: Any,
-    excess: float,
-    dt: float,
+def measure_contact(
+    robot: Any, row: Any, load: Any, columns: Any, dt: float, most_impulse: float
 ) -> None:
+    """Write the contact state of one robot."""
+    robot.load = load[0]
+    robot.limit_passed_s = load[1]
+    robot.contact_force = contact_force(robot, row, load[2:], columns, WEIGHED_S / dt)
+    robot.hand_speed = fastest_hand(row, columns.hands)
+
+    excess = 0.0
+    if np.isfinite(robot.contact_force):
+        excess = max(robot.contact_force - FREE_FORCE, 0.0)
+    robot.pressed_impulse += excess * dt
+    lean(robot, excess, dt)
+
+    leans = robot.leaning_time > LEANS_S / (1.0 + SOONER * robot.strikes)
+    passed = robot.load > 1.0 or np.isfinite(robot.limit_passed_s)
+    robot.presses = passed or leans or robot.pressed_impulse > most_impulse
+
+
+@inner
+def lean(robot: Any, excess: float, dt: float) -> None:
     """Take a force ``excess`` [N] beyond the free one into the time that the arm has leant on something."""
     time = -dt
     if excess > 0.0:
@@ -163,13 +149,7 @@ def lean(
 
 
 @inner
-def contact_force(
-    robot: Any,
-    row: Any,
-    felt: Any,
-    columns: Any,
-    steps: float,
-) -> float:
+def contact_force(robot: Any, row: Any, felt: Any, columns: Any, steps: float) -> float:
     """Return the contact force on an arm [N]; not a number where nothing says.
 
     What the arm feels itself is not what a faulty sensor says of it; where it feels nothing, the row says.
@@ -183,54 +163,54 @@ def contact_force(
 
 
 @inner
-def wrist_force(
-    numbers: Any,
-    wrists: Any,
-    weighed: Any,
-    steps: float,
-) -> float:
+def wrist_force(numbers: Any, wrists: Any, weighed: Any, steps: float) -> float:
     """Return the largest force at wrists (W, 3) less the weight of their hands [N]; NaN where one is, or without any.
 
     Args:
         weighed: records of ``WEIGHED_WRIST``, which move on.
         steps: over which the weight is averaged.
     """
-    forces = np.empty(len(wrists))
+    if len(wrists) == 0:
+        return np.nan
+    largest = 0.0
     for w in range(len(wrists)):
-        force = numbers[wrists[w]].astype(np.float64)
+        x = float(numbers[wrists[w, 0]])
+        y = float(numbers[wrists[w, 1]])
+        z = float(numbers[wrists[w, 2]])
         weight = weighed[w].force
-        if squared(force) < HEAVIEST * HEAVIEST:
+        if x * x + y * y + z * z < HEAVIEST * HEAVIEST:
             weighed[w].steps = min(weighed[w].steps + 1.0, steps)
-            weight[:] += (force - weight) / weighed[w].steps
-        forces[w] = np.sqrt(squared(force - weight))
-    return largest(forces)
+            weight[0] += (x - weight[0]) / weighed[w].steps
+            weight[1] += (y - weight[1]) / weighed[w].steps
+            weight[2] += (z - weight[2]) / weighed[w].steps
+        largest = np.maximum(largest, norm(x - weight[0], y - weight[1], z - weight[2]))
+    return largest
 
 
 @inner
-def joint_force(
-    numbers: Any,
-    torques: Any,
-) -> float:
+def joint_force(numbers: Any, torques: Any) -> float:
     """Return the largest external torque over its lever [N]; NaN where one is, or without any."""
-    return largest(np.abs(numbers[torques])) / LEVER
+    if len(torques) == 0:
+        return np.nan
+    largest = 0.0
+    for column in torques:
+        largest = np.maximum(largest, abs(float(numbers[column])))
+    return largest / LEVER
 
 
 @inner
-def fastest_hand(
-    row: Any,
-    hands: Any,
-) -> float:
+def fastest_hand(row: Any, hands: Any) -> float:
     """Return the speed of the fastest hand (H, 3) [m/s]; NaN where one is, or without any."""
-    speeds = np.empty(len(hands))
+    if len(hands) == 0:
+        return np.nan
+    largest = 0.0
     for h in range(len(hands)):
-        speeds[h] = np.sqrt(squared(row[hands[h]].astype(np.float64)))
-    return largest(speeds)
+        speed = norm(float(row[hands[h, 0]]), float(row[hands[h, 1]]), float(row[hands[h, 2]]))
+        largest = np.maximum(largest, speed)
+    return largest
 
 
 @inner
-def largest(numbers: Any) -> float:
-    """Return the largest of numbers that are not negative; NaN where one is, or without any."""
-    most = 0.0
-    for number in numbers:
-        most = np.maximum(most, float(number))
-    return most if len(numbers) else np.nan
+def norm(x: float, y: float, z: float) -> float:
+    """Return the length of a vector."""
+    return np.sqrt(x * x + y * y + z * z)

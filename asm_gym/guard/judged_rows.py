@@ -65,7 +65,11 @@ def judge_rows(
     robots = arrays.robots
     if validate_rows(robots, rows, arrays.recent, arrays.hand_geometry, arrays.hand_state):
         return STOPPED
-    observe_rows(memory, rows.astype(np.float64), arrays.judged, attribution)
+    exact = np.empty(rows.shape)
+    for n in range(len(rows)):
+        for i in range(rows.shape[1]):
+            exact[n, i] = rows[n, i]
+    observe_rows(memory, exact, arrays.judged, attribution)
     measure_contacts(robots, rows, load, arrays.contact_columns, arrays.dt, arrays.most_impulse)
     to_decide = apply_alarm_rule(robots, arrays.judged, attribution)
     record_motion(robots, rows, executed, arrays.motion)
@@ -123,11 +127,12 @@ def take_up_surprise(robot: Any, judged: Any, attribution: Any) -> None:
     if robot.failed or not judged.surprise > -np.inf or not np.isfinite(counted):  # NaN too
         robot.failed = True
         robot.surprise = np.inf
-        attribution[:] = 0.0
     if not robot.active:
         robot.surprise = 0.0
         robot.raw_surprise = 0.0
-        attribution[:] = 0.0
+    if robot.failed or not robot.active:
+        for i in range(len(attribution)):
+            attribution[i] = 0.0
 
 
 @inner

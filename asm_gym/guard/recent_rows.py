@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import inner
-from asm_gym.guard.robot_table import Mask
 from asm_gym.spec import StreamSpec
 
 IMPOSSIBLE = 40.0  # once in e⁴⁰ rows
@@ -23,6 +22,7 @@ LEAST_CHANCE = 1e-6  # of a sense without resolution, whose numbers are of singl
 MOST_CHANCE = 0.5  # senses that repeat more often tell nothing
 MOST_REPEAT = 0.5  # share of the senses with noise
 
+Mask = NDArray[np.bool_]
 Floats32 = NDArray[np.float32]
 
 
@@ -45,12 +45,7 @@ class RecentRows:
         kept: K, how many rows are kept of each at least.
     """
 
-    def __init__(
-        self,
-        count: int,
-        spec: StreamSpec,
-        kept: int,
-    ) -> None:
+    def __init__(self, count: int, spec: StreamSpec, kept: int) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             chance = np.clip(spec.resolution / (2 * np.sqrt(np.pi) * spec.noise), LEAST_CHANCE, 1.0)
         noisy = (spec.noise > 0) & (chance < MOST_CHANCE)
@@ -68,20 +63,12 @@ class RecentRows:
         """Begin new episodes in the streams of ``which`` (n,)."""
         self.arrays.readings[which] = np.nan
 
-    def last(
-        self,
-        robot: int,
-        count: int,
-    ) -> Floats32:
+    def last(self, robot: int, count: int) -> Floats32:
         """Return (T, D) the last rows of a robot, ``count`` of them or as many as are kept, the newest last."""
         end = int(self.arrays.end[0])
-        return self.arrays.rows[robot, end - min(count, self._kept) : end]
+        return self.arrays.rows[robot, end - min(count, self._kept, end) : end]
 
-    def replace_last(
-        self,
-        robot: int,
-        row: Floats32,
-    ) -> None:
+    def replace_last(self, robot: int, row: Floats32) -> None:
         """Keep another row (D,) of a robot in the place of its newest."""
         self.arrays.rows[robot, self.arrays.end[0] - 1] = row
 
@@ -92,24 +79,29 @@ def make_room(recent: Any) -> int:
     rows = recent.rows
     kept = rows.shape[1] // 2
     if recent.end[0] == rows.shape[1]:
-        rows[:, :kept] = rows[:, kept:]
+        for n in range(len(rows)):
+            for k in range(kept):
+                for i in range(rows.shape[2]):
+                    rows[n, k, i] = rows[n, kept + k, i]
         recent.end[0] = kept
     recent.end[0] += 1
     return recent.end[0] - 1
 
 
 @inner
-def leave_out_stale(
-    row: Any,
-    recent: Any,
-    robot: int,
-) -> None:
+def leave_out_stale(row: Any, recent: Any, robot: int) -> None:
     """Write NaN into a row (D,) in the place of the senses that are stale."""
+    noisy = recent.noisy
     readings = recent.readings[robot]
-    sensed = row[recent.noisy]
-    repeats = sensed == readings
-    readings[:] = sensed
-    if np.sum(repeats * recent.unlikely) <= IMPOSSIBLE:
-        return
-    if np.sum(repeats) > MOST_REPEAT * len(sensed):
-        row[recent.noisy[repeats]] = np.nan
+    repeated = 0
+    unlikely = 0.0
+    for k in range(len(noisy)):
+        if row[noisy[k]] == readings[k]:
+            repeated += 1
+            unlikely += recent.unlikely[k]
+    stale = unlikely > IMPOSSIBLE and repeated > MOST_REPEAT * len(noisy)
+    for k in range(len(noisy)):
+        reading = row[noisy[k]]
+        if stale and reading == readings[k]:
+            row[noisy[k]] = np.nan
+        readings[k] = reading
