@@ -16,6 +16,11 @@ from rich.console import Console
 
 from asm_gym.compilation import kept_in
 from asm_gym.data.episode import Episode
+from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.guard.adapter import SensedRows
+from asm_gym.guard.guard import Guard
+from asm_gym.guard.options import GuardOptions
+from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.row_kernel import observe_rows
 from asm_gym.rollouts.progress import stage
@@ -53,6 +58,10 @@ def _learn() -> None:
     asm = NeuralASM.pretrained("panda")
     for batch in (1, 2):
         asm.observe(asm.initial_state(batch), np.zeros((batch, asm.spec.size)))
+    guard = Guard(RobotFacts.unknown(asm.spec), asm, GuardOptions("monitor"))
+    guard.begin()
+    nothing = np.zeros((1, asm.spec.motor.size), np.float32)
+    guard.judge(SensedRows(np.zeros((1, asm.spec.size), np.float32)), nothing)
     spec = StreamSpec((Channel("x", 3, group="joint"), Channel("u", 1, group="action")), dt=0.05)
     rng = np.random.default_rng(0)
     episodes = [Episode.from_stream(rng.normal(size=(30, 4)), spec) for _ in range(8)]
@@ -64,6 +73,8 @@ def _step(around: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] = lambda env:
     if find_spec("robosuite"):
         with around(gym.make("asm_gym/Lift-v0")) as env:
             env.reset(seed=0)
+            arm: Any = env.unwrapped
+            arm.contact_limits = arm.contact_limits or ContactLimits()
             for _ in range(3):
                 env.step(np.zeros(env.action_space.shape or (), np.float32))
 
