@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, short_repr, typed
 
+# what environments call their clock [s]
 CLOCKS = (
     "time",
     "sim_time",
     "simulation_time",
     "elapsed_time",
     "t",
-)  # what environments call their clock [s]
+)
 MOTOR = "action"  # the group that holds the commanded action
 
 

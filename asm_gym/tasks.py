@@ -14,6 +14,7 @@ from asm_gym.extras import needed_for
 from asm_gym.registries import Registry
 from asm_gym.validation import check_choice, check_number, check_text
 
+# arms that the tasks are tested with
 ROBOTS = (
     "Panda",
     "Sawyer",
@@ -21,7 +22,7 @@ ROBOTS = (
     "Kinova3",
     "IIWA",
     "Jaco",
-)  # arms that the tasks are tested with
+)
 
 
 @dataclass(frozen=True)

@@ -115,11 +115,12 @@ RULES: dict[str, Rule] = {
     "into itself": lambda policy, t, rng: (-1.0, 0.0, -0.3),
     "turning": lambda policy, t, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
     "rolling": lambda policy, t, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    # a trial comes after 10
     "waits for the hand-back": lambda policy, t, rng: (
         0.0,
         0.0,
         -1.0 * (t % 36 < 24),
-    ),  # a trial comes after 10
+    ),
     "first rows": lambda policy, t, rng: (
         1.0 * (t < 12),
         0.0,

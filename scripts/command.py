@@ -36,13 +36,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Args = TypeVar("Args")
 DONE, BAD_NEWS, REFUSED = 0, 1, 2
+# errors that a user can put right
 USAGE_ERRORS = (
     ValueError,
     TypeError,
     OSError,
     ImportError,
     gym.error.Error,
-)  # errors that a user can put right
+)
 MOST_NAMES = 7  # that the help of an option lists; a wrong name lists all
 _SAME: Any = object()
 _ANNOTATED: Any = Annotated
@@ -60,9 +61,8 @@ def option(
     *,
     quick: T = _SAME,  # default with ``--quick``
     least: float | None = None,  # lowest number, or the least length of a tuple
-    known: Iterable[
-        str
-    ] = (),  # names that the help lists; no others are accepted, unless ``check`` decides
+    # names that the help lists; no others are accepted, unless ``check`` decides
+    known: Iterable[str] = (),
     check: Callable[[Any], object]
     | None = None,  # raises for a value, or an element of a tuple, that is not accepted
     metavar: str = "",  # placeholder of the value in the help

@@ -135,12 +135,13 @@ def pairs(wheel: Path) -> str:
 
 MATRIX = ("3.11 numpy<2", "3.12 numpy<2", "3.11 numpy>=2", "3.12 numpy>=2", "3.13 numpy>=2")
 """Pythons and NumPys; NumPy 1.26 has no build for Python 3.13."""
+# variables that a fresh environment must not see
 OURS = (
     "PYTHONPATH",
     "VIRTUAL_ENV",
     "MAKEFLAGS",
     "ARGS",
-)  # variables that a fresh environment must not see
+)
 
 
 def matrix(asked: str = "") -> int:

@@ -141,13 +141,14 @@ def test_threshold_is_the_hand_computed_rank():
     maxima = np.array([5.0, 1.0, 9.0, 3.0, 7.0, 2.0, 8.0, 4.0, 6.0])
     assert [conformal_threshold(maxima, rate) for rate in (0.1, 0.25, 0.3)] == [9.0, 8.0, 7.0]
     blocks = Blocks(np.array([5.0, 1.0, 9.0, 3.0, 7.0]), np.full(5, 0.5))  # 2.5 hours
+    # at 0.8 one may exceed it: 1 + 1 <= 0.8 * 2.5
     rates = {
         0.4: 9.0,
         0.79: 9.0,
         0.8: 7.0,
         1.2: 5.0,
         100.0: 1.0,
-    }  # at 0.8 one may exceed it: 1 + 1 <= 0.8 * 2.5
+    }
     assert [hourly_threshold(blocks, rate) for rate in rates] == list(rates.values())
 
 

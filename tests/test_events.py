@@ -61,13 +61,14 @@ def test_what_the_senses_say_of_a_row(row, event, divisor):
 
 def test_a_joint_that_was_seen_on_its_way_is_at_its_stop_and_one_that_jumps_there_is_not():
     on_its_way = 1.0 - NEAR_STOP - 0.9 * FASTEST * ARM.dt
+    # at 20 Hz a joint of 5 rad/s gets from there to its stop in a row
     path = [
         0.5,
         on_its_way,
         0.98,
         1.05,
         0.98,
-    ]  # at 20 Hz a joint of 5 rad/s gets from there to its stop in a row
+    ]
     assert [event for event, _ in excused([changed(0, q) for q in path])] == [
         "",
         "",

@@ -66,10 +66,11 @@ def test_success_is_paired_by_scene_and_counted_without_a_blow():
     records = []
     for policy, seed, alone, guarded, blow in (
         *(("scripted", 1, True, True, 10.0), ("scripted", 2, True, False, 300.0)),
+        # the last leans for 0.6 s
         *(
             ("lift_sac", 1, False, True, 10.0),
             ("lift_sac", 2, True, True, 60.0),
-        ),  # the last leans for 0.6 s
+        ),
     ):
         records.append(record(ALONE, seed, blow, policy, "healthy", alone))
         records.append(record(DEFAULT, seed, 10.0, policy, "healthy", guarded))

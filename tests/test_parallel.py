@@ -68,9 +68,8 @@ def start(tmp_path):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks into /proc")
-@pytest.mark.parametrize(
-    "where", ["main", "thread"]
-)  # from a thread, workers have no signal and look for themselves
+# from a thread, workers have no signal and look for themselves
+@pytest.mark.parametrize("where", ["main", "thread"])
 def test_workers_end_within_seconds_of_their_killed_parent(start, where):
     parent, workers = start(where)
     assert all(map(is_alive, workers))

@@ -91,9 +91,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
     def _wrap(self, env: gym.Env[Any, Any], monitor: Monitor | None) -> None:
         recorded = {"monitor": monitor, **vars(self._options)}
-        RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, **recorded
-        )  # reflexes and memories are large
+        # reflexes and memories are large
+        RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **recorded)
         gym.Wrapper.__init__(self, env)
         self._box: gym.spaces.Box | None = None  # of actions; None where a guard cannot act in it
         if isinstance(env.action_space, gym.spaces.Box):
@@ -219,9 +218,8 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
         """Write the report of a step to its ``info``."""
         robots = [report.robots[0] for report in reports]
-        alarm = any([bool(robot["alarm"]) for robot in robots]) or bool(
-            target.get("asm_alarm")
-        )  # of a guard inside
+        # of a guard inside
+        alarm = any([bool(robot["alarm"]) for robot in robots]) or bool(target.get("asm_alarm"))
         intervened = any([bool(robot["overridden"]) for robot in robots]) or bool(
             target.get("asm_intervened")
         )

@@ -84,9 +84,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             self._members.set_attr("keeps_holding", [True] * env.num_envs)
         self._alarms = np.zeros(env.num_envs, np.int64)
         self._ended: Mask | None = None  # (n,) None before the first reset, and where a step failed
-        self._forced = np.zeros(
-            env.num_envs, bool
-        )  # ended by this wrapper, which the environment does not know yet
+        # ended by this wrapper, which the environment does not know yet
+        self._forced = np.zeros(env.num_envs, bool)
 
     def _stream_spec(self) -> StreamSpec:
         """Return the spec of the members' own streams."""
@@ -153,9 +152,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             raise ValueError(
                 f"actions have the shape {self.env.action_space.shape}, got {proposed.shape}"
             )
-        begun = (
-            self._ended.copy()
-        )  # their members begin an episode in this step, and take no action
+        # their members begin an episode in this step, and take no action
+        begun = self._ended.copy()
         running = ~begun
         self._ended = None  # where anything raises, nobody knows what was done
 
@@ -227,9 +225,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         """Write the report of a step to its infos, with Gymnasium's masks of the members that are present."""
         report = reports[-1]
         robots = report.robots
-        alarm = robots["alarm"] | np.asarray(
-            target.get("asm_alarm", False), bool
-        )  # of guards inside
+        # of guards inside
+        alarm = robots["alarm"] | np.asarray(target.get("asm_alarm", False), bool)
         self._alarms += alarm
         fields: dict[str, Any] = {
             "asm_surprise": robots["surprise"].copy(),

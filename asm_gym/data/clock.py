@@ -23,12 +23,13 @@ from asm_gym.data.reader_notes import note
 
 Floats = NDArray[np.float64]
 
+# least number since 1970, and its unit [s]
 EPOCHS = (
     (1e17, 1e-9),
     (1e14, 1e-6),
     (1e11, 1e-3),
     (1e8, 1.0),
-)  # least number since 1970, and its unit [s]
+)
 SLOWEST_WITHOUT_UNIT = (
     2.0  # step from which on a clock without a unit is not believed to count seconds
 )

@@ -72,9 +72,8 @@ class LogLayout:
     rate: float | None = None  # rows a second [Hz], whatever the clock says
     action: Sequence[str] = ()  # patterns of the columns that were commanded
     channels: Sequence[str] = ()  # patterns of the columns that are read; all where empty
-    labels: Sequence[
-        str
-    ] = ()  # patterns of the columns that say what is wrong, beside those that are called so
+    # patterns of the columns that say what is wrong, beside those that are called so
+    labels: Sequence[str] = ()
     columns: Sequence[str] = ()  # names of the columns of files without a header
     by_name: bool = False  # without an ``action``, columns that are called so were commanded
     ignore: Sequence[str] = ()  # patterns of the columns that are left out

@@ -46,12 +46,13 @@ FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
 """Reader of a file's columns, by its suffix."""
 
 HDF5 = (".hdf5", ".h5")  # files of several demonstrations, as robomimic writes them
+# read where they are named, and not in a folder: most are no logs
 ASKED_FOR = (
     ".txt",
     ".dat",
     ".data",
     ".log",
-)  # read where they are named, and not in a folder: most are no logs
+)
 POINTER = b"version https://git-lfs.github.com"
 FIRST_TABLES = 20  # by how many of a folder's tables it is decided what columns are,
 FIRST_NUMBERS = 20_000_000  # or by how many numbers of these

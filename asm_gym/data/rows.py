@@ -140,9 +140,8 @@ class RowReader:
         self._plan: ColumnPlan | None = None  # of rows by name
         self._named: Named = {}  # columns that name others
         self._joint = ""  # column that says whose numbers a row holds
-        self._gathered: dict[
-            str, Any
-        ] = {}  # of the joints that came, where a row is one of a joint
+        # of the joints that came, where a row is one of a joint
+        self._gathered: dict[str, Any] = {}
         self._publishers = Publishers(silence)
         # when the newest line came, and the first that lacks columns
         self._now, self._since = (

@@ -41,12 +41,13 @@ MOST_LOST = (
 BRIDGED_ROWS = 2  # rows that are bridged where nobody says for how long
 PAID_BACK = 0.1  # of a second that is whole, how much may be missing for good: a tenth of all rows
 TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
+# why there is an alarm
 SURPRISING, MISSING, NOT_FINITE, LATE = (
     "surprise",
     "missing data",
     "not finite",
     "late",
-)  # why there is an alarm
+)
 
 
 class Timing(NamedTuple):

@@ -48,9 +48,8 @@ STOP_EVENT = EVENTS.index(STOP)
 class EventState(NamedTuple):
     """State of B streams; never changed in place."""
 
-    left: NDArray[
-        np.int64
-    ]  # (B, 3) rows that a knock, a joint at its stop and a sliding finger go on to excuse
+    # (B, 3) rows that a knock, a joint at its stop and a sliding finger go on to excuse
+    left: NDArray[np.int64]
     approached: NDArray[np.bool_]  # (B, J) which joints may be at their stops in the next row
 
     @classmethod

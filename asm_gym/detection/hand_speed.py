@@ -34,9 +34,8 @@ STILL = 1e-9  # no speed is divided by less [m/s]
 class SpeedLimit(NamedTuple):
     """The limits of the hands' speed, as compiled code reads them."""
 
-    grid: NDArray[
-        np.float32
-    ]  # (arms, x, y, z, 12) see ``HandSpeedMap``; (0, 1, 1, 1, 12) without a map
+    # (arms, x, y, z, 12) see ``HandSpeedMap``; (0, 1, 1, 1, 12) without a map
+    grid: NDArray[np.float32]
     low: NDArray[np.int64]  # (4,) arm and place of the grid's first cell
     hand_speed: float  # the usual limit [m/s]
     momentum: float  # the limit where no healthy hand was [N s]

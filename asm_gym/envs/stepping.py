@@ -37,9 +37,8 @@ class SteppedEnv(gym.Env[Any, NDArray[np.float32]]):
 
     def __init__(self, substeps: int) -> None:
         self.substeps = substeps  # physics substeps of a control step
-        self.corruptions: list[
-            Corruption
-        ] = []  # sensor faults: each edits the measured row in place, after the noise
+        # sensor faults: each edits the measured row in place, after the noise
+        self.corruptions: list[Corruption] = []
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         """Action faults: each replaces the commanded action."""
         self.edits = SimulatorEdits()  # changes of the simulator's numbers that will be undone

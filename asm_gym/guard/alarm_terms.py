@@ -10,14 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.guard.responses import GOING_ON, RESPONSES
-from asm_gym.guard.robot_table import RobotTable
+from asm_gym.guard.robot_table import Mask, RobotTable
 from asm_gym.registries import Registry
 from asm_gym.validation import check_choice, check_number, short_repr
-
-Mask = NDArray[np.bool_]
 
 BY_CAUSE = "by cause"  # diagnosis chooses the response from the table of responses
 

@@ -42,11 +42,12 @@ ITERATIONS = 8
 HAND_GEOMETRY = np.dtype(
     [
         ("joints", np.int64),  # J
+        # of the stream: J angles, J speeds, the hand
         (
             "columns",
             np.int64,
             2 * MOST_JOINTS + HAND,
-        ),  # of the stream: J angles, J speeds, the hand
+        ),
         ("axes", np.float64, (MOST_JOINTS, 3)),  # as in ``Chain``
         ("anchors", np.float64, (MOST_JOINTS, 3)),
         ("pose", np.float64, (3, 3)),
@@ -63,11 +64,12 @@ HAND_STATE = np.dtype(
         ("mean", np.float64, HAND),  # m
         ("distance", np.float64),  # |m|; -1 where a number is missing
         ("whole_rows", np.int64),  # since a number was missing
+        # the last that were whole, the newest last; 0 before the first
         (
             "rows",
             np.float64,
             (WINDOW, 2 * MOST_JOINTS + HAND),
-        ),  # the last that were whole, the newest last; 0 before the first
+        ),
         ("angles", np.float64, MOST_JOINTS),  # that were believed last [rad]
     ],
     align=True,

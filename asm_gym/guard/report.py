@@ -26,9 +26,8 @@ KNOCKED = EVENTS.index(KNOCK)
 class Outcome:
     """What became of the row of one robot about which there was something to decide."""
 
-    terms: tuple[
-        str, ...
-    ] = ()  # alarm terms that hold, in the order of priority; empty for no alarm
+    # alarm terms that hold, in the order of priority; empty for no alarm
+    terms: tuple[str, ...] = ()
     event: int = 0  # an index in ``EVENTS``; 0 where there is no alarm
     response: Response = NO_RESPONSE  # what is done about it
     decision: Decision = field(default_factory=Decision)  # what it has led to

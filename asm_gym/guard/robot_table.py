@@ -36,10 +36,8 @@ ROBOT = np.dtype(
         ("failed", np.bool_),  # monitor, stream, policy or reflex failed
         ("overridden", np.bool_),  # something else than the policy's action was executed
         ("held", np.bool_),  # a reflex acted
-        (
-            "must_decide",
-            np.bool_,
-        ),  # there is something to decide, whatever surprise and contact are
+        # there is something to decide, whatever surprise and contact are
+        ("must_decide", np.bool_),
         # Row validation (``recent_rows``, ``hand_check``)
         ("episode_rows", np.int64),  # rows in this episode
         ("lost", np.bool_),  # a number is not finite
@@ -49,19 +47,13 @@ ROBOT = np.dtype(
         ("raw_surprise", np.float64),  # before a benign event excuses part of it
         ("excuse", np.int8),  # that event, an index in ``EVENTS``
         # Contact state (``contact_state``)
-        (
-            "load",
-            np.float64,
-        ),  # largest share of a contact limit in the physics substeps of this step
-        (
-            "limit_passed_s",
-            np.float64,
-        ),  # when in the step a limit was passed [s]; infinite for never
+        # largest share of a contact limit in the physics substeps of this step
+        ("load", np.float64),
+        # when in the step a limit was passed [s]; infinite for never
+        ("limit_passed_s", np.float64),
         ("contact_force", np.float64),  # on the arm, estimated from wrist and joints [N]
-        (
-            "pressed_impulse",
-            np.float64,
-        ),  # of that force beyond ``FREE_FORCE``, in this episode [N s]
+        # of that force beyond ``FREE_FORCE``, in this episode [N s]
+        ("pressed_impulse", np.float64),
         ("leaning_time", np.float64),  # for which the arm has leant on something [s]
         ("hand_speed", np.float64),  # of the fastest hand [m/s]
         ("presses", np.bool_),  # a limit was passed, or the arm leans on something
@@ -78,18 +70,14 @@ ROBOT = np.dtype(
         ("calm_rows", np.int64),  # of low surprise, one after the other
         ("free_rows", np.int64),  # of a reflex without a contact, one after the other
         ("held_rows", np.int64),  # of a reflex since it took over
-        (
-            "override_rows",
-            np.int64,
-        ),  # the same, those before a hand-back that came too early included
+        # the same, those before a hand-back that came too early included
+        ("override_rows", np.int64),
         ("early_returns", np.int64),  # hand-backs that came too early, one after the other
         ("rows_since_return", np.int64),  # of the policy since control was handed back
         ("rows_going_on", np.int64),  # of the policy in alarm, in this episode
         ("strikes", np.int64),  # how often the policy has pressed too hard in this episode
-        (
-            "rows_until_trial",
-            np.float64,
-        ),  # that a reflex acts before a trial; infinite for no trial
+        # that a reflex acts before a trial; infinite for no trial
+        ("rows_until_trial", np.float64),
         ("on_trial", np.bool_),  # the last hand-back was a trial
         ("confirmed", np.bool_),  # an alarm in this episode was no false one
         ("largest_surprise", np.float64),  # in this episode while the policy acted

@@ -57,13 +57,14 @@ KINDS = (
 )
 """Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
 
+# of channels, whose share of the surprise is evidence
 GROUPS = (
     "joint",
     "torque",
     "hand",
     "wrench",
     "gripper",
-)  # of channels, whose share of the surprise is evidence
+)
 
 EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
 """In order: how much the best hypothesis of each kind explains; the energy; the largest share of the surprise in one

@@ -312,12 +312,13 @@ class ValueAssociation(ScaledModel):
         for g in range(int(groups.max()) + 1):
             own = np.flatnonzero(groups == g)
             derived = 3 * X + np.flatnonzero(self._derived.sources[:, own].any(axis=1))
+            # a value is predicted from this row alone
             withheld = [
                 own,
                 X + own,
                 derived,
                 2 * X + np.arange(X),
-            ]  # a value is predicted from this row alone
+            ]
             found.append(np.unique(np.concatenate(withheld)).astype(np.intp))
         return found
 

@@ -40,9 +40,8 @@ class CarryTask(NamedTuple):
     clearance: float  # how far above its grip to come from [m]
     place: Vector  # (3,) where its origin is to go [m]
     over: float  # how far above ``place`` to carry it [m]
-    headings: tuple[
-        float, ...
-    ] = ()  # those of its x axis that fit the place [rad]; empty where every one does
+    # those of its x axis that fit the place [rad]; empty where every one does
+    headings: tuple[float, ...] = ()
     heading_fit: float = 0.06  # how exactly it must have one of them before it is lowered [rad]
     fit: float = 0.02  # how exactly it must stand over its place before it is lowered [m]
     haste: float = 1.0  # with which share of the usual speed the hand comes down

@@ -61,6 +61,7 @@ ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100), ("Sawyer", 100), ("II
 AGAINST = ("hostile", "elsewhere", "faulty")
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
+# values that distinguish one case from another
 CASE = (
     "kind",
     "task",
@@ -68,7 +69,7 @@ CASE = (
     "fault",
     "robot",
     "rate",
-)  # values that distinguish one case from another
+)
 FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
 
 
