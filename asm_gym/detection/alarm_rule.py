@@ -26,6 +26,9 @@ STOP = "stop"
 FAULT = "fault"
 EVENTS = (NO_EVENT, KNOCK, STOP, FAULT)
 """Kinds of rows; the last is the worst. Rows keep an index in it."""
+KNOCK_EVENT = EVENTS.index(KNOCK)
+STOP_EVENT = EVENTS.index(STOP)
+FAULT_EVENT = EVENTS.index(FAULT)
 
 MINUTE = 60.0  # time below the threshold before another alarm counts [s]
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.detection.alarm_rule import EVENTS, JUDGED, KNOCK, STOP
+from asm_gym.detection.alarm_rule import JUDGED, KNOCK_EVENT, STOP_EVENT
 from asm_gym.detection.base import Floats
 from asm_gym.detection.detector import GAINS
 from asm_gym.spec import Channel, StreamSpec
@@ -41,8 +41,6 @@ FADING = math.ceil(-math.log(EXCUSED) / math.log(FADE))
 KNOCKED = 0  # columns of ``EventState.left``
 AT_STOP = 1
 SLIDING = 2
-KNOCK_EVENT = EVENTS.index(KNOCK)
-STOP_EVENT = EVENTS.index(STOP)
 
 
 class EventState(NamedTuple):

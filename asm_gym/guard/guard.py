@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from asm_gym.blas import one_thread_for
 from asm_gym.compilation import bind
-from asm_gym.detection.alarm_rule import EVENTS, FAULT, JUDGED
+from asm_gym.detection.alarm_rule import FAULT_EVENT, JUDGED, KNOCK_EVENT
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.alarm_terms import BY_CAUSE, CONTACT, SURPRISE, AlarmTerms
 from asm_gym.guard.arbiter import Arbiter
@@ -36,7 +36,7 @@ from asm_gym.guard.observer import Observer, joined, unjudged
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.preview import Preview, preview_chunk
 from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, motion_arrays, record_motion
-from asm_gym.guard.report import KNOCKED, Outcome, RowReport
+from asm_gym.guard.report import Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from, unexplained
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.guard.robot_table import (
@@ -52,8 +52,6 @@ from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator, ValidatedRows
 from asm_gym.monitors import Monitor, Surprise
 from asm_gym.policies.base import Policy
-
-FAULTY = EVENTS.index(FAULT)
 
 
 @dataclass(slots=True)
@@ -489,9 +487,9 @@ class Guard:
         if not evidence.alarm:
             return Outcome(response=response, decision=decision)
         robot.alarm = True
-        robot.event = FAULTY
+        robot.event = FAULT_EVENT
         if self._only_contact(evidence):
-            robot.event = KNOCKED
+            robot.event = KNOCK_EVENT
         return Outcome(evidence.terms, int(robot.event), response, decision)
 
     @staticmethod

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.detection.alarm_rule import EVENTS, KNOCK, benign_event, over_threshold
+from asm_gym.detection.alarm_rule import KNOCK_EVENT, benign_event, over_threshold
 from asm_gym.guard.arbiter import MOSTLY_AFTER
 from asm_gym.guard.contact_state import ContactColumns, measure_contacts
 from asm_gym.guard.recent_rows import RowArrays
@@ -25,7 +25,6 @@ from asm_gym.guard.robot_table import POLICY, REFLEX
 from asm_gym.guard.row_validation import validate_rows
 from asm_gym.monitors.row_kernel import observe_rows
 
-KNOCKED = EVENTS.index(KNOCK)
 # in the place of how many robots there are to decide about: the rows are to be repaired first
 STOPPED = -1
 
@@ -98,7 +97,7 @@ def apply_alarm_rule(robots: Any, judged: Any, attribution: Any) -> int:
         robot.event = benign_event(
             robot.raw_surprise, robot.surprise, robot.excuse, robot.threshold
         )
-        robot.knocked = robot.event == KNOCKED
+        robot.knocked = robot.event == KNOCK_EVENT
         robot.alarm = False
         robot.must_decide = robot.active and (robot.must_decide or is_eventful(robot))
         if robot.must_decide:

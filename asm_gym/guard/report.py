@@ -10,7 +10,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.alarm_rule import EVENTS, KNOCK
+from asm_gym.detection.alarm_rule import EVENTS, KNOCK_EVENT
 from asm_gym.guard.alarm_terms import ALARM_TERMS, CONTACT
 from asm_gym.guard.arbiter import Decision
 from asm_gym.guard.contact_state import severity_info
@@ -18,8 +18,6 @@ from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
 from asm_gym.guard.robot_table import ENDED, STATES, Mask
 from asm_gym.spec import StreamSpec
-
-KNOCKED = EVENTS.index(KNOCK)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class Outcome:
     @property
     def ends(self) -> bool:
         """Whether it ends the episode, where alarms do: a knock that passes no contact limit does not."""
-        return bool(self.terms) and (self.event != KNOCKED or self.reason == CONTACT)
+        return bool(self.terms) and (self.event != KNOCK_EVENT or self.reason == CONTACT)
 
 
 @dataclass(frozen=True, slots=True)

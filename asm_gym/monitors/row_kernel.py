@@ -259,7 +259,7 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
         step_repetition(repetition, before.detection.repetition, after.detection.repetition, rows)
         find_events(senses, before.excuses, after.excuses, rows, judged)
         unlikely = after.detection.repetition.unlikely
-        judge_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
+        surprise_of_rows(repetition, unlikely, shares, reading.finite, judged, attribution)
     return errors
 
 
@@ -415,7 +415,7 @@ def associate(weights: RowWeights, reading: ScaledRows) -> Any:
 
 
 @inner
-def judge_rows(
+def surprise_of_rows(
     repetition: RepetitionWeights,
     unlikely: Any,
     shares: Any,
