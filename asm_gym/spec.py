@@ -6,30 +6,19 @@ The sensors are read after the control step in which the action was commanded (t
 from __future__ import annotations
 
 import json
-import math
-import warnings
-from contextlib import suppress
-from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from numbers import Real
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.control_period import PeriodWarning as PeriodWarning
+from asm_gym.control_period import control_period as control_period
 from asm_gym.validation import check_number, short_repr, typed
 
-# what environments call their clock [s]
-CLOCKS = (
-    "time",
-    "sim_time",
-    "simulation_time",
-    "elapsed_time",
-    "t",
-)
 MOTOR = "action"  # the group that holds the commanded action
 
 
@@ -283,63 +272,3 @@ def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.fl
     return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(
         rows, -1
     )
-
-
-def control_period(env: gym.Env[Any, Any]) -> float:
-    """Return the control period of any environment [s], by what it says of time; 1 where it says nothing.
-
-    It may say ``dt``, ``tau``, ``control_timestep``, ``frame_skip`` of a model's ``timestep``, or a frequency of
-    control or of its policy; or a copy of it has a clock that goes on by as much in every step. The rate of its videos
-    is taken where nothing else is said, with a warning.
-    """
-    bare: Any = env.unwrapped
-    for name in ("dt", "tau", "control_timestep"):
-        found = getattr(bare, name, None)
-        if dt := _positive(found() if callable(found) else found):
-            return dt
-    timestep = getattr(getattr(getattr(bare, "model", None), "opt", None), "timestep", None)
-    if dt := _positive(getattr(bare, "frame_skip", None)) * _positive(timestep):
-        return dt
-    config = getattr(bare, "config", None)
-    for name in ("control_freq", "policy_frequency", "control_frequency"):
-        own = config.get(name) if isinstance(config, dict) else None
-        if rate := _positive(own or getattr(env, name, None) or getattr(bare, name, None)):
-            return 1.0 / rate
-    if dt := _by_its_clock(bare):
-        return dt
-    rate = _positive((env.metadata or {}).get("render_fps"))
-    if not rate:
-        return 1.0
-    warnings.warn(
-        f"{type(bare).__name__} does not state its control period: {1 / rate:g} s is taken from its render_fps; if "
-        "that is wrong, give it an attribute dt [s]",
-        PeriodWarning,
-        stacklevel=2,
-    )
-    return 1.0 / rate
-
-
-def _by_its_clock(bare: Any) -> float:
-    """Return by how much the own clock of an environment goes on in a step of a copy [s]; 0 where nothing tells."""
-    for name in CLOCKS:
-        if isinstance(getattr(bare, name, None), float):
-            with suppress(Exception):  # whatever copying or stepping somebody's environment raises
-                copied = deepcopy(bare)
-                copied.reset()
-                times = [getattr(copied, name)]
-                for _ in range(3):
-                    copied.step(copied.action_space.sample())
-                    times.append(getattr(copied, name))
-                steps = np.diff(times)
-                return _positive(float(steps[0])) if np.allclose(steps, steps[0]) else 0.0
-    return 0.0
-
-
-class PeriodWarning(UserWarning):
-    """How long a control step takes was guessed."""
-
-
-def _positive(value: Any) -> float:
-    """A number that is positive; 0 for anything else."""
-    known = isinstance(value, Real) and value is not True and 0 < float(value) < math.inf
-    return float(value) if known else 0.0

@@ -2,44 +2,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import replace
+from math import isclose
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers import NormalizeObservation
 from gymnasium.wrappers.vector import NormalizeObservation as VectorNormalizeObservation
 from numpy.typing import NDArray
 
-from asm_gym.spec import StreamSpec, control_period, flat
+from asm_gym.control_period import PeriodCheck, control_period, stream_provider
+from asm_gym.control_period import layers as layers
+from asm_gym.spec import StreamSpec, flat
 from asm_gym.validation import as_float32
+
+StepResult = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 class StreamSource:
     """Where an environment's stream comes from: ``info["stream"]`` of its ``own``, or else observation and action.
 
-    Without its own, TypeError says that its spaces cannot be read as rows of numbers, and ValueError that a wrapper
-    inside changes what it makes of the same sense as it goes on.
+    Raises:
+        TypeError: its spaces cannot be read as rows of numbers.
+        ValueError: a wrapper changes how the same sense reads over time, or repeats the steps of a
+            stream that is faster than control.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._env, self.own = env, env.has_wrapper_attr("stream_spec")
-        if not self.own:
+        self._env = env
+        self.own = env.has_wrapper_attr("stream_spec")
+        self._check = PeriodCheck(env, control_period(env))
+        if self.own:
+            self._refuse_lost_rows()
+        else:
             refuse_running_statistics(env)
             self._spaces = StreamSpec.from_spaces(
-                env.observation_space, env.action_space, control_period(env)
+                env.observation_space, env.action_space, self.period
             )
+
+    @property
+    def period(self) -> float:
+        """Control period [s]; ``step`` corrects it by the simulator's clock."""
+        return self._check.period
 
     @property
     def spec(self) -> StreamSpec:
         """Names the numbers of a row; whoever makes the stream run faster changes it."""
-        return self._env.get_wrapper_attr("stream_spec") if self.own else self._spaces
+        spec = self._stated_spec
+        dt = self.period / self.rows_per_step
+        if isclose(dt, spec.dt):
+            return spec
+        return replace(spec, dt=dt)
 
     @property
     def rows_per_step(self) -> int:
         """How many rows a control step has."""
-        return max(1, round(control_period(self._env) / self.spec.dt)) if self.own else 1
+        if not self.own:
+            return 1
+        inner = control_period(stream_provider(self._env))
+        return max(1, round(inner / self._stated_spec.dt))
+
+    @property
+    def _stated_spec(self) -> StreamSpec:
+        """The spec whose period may be that of a step inside a wrapper that repeats actions."""
+        if self.own:
+            return self._env.get_wrapper_attr("stream_spec")
+        return self._spaces
+
+    def _refuse_lost_rows(self) -> None:
+        """Raise ValueError for a wrapper that repeats steps of several rows each."""
+        rows = self.rows_per_step
+        if rows > 1 and not isclose(self.spec.dt, self._stated_spec.dt):
+            raise ValueError(
+                f"the stream has {rows} rows in each step of the robot, and a wrapper that repeats actions "
+                "hides all but those of the last: put that wrapper outside"
+            )
+
+    def step(self, action: Any) -> StepResult:
+        """Step the environment as ``stepped`` does; correct ``period`` if its clock shows another."""
+        expected = self.period
+        self._check.begin()
+        result = stepped(self._env, action)
+        self._check.end(bool(result[2] or result[3]))
+        if self.own and self.period != expected:
+            self._refuse_lost_rows()
+        return result
 
     def row(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(D,) what was sensed after ``action``, and the action."""
@@ -65,9 +113,7 @@ class StreamSource:
         return info["streams"] if "streams" in info else self.row(observation, action, info)[None]
 
 
-def stepped(
-    env: gym.Env[Any, Any], action: Any
-) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+def stepped(env: gym.Env[Any, Any], action: Any) -> StepResult:
     """Return what a step of an environment returns. Raises TypeError unless it is the five values of Gymnasium."""
     found: Any = env.step(action)
     if not isinstance(found, tuple) or len(found) != 5:
@@ -78,13 +124,6 @@ def stepped(
             f"reward, terminated, truncated, info{cost if size == 6 else ''}"
         )
     return found
-
-
-def layers(env: Any) -> Iterator[Any]:
-    """Yield the wrappers around an environment, or around many, the outermost first."""
-    while isinstance(env, gym.Wrapper | VectorWrapper):
-        yield env
-        env = env.env
 
 
 def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:

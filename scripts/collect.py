@@ -13,8 +13,8 @@ from pathlib import Path
 import gymnasium as gym
 from rich.console import Console
 
-from asm_gym.data.datasets import require_minari, write_dataset
 from asm_gym.data.episode import load_episode
+from asm_gym.data.minari_datasets import require_minari, write_dataset
 from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions

@@ -29,7 +29,6 @@ from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
-from asm_gym.monitors.arm_inputs import judged_by_values
 from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.monitors.registry import check_monitor_name
@@ -187,12 +186,9 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
     return parts, said
 
 
-def settings(args: Args, spec: StreamSpec) -> dict[str, Any]:
+def settings(args: Args) -> dict[str, Any]:
     """Return the hyperparameters that suit the recordings."""
-    suitable: dict[str, Any] = {
-        "seed": args.seed,
-        "values": spec.source == "table" or judged_by_values(spec),
-    }
+    suitable: dict[str, Any] = {"seed": args.seed}
     if args.quick:
         suitable["epochs"] = QUICK_EPOCHS
     if args.urdf is not None:
@@ -263,9 +259,7 @@ def fit(args: Args, console: Console) -> int:
     )
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:
-        monitor: Any = make_monitor(args.monitor, spec, **settings(args, spec)).fit(
-            fitting, progress
-        )
+        monitor: Any = make_monitor(args.monitor, spec, **settings(args)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
     for line in [

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from asm_gym.data.datasets import read_dataset
 from asm_gym.data.episode import load_episode
+from asm_gym.data.minari_datasets import read_dataset
 from asm_gym.files import write_text
 from asm_gym.policies import rollout
 from asm_gym.rollouts.collect import check, collect_to

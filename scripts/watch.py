@@ -25,7 +25,8 @@ from typing import Any
 
 from rich.console import Console
 
-from asm_gym.data.live import lines_from, live_source, publisher
+from asm_gym.data.dds_topics import publisher
+from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.timing import SURPRISING, bridge_of, bridged

@@ -6,7 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.data.action_meaning import ACTIONS, ActionMeaning, found_meaning
+from asm_gym.data.action_identification import found_meaning
+from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
 from asm_gym.monitors import Surprise
 from asm_gym.policies.hold import Hold
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder, VectorNeuralASMSafety

@@ -93,7 +93,7 @@ def test_one_episode_fits_and_says_what_its_threshold_lacks(name):
         ValueError,
         match=r"needs at least 19 nominal episodes, got 1, which can promise 0\.5 at best",
     ):
-        monitor.calibrate([only], 0.05)
+        monitor.calibrate(sine_episodes(1, seed=1), 0.05)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -249,8 +249,8 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
     (tmp_path / "arm.urdf").unlink()
     again = load_monitor(tmp_path / "x.asm")
     np.testing.assert_array_equal(again.score(cut[25]).value, asm.score(cut[25]).value)
-    with pytest.raises(ValueError, match="only values=True judges"):
-        NeuralASM(cut[0].spec, urdf=urdf)
+    with pytest.raises(ValueError, match="values are not judged"):
+        NeuralASM(cut[0].spec, values=False, urdf=urdf)
     bare = Episode.from_table({"position": np.zeros((9, 3)), "velocity": np.zeros(9)}, rate=10.0)
     with pytest.raises(ValueError, match="by their names 3 numbers are angles and 1 are speeds"):
         NeuralASM(bare.spec, values=True, urdf=urdf)

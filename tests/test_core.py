@@ -72,7 +72,7 @@ print(json.dumps([
     said(lambda: gymnasium.make("asm_gym/Lift-v0")),
     said(lambda: asm_gym.wrappers.FaultInjection),
     said(lambda: asm_gym.monitors.make_monitor("gru", spec)),
-    said(lambda: __import__("asm_gym.data.datasets").data.datasets.require_minari()),
+    said(lambda: __import__("asm_gym.data.minari_datasets").data.minari_datasets.require_minari()),
     said(lambda: __import__("asm_gym.tasks").tasks.env_id("gymnasium_robotics:FetchReach-v4")),
     {name: said(lambda: getattr(asm_gym, name)) for name in asm_gym.__all__},
 ]))

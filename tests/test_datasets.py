@@ -18,7 +18,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
 from asm_gym import collect
-from asm_gym.data.datasets import read_dataset, write_dataset
+from asm_gym.data.minari_datasets import read_dataset, write_dataset
 from asm_gym.files import UNFINISHED
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import make_policy, rollout

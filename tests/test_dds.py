@@ -148,7 +148,7 @@ def test_a_topic_that_falls_silent_has_died(publish):
 
 
 def test_a_topic_of_another_type_or_that_nobody_publishes_is_one_line(publish, monkeypatch):
-    monkeypatch.setattr("asm_gym.data.live.CONNECT_S", 1.0)
+    monkeypatch.setattr("asm_gym.data.dds_topics.CONNECT_S", 1.0)
     publish("/speech", lambda k: Text("good morning"))
     with pytest.raises(ValueError, match=r"/speech .*std_msgs::msg::dds_::String_.* sensor_msgs"):
         next(lines("/speech"))

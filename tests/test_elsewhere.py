@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import NormalizeObservation
 
 from asm_gym import collect, register_task
-from asm_gym.data.datasets import read_dataset
+from asm_gym.data.minari_datasets import read_dataset
 from asm_gym.faults import (
     ActionDelay,
     ActionScale,

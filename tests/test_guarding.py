@@ -199,9 +199,10 @@ class Twice(gym.Wrapper):
     """Makes two steps of one, and notes before each whether the arm is held."""
 
     held = ()
+    repeat = 2
 
     def step(self, action):
-        for _ in range(2):
+        for _ in range(self.repeat):
             self.held = (*self.held, self.unwrapped.holding)
             outcome = self.env.step(action)
         return outcome
@@ -248,7 +249,8 @@ def test_a_hold_of_an_outer_guard_lasts_through_all_parts_of_its_step(lift):
     memory, action = NeuralASM.pretrained("panda"), np.full(7, 0.5, np.float32)
     inner = NeuralASMSafety(lift, CueMonitor([], memory.spec), "hold", contact_limits=None)
     twice = Twice(inner)
-    env = NeuralASMSafety(twice, CueMonitor([1], memory.spec), "hold", contact_limits=None)
+    slower = replace(memory.spec, dt=0.1)
+    env = NeuralASMSafety(twice, CueMonitor([1], slower), "hold", contact_limits=None)
     env.reset(seed=0)
     for _ in range(4):
         env.step(action)

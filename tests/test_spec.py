@@ -206,7 +206,7 @@ def test_the_control_period_is_what_an_environment_says_of_time_and_never_silent
     own = {
         "time": 3.0,
         "step": step,
-        "reset": lambda self: None,
+        "reset": lambda self, **_: None,
         "action_space": gym.spaces.Discrete(2),
     }
     clocked = env(**own)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from asm_gym.data.datasets import write_dataset
 from asm_gym.data.episode import Episode
+from asm_gym.data.minari_datasets import write_dataset
 from asm_gym.policies.network import NetworkPolicy
 from asm_gym.rollouts.training import Standardised, clone, export, fill_buffer, make_learner, train
 from asm_gym.scripts.cli import main

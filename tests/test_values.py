@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,6 +20,7 @@ from asm_gym.monitors.baselines.linear import FrictionRule
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.value_association import ValueAssociation, averaged
 from asm_gym.monitors.values import Values
+from asm_gym.scripts.cli import main
 from asm_gym.spec import Channel
 from asm_gym.synthetic_arm import SyntheticArm
 from tests.streams import pendulum_columns
@@ -183,11 +185,40 @@ def test_the_rule_takes_friction_from_torque_and_needs_a_speed():
         FrictionRule(Episode.from_table({"q": np.zeros((9, 2))}, rate=10).spec)
 
 
-def test_values_are_judged_where_torques_are_measured_and_nothing_feels_contact():
+def test_values_are_judged_where_torques_are_measured_and_a_simulation_does_not_feel_contact():
     arm = SyntheticArm.stream_spec
     assert judged_by_values(arm)
     felt = replace(
         arm, channels=(*arm.channels, Channel("external_torque", 7, "N m", group="torque"))
     )
     assert not judged_by_values(felt)
+    assert judged_by_values(replace(felt, source="table"))
     assert not judged_by_values(Episode.from_table({"position": np.eye(9)}, rate=10.0).spec)
+
+
+@pytest.mark.parametrize("with_torques", [True, False])
+def test_python_and_the_command_judge_values_alike(with_torques, tmp_path):
+    columns = pendulum_columns(3000)
+    if not with_torques:
+        del columns["effort"]
+    cut = pieces(Episode.from_table(columns), 1.0)
+    small = {"hidden_size": 8, "association_size": 16, "epochs": 1}
+    made = [NeuralASM(cut[0].spec, **small), make_monitor("neural_asm", cut[0].spec, **small)]
+    fitted = [monitor.fit(cut[:10]) for monitor in made]
+
+    for number, piece in enumerate(cut):
+        table = pd.DataFrame(piece.stream, columns=piece.spec.labels)
+        table.insert(0, "time", np.arange(len(piece)) * piece.spec.dt)
+        table.to_csv(tmp_path / f"{number}.csv", index=False)
+    file = tmp_path / "memory.asm"
+    command = ["fit", str(tmp_path), "--out", str(file), "--false-alarm-rate", "0.1", "--quick"]
+    assert main(command) == 0
+    fitted.append(load_monitor(file))
+
+    for monitor in fitted:
+        assert monitor.get_params()["values"] is with_torques
+        assert (monitor.values_ is not None) is with_torques
+    fitted[0].save(file)
+    again = load_monitor(file)
+    assert again.get_params() == fitted[0].get_params()
+    assert (again.values_ is not None) is with_torques

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Literal
 from uuid import uuid4
@@ -47,6 +48,7 @@ class Guarding:
     """The guard: its table of robots, and how often each alarm term held."""
 
     _spec: StreamSpec  # of the streams that are watched
+    _period: float  # control period [s]
     _rows_per_step = 1
 
     def __init__(
@@ -99,9 +101,10 @@ class Guarding:
         recorded = getattr(monitor, "about", {}).get(ACTIONS)
         if recorded is not None:
             recorded = ActionMeaning.from_json(recorded)
-        self._facts, self._observation_map = robots_of(
+        facts, self._observation_map = robots_of(
             self.env, monitor.spec, recorded, options.action_means
         )
+        self._facts = replace(facts, dt=self._period)
 
         policies: list[Policy] = []
         reaction = options.reaction(diagnosis_of(monitor) is not None)
@@ -113,6 +116,14 @@ class Guarding:
     def _check(self, monitor: Monitor) -> None:
         """Raise where a monitor does not fit the streams or the controller."""
         check_monitor(monitor, self._spec, controller_of(EnvAttributes(self.env)))
+
+    def _check_period(self, period: float) -> None:
+        """Raise ValueError if steps take another time [s] than the monitor was accepted for."""
+        if period == self._period:
+            return
+        self._period = period
+        self._spec = replace(self._spec, dt=period / self._rows_per_step)
+        self._check(self.guard.fitted.monitor)
 
     def _limit_contact(self, anew: bool = False) -> None:
         """Set the environments' contact limits if they changed, or ``anew`` for new episodes."""

@@ -5,17 +5,19 @@ T control steps ► Episode: stream (k T, D), actions (T, A), observations (T + 
 
 from __future__ import annotations
 
+import warnings
 from copy import deepcopy
-from typing import Any, SupportsFloat
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.control_period import PeriodWarning
 from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.spec import StreamSpec, flat
-from asm_gym.stream_source import StreamSource, stepped
+from asm_gym.stream_source import StepResult, StreamSource
 from asm_gym.validation import as_float32
 
 
@@ -73,8 +75,8 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._begin(seed, [deepcopy(observation)])
         return observation, {**info, "stream": self._source.first(observation, info)}
 
-    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = stepped(self.env, action)
+    def step(self, action: Any) -> StepResult:
+        observation, reward, terminated, truncated, info = self._stepped(action)
         info = {**info, "stream": self._source.row(observation, action, info)}
 
         # Copies: an environment, a driver or a policy may use its arrays again.
@@ -91,6 +93,17 @@ class StreamRecorder(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if terminated or truncated:
             self._finish(bool(terminated))
         return observation, reward, terminated, truncated, info
+
+    def _stepped(self, action: Any) -> StepResult:
+        """Step the environment; warn if the simulator's clock shows another control period."""
+        expected = self._source.period
+        result = self._source.step(action)
+        measured = self._source.period
+        if measured != expected:
+            message = f"a control step takes {measured:g} s and not {expected:g} s"
+            advice = "by the simulator's clock: the recorded stream has the measured period"
+            warnings.warn(f"{message} {advice}", PeriodWarning, stacklevel=3)
+        return result
 
     def finish(self) -> Episode:
         """End the running episode; remove the last episode and return it.

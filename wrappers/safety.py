@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, SupportsFloat
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,12 +16,11 @@ from asm_gym.guard.preview import Preview, checked_chunk
 from asm_gym.guard.report import AsmInfo, LazyInfo, RowReport, asm_info
 from asm_gym.monitors import Monitor
 from asm_gym.policies.hold import HoldsItself, why_changed
-from asm_gym.stream_source import StreamSource, stepped
+from asm_gym.stream_source import StepResult, StreamSource
 from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.guarding import Guarding, as_action, load_felt, sensed_row
 
 Floats32 = NDArray[np.float32]
-StepResult = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -108,6 +107,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
 
         self._source = StreamSource(env)
         self._spec = self._source.spec
+        self._period = self._source.period
         self._rows_per_step = self._source.rows_per_step
         changed = why_changed(env, "a reflex within a step")
         if self._rows_per_step > 1 and changed:
@@ -176,6 +176,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._ended = True  # where anything raises, nobody knows what was done
         self._reports: list[RowReport] = []
         overridden, (observation, reward, terminated, truncated, info) = self._run()
+        self._check_period(self._source.period)
         info = dict(info)  # an environment may use its own again
         if "success" in info:
             self._solved |= bool(info["success"])
@@ -271,7 +272,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             if self._holds_itself:
                 inner.keeps_holding = True
             overridden = self._command()
-            return overridden, stepped(self.env, as_action(self._box, self._executed))
+            return overridden, self._source.step(as_action(self._box, self._executed))
         finally:
             if self._holds_itself:
                 inner.keeps_holding = keeps_holding

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,12 +14,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
+from asm_gym.control_period import PeriodCheck, control_period
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
 from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
 from asm_gym.guard.robot_table import Mask
 from asm_gym.monitors import Monitor
-from asm_gym.spec import StreamSpec, control_period
+from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
 from asm_gym.wrappers.env_attributes import EnvAttributes, askable
@@ -73,6 +75,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._resets_itself = mode == AutoresetMode.NEXT_STEP
         self._members = askable(env)
         self._has_stream = all(self._members.call("has_wrapper_attr", "stream_spec"))
+        self._period = control_period(env)
+        members = getattr(self._members, "envs", [None])  # None: they are in worker processes
+        self._first_step = PeriodCheck(members[0], self._period)
         if self._has_stream:
             self._spec = self._stream_spec()
         else:
@@ -96,7 +101,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
             raise ValueError(
                 "a vector is watched at its control rate: make the environments without stream_freq"
             )
-        return first
+        return replace(first, dt=self._period)
 
     def _spec_of_spaces(self) -> StreamSpec:
         """Return the spec of streams that observations and actions form."""
@@ -106,8 +111,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                 f"environments without a stream must have Box observations to be watched in a vector, got "
                 f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
             )
-        dt = float(EnvAttributes(env).first("dt") or control_period(env))
-        return StreamSpec.from_spaces(env.single_observation_space, env.single_action_space, dt)
+        return StreamSpec.from_spaces(
+            env.single_observation_space, env.single_action_space, self._period
+        )
 
     @property
     def threshold(self) -> NDArray[np.float64]:
@@ -159,7 +165,10 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
 
         self._limit_contact()
         command = self.guard.act(proposed.reshape(self._flat_shape), self._observed_by, idle=begun)
+        self._first_step.begin()
         observations, rewards, terminated, truncated, infos = self.send_command(command)
+        self._first_step.end(bool(begun[0] or terminated[0] or truncated[0]))
+        self._check_period(self._first_step.period)
         infos = dict(infos)
         infos["overridden"] = command.overridden | infos.get("overridden", False)
         infos["_overridden"] = np.ones_like(begun)

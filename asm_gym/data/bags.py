@@ -11,9 +11,13 @@ newest values of all others, such as a gripper on the same topic, as long as the
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import HELD, Columns
@@ -23,44 +27,48 @@ Numbers = dict[str, float]
 
 
 def _joints(message: Any) -> Numbers:
-    found: Numbers = {}
+    numbers = {}
     for kind in ("position", "velocity", "effort"):
         values = getattr(message, kind)
-        if len(values) == len(message.name):  # others are missing: nothing tells whose they are
-            found |= {
-                f"{kind}[{name}]": float(v) for name, v in zip(message.name, values, strict=True)
-            }
-    return found
+        if len(values) != len(message.name):
+            continue  # nothing tells whose they are
+        for name, value in zip(message.name, values, strict=True):
+            numbers[f"{kind}[{name}]"] = value
+    return numbers
 
 
 def _wrench(message: Any) -> Numbers:
-    parts = {"force": message.wrench.force, "torque": message.wrench.torque}
-    return {
-        f"{name}[{axis}]": float(getattr(part, axis))
-        for name, part in parts.items()
-        for axis in "xyz"
-    }
+    numbers = {}
+    for kind in ("force", "torque"):
+        vector = getattr(message.wrench, kind)
+        for axis in "xyz":
+            numbers[f"{kind}[{axis}]"] = getattr(vector, axis)
+    return numbers
+
+
+def _array(message: Any) -> Numbers:
+    return {f"data[{k}]": value for k, value in enumerate(message.data)}
 
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MESSAGES: dict[str, Callable[[Any], Numbers]] = {
     JOINT_STATE: _joints,
     "geometry_msgs/msg/WrenchStamped": _wrench,
-    "std_msgs/msg/Float64MultiArray": lambda message: {
-        f"data[{k}]": float(v) for k, v in enumerate(message.data)
-    },
+    "std_msgs/msg/Float64MultiArray": _array,
 }
 """The numbers of a message, by its type."""
 
-MENDS = {".mcap": "mcap recover", ".bag": "rosbag reindex"}
+MENDS = {
+    ".mcap": "mcap recover",
+    ".bag": "rosbag reindex",
+}
 """What mends a bag that was cut off, by its suffix."""
 
 
 def read_bag(path: Path) -> Columns:
     """Return the columns of a bag, ``time`` [s] among them. Raises ValueError if it is damaged or has no JointState."""
-    highlevel, typesys = (
-        require(f"rosbags.{name}", what="a ROS bag") for name in ("highlevel", "typesys")
-    )
+    highlevel = require("rosbags.highlevel", what="a ROS bag")
+    typesys = require("rosbags.typesys", what="a ROS bag")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
         with highlevel.AnyReader([path], default_typestore=store) as bag:
@@ -68,50 +76,79 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = (
-            f"; where its recorder was killed, {MENDS[path.suffix]} mends it"
-            if path.suffix in MENDS
-            else ""
-        )
-        raise ValueError(f"it is damaged: {error}{mend}") from error
+        mend = MENDS.get(path.suffix)
+        hint = f"; where its recorder was killed, {mend} mends it" if mend else ""
+        raise ValueError(f"it is damaged: {error}{hint}") from error
 
 
 def _columns(bag: Any) -> Columns:
+    """The columns of an open bag, in the order in which they first come."""
+    if not any(c.msgtype == JOINT_STATE and c.msgcount for c in bag.connections):
+        topics = ", ".join(f"{c.topic} ({c.msgtype})" for c in bag.connections)
+        raise ValueError(
+            f"it holds no sensor_msgs/JointState; its topics: {topics or 'none'}",
+        )
+    tables = _tables(bag)
+    names = dict.fromkeys(chain.from_iterable(tables.values()))
+    del names["came"]
+    clock = max(tables, key=lambda publisher: (len(publisher), len(tables[publisher])))
+    rows = tables.pop(clock)
+    if tables:
+        note(
+            f"messages come at several rates: a row is one of {' '.join(clock)}, "
+            "others keep their newest values"
+        )
+    for other in tables.values():
+        rows = _with_newest(rows, other)
+    rows["time"] -= rows["time"].iloc[0]  # seconds since 1970 would cost digits
+    return {name: rows[name].to_numpy() for name in names}
+
+
+def _tables(bag: Any) -> dict[tuple[str, ...], Any]:
+    """The messages of each publisher as a frame of pandas.
+
+    Returns:
+        By a topic and the joints that its messages name: when messages came [s], their times [s], and their numbers.
+    """
     import pandas as pd
 
-    chosen = [c for c in bag.connections if c.msgtype in MESSAGES]
-    states = [c for c in chosen if c.msgtype == JOINT_STATE]
-    if not any(c.msgcount for c in states):
-        topics = ", ".join(f"{c.topic} ({c.msgtype})" for c in bag.connections) or "none"
-        raise ValueError(f"it holds no sensor_msgs/JointState; its topics: {topics}")
-    said: dict[tuple[str, ...], list[Numbers]] = {}  # on a topic, of the same joints
-    for connection, written, raw in bag.messages(connections=chosen):
-        message = bag.deserialize(raw, connection.msgtype)
-        numbers = MESSAGES[connection.msgtype](message)
-        key = (connection.topic, *sorted(getattr(message, "name", ())))
-        named = {f"{connection.topic.strip('/')}.{name}": value for name, value in numbers.items()}
+    messages: dict[tuple[str, ...], list[Numbers]] = defaultdict(list)
+    connections = [c for c in bag.connections if c.msgtype in MESSAGES]
+    for connection, written, raw in bag.messages(connections=connections):
+        kind = connection.msgtype
+        topic = connection.topic.strip("/")
+        message = bag.deserialize(raw, kind)
         came = 1e-9 * written
-        said.setdefault(key, []).append({"came": came, "time": stamp_of(message) or came} | named)
-    of_states = {c.topic for c in states}
-    clock = max(
-        (key for key in said if key[0] in of_states), key=lambda key: (len(key), len(said[key]))
+        row = {"came": came, "time": stamp_of(message) or came}
+        row |= numbers_of(kind, topic, message)
+        joints = sorted(getattr(message, "name", ()))
+        messages[topic, *joints].append(row)
+    return {publisher: pd.DataFrame(rows) for publisher, rows in messages.items()}
+
+
+def _with_newest(rows: Any, other: Any) -> Any:
+    """Rows with the newest values of another publisher, as long as these are not old."""
+    import pandas as pd
+
+    period = np.ptp(other["came"]) / max(len(other) - 1, 1)  # [s]
+    new = other.columns.difference(rows.columns)
+    return pd.merge_asof(
+        rows,
+        other[["came", *new]],
+        on="came",
+        tolerance=HELD * period,
     )
-    if len(said) > 1:
-        note(
-            f"messages come at several rates: a row is one of {' '.join(clock)}, others keep their newest values"
-        )
-    tables = {key: pd.DataFrame(messages) for key, messages in said.items()}
-    rows = tables[clock]
-    for other in (table for key, table in tables.items() if key != clock):
-        old = HELD * (other["came"].iloc[-1] - other["came"].iloc[0]) / max(len(other) - 1, 1)
-        new = other[["came", *other.columns.difference(rows.columns)]]
-        rows = pd.merge_asof(rows, new, on="came", tolerance=old)
-    rows["time"] -= rows["time"].iloc[0]  # seconds since 1970 would cost digits
-    names = dict.fromkeys(name for table in tables.values() for name in table if name != "came")
-    return {name: rows[name].to_numpy() for name in names}
+
+
+def numbers_of(kind: str, topic: str, message: Any) -> Numbers:
+    """Return the numbers of a message of a type in ``MESSAGES``, each named after its topic."""
+    numbers = MESSAGES[kind](message)
+    return {f"{topic}.{name}": value for name, value in numbers.items()}
 
 
 def stamp_of(message: Any) -> float:
     """Return the time in the header of a message [s]; 0 where it has none."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return 0.0 if stamp is None else float(stamp.sec + 1e-9 * stamp.nanosec)
+    if not hasattr(message, "header"):
+        return 0.0
+    stamp = message.header.stamp
+    return float(stamp.sec + 1e-9 * stamp.nanosec)

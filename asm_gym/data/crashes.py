@@ -18,33 +18,44 @@ CRASH = 2.0  # A crash presses this many times as hard as is usual
 def peak_force(episode: Episode) -> float:
     """Return the greatest contact force [N]; NaN where none was measured."""
     force = episode.contact_force
-    return float(np.nanmax(force)) if np.isfinite(force).any() else float("nan")
+    if not np.isfinite(force).any():
+        return float("nan")
+    return float(np.nanmax(force))
 
 
 def peak_torques(episode: Episode) -> NDArray[np.float64]:
-    """Return (T,) the largest external torque on a joint in each row [N m], within it where sensed; 0 without any."""
-    slices = episode.spec.slices
-    sensed = [
-        [s for name, s in slices.items() if name.endswith(f"external_torque{end}")]
-        for end in ("_peak", "")
-    ]
-    torques = [np.abs(episode.stream[:, s]).max(axis=1) for s in sensed[0] or sensed[1]]
-    return np.max([np.zeros(len(episode)), *torques], axis=0)
+    """Return (T,) the largest external torque on a joint in each row [N m]; 0 where none is sensed.
+
+    The largest torque within a row is taken where the robot senses it.
+    """
+    for ending in ("external_torque_peak", "external_torque"):
+        channels = [s for name, s in episode.spec.slices.items() if name.endswith(ending)]
+        if channels:
+            torques = np.hstack([episode.stream[:, s] for s in channels])
+            largest = np.abs(torques).max(axis=1)
+            return largest.astype(np.float64)
+    return np.zeros(len(episode))
 
 
 def crashes(
-    episodes: Sequence[Episode], tasks: Sequence[str], reference: Sequence[bool] = ()
+    episodes: Sequence[Episode],
+    tasks: Sequence[str],
+    reference: Sequence[bool] = (),
 ) -> dict[int, float]:
-    """Return the numbers of the episodes that crash, and how many times as hard as is usual in their tasks they press.
+    """Return the crashes, as how many times as hard as is usual they press, by the number of the episode.
 
-    ``reference`` says which episodes tell what is usual: by default, and where none does, all.
+    Args:
+        episodes: of any tasks.
+        tasks: the task of each episode.
+        reference: whether an episode tells what is usual in its task; by default, and where none of a task does, all.
     """
-    of, times = np.asarray(tasks), np.zeros(len(episodes))
-    tells = np.array(reference or [True] * len(episodes), bool)
-    peak = np.array([peak_force(e) for e in episodes])
-    for task in dict.fromkeys(tasks):
-        own = (of == task) & np.isfinite(peak)
-        known = own & tells if (own & tells).any() else own
-        if own.any() and (usual := np.median(peak[known])) > 0:
-            times[own] = peak[own] / usual
-    return {int(n): float(times[n]) for n in np.flatnonzero(times > CRASH)}
+    import pandas as pd
+
+    peaks = pd.Series([peak_force(e) for e in episodes], dtype=np.float64)
+    by_task = np.asarray(tasks)
+    usual = peaks.groupby(by_task).transform("median")
+    if reference:
+        chosen = peaks.where(np.asarray(reference))
+        usual = chosen.groupby(by_task).transform("median").fillna(usual)
+    times = peaks / usual.where(usual > 0)
+    return times[times > CRASH].to_dict()

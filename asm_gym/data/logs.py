@@ -19,8 +19,9 @@ from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
 from asm_gym.data.channels import RESAMPLED, clock_of, read_recorded
 from asm_gym.data.columns import LogLayout
-from asm_gym.data.datasets import INFO, METADATA, read_dataset, read_lerobot
 from asm_gym.data.episode import Episode, load_episode
+from asm_gym.data.lerobot_datasets import INFO, read_lerobot
+from asm_gym.data.minari_datasets import METADATA, read_dataset
 from asm_gym.data.names import is_label
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.tables import Columns, laid_out

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from asm_gym.control_period import whole_multiple
 from asm_gym.data.episode import CONTROLLER
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
@@ -65,10 +66,24 @@ def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -
         raise TypeError(
             f"monitor must have initial_state() and observe(), got {short_repr(monitor)}"
         )
-    monitor.spec.require(watched, "the monitor")
+    _check_stream(monitor.spec, watched)
     _check_same("robot", monitor.spec.source, watched.source)
     _check_same(CONTROLLER, getattr(monitor, "about", {}).get(CONTROLLER, ""), controller)
     return check_number("the monitor's threshold", monitor.threshold)
+
+
+def _check_stream(learned: StreamSpec, watched: StreamSpec) -> None:
+    """Raise ValueError unless a monitor of the stream ``learned`` can read the stream ``watched``."""
+    try:
+        learned.require(watched, "the monitor")
+    except ValueError as error:
+        multiple = whole_multiple(watched.dt, learned.dt)
+        if multiple < 2:
+            raise
+        raise ValueError(
+            f"{error}\nA control step takes {multiple} times as long. If a wrapper inside the guard repeats actions, "
+            "put it outside, or fit a monitor on episodes that were recorded through it"
+        ) from error
 
 
 def _check_same(what: str, learned: str, watched: str) -> None:

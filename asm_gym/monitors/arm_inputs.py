@@ -135,9 +135,18 @@ def forces(spec: StreamSpec) -> NDArray[np.intp]:
 
 
 def judged_by_values(spec: StreamSpec) -> bool:
-    """Tell whether a held push shows in values alone: torques are measured, and nothing feels contact itself."""
-    felt = any(c.group == "wrench" or "external" in c.name for c in spec.channels)
-    return bool(len(forces(spec)) and len(speeds(spec)[0])) and not felt
+    """Return whether a memory of this stream judges values by default.
+
+    It does where the stream has torques, currents or efforts, by the names of its channels. A
+    simulation that also measures contact itself, by a wrist sensor or as external torque, is left
+    to changes: there contact shows a held push. In a log (``spec.source`` of ``"table"``) such
+    channels are estimates of the robot's own controller, and values are judged beside them.
+    """
+    measures_contact = any(
+        channel.group == "wrench" or "external" in channel.name for channel in spec.channels
+    )
+    is_log = spec.source == "table"
+    return len(forces(spec)) > 0 and (is_log or not measures_contact)
 
 
 def motion(spec: StreamSpec) -> NDArray[np.intp]:

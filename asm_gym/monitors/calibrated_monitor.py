@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.data.action_meaning import ACTIONS, found_meaning
+from asm_gym.data.action_identification import found_meaning
+from asm_gym.data.action_meaning import ACTIONS
 from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
@@ -22,7 +23,6 @@ from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import (
-    LOG,
     AlarmRate,
     apart_for_ceilings,
     require_sight,
@@ -171,15 +171,23 @@ class CalibratedMonitor:
         return self
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
-        rng, one_in = np.random.default_rng(self.seed), self.model.held_out
-        order = rng.permutation(len(episodes)) if one_in else np.arange(len(episodes))
-        kept = len(episodes) // one_in if one_in else 0
-        held_out, learned = ([episodes[i] for i in part] for part in (order[:kept], order[kept:]))
+        rng = np.random.default_rng(self.seed)
+        order = list(range(len(episodes)))
+        kept = 0
+        if self.model.held_out:
+            order = rng.permutation(len(episodes)).tolist()
+            kept = len(episodes) // self.model.held_out
+        held_out = [episodes[n] for n in order[:kept]]
+        learned = [episodes[n] for n in order[kept:]]
+
         self._uncalibrate()
+        hashes = hashes_of(episodes)
+        if warm_start and self.learned_from_ is not None:
+            hashes = np.union1d(self.learned_from_, hashes)
+        self.learned_from_ = hashes
         if not warm_start:
-            self.learned_from_ = self.ceilings_from_ = None
-        before = np.zeros(0) if self.learned_from_ is None else self.learned_from_
-        self.learned_from_ = np.union1d(before, hashes_of(episodes))
+            self.ceilings_from_ = None
+
         model: Any = self.model
         with threadpool_limits(1):  # products this small are slower on several threads
             if warm_start:
@@ -233,7 +241,7 @@ class CalibratedMonitor:
 
         Raises:
             ValueError: too few episodes or hours for this rate (the message names the rate that they can promise), bad
-                episodes, or not exactly one rate; per hour also an episode given twice, or one used in ``fit``.
+                episodes, not exactly one rate, an episode that was given to ``fit``, or one that is given twice.
         """
         self._require_fitted()
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
@@ -243,54 +251,50 @@ class CalibratedMonitor:
                 f"each must name a group for each episode, got {len(each)} for {len(episodes)} episodes"
             )
         asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
-        evidence = isinstance(self.detection, EvidenceDetection)
-        apart = (
-            apart_for_ceilings(episodes, asked, each)
-            if evidence
-            else np.zeros(len(episodes), np.bool_)
-        )
-        try:
-            check_fresh(episodes, self.learned_from_, None if apart.any() else self.ceilings_from_)
-        except ValueError as error:
-            if asked.per == HOUR:
-                raise
-            LOG.warning("%s; with it the promised rate does not hold", error)
+        apart: set[int] = set()
+        if isinstance(self.detection, EvidenceDetection):
+            apart = apart_for_ceilings(episodes, asked, each)
+        check_fresh(episodes, self.learned_from_, None if apart else self.ceilings_from_)
+
         new = self._copy()
-        chosen, fresh = (
-            [episodes[n] for n in np.flatnonzero(part).tolist()] for part in (apart, ~apart)
-        )
-        if chosen:
-            new.detection, new.ceilings_from_ = with_ceilings(self, chosen), hashes_of(chosen)
+        if apart:
+            chosen = [episodes[n] for n in sorted(apart)]
+            new.detection = with_ceilings(self, chosen)
             new.detections[new.detection.name] = new.detection
-            each = [each[n] for n in np.flatnonzero(~apart).tolist()] if each else ()
+            new.ceilings_from_ = hashes_of(chosen)
+        fresh = [episode for n, episode in enumerate(episodes) if n not in apart]
+        groups = [group for n, group in enumerate(each) if n not in apart]
+
         new = new._balanced(fresh)
-        values = [s.value for s in new.score_episodes(fresh)]
-        threshold = asked.threshold_of(values, self.spec.dt, each)
-        require_sight(new.detection, self.model.error_columns, self.spec, threshold)
+        new._set_threshold(fresh, asked, groups)
+        new._keep_limits(episodes)
         vars(self).update(vars(new))
-        self.threshold_, self.promised_ = threshold, asked.per
-        self.maxima_, self.blocks_ = (
-            np.array([v.max() for v in values]),
-            Blocks.of(values, self.spec.dt, each),
-        )
-        streams = [episode.stream for episode in episodes]
-        self.healthy_, self.pace_ = (
-            healthy_forces(streams, self.spec),
-            HandSpeedMap.by_task(episodes, self.spec),
-        )
-        self.motion_, self.commands_ = (
-            learned_motion(streams, self.spec),
-            healthy_commands(streams, self.spec),
-        )
         return self
+
+    def _set_threshold(
+        self, episodes: Sequence[Episode], asked: AlarmRate, groups: Sequence[str]
+    ) -> None:
+        """Set the threshold for a rate of alarms in fresh episodes, and in each of their groups."""
+        values = [surprise.value for surprise in self.score_episodes(episodes)]
+        self.threshold_ = asked.threshold_of(values, self.spec.dt, groups)
+        require_sight(self.detection, self.model.error_columns, self.spec, self.threshold_)
+        self.promised_ = asked.per
+        self.maxima_ = np.array([value.max() for value in values])
+        self.blocks_ = Blocks.of(values, self.spec.dt, groups)
+
+    def _keep_limits(self, episodes: Sequence[Episode]) -> None:
+        """Keep the forces, speeds, motion and commands of healthy episodes."""
+        streams = [episode.stream for episode in episodes]
+        self.healthy_ = healthy_forces(streams, self.spec)
+        self.pace_ = HandSpeedMap.by_task(episodes, self.spec)
+        self.motion_ = learned_motion(streams, self.spec)
+        self.commands_ = healthy_commands(streams, self.spec)
 
     @property
     def threshold(self) -> float:
         """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
         if self.threshold_ is None:
-            raise RuntimeError(
-                f"this {self._name} has no threshold yet: call calibrate(nominal_episodes) first"
-            )
+            raise self._lacking("threshold")
         return self.threshold_
 
     @typed
@@ -301,18 +305,14 @@ class CalibratedMonitor:
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         kept = self.blocks_ if asked.per == HOUR else self.maxima_
         if kept is None or self.maxima_ is None:
-            raise RuntimeError(
-                f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first"
-            )
+            raise self._lacking("calibration")
         return asked.threshold(self.maxima_, self.blocks_)
 
     @property
     def promise(self) -> Promise:
         """The promised rate of alarms in nominal operation. Raises RuntimeError before ``calibrate``."""
         if self.maxima_ is None:
-            raise RuntimeError(
-                f"this {self._name} has no calibration yet: call calibrate(nominal_episodes) first"
-            )
+            raise self._lacking("calibration")
         if self.promised_ == HOUR and self.blocks_ is not None:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
@@ -365,17 +365,13 @@ class CalibratedMonitor:
         for episode in episodes:
             self.spec.require(episode.spec, "the episode")
         self._require_fitted()
-        scores: list[Surprise] = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(
-            episodes
-        )
+        scores = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
         with threadpool_limits(1):
             for group, steps in side_by_side(episodes, self.initial_state, self.observe):
-                known = [f for f in Surprise._fields if steps and getattr(steps[0], f) is not None]
-                for n, i in enumerate(group):
-                    if own := steps[: len(episodes[i])]:
-                        scores[i] = Surprise(
-                            **{name: np.array([getattr(s, name)[n] for s in own]) for name in known}
-                        )
+                for stream, number in enumerate(group):
+                    own = steps[: len(episodes[number])]
+                    if own:
+                        scores[number] = _of_stream(own, stream)
         return scores
 
     @typed
@@ -414,13 +410,24 @@ class CalibratedMonitor:
         return self
 
     def _uncalibrate(self) -> None:
-        self.threshold_ = self.maxima_ = self.blocks_ = None
-        self.promised_, self.healthy_ = EPISODE, ()
-        self.pace_, self.motion_, self.commands_ = {}, None, None
+        self.threshold_ = None
+        self.maxima_ = None
+        self.blocks_ = None
+        self.promised_ = EPISODE
+        self.healthy_ = ()
+        self.pace_ = {}
+        self.motion_ = None
+        self.commands_ = None
 
     @property
     def _name(self) -> str:
         return f"{self.model.kind} monitor"
+
+    def _lacking(self, what: str) -> RuntimeError:
+        """Return the error of a monitor that is not calibrated."""
+        return RuntimeError(
+            f"this {self._name} has no {what} yet: call calibrate(nominal_episodes) first"
+        )
 
     def _copy(self) -> Self:
         """Return a copy that shares nothing that learning changes; learned arrays are never changed in place."""
@@ -457,3 +464,12 @@ class CalibratedMonitor:
     def _place_errors(self) -> None:
         """Find the columns of errors, once the model knows them."""
         self._places = error_places(self.model.error_columns, self.spec)
+
+
+def _of_stream(steps: Sequence[Surprise], stream: int) -> Surprise:
+    """Return the surprise over T steps of one of several streams that were observed together."""
+    fields = {}
+    for name in Surprise._fields:
+        if getattr(steps[0], name) is not None:
+            fields[name] = np.array([getattr(step, name)[stream] for step in steps])
+    return Surprise(**fields)

@@ -25,6 +25,7 @@ from asm_gym.detection.conformal import (
 )
 from asm_gym.detection.evidence import FEWEST_EPISODES
 from asm_gym.monitors.stream_model import model_outputs
+from asm_gym.monitors.training_data import shortened
 from asm_gym.spec import StreamSpec
 
 if TYPE_CHECKING:
@@ -39,7 +40,6 @@ ONE_IN = (
 )
 AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
-MOST_NAMED = 6  # channels that a message names
 
 
 class AlarmRate(NamedTuple):
@@ -119,11 +119,10 @@ def require_sight(
     blind = blind_to(detection, errors, spec, threshold)
     if not blind:
         return
-    named = ", ".join(blind[:MOST_NAMED])
-    named += f" and {len(blind) - MOST_NAMED} more" if len(blind) > MOST_NAMED else ""
     message = (
-        f"the threshold came to {threshold:.3g}, which no fault of {named} could pass, however strong: an episode "
-        "to calibrate on is unlike those learned from, or a channel hardly moved in them: learn from more"
+        f"the threshold came to {threshold:.3g}, which no fault of {shortened(blind)} could pass, "
+        "however strong: an episode to calibrate on is unlike those learned from, "
+        "or a channel hardly moved in them: learn from more"
     )
     if len(blind) > MOST_BLIND * len(np.unique(errors[errors >= 0])):
         raise ValueError(message)
@@ -132,8 +131,8 @@ def require_sight(
 
 def apart_for_ceilings(
     episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()
-) -> NDArray[np.bool_]:
-    """Return which nominal episodes (n,) are to set ceilings, and not the threshold: one in so many of each group.
+) -> set[int]:
+    """Return which nominal episodes are to set ceilings, and not the threshold: one in so many of each group.
 
     None are where they would be fewer than ``FEWEST_EPISODES``, or the others too few for the rate that is asked for.
     """
@@ -141,10 +140,9 @@ def apart_for_ceilings(
     for n, name in enumerate(each or [""] * len(episodes)):
         groups[name].append(n)
     for one_in in ONE_IN:
-        apart = np.zeros(len(episodes), np.bool_)
-        apart[[n for own in groups.values() for n in own[::one_in]]] = True
-        others = ([episodes[n] for n in own if not apart[n]] for own in groups.values())
-        if apart.sum() >= FEWEST_EPISODES and all(map(asked.possible, others)):
+        apart = {n for own in groups.values() for n in own[::one_in]}
+        others = ([episodes[n] for n in own if n not in apart] for own in groups.values())
+        if len(apart) >= FEWEST_EPISODES and all(map(asked.possible, others)):
             return apart
     if len(episodes) >= ONE_IN[0] * FEWEST_EPISODES:
         LOG.warning(
@@ -152,7 +150,7 @@ def apart_for_ceilings(
             "and fewer faults are found: record more, or ask for a higher rate",
             len(episodes),
         )
-    return np.zeros(len(episodes), np.bool_)
+    return set()
 
 
 def with_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> EvidenceDetection:

@@ -22,7 +22,7 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
-from asm_gym.monitors.arm_inputs import Derived
+from asm_gym.monitors.arm_inputs import Derived, judged_by_values
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
@@ -56,14 +56,15 @@ class NeuralASM(CalibratedMonitor):
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
         values: judge values, such as torques, beside changes (``monitors.values``), if other senses predict them: for
-            lasting pushes, in logs of real arms.
+            lasting pushes. None judges them where torques, currents or efforts are among the senses
+            (``arm_inputs.judged_by_values``).
         urdf: text of the arm's body model, from ``body_model.read_urdf``, to predict torques from the weight and the
-            inertia of its links. It needs ``values=True``.
+            inertia of its links, where values are judged.
         seed: of the initial weights and of the order of the episodes.
         config: all other hyperparameters.
 
     Attributes:
-        values_: judges values; None before ``fit``, with ``values=False``, and if nothing predicts a value.
+        values_: judges values; None before ``fit``, where values are not judged, and if nothing predicts one.
         excuses_: distinguishes knocks and stops from faults; None with ``excuses=False``.
 
     Example:
@@ -93,7 +94,7 @@ class NeuralASM(CalibratedMonitor):
         habituates: bool = True,
         dynamics: str = TRACES,
         excuses: bool = False,
-        values: bool = False,
+        values: bool | None = None,
         urdf: str = "",
         seed: int = 0,
         config: MemoryConfig | None = None,
@@ -114,9 +115,15 @@ class NeuralASM(CalibratedMonitor):
         self.free_running_probability = check_number(
             "free_running_probability", free_running_probability, low=0.0, high=1.0
         )
-        self.values, self.excuses = check_flag("values", values), check_flag("excuses", excuses)
-        if urdf and not values:
-            raise ValueError("a body model predicts torques, which only values=True judges")
+        if values is None:
+            values = judged_by_values(spec)
+        self.values = check_flag("values", values)
+        self.excuses = check_flag("excuses", excuses)
+        if urdf and not self.values:
+            raise ValueError(
+                "a body model predicts torques, and values are not judged: "
+                "the stream has none, or values=False was given; leave urdf out"
+            )
         Derived.of(spec, urdf)  # refuses a body model that does not fit
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)

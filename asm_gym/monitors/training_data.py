@@ -17,6 +17,7 @@ from asm_gym.spec import StreamSpec
 WILD = 1e6  # largest distance of a number from its channel's median, in ranges of the channel
 
 ALIKE = 1.0 - 1e-9  # correlation of copies
+MOST_NAMED = 6  # names that a message lists
 
 Hashes = NDArray[np.float64]  # one of each episode, of 52 bits, which a double holds exactly
 
@@ -55,22 +56,20 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
 
 def mute_channels(episodes: Sequence[Episode]) -> list[str]:
     """Say, a line each, which numbers of the stream never move, and which are copies of others."""
-    rows, labels = (
-        np.concatenate([e.stream for e in episodes]).astype(np.float64),
-        episodes[0].spec.labels,
-    )
+    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
+    labels = np.array(episodes[0].spec.labels)
     moves = np.ptp(rows, axis=0) > 0
-    lines = [
-        f"{labels[i]} never moves in these episodes: its motion will be an alarm"
-        for i in np.flatnonzero(~moves)
+    notes = [
+        f"{label} never moves in these episodes: its motion will be an alarm"
+        for label in labels[~moves]
     ]
-    moving = np.flatnonzero(moves)
-    alike = np.abs(np.corrcoef(rows[:, moving], rowvar=False).reshape(len(moving), -1)) > ALIKE
-    pairs = ((i, np.argmax(own)) for i, own in enumerate(alike) if np.argmax(own) < i)
-    return lines + [
-        f"{labels[moving[i]]} is a copy of {labels[moving[j]]}, and cannot check it"
-        for i, j in pairs
-    ]
+    moving = labels[moves]
+    correlation = np.corrcoef(rows[:, moves], rowvar=False).reshape(len(moving), -1)
+    for column, own in enumerate(np.abs(correlation) > ALIKE):
+        first = np.argmax(own)
+        if first < column:
+            notes.append(f"{moving[column]} is a copy of {moving[first]}, and cannot check it")
+    return notes
 
 
 def hashes_of(episodes: Sequence[Episode]) -> Hashes:
@@ -81,14 +80,36 @@ def hashes_of(episodes: Sequence[Episode]) -> Hashes:
 
 
 def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
-    """Raise ValueError for an episode that is given twice or whose hash is among those ``learned`` from."""
-    known = [hashes for hashes in learned if hashes is not None]
-    first: dict[float, int] = {}
-    for n, own in enumerate(hashes_of(episodes)):
-        if any(own in hashes for hashes in known):
+    """Check that calibration episodes were not learned from, and that each is given once.
+
+    Args:
+        episodes: to calibrate on.
+        *learned: hashes of episodes that were learned from, each perhaps None.
+
+    Raises:
+        ValueError: some were, or are copies of others; the message gives their numbers.
+    """
+    hashes = hashes_of(episodes)
+    for known in learned:
+        seen = np.flatnonzero(np.isin(hashes, [] if known is None else known))
+        if len(seen):
             raise ValueError(
-                f"episode {n} was learned from, so its surprise is too low to set a threshold: give other episodes"
+                "calibrate() needs episodes that were not learned from, as the surprise of others is "
+                f"too low to set a threshold: leave out episodes {shortened(seen)}, or replace them"
             )
-        if own in first:
-            raise ValueError(f"episodes {first[own]} and {n} are the same: give each once")
-        first[own] = n
+    _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
+    original = first[group]  # (N,) number of the first episode with the same rows
+    copies = np.flatnonzero(original != np.arange(len(hashes)))
+    if len(copies):
+        raise ValueError(
+            f"calibrate() needs each episode once: leave out episodes {shortened(copies)}, "
+            f"whose rows are those of episodes {shortened(original[copies])}"
+        )
+
+
+def shortened(names: Sequence[object] | NDArray[np.intp]) -> str:
+    """Return the first names, and how many more there are."""
+    text = ", ".join(map(str, names[:MOST_NAMED]))
+    if len(names) > MOST_NAMED:
+        text += f" and {len(names) - MOST_NAMED} more"
+    return text

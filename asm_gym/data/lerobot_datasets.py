@@ -1,0 +1,103 @@
+"""Read LeRobot's datasets, without LeRobot.
+
+    meta/info.json       version, rate (fps), and the features: dtype, shape, names
+    data/**/*.parquet    a row a frame; version 2 has a file for each episode, version 3 many episodes in one
+
+Source: https://huggingface.co/docs/lerobot/lerobot-dataset-v3.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from asm_gym.data.arrays import read_parquet
+from asm_gym.data.tables import Columns, as_array
+
+INFO = Path("meta") / "info.json"
+
+# Features that are read begin so; pictures are left out.
+SENSED = "observation."
+COMMANDED = "action"
+
+
+def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
+    """Yield the columns of each episode, its rate [Hz], and whether it succeeded (by default it did)."""
+    import pandas as pd
+
+    rate, features = _features(folder)
+    data = folder / "data"
+    files = sorted(data.rglob("*.parquet"))
+    if not files:
+        raise ValueError(f"{folder} holds no data/**/*.parquet")
+    for file in files:
+        frames = pd.DataFrame(read_parquet(file))
+        missing = {*features, "episode_index"}.difference(frames)
+        if missing:
+            names = ", ".join(sorted(missing))
+            raise ValueError(
+                f"{file} lacks {names}, which {INFO} declares",
+            )
+        for _, episode in frames.groupby("episode_index", sort=False):
+            columns: Columns = {}
+            # Frames that were lost are known by the stamps alone.
+            if "timestamp" in frames:
+                columns["timestamp"] = episode["timestamp"].to_numpy()
+            for name, elements in features.items():
+                values = as_array(episode[name])
+                columns |= _columns(name, values, elements)
+            success = True
+            if "next.success" in frames:
+                success = bool(episode["next.success"].any())
+            yield columns, rate, success
+
+
+def _features(folder: Path) -> tuple[float, dict[str, list[str]]]:
+    """The rate [Hz], and the names of the numbers of each feature that is read, from the description of a dataset."""
+    path = folder / INFO
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+        version = str(info["codebase_version"])
+        rate = float(info["fps"])
+        features = dict(info["features"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no LeRobot dataset's: {error!r}") from error
+    if not version.startswith(("v2", "v3")):
+        raise ValueError(
+            f"{folder} is of LeRobot's {version}, and v2 and v3 can be read",
+        )
+    read = {}
+    for name, feature in features.items():
+        dtype = str(feature.get("dtype"))
+        is_number = dtype.startswith(("float", "int"))
+        if is_number and name.startswith((SENSED, COMMANDED)):
+            read[name] = _element_names(feature.get("names"))
+    if not any(name.startswith(SENSED) for name in read):
+        known = ", ".join(features)
+        raise ValueError(
+            f"{folder} has no feature that is sensed, observation.… of numbers: {known}",
+        )
+    return rate, read
+
+
+def _element_names(names: Any) -> list[str]:
+    """Names of the numbers of a feature, in a list or in lists by what they name; empty where they have none."""
+    if isinstance(names, dict):
+        names = list(names.values())
+    if not isinstance(names, list) or not names:
+        return []
+    return np.hstack(names).astype(str).tolist()
+
+
+def _columns(name: str, values: Any, elements: list[str]) -> Columns:
+    """The columns of a feature (T,) or (T, k), each by its name where there are as many different names."""
+    columns = {}
+    for element, column in zip(elements, values.T, strict=False):
+        columns[f"{name}[{element}]"] = column
+    if values.shape[1:] == (len(columns),) == (len(elements),):
+        return columns
+    return {name: values}
