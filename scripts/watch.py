@@ -28,6 +28,7 @@ from rich.console import Console
 from asm_gym.data.live import lines_from, live_source, publisher
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.schema import LogSchema
 from asm_gym.data.timing import SURPRISING, bridge_of, bridged
 from asm_gym.evaluation import alarms as recorded
 from asm_gym.evaluation.alarms import HEADINGS, Alarm
@@ -46,7 +47,7 @@ from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
 LIVE_ONLY = ("until_alarm", "json", "hook", "topic", "watchdog", "policy")  # options
-RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns", "like")
+RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
 KINDS = "a live source", "a recording"
 SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
 
@@ -95,7 +96,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     bridge = bridge_of(args.bridge, monitor.spec.dt)
     writable(args.out / "alarms.csv")
     with stage("watching", console, {}) as progress, noted() as notes:
-        logs = iter(read_logs(args.source, args.layout(spec=monitor.spec)))
+        logs = iter(read_logs(args.source, args.hints(), schema_of(args, monitor)))
         while group := list(
             islice(logs, AT_ONCE)
         ):  # a folder of recordings may be larger than memory
@@ -138,6 +139,19 @@ def review(args: Args, monitor: Any, console: Console) -> int:
         say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
     say(written)
     return ended(notes, BAD_NEWS if alarms else DONE)
+
+
+def schema_of(args: Args, monitor: Any) -> LogSchema:
+    """Return how logs are read: by --schema, by the schema that the memory keeps, or by its channels.
+
+    Raises:
+        ValueError: the schema is of other channels than the memory.
+    """
+    given = args.given_schema()
+    if given is None:
+        return LogSchema.kept_in(monitor.about, monitor.spec)
+    monitor.spec.require(given.spec, f"the schema {args.schema}")
+    return given
 
 
 def publish(
@@ -204,6 +218,7 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
             beat=beat,
             clock=args.clock,
             silence_s=args.silence,
+            schema=schema_of(args, monitor),
         )
         alarms = follow(lines, monitor, say, settings)
     if alarms:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.rows import Row, RowReader, SourceDied
+from asm_gym.data.schema import LogSchema
 from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.adapter import Adapter, SensedRows
@@ -62,6 +63,7 @@ class WatchSettings:
     beat: Callable[[], bool] | None = None  # tells a watchdog of a row; whether the watchdog lives
     clock: str = ""  # column of times; by default the first that has a clock's name
     silence_s: float = 2.0  # after which the numbers of one of several publishers are missing [s]
+    schema: LogSchema | None = None  # how lines are read; by default that of the memory
 
 
 USUAL = WatchSettings()
@@ -128,7 +130,8 @@ class LiveWatch(Adapter):
         self._say = say
         self._settings = settings
         self._spec = spec
-        self._reader = RowReader(spec, settings.clock, settings.silence_s)
+        schema = settings.schema or LogSchema.kept_in(getattr(monitor, "about", {}), spec)
+        self._reader = RowReader(schema, settings.clock, settings.silence_s)
         options = GuardOptions("monitor", contact_limits=None)
         self._guard = Guard(RobotFacts.unknown(spec), monitor, options)
         self._no_action = np.zeros((1, spec.motor.size), np.float32)
