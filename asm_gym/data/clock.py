@@ -26,6 +26,7 @@ TIME_OF_DAY = "time of day"
 KINDS = (NUMBER, DATE, TIME_OF_DAY)
 
 SINCE_1970 = 1e8  # a number of seconds from which on it counts from 1970: March 1973
+LATEST_DATE = 1e11  # stamps up to the year 5138 are dates [s]
 DAY_S = 86400.0
 _TIME_OF_DAY = r"\d{1,2}:\d\d:\d\d([.,]\d+)?"
 
@@ -247,3 +248,10 @@ def unit_by_size(number: float) -> float | None:
         if number >= least:
             return unit
     return None
+
+
+def date_of(stamp: float) -> str:
+    """Return a stamp since 1970 [s] as a date in ISO 8601; empty if it counts from elsewhere."""
+    if not SINCE_1970 <= stamp < LATEST_DATE:
+        return ""
+    return datetime.fromtimestamp(stamp, UTC).isoformat(timespec="milliseconds")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
+from asm_gym.data.log_comparison import refuse_unlike
 from asm_gym.data.logs import Log
 from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.readings import spans
@@ -27,10 +28,14 @@ def normal_episodes(
 
     ``progress`` is called with the number of logs so far. A table with marked rows is left out, or with
     ``between_marks`` learned from where none of them is near.
+
+    Raises:
+        ValueError: logs are copies of each other, or of different scale.
     """
     kept: list[Episode] = []
+    names: list[str] = []
     left_out = Counter[str]()
-    for n, (_, episode) in enumerate(logs, 1):
+    for n, (name, episode) in enumerate(logs, 1):
         progress(n, n)  # how many there are is known at the end
         role = ""
         if episode.label is not None:
@@ -38,13 +43,17 @@ def normal_episodes(
         if between_marks and episode.spec.source == "table" and episode.faults.any():
             near = round(AROUND_S / episode.spec.dt)
             close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
-            kept.extend(_parts(episode, ~close))
+            parts = _parts(episode, ~close)
+            kept += parts
+            names += [f"{name} part {part}" for part in range(len(parts))]
         elif episode.faults.any() or role == "faulty":
             left_out["with a fault"] += 1
         elif not episode.success:
             left_out["failed"] += 1
         else:
             kept.append(episode)
+            names.append(name)
+    refuse_unlike(kept, names)
     return kept, left_out
 
 
