@@ -15,8 +15,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.control_period import PeriodWarning as PeriodWarning
-from asm_gym.control_period import control_period as control_period
 from asm_gym.validation import check_number, short_repr, typed
 
 MOTOR = "action"  # the group that holds the commanded action

@@ -22,7 +22,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.selection import SHORTEST_S, normal_episodes, pieces, with_shared_noise
+from asm_gym.data.selection import SHORTEST_S, normal_episodes, pieces
 from asm_gym.data.timing import bridge_of, filled
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
@@ -237,10 +237,11 @@ def fit(args: Args, console: Console) -> int:
     args = record_live(args, say) if live else args
     start = time.perf_counter()
     writable(args.out)
-    layout = args.layout(action=args.action, by_name=True)
     with stage("reading", console, {}) as progress, noted() as notes:
         found, reasons = normal_episodes(
-            read_logs(args.data, layout), args.split is not None, progress
+            read_logs(args.data, args.hints(args.action), args.given_schema()),
+            args.split is not None,
+            progress,
         )
     left_out = ", ".join(f"{count} {why}" for why, count in reasons.items())
     if not found:
@@ -253,7 +254,7 @@ def fit(args: Args, console: Console) -> int:
             else ""
         )
         raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    parts, cuts = parts_between_gaps(args, with_shared_noise(found))
+    parts, cuts = parts_between_gaps(args, found)
     fitting, calibration = divide(
         args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live
     )

@@ -7,6 +7,7 @@ the log cannot be read as it is, or not with the others of its folder.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,9 +16,12 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from asm_gym.data.inspection import Inspection, inspected
-from asm_gym.data.logs import LIKE, Source, first_tables, read_tables
+from asm_gym.data.inspection import Inspection, inspect_log
+from asm_gym.data.logs import Source, first_sources, read_sources
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.schema import LogSchema
+from asm_gym.data.schema_file import write_schema
+from asm_gym.data.schema_inference import SchemaHints, infer_schema, recordings_in
 from asm_gym.data.tables import Columns
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
@@ -43,45 +47,71 @@ class Args(LogOptions):
     """Folder of the pictures."""
     logs: int = option(3, least=1)
     """Number of logs of a folder to draw; each other log gets one line."""
+    schema: Path | None = option(None, metavar="FILE")
+    """File to write the schema to, which says how the logs are read; edit it, and name it to fit and watch."""
 
 
 def inspect(args: Args, console: Console) -> int:
     """Read, print the table of the first log and a line of every other, and draw pictures."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    known, trouble, first = set[str](), False, None
+    said: set[str] = set()
+    first: Inspection | None = None
+    trouble = False
     with noted() as notes:
-        layout = args.layout()
-        sources, tables = first_tables(read_tables(args.log, layout))
-        for n, source in enumerate(sources):
-            columns, nominal = table_of_source(source), replace(layout, nominal=source.rate)
-            if source.episode is not None:  # its stream is what it is
-                nominal = replace(nominal, channels=("*",))
-            log = inspected(
-                source.name, columns, nominal, [t for t in tables if t is not source.columns]
-            )
-            trouble = trouble or bool(log.trouble) or not log.rate
+        hints = args.hints()
+        for n, (source, schema, problem) in enumerate(sources_with_schema(args, hints)):
+            log = inspect_log(source.name, table_of_source(source), schema, problem)
+            trouble = trouble or bool(log.trouble)
             say(log.caption())
-            lines = [
-                *(table(log.facts) if first is None else []),
-                *(f"- {line}" for line in log.remarks()),
-            ]
+            lines = [] if first is not None else table(log.facts())
+            lines += [f"- {line}" for line in log.remarks()]
             for line in lines:
-                if line not in known:  # of many logs what is alike is said once
+                if line not in said:  # what is alike in many logs is said once
                     say(line)
-            known.update(line for line in lines if line.startswith("- "))
+            said.update(line for line in lines if line.startswith("- "))
             if n < args.logs:
-                name = (
-                    source.name.replace(Path(source.file).suffix, "").replace(os.sep, "_") or "log"
-                )
-                picture = figures.save(figures.log_figure(log), args.out / f"{name}.png")
-                say(f"Wrote {picture}")
-            if first is not None and (line := differences(first, log)):
-                trouble = True
-                say(line)
-            first = first or log
+                picture = args.out / f"{picture_name(source)}.png"
+                say(f"Wrote {figures.save(figures.log_figure(log), picture)}")
+            if first is None:
+                first = log
+                if args.schema is not None:
+                    write_schema(args.schema, schema)
+                    say(f"Wrote {args.schema}. Next: asm-gym fit {args.log} --schema {args.schema}")
     for note in notes:
         say(f"Note: {note}.")
     return ended(notes, BAD_NEWS if trouble else DONE)
+
+
+def sources_with_schema(args: Args, hints: SchemaHints) -> Iterator[tuple[Source, LogSchema, str]]:
+    """Yield the recordings, cut where their clock begins anew, and the schema of the first of them.
+
+    Also yields why no schema can be inferred as it is; empty if one can.
+    """
+    sources, first = first_sources(read_sources(args.log, hints))
+    schema = None
+    problem = ""
+    if first:
+        hints = replace(hints, stated_rate=first[0].stated_rate)
+        tables = [source.columns for source in first]
+        try:
+            schema = infer_schema(tables, hints)
+        except ValueError as error:
+            problem = str(error)
+            schema = infer_schema(tables, replace(hints, clock="", rate=1.0))
+    for source in sources:
+        if source.episode is not None or schema is None:
+            yield source, infer_schema([table_of_source(source)], SchemaHints(channels=("*",))), ""
+            continue
+        parts = recordings_in(source.columns, schema.clock)
+        for number, part in enumerate(parts, 1):
+            name = source.name if len(parts) == 1 else f"{source.name} part {number}"
+            yield replace(source, name=name, columns=part), schema, problem
+
+
+def picture_name(source: Source) -> str:
+    """Return the name of a recording's picture."""
+    name = source.name.replace(Path(source.file).suffix, "") if source.file else source.name
+    return name.replace(os.sep, "_") or "log"
 
 
 def table_of_source(source: Source) -> Columns:
@@ -106,16 +136,6 @@ def table(facts: list[dict[str, Any]]) -> list[str]:
 def _cell(heading: str, fact: Any) -> str:
     known = fact == fact and (fact or heading in ("from", "to"))  # words have no range: NaN
     return FORMATS.get(heading, "{}").format(fact) if known else ""
-
-
-def differences(first: Inspection, other: Inspection) -> str:
-    """Say why two logs of a folder could not be learned from together; empty where they can."""
-    mine, theirs = ({c.name for c in log.columns if c.read} for log in (first, other))
-    if mine != theirs:
-        return f"{other.name} has other columns than {first.name}: {', '.join(sorted(mine ^ theirs)[:6])}; {LIKE}"
-    if first.rate and other.rate and abs(first.rate / other.rate - 1) > 0.01:
-        return f"{other.name} comes at {other.rate:.5g} Hz and {first.name} at {first.rate:.5g}: say --rate; {LIKE}"
-    return ""
 
 
 main = partial(run, "inspect", Args, inspect)

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from asm_gym.data.columns import LogLayout
 from asm_gym.data.reader_notes import UNREAD
+from asm_gym.data.schema import LogSchema
+from asm_gym.data.schema_file import read_schema
+from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.scripts.command import DONE, REFUSED, Checked, option
 from asm_gym.validation import check_number
 
@@ -30,20 +31,35 @@ class LogOptions(Checked):
     """Columns that mark faulty rows, beside those with usual names; marked rows are not learned from."""
     columns: tuple[str, ...] = option((), metavar="NAME")
     """Names of the columns of files without a header."""
-    like: Path | None = option(None, metavar="FILE")
-    """Log of one robot: of a folder with logs of several robots, read only those with its columns and its rate."""
+    schema: Path | None = option(None, metavar="FILE")
+    """Schema of the logs, written by asm-gym inspect --schema and edited; by default it is inferred."""
 
-    def layout(self, **more: Any) -> LogLayout:
-        """Return how to read logs; ``more`` are other fields of it."""
-        said = {
-            "channels": self.channels,
-            "labels": self.label,
-            "columns": self.columns,
-            "ignore": self.ignore,
-        }
-        return LogLayout(
-            **{"rate": self.rate, "clock": self.clock, "like": self.like} | said | more
+    def hints(self, action: Sequence[str] = ()) -> SchemaHints:
+        """Return what the user says of the logs; ``action`` are patterns of the commands."""
+        return SchemaHints(
+            rate=self.rate,
+            clock=self.clock,
+            channels=self.channels,
+            action=action,
+            labels=self.label,
+            ignore=self.ignore,
+            columns=self.columns,
         )
+
+    def given_schema(self) -> LogSchema | None:
+        """Return the schema that the user names; None without one.
+
+        Raises:
+            OSError: there is no such file.
+            ValueError: it is damaged, or options stand beside it that it holds itself.
+        """
+        if self.schema is None:
+            return None
+        if self.channels:
+            raise ValueError(
+                "--channels and --schema exclude each other: the schema names the roles"
+            )
+        return read_schema(self.schema)
 
 
 def ended(notes: Sequence[str], code: int = DONE) -> int:

@@ -17,7 +17,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -25,10 +25,12 @@ from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.clock import date_of
 from asm_gym.data.dds_topics import publisher
 from asm_gym.data.live import lines_from, live_source
-from asm_gym.data.logs import read_logs
+from asm_gym.data.logs import Log, read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.schema import ORIGIN, LogSchema
 from asm_gym.data.timing import SURPRISING, bridge_of, bridged
 from asm_gym.evaluation import alarms as recorded
 from asm_gym.evaluation.alarms import HEADINGS, Alarm
@@ -36,8 +38,15 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
-from asm_gym.guard.live_events import ALARM, LiveEvent, hold_by_hook, run_hook
-from asm_gym.guard.live_watch import WatchSettings, follow
+from asm_gym.guard.live_events import (
+    ALARM,
+    NOTE,
+    SUMMARY,
+    LiveEvent,
+    hold_by_hook,
+    run_hook,
+)
+from asm_gym.guard.live_watch import WatchSettings, counted, follow
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
@@ -46,8 +55,8 @@ from asm_gym.scripts.log_options import LogOptions, ended
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
-LIVE_ONLY = ("until_alarm", "json", "hook", "topic", "watchdog", "policy")  # options
-RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns", "like")
+LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy")  # options
+RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
 KINDS = "a live source", "a recording"
 SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
 
@@ -71,7 +80,7 @@ class Args(LogOptions):
     until_alarm: bool = False
     """End at the first alarm of a live source, with exit code 1: asm-gym watch ... --until-alarm || stop."""
     json: bool = False
-    """Print events of a live source as JSON lines: kind, time, text, reason, channel, thresholds, latency_ms."""
+    """Print events as JSON lines: kind, time, text, stamp, date, log, reason, channel, thresholds, latency_ms."""
     hook: str | None = option(None, metavar="COMMAND")
     """Shell command to run at every alarm of a live source; it gets the alarm as JSON on its standard input."""
     topic: str = option("", metavar="TOPIC")
@@ -88,62 +97,127 @@ class Args(LogOptions):
     """Number of episodes to draw, the most surprising first."""
 
 
+@dataclass
+class Review:
+    """What was found in the recordings up to now."""
+
+    alarms: list[Alarm] = field(default_factory=list)
+    worst: list[ScoredEpisode] = field(default_factory=list)  # the most surprising first
+    episodes: int = 0
+    excused: Counter[str] = field(default_factory=Counter)  # events that were no alarms
+    bridged_rows: int = 0
+
+    def add(self, logs: Sequence[Log], monitor: Any, bridge: float, figures: int) -> None:
+        """Score some recordings, and keep the ``figures`` most surprising ones."""
+        for log, trace in zip(logs, recorded.traces_of(logs, monitor, bridge), strict=True):
+            rows = bridged(log.episode.stream, monitor.spec.dt, bridge)
+            self.bridged_rows += int(rows.sum())
+            self.alarms += recorded.alarms_of(trace, log.episode.info.get(ORIGIN))
+            self.excused.update(recorded.excused_in(trace))
+            self.worst.append(trace)
+        self.worst.sort(key=lambda trace: -recorded.sensed_peak(trace))
+        del self.worst[figures:]
+        self.episodes += len(logs)
+
+    def summary(self) -> str:
+        """Return how many alarms there were, and how many events that were none."""
+        logs = len({alarm.log for alarm in self.alarms})
+        parts = [f"{counted(len(self.alarms), 'alarm')} in {logs} of {self.episodes} episodes"]
+        parts += [counted(count, event) for event, count in self.excused.items() if count]
+        return ", ".join(parts)
+
+
 def review(args: Args, monitor: Any, console: Console) -> int:
     """Score a recording, write its alarms and a report, and print the alarms."""
-    alarms: list[Alarm] = []
-    worst: list[ScoredEpisode] = []
-    episodes, excused, over = 0, Counter[str](), 0
+    found = Review()
     bridge = bridge_of(args.bridge, monitor.spec.dt)
     writable(args.out / "alarms.csv")
-    with stage("watching", console, {}) as progress, noted() as notes:
-        logs = iter(read_logs(args.source, args.layout(spec=monitor.spec)))
-        while group := list(
-            islice(logs, AT_ONCE)
-        ):  # a folder of recordings may be larger than memory
-            traces = recorded.traces_of(group, monitor, bridge)
-            over += sum(
-                int(bridged(log.episode.stream, monitor.spec.dt, bridge).sum()) for log in group
-            )
-            alarms += [alarm for trace in traces for alarm in recorded.alarms_of(trace)]
-            excused.update(
-                event
-                for trace in traces
-                for event in Counter(recorded.excused_in(trace)).elements()
-            )
-            worst = sorted([*worst, *traces], key=lambda trace: -recorded.sensed_peak(trace))[
-                : args.figures
-            ]
-            episodes += len(group)
-            progress(episodes, episodes)
-    summary = f"{len(alarms)} alarm{'s' * (len(alarms) != 1)} in {len({a.log for a in alarms})} of {episodes} episodes"
-    summary += "".join(f", {count} {event}{'s' * (count != 1)}" for event, count in excused.items())
+    progress_to = Console(stderr=True) if args.json else console
+    with stage("watching", progress_to, {}) as progress, noted() as notes:
+        logs = iter(read_logs(args.source, args.hints(), schema_of(args, monitor)))
+        while group := list(islice(logs, AT_ONCE)):  # a folder may be larger than memory
+            found.add(group, monitor, bridge, args.figures)
+            progress(found.episodes, found.episodes)
+
     table = io.StringIO(newline="")
-    csv.writer(table).writerows(
-        [HEADINGS, *(map(recorded.plain_cell, alarm.cells()) for alarm in alarms)]
-    )
+    rows = [map(recorded.plain_cell, alarm.cells()) for alarm in found.alarms]
+    csv.writer(table).writerows([HEADINGS, *rows])
     write_text(args.out / "alarms.csv", table.getvalue())
-    written = publish(args, summary, alarms, worst)
+    written = publish(args, found)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
+    if args.json:
+        say_events(found, notes, say)
+    else:
+        say_table(found, notes, bridge, say)
+        say(written)
+    return ended(notes, BAD_NEWS if found.alarms else DONE)
+
+
+def say_events(found: Review, notes: Sequence[str], say: Callable[[str], None]) -> None:
+    """Print notes, alarms and the summary of recordings as JSON lines."""
+    for line in notes:
+        say(LiveEvent(kind=NOTE, time=0.0, text=line).to_json())
+    for alarm in found.alarms:
+        say(event_of(alarm).to_json())
+    say(LiveEvent(kind=SUMMARY, time=0.0, text=found.summary()).to_json())
+
+
+def event_of(alarm: Alarm) -> LiveEvent:
+    """Return an alarm of a recording as the event that a live watch makes of it."""
+    date = ""
+    if alarm.stamp is not None:
+        date = date_of(alarm.stamp)
+    return LiveEvent(
+        kind=ALARM,
+        time=alarm.start,
+        text=f"{alarm.excess:.2f} thresholds up to {alarm.end:.3f} s",
+        reason=alarm.why,
+        channel=alarm.channel,
+        thresholds=alarm.excess,
+        stamp=alarm.stamp,
+        date=date,
+        log=alarm.log,
+    )
+
+
+def say_table(
+    found: Review, notes: Sequence[str], bridge: float, say: Callable[[str], None]
+) -> None:
+    """Print notes, the summary and the largest alarms of recordings, missing data last."""
     for line in notes:
         say(f"Note: {line}.")
-    if over:
+    if found.bridged_rows:
         say(
-            f"Bridged {over} rows that lack a number, in gaps of at most {bridge:.3g} s: they are not judged."
+            f"Bridged {found.bridged_rows} rows that lack a number, in gaps of at most "
+            f"{bridge:.3g} s: they are not judged."
         )
-    shown = sorted(alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))[:SHOWN_ROWS]
-    say(summary + ("" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} largest:"))
-    width = max((len(alarm.channel) for alarm in shown), default=0)
-    for log, start, end, channel, why, excess in (
-        [HEADINGS, *(alarm.cells() for alarm in shown)] if shown else []
-    ):
-        say(f"{start:>10} {end:>10} {excess:>11}  {channel:<{width}}  {why:<12}  {log}")
-    say(written)
-    return ended(notes, BAD_NEWS if alarms else DONE)
+    alarms = sorted(found.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
+    shown = [alarm.cells() for alarm in alarms[:SHOWN_ROWS]]
+    more = "" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} largest:"
+    say(found.summary() + more)
+    if not shown:
+        return
+    has_stamps = any(cells[6] for cells in shown)
+    width = max(len(cells[3]) for cells in shown)
+    for log, start, end, channel, why, excess, stamp, _ in [HEADINGS, *shown]:
+        clock = f"{stamp:>16}  " if has_stamps else ""
+        say(f"{start:>10} {end:>10} {excess:>11}  {clock}{channel:<{width}}  {why:<12}  {log}")
 
 
-def publish(
-    args: Args, summary: str, alarms: Sequence[Alarm], worst: Sequence[ScoredEpisode]
-) -> str:
+def schema_of(args: Args, monitor: Any) -> LogSchema:
+    """Return how logs are read: by --schema, by the schema that the memory keeps, or by its channels.
+
+    Raises:
+        ValueError: the schema is of other channels than the memory.
+    """
+    given = args.given_schema()
+    if given is None:
+        return LogSchema.kept_in(monitor.about, monitor.spec)
+    monitor.spec.require(given.spec, f"the schema {args.schema}")
+    return given
+
+
+def publish(args: Args, found: Review) -> str:
     """Write a report with the most surprising episodes; return what was written, and what is missing for more."""
     try:
         with needed_for("the report"):
@@ -152,14 +226,20 @@ def publish(
     except ImportError as error:
         return f"Wrote {args.out / 'alarms.csv'}; {error}"
     over_time = "Surprise over time, the most surprising episode first (--figures sets how many)"
-    drawn = {"surprise": figures.surprise_figure(worst), "stream": figures.stream_figure(worst[0])}
+    drawn = {
+        "surprise": figures.surprise_figure(found.worst),
+        "stream": figures.stream_figure(found.worst[0]),
+    }
     for name, figure in drawn.items():
         figures.save(figure, args.out / f"{name}.png")
+    tables = []
+    if found.alarms:
+        tables = [Table("Alarms", HEADINGS, [alarm.cells() for alarm in found.alarms])]
     write_report(
         args.out / "report.html",
         f"asm-gym watch: {args.source}",
-        f"{summary}, as {args.monitor} sees them.",
-        [Table("Alarms", HEADINGS, [alarm.cells() for alarm in alarms])] if alarms else [],
+        f"{found.summary()}, as {args.monitor} sees them.",
+        tables,
         {over_time: drawn["surprise"], "What its most surprising channels sensed": drawn["stream"]},
         details=origin(),
     )
@@ -205,6 +285,7 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
             beat=beat,
             clock=args.clock,
             silence_s=args.silence,
+            schema=schema_of(args, monitor),
         )
         alarms = follow(lines, monitor, say, settings)
     if alarms:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from asm_gym.data.arrays import read_hdf5, read_mat
-from asm_gym.data.columns import LogLayout
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.schema_inference import SchemaHints
 from tests.needs import needs
 
 h5py = needs("h5py")
@@ -43,7 +43,7 @@ def test_of_an_aloha_file_the_joints_are_read_and_compressed_pictures_are_left_o
         compress_len=np.full((2, ROWS), 9000.0),
     )
     with noted() as notes:
-        ((_, episode),) = read_logs(path, LogLayout(rate=50.0))
+        ((_, episode),) = read_logs(path, SchemaHints(rate=50.0))
     qpos = [f"observations.qpos[{k}]" for k in range(14)]
     assert set(episode.spec.labels) == {*qpos, *(f"action[{k}]" for k in range(14))}
     first = episode.spec.labels.index(qpos[0])

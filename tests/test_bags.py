@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.data.columns import LogLayout
 from asm_gym.data.logs import read_logs
+from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.spec import MOTOR
 from tests.needs import needs
 
@@ -72,7 +72,7 @@ def bag(
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_a_bag_is_a_table_at_the_rate_of_its_joints(plugin, tmp_path):
     folder = bag(tmp_path / "bag", plugin)
-    ((name, episode),) = read_logs(folder, LogLayout(action=["target*"]))
+    ((name, episode),) = read_logs(folder, SchemaHints(action=["target*"]))
     assert Path(name).suffix == {"SQLITE3": ".db3", "MCAP": ".mcap"}[plugin]
     assert episode.spec.labels[:2] == ("wrist.force[x]", "wrist.force[y]")
     column = {label: episode.stream[:, k] for k, label in enumerate(episode.spec.labels)}

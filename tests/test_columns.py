@@ -9,13 +9,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from asm_gym.data.channels import ColumnPlan, read_recorded
-from asm_gym.data.clock import find_clock
-from asm_gym.data.columns import LogLayout, code_of, counts, decide, follows, turn_of
+from asm_gym.data.column_behaviour import (
+    counts,
+    is_second_clock,
+    missing_value_sentinel,
+    wrap_period,
+)
 from asm_gym.data.episode import Episode
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import LogWarning, noted
 from asm_gym.data.rows import RowReader
+from asm_gym.data.schema import ColumnMatch, LogSchema
 from asm_gym.evaluation.alarms import alarms_of, sensed_peak
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.scripts.cli import main
@@ -49,11 +53,11 @@ def test_a_counter_rises_by_a_constant_and_may_wrap_and_lose_rows(values, is_cou
 
 
 def test_a_second_clock_goes_on_as_the_first_does():
-    assert follows(3600 + T / 3600, T)
-    assert follows((T * 1e9).astype(np.int64) + RNG.integers(0, 1000, ROWS), T)
-    assert not follows(Q, T)
-    assert not follows(np.exp(T / 4), T)  # warms up
-    assert not follows(np.zeros(ROWS), T)
+    assert is_second_clock(3600 + T / 3600, T)
+    assert is_second_clock((T * 1e9).astype(np.int64) + RNG.integers(0, 1000, ROWS), T)
+    assert not is_second_clock(Q, T)
+    assert not is_second_clock(np.exp(T / 4), T)  # warms up
+    assert not is_second_clock(np.zeros(ROWS), T)
 
 
 @pytest.mark.parametrize("turn", [360.0, 2 * np.pi])
@@ -61,17 +65,17 @@ def test_a_second_clock_goes_on_as_the_first_does():
 def test_an_angle_that_turns_over_is_found(turn, low):
     angle = 0.7 * turn * np.sin(T) + 0.4 * turn
     over = (angle - low * turn) % turn + low * turn
-    assert turn_of(over, "") == pytest.approx(turn)
-    assert turn_of(angle, "") == 0
-    assert turn_of(np.where(T % 1 < 0.5, -turn / 2, turn / 2), "") == 0  # a switch
-    assert turn_of(Q, "rad") == 0
+    assert wrap_period(over, "") == pytest.approx(turn)
+    assert wrap_period(angle, "") == 0
+    assert wrap_period(np.where(T % 1 < 0.5, -turn / 2, turn / 2), "") == 0  # a switch
+    assert wrap_period(Q, "rad") == 0
 
 
 def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat():
     for code in (-99999.0, 9999.0, -1e38, 6553.5):
         coded = Q.copy()
         coded[[5, 60, 61, 150]] = code
-        assert code_of(coded) == code
+        assert missing_value_sentinel(coded) == code
     for code, rest in (
         (-1.0, 200 + Q),
         (0.0, 5 + 0.1 * Q),
@@ -79,11 +83,13 @@ def test_numbers_that_stand_for_missing_data_are_isolated_extremes_that_repeat()
     ):  # a small one stands in single rows
         coded = rest.copy()
         coded[7::15] = code
-        assert code_of(coded) == code
-        assert np.isnan(code_of(np.where(T > 2, code, rest)))
-    assert np.isnan(code_of(Q))
-    assert np.isnan(code_of(np.where(T > 3.5, 2.0, Q)))  # a stop
-    assert np.isnan(code_of(np.where(np.arange(ROWS) == 9, 500.0, Q)))  # once: a glitch
+        assert missing_value_sentinel(coded) == code
+        assert np.isnan(missing_value_sentinel(np.where(T > 2, code, rest)))
+    assert np.isnan(missing_value_sentinel(Q))
+    assert np.isnan(missing_value_sentinel(np.where(T > 3.5, 2.0, Q)))  # a stop
+    assert np.isnan(
+        missing_value_sentinel(np.where(np.arange(ROWS) == 9, 500.0, Q))
+    )  # once: a glitch
 
 
 HEALTHY = {"time": T, "q0": Q, "q1": np.cos(2 * T) + 1e-3 * RNG.normal(size=ROWS)}
@@ -92,8 +98,8 @@ ASIDE = {
     "hours": (T / 3600, "counter"),
     "mode": (np.full(ROWS, 7), "constant"),
     "again": (Q, "copy"),
-    "nothing": (np.full(ROWS, np.nan), "empty"),
-    "frame_id": (np.array(["base"] * ROWS, object), "words"),
+    "nothing": (np.full(ROWS, np.nan), "ignored"),
+    "frame_id": (np.array(["base"] * ROWS, object), "ignored"),
     "y_true": (np.zeros(ROWS), "label"),
     "remaining": (5000 - np.arange(ROWS), "counter"),
     "time_left": (60 - T, "counter"),
@@ -107,14 +113,15 @@ def test_what_is_no_sense_is_set_aside_and_changes_nothing(name):
     """The same motion, read by a memory, whatever such a column does later."""
     values, role = ASIDE[name]
     table = HEALTHY | {name: values}
-    columns = {c.name: c for c in decide([table], LogLayout(), find_clock(table))}
+    schema = LogSchema.infer([table])
+    columns = {c.name: c for c in schema.columns}
     assert columns[name].role == role
-    found = read_recorded(table, LogLayout())
+    found = schema.read(table)
     assert found.spec.labels == ("q[0]", "q[1]")
     later = table | {name: values + 30_000 if values.dtype.kind in "iuf" else values}
-    np.testing.assert_array_equal(read_recorded(later, LogLayout(found.spec)).stream, found.stream)
+    np.testing.assert_array_equal(schema.read(later).stream, found.stream)
     if role in ("counter", "constant", "copy", "clock", "label"):
-        assert "--channels" in columns[name].why
+        assert "--channels" in columns[name].reason
         assert name in Episode.from_table(table, channels=["q*", name]).spec.labels
 
 
@@ -122,28 +129,28 @@ def test_a_label_that_is_constant_in_training_is_said_and_changes_nothing_when_i
     for name in ("y_true", "is_anomaly", "ground_truth", "fault_id"):
         healthy = HEALTHY | {name: np.zeros(ROWS)}
         with noted() as notes:
-            spec = read_recorded(healthy, LogLayout()).spec
+            spec = Episode.from_table(healthy).spec
         assert any(name in line and "--channels" in line for line in notes)
         marked = HEALTHY | {name: np.where(T > 2, 3.0, 0.0)}
         np.testing.assert_array_equal(
-            read_recorded(marked, LogLayout(spec)).stream,
-            read_recorded(healthy, LogLayout(spec)).stream,
+            Episode.from_table(marked, spec).stream,
+            Episode.from_table(healthy, spec).stream,
         )
-        assert read_recorded(marked, LogLayout()).faults.sum() == (T > 2).sum()
+        assert Episode.from_table(marked).faults.sum() == (T > 2).sum()
 
 
 def test_a_sense_that_is_called_as_a_label_is_is_read_and_one_of_whole_numbers_where_the_user_says_so():
     current = HEALTHY | {"fault_current": Q * Q}
-    found = read_recorded(current, LogLayout())
+    found = Episode.from_table(current)
     assert "fault_current" in found.spec.labels
     assert not found.faults.any()
     steps = HEALTHY | {"fault_current": np.rint(500 + 100 * Q)}
-    assert read_recorded(steps, LogLayout()).faults.all()
-    assert not read_recorded(steps, LogLayout(ignore=("fault*",))).faults.any()
-    asked = read_recorded(steps, LogLayout(channels=("q*", "fault_current")))
+    assert Episode.from_table(steps).faults.all()
+    assert not Episode.from_table(steps, ignore=("fault*",)).faults.any()
+    asked = Episode.from_table(steps, channels=("q*", "fault_current"))
     assert "fault_current" in asked.spec.labels
     assert not asked.faults.any()
-    assert read_recorded(current, LogLayout(labels=("fault*",))).faults.all()
+    assert Episode.from_table(current, labels=("fault*",)).faults.all()
 
 
 def test_tables_of_one_robot_have_one_spec_though_a_column_stands_still_in_some():
@@ -158,9 +165,9 @@ def test_tables_of_one_robot_have_one_spec_though_a_column_stands_still_in_some(
 
 def test_a_joint_that_stands_while_others_move_is_read_and_one_that_all_logs_leave_alone_is_not():
     table = HEALTHY | {"q2": np.zeros(ROWS), "brake": np.ones(ROWS)}
-    assert read_recorded(table, LogLayout()).spec.labels == ("q[0]", "q[1]", "q[2]")
+    assert Episode.from_table(table).spec.labels == ("q[0]", "q[1]", "q[2]")
     moves = HEALTHY | {"q2": np.zeros(ROWS), "brake": (T > 2).astype(float)}
-    assert "brake" in read_recorded(table, LogLayout(), [moves]).spec.labels
+    assert "brake" in LogSchema.infer([table, moves]).spec.labels
 
 
 @pytest.mark.parametrize("unit", ["deg", "rad"])
@@ -169,23 +176,23 @@ def test_a_bias_of_an_angle_is_the_same_wherever_it_turns_over_in_files_and_live
     angle = 0.1 * turn * np.sin(2 * T) + 0.5 * turn
     over = (angle + turn / 2) % turn - turn / 2
     table = {"time": T, f"yaw [{unit}]": over, "q": Q}
-    found = read_recorded(table, LogLayout())
+    found = Episode.from_table(table)
     assert found.spec.labels == ("yaw[sin]", "yaw[cos]", "q")
     np.testing.assert_allclose(found.stream[:, 0], np.sin(2 * np.pi * angle / turn), atol=1e-6)
     saved = StreamSpec.from_json(found.spec.to_json())
     lines = [
         json.dumps({name: float(values[k]) for name, values in table.items()}) for k in range(20)
     ]
-    live = np.array([row.numbers for row, _ in RowReader(saved).rows(lines)])
+    live = np.array([row.numbers for row, _ in RowReader(LogSchema.of_spec(saved)).rows(lines)])
     np.testing.assert_allclose(live, found.stream[:20], atol=1e-6)
 
 
 def test_codes_for_missing_data_are_kept_with_the_memory_and_missing_live_too():
     q = Q.copy()
     q[[9, 50, 90]] = -99999
-    spec = read_recorded(HEALTHY | {"q0": q}, LogLayout()).spec
-    plan = ColumnPlan(["q0", "q1"], StreamSpec.from_json(spec.to_json()))
-    np.testing.assert_array_equal(plan.row({"q0": -99999, "q1": 1.0}), [np.nan, 1.0])
+    schema = LogSchema.infer([HEALTHY | {"q0": q}])
+    match = ColumnMatch(LogSchema.from_json(json.loads(json.dumps(schema.to_json()))), ["q0", "q1"])
+    np.testing.assert_array_equal(match.row({"q0": -99999, "q1": 1.0}), [np.nan, 1.0])
 
 
 def test_clocks_that_disagree_are_said_and_the_user_chooses():
@@ -296,33 +303,10 @@ def test_a_pointer_a_folder_of_two_robots_and_an_unwritable_output_are_refused_i
     assert "git lfs pull" in capsys.readouterr().err
     (tmp_path / "b").mkdir()
     pd.DataFrame(arm_table(0)).to_csv(tmp_path / "b" / "0.csv", index=False)
-    other = tmp_path / "b" / "1.csv"
-    pd.DataFrame(HEALTHY).to_csv(other, index=False)
+    pd.DataFrame(HEALTHY).to_csv(tmp_path / "b" / "1.csv", index=False)
     assert main(["fit", str(tmp_path / "b")]) == 2
     said = capsys.readouterr().err
     assert "1.csv: the memory reads channels that are not there: torque" in said
-    assert f"or {other}" in said
-    # at its rate
-    pd.DataFrame(HEALTHY | {"time": 3 * HEALTHY["time"]}).to_csv(
-        tmp_path / "b" / "2.csv", index=False
-    )
-    logs = read_logs(tmp_path / "b", LogLayout(like=other))
-    assert [log.name for log in logs] == ["1.csv"]
-    how = [
-        "--out",
-        str(tmp_path / "m.asm"),
-        "--monitor",
-        "kalman",
-        "--split",
-        "0.2",
-        "--false-alarm-rate",
-        "0.2",
-    ]
-    assert main(["fit", str(tmp_path / "b"), *how, "--like", str(other)]) == 0
-    assert (
-        main(["inspect", str(tmp_path / "b"), "--out", str(tmp_path / "i"), "--like", str(other)])
-        == 0
-    )
     (tmp_path / "file").write_text("")
     assert main(["fit", str(tmp_path / "b"), "--out", str(tmp_path / "file" / "m.asm")]) == 2
     assert str(tmp_path / "file") in capsys.readouterr().err

@@ -14,6 +14,7 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.data.live import SourceDied, lines_from
 from asm_gym.data.rows import RowReader
+from asm_gym.data.schema import LogSchema
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main
 from asm_gym.spec import Channel, StreamSpec
@@ -184,7 +185,7 @@ def test_joints_in_any_order_dropped_and_late_messages_and_another_quality_are_r
     publish(
         "/joint_states", shuffled, quality=core.Qos(reliable, core.Policy.Durability.TransientLocal)
     )
-    reader = RowReader(spec)
+    reader = RowReader(LogSchema.of_spec(spec))
     rows = [row for (row, _), _ in zip(reader.rows(lines()), range(80), strict=False)]
     read = [row for row in rows if row.read]
     assert all(row.numbers[0] == -row.numbers[1] == row.numbers[2] for row in read)

@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from asm_gym.data.columns import LogLayout
 from asm_gym.data.logs import Log, read_logs
 from asm_gym.data.reader_notes import noted
+from asm_gym.data.schema_inference import SchemaHints
 from tests.needs import needs
 
 ROWS, START = 200, 1_700_000_000
@@ -478,7 +478,7 @@ SHAPES = {
 def logs_of(shape: Shape, at: Path) -> tuple[list[Log], Motion]:
     m = motion(shape.hz)
     with noted():
-        return list(read_logs(shape.write(at, m), LogLayout(**shape.layout, by_name=True))), m
+        return list(read_logs(shape.write(at, m), SchemaHints(**shape.layout))), m
 
 
 @pytest.mark.parametrize("name", SHAPES)

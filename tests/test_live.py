@@ -14,10 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.data.columns import LogLayout
 from asm_gym.data.live import SourceDied, lines_from, live_source, record
+from asm_gym.data.live_clock import NEWEST, Pace
 from asm_gym.data.logs import read_logs
-from asm_gym.data.rows import NEWEST, Pace, Publishers, RowReader
+from asm_gym.data.rows import Publishers, RowReader
+from asm_gym.data.schema import LogSchema
+from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
@@ -36,11 +38,14 @@ def csv_lines(times=None, rows=ROWS, header="time [s],cmd,q_0 [rad],q_1 [rad],no
 
 
 def read(lines):
-    return [(row.numbers.tolist(), row.lost) for row, _ in RowReader(SPEC).rows(lines)]
+    return [
+        (row.numbers.tolist(), row.lost)
+        for row, _ in RowReader(LogSchema.of_spec(SPEC)).rows(lines)
+    ]
 
 
 def problems(lines):
-    return [row.problem for row, _ in RowReader(SPEC).rows(lines)]
+    return [row.problem for row, _ in RowReader(LogSchema.of_spec(SPEC)).rows(lines)]
 
 
 def test_csv_is_read_by_its_header_in_whatever_order():
@@ -64,7 +69,7 @@ def test_rows_that_are_missing_by_their_time_are_counted():
 def test_the_clock_that_is_asked_for_is_read():
     row = {"time": 0, "q": [1, 2], "torque": 3, "cmd": 4}  # the first clock stands still
     lines = [json.dumps(row | {"tick": 20 * k}) for k in (0, 1, 4)]
-    rows = [row for row, _ in RowReader(SPEC, "tick [ms]").rows(lines)]
+    rows = [row for row, _ in RowReader(LogSchema.of_spec(SPEC), "tick [ms]").rows(lines)]
     assert [(row.lost, row.problem) for row in rows] == [(0, ""), (0, ""), (2, "")]
 
 
@@ -74,7 +79,7 @@ def test_nested_json_and_units_are_read_as_from_a_file():
         '{"arm": {"q [deg]": [180, 90]}, "current [mA]": 500}',
         '{"arm": {"q [deg]": [0, null]}, "current [mA]": 1}',
     ]
-    first, second = (row.numbers for row, _ in RowReader(spec).rows(lines))
+    first, second = (row.numbers for row, _ in RowReader(LogSchema.of_spec(spec)).rows(lines))
     np.testing.assert_allclose(first, [np.pi, np.pi / 2, 0.5])
     np.testing.assert_allclose(second, [0.0, np.nan, 0.001])
 
@@ -85,10 +90,12 @@ def test_text_of_any_encoding_is_read_as_from_a_file(encoding, tmp_path):
     path = tmp_path / "x.csv"
     rows = [f"{k / 50:.2f};{90 * np.sin(k / 9):.3f};{k % 7}".replace(".", ",") for k in range(60)]
     path.write_bytes("\n".join(["Zeit [s];Achse 1 [°];Öl", *rows, ""]).encode(encoding))
-    ((_, episode),) = read_logs(path, LogLayout(clock="Zeit"))
+    ((_, episode),) = read_logs(path, SchemaHints(clock="Zeit"))
     followed = lines_from(f"tail:{path}", io.StringIO(), 1.0)
     lines = [line for _, line in zip(range(61), followed, strict=False)]
-    live = [row.numbers for row, _ in RowReader(episode.spec, "Zeit").rows(lines)]
+    live = [
+        row.numbers for row, _ in RowReader(LogSchema.of_spec(episode.spec), "Zeit").rows(lines)
+    ]
     assert episode.spec.labels == ("Achse 1", "Öl")
     np.testing.assert_allclose(live, episode.stream, rtol=1e-6)
 
@@ -110,7 +117,7 @@ def test_a_row_of_each_joint_makes_one_of_all_in_any_order_and_one_that_was_lost
         if as_json
         else ["time,joint,position [rad]", *(f"{0.02 * k},{j},{x}" for k, j, x in rows)]
     )
-    read = [row for row, _ in RowReader(spec).rows(lines)]
+    read = [row for row, _ in RowReader(LogSchema.of_spec(spec)).rows(lines)]
     np.testing.assert_array_equal(
         [r.numbers for r in read], [[0, 10], [1, 11], [2, np.nan], [3, 13], [4, 14]]
     )
@@ -143,7 +150,7 @@ def test_publishers_of_other_joints_make_one_row_and_one_that_lacks_a_number_lac
             else []
         )
     lines.insert(-1, said(18.5, elbow=18))  # without its lift
-    read = [row for row, _ in RowReader(spec).rows(lines)]
+    read = [row for row, _ in RowReader(LogSchema.of_spec(spec)).rows(lines)]
     first = 0 if finger_first else 1
     wanted = [[k, k + 100, (k - 1) // 4 * 4 if k else -1] for k in range(first, 19)]
     np.testing.assert_array_equal(
@@ -221,7 +228,7 @@ def test_whatever_a_line_holds_reading_goes_on():
     ]
     rows = [
         row
-        for row, _ in RowReader(SPEC).rows(
+        for row, _ in RowReader(LogSchema.of_spec(SPEC)).rows(
             [bad[0], good, *(line for b in bad for line in (b, good))]
         )
     ]
@@ -231,7 +238,7 @@ def test_whatever_a_line_holds_reading_goes_on():
 
 def stamped(*stamps):
     named = ({"t": t, "q": [1, 2], "torque": 3, "cmd": 4} for t in stamps)
-    return [row for row, _ in RowReader(SPEC).rows(map(json.dumps, named))]
+    return [row for row, _ in RowReader(LogSchema.of_spec(SPEC)).rows(map(json.dumps, named))]
 
 
 @pytest.mark.parametrize("stamp", [-1.0, 0.0, 0.02, 1e18, 1e300, "NaN", "soon"])

@@ -292,8 +292,8 @@ def test_an_infinite_surprise_is_json_too():
 
 
 def test_what_is_for_a_live_source_is_refused_with_a_recording(monitor, tmp_path, capsys):
-    assert live(monitor, tmp_path, str(tmp_path), "--json") == 2
-    assert "--json is for a live source" in capsys.readouterr().err
+    assert live(monitor, tmp_path, str(tmp_path), "--until-alarm") == 2
+    assert "--until-alarm is for a live source" in capsys.readouterr().err
     assert live(monitor, tmp_path, "-", "--ignore", "q") == 2
     assert "--ignore is for a recording" in capsys.readouterr().err
 

@@ -12,12 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from asm_gym.data.clock import clocks_among
-from asm_gym.data.columns import LogLayout
+from asm_gym.data.clock_inference import clocks_among
 from asm_gym.data.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.data.logs import FILES, read_logs
 from asm_gym.data.names import is_command
 from asm_gym.data.reader_notes import LogWarning, noted
+from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.data.selection import normal_episodes
 from asm_gym.data.text import read_text
 from asm_gym.data.timing import evenly, period
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings("default::asm_gym.data.reader_notes.LogW
 
 
 def read(path: Path, **layout: Any) -> Episode:
-    ((_, episode),) = read_logs(path, LogLayout(**layout))
+    ((_, episode),) = read_logs(path, SchemaHints(**layout))
     return episode
 
 
@@ -110,10 +110,7 @@ def test_a_memory_says_what_a_log_lacks():
     lacking = {name: values for name, values in log(0).items() if name != "q_1"}
     with pytest.raises(ValueError, match=r"channels that are not there: q\[1\]"):
         Episode.from_table(lacking, channels=spec)
-    with (
-        pytest.raises(ValueError, match="reads 50 rows a second, these come at 100"),
-        pytest.warns(LogWarning),
-    ):
+    with pytest.raises(ValueError, match="reads 50 rows a second, these come at 100"):
         Episode.from_table(log(0), channels=spec, rate=100)
 
 
@@ -486,7 +483,7 @@ def test_a_run_folder_a_file_and_arrays_are_read(tmp_path):
     assert name == "Lift/fit/3.npz"
     np.testing.assert_array_equal(read.stream, episode.stream)
     np.savez(tmp_path / "raw.npz", **log(0))
-    ((name, read),) = read_logs(tmp_path / "raw.npz", LogLayout(action=()))
+    ((name, read),) = read_logs(tmp_path / "raw.npz", SchemaHints(action=()))
     assert name == "raw.npz"
     np.testing.assert_array_equal(read.stream, episode.stream)
 
@@ -529,7 +526,7 @@ def test_every_format_of_a_table_gives_the_same_rows(tmp_path):
     pd.DataFrame(columns).to_json(
         tmp_path / "f.jsonl", orient="records", lines=True, double_precision=15
     )
-    found = {name: episode for name, episode in read_logs(tmp_path, LogLayout(action=["cmd*"]))}
+    found = {name: episode for name, episode in read_logs(tmp_path, SchemaHints(action=["cmd*"]))}
     assert list(found) == ["a.csv", "b.parquet", "c.parquet", "d.npz", "f.jsonl"]
     for episode in found.values():
         np.testing.assert_allclose(episode.stream, wanted.stream, rtol=1e-6)

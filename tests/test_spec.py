@@ -11,8 +11,9 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asm_gym.control_period import PeriodWarning, control_period
 from asm_gym.data.episode import Episode, EpisodeLabel, load_episode, save_episode
-from asm_gym.spec import MOTOR, Channel, PeriodWarning, StreamSpec, control_period
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers.recording import StreamRecorder
 
 SPEC = StreamSpec(

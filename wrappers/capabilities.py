@@ -10,12 +10,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.control_period import control_period
 from asm_gym.data.action_meaning import ActionMeaning, ActionMeans
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.kinematics import Chain
 from asm_gym.guard.robot_facts import RobotFacts, TurningAction
 from asm_gym.policies.hold import Staying, gripper_columns, nearest_to_zero, staying, why_changed
-from asm_gym.spec import Channel, StreamSpec, control_period
+from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers.env_attributes import AnyEnv, EnvAttributes
 from asm_gym.wrappers.observation_map import ObservationMap, ObservationPart, parts_of
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeans
-from asm_gym.data.rows import ClockWentBack, Pace
+from asm_gym.data.live_clock import ClockWentBack, Pace
 from asm_gym.data.timing import blamed, reason
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.alarm_terms import FAILURE

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
-from asm_gym.data.channels import read_recorded
-from asm_gym.data.columns import LogLayout
+from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
+from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns
 from asm_gym.data.tables import laid_out
 from asm_gym.files import regular_file
 from asm_gym.readings import spans as spans
@@ -126,7 +126,7 @@ class Episode:
     @classmethod
     @typed
     def from_table(
-        cls, frame: Any, channels: StreamSpec | Sequence[str] | None = None, **how: Any
+        cls, frame: Any, channels: LogSchema | StreamSpec | Sequence[str] | None = None, **how: Any
     ) -> Episode:
         """Make an episode from one log; the arguments are those of ``from_tables``."""
         return cls.from_tables([frame], channels, **how)[0]
@@ -136,7 +136,7 @@ class Episode:
     def from_tables(
         cls,
         frames: Sequence[Any],
-        channels: StreamSpec | Sequence[str] | None = None,
+        channels: LogSchema | StreamSpec | Sequence[str] | None = None,
         rate: float | None = None,
         action: Sequence[str] = (),
         labels: Sequence[str] = (),
@@ -144,32 +144,50 @@ class Episode:
         clock: str = "",
         **fields: Any,
     ) -> list[Episode]:
-        """Make an episode from each log of one robot, with one spec that is found from all logs together.
+        """Make an episode from each log of one robot, with one schema that all logs together tell.
 
         Args:
             frames: for each log a dictionary of arrays, a pandas or Polars frame, or an Arrow table.
-            channels: the columns to read, as patterns such as ``joint*``; or a spec. By default all sensor columns.
+            channels: a schema; or the columns to read, as patterns such as ``joint*``; or the spec
+                of a memory. By default all senses and commands.
             rate: rows a second [Hz]; by default from the clock.
-            action: patterns of the columns of commands.
+            action: patterns of the columns of commands; by default by their names.
             labels: patterns of further columns that label faults.
             ignore: patterns of columns to leave out.
-            clock: the column of times, optionally with a unit, ``"tick [ms]"``; by default the steadiest.
+            clock: the column of times, perhaps with a unit, ``"tick [ms]"``; by default the steadiest.
             fields: other arguments of ``Episode``.
 
         Raises:
-            ValueError: bad columns; the rate is unknown or differs from the spec's; time runs backwards.
+            ValueError: bad columns; the rate is unknown or differs from the spec's; time runs
+                backwards; logs differ in scale or are copies of each other.
         """
-        spec = channels if isinstance(channels, StreamSpec) else None
-        chosen = () if isinstance(channels, StreamSpec) else tuple(channels or ())
-        layout = LogLayout(spec, rate, action, chosen, labels, ignore=ignore, clock=clock)
-        tables, made = [laid_out(frame) for frame in frames], list[Episode]()
-        for n, table in enumerate(tables):
-            found = read_recorded(
-                table, layout, tables[:n] + tables[n + 1 :] if layout.spec is None else ()
-            )
-            layout = replace(layout, spec=found.spec)
-            made.append(cls(found.stream, found.spec, **{"faults": found.faults} | fields))
-        return made
+        chosen = () if isinstance(channels, LogSchema | StreamSpec | None) else tuple(channels)
+        hints = SchemaHints(
+            rate=rate, clock=clock, channels=chosen, action=action, labels=labels, ignore=ignore
+        )
+        tables = [laid_out(frame) for frame in frames]
+        if isinstance(channels, LogSchema):
+            schema = hints.apply(channels)
+        elif isinstance(channels, StreamSpec):
+            schema = hints.apply(LogSchema.of_spec(channels))
+        else:
+            schema = infer_schema(tables, hints)
+        note_columns(schema)
+        return [cls.read(table, schema, **fields) for table in tables]
+
+    @classmethod
+    def read(cls, table: Any, schema: LogSchema, **fields: Any) -> Episode:
+        """Make an episode from a log by its schema, which it keeps.
+
+        Raises:
+            ValueError: the log does not fit the schema.
+        """
+        recorded = schema.read(table)
+        info: dict[str, Any] = {ORIGIN: recorded.origin}
+        if schema.memory_spec is None:
+            info[LOG_SCHEMA] = schema.to_json()
+        made: dict[str, Any] = {"faults": recorded.faults, "info": info} | fields
+        return cls(recorded.stream, recorded.spec, **made)
 
 
 def check_recorded(episode: Episode) -> None:

@@ -2,126 +2,159 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import clock_of
-from asm_gym.data.clock import Clock
-from asm_gym.data.columns import Column, LogLayout, decide
-from asm_gym.data.tables import Columns, is_numeric, laid_out
-from asm_gym.data.timing import BRIDGED_ROWS, FAR, evenly, timing_of
+from asm_gym.data.names import split_unit
+from asm_gym.data.schema import COMMAND, IGNORED, SENSE, LogColumn, LogSchema
+from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.timing import BRIDGED_ROWS, FAR, Timing, evenly, timing_of
 from asm_gym.readings import noise_of, resolution, spans
 
-FEW_VALUES = 8  # A channel of fewer different values hardly moves
+FEW_VALUES = 8  # a channel of fewer different values hardly moves
 JITTERS = 0.1  # share of a period that steps spread by from which on a clock jitters
 
 
-class Inspection(NamedTuple):
-    """A log."""
+@dataclass(frozen=True, kw_only=True)
+class Inspection:
+    """A log, and how it is read.
+
+    Args:
+        name: of the log.
+        table: its columns by their headers.
+        columns: what is done with each, by its header.
+        times: (T,) when rows were sensed [s]; their numbers without a rate.
+        rate: rows a second in the mean, gaps left out [Hz]; 0 if nothing tells.
+        clock: names of the columns that are its clock.
+        jitter: standard deviation of a step that is no gap, as a share of the period.
+        gaps: (N, 2) from when to when nothing came [s].
+        trouble: why it cannot be read.
+    """
 
     name: str
-    columns: list[Column]  # what is done with each
-    facts: list[dict[str, Any]]  # what the values of each are like, by heading
-    times: NDArray[np.float64]  # (T,) [s], or row numbers without a clock
-    rate: float  # rows a second in the mean, gaps left out [Hz]; 0 where it is unknown
-    by: str = ""  # the columns that are its clock
-    jitter: float = 0.0  # standard deviation of a step that is no gap, as a share of the period
-    gaps: NDArray[np.float64] = np.zeros((0, 2))  # from when to when nothing came [s]
-    trouble: str = ""  # why it cannot be read
+    table: Columns
+    columns: dict[str, LogColumn]
+    times: NDArray[np.float64]
+    rate: float = 0.0
+    clock: str = ""
+    jitter: float = 0.0
+    gaps: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    trouble: str = ""
 
     def caption(self) -> str:
         """Say in a line how long it is, and at which rate it comes."""
-        seconds = float(np.ptp(self.times)) if self.rate and len(self.times) else 0.0
-        by = f" by {self.by!r}" if self.by else ""
-        rate = (
-            f"{self.rate:.6g} Hz{by}, jitter {100 * self.jitter:.1f} %" if self.rate else "no rate"
-        )
-        return (
-            f"{self.name}: {len(self.times)} rows, {seconds:.5g} s, {rate}, {len(self.gaps)} gaps"
-        )
+        rate = "no rate"
+        seconds = 0.0
+        if self.rate:
+            by = f" by {self.clock!r}" if self.clock else ""
+            rate = f"{self.rate:.6g} Hz{by}, jitter {100 * self.jitter:.1f} %"
+            seconds = float(np.ptp(self.times)) if len(self.times) else 0.0
+        rows = f"{len(self.times)} rows, {seconds:.5g} s"
+        return f"{self.name}: {rows}, {rate}, {len(self.gaps)} gaps"
 
     def remarks(self) -> list[str]:
         """List what a user should know of the whole, a line each."""
-        longest = np.diff(self.gaps, axis=1).max(initial=0.0)
-        remarks = {
-            f"cannot be read: {self.trouble}": bool(self.trouble),
-            "no clock: say --rate, rows a second, or name the column of times with --clock": not (
-                self.trouble or self.rate
-            ),
-            f"the clock jitters by {self.jitter:.0%} of a step": self.jitter > JITTERS
-            and not self.trouble,
-            f"{len(self.gaps)} gaps in the clock, the longest {longest:.3g} s: up to {BRIDGED_ROWS} lost rows, or "
-            "--bridge, are filled, the log is cut at others": len(self.gaps) > 0,
-            "no command by name: the memory learns without the arm's commands, unless fit --action says": all(
-                c.role != "command" for c in self.columns
-            ),
-        }
-        return [line for line, holds in remarks.items() if holds]
+        if self.trouble:
+            return [f"cannot be read: {self.trouble}"]
+        remarks = []
+        if self.jitter > JITTERS:
+            remarks.append(f"the clock jitters by {self.jitter:.0%} of a step")
+        if len(self.gaps):
+            longest = np.diff(self.gaps, axis=1).max()
+            remarks.append(
+                f"{len(self.gaps)} gaps in the clock, the longest {longest:.3g} s: up to "
+                f"{BRIDGED_ROWS} lost rows, or --bridge, are filled, the log is cut at others"
+            )
+        if all(column.role != COMMAND for column in self.columns.values()):
+            remarks.append(
+                "no command by name: the memory learns without the arm's commands, unless "
+                "fit --action or the schema says which they are"
+            )
+        return remarks
+
+    def facts(self) -> list[dict[str, Any]]:
+        """Return what the values of each column are like, by heading."""
+        return [_facts(column, self.table[header]) for header, column in self.columns.items()]
 
 
-def inspected(
-    name: str,
-    table: Mapping[str, NDArray[Any]],
-    layout: LogLayout | None = None,
-    others: Sequence[Columns] = (),
-) -> Inspection:
-    """Describe a table of columns (T,) or (T, k), as ``asm-gym fit`` reads it; ``others`` are of the same folder."""
-    table, layout = laid_out(table), layout or LogLayout()
-    rate, clock, trouble, found = layout.rate or layout.nominal or 0.0, None, "", dict[str, Any]()
-    try:
-        if (clock := clock_of(table, layout)) is not None:
-            found = _by_clock(table, clock)
-    except ValueError as error:
-        trouble = "" if layout.rate else str(error)
-    columns = decide([table, *others], layout, clock)
-    refused = [f"{c.name} {c.why}" for c in columns if c.role in ("mixed", "double")]
-    refused += [] if any(c.read for c in columns) or refused else ["no column of numbers is left"]
+def inspect_log(name: str, table: Columns, schema: LogSchema, trouble: str = "") -> Inspection:
+    """Describe a log as it is read.
+
+    Args:
+        name: of the log.
+        table: its columns, as ``asm_gym.data.tables.laid_out`` returns them.
+        schema: how it is read.
+        trouble: why it cannot be read; empty if that is not known yet.
+    """
+    columns = {header: _column_of(header, schema) for header in table}
     rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
-    unread: dict[str, Any] = {
-        "times": rows / (rate or 1.0),
-        "rate": rate,
-        "trouble": trouble or "; ".join(refused),
-    }
-    return Inspection(name, columns, [_facts(c) for c in columns], **unread | found)
+    try:
+        if trouble:
+            raise ValueError(trouble)
+        schema.read(table)
+        clock = schema.clock_in(table)
+    except ValueError as error:
+        return Inspection(name=name, table=table, columns=columns, times=rows, trouble=str(error))
+    if clock is None:
+        times = rows / schema.rate
+        return Inspection(name=name, table=table, columns=columns, times=times, rate=schema.rate)
 
-
-def _by_clock(table: Columns, clock: Clock) -> dict[str, Any]:
-    """What the clock tells. Raises ValueError where it cannot be read."""
     timing = timing_of(table, clock)
-    times, dt = timing.times, timing.dt
-    if dt is None:
-        raise ValueError("one row")
-    # as fit and watch read them
-    lost = spans(np.isnan(evenly(np.ones((len(times), 1)), times, dt)[:, 0]))
-    gaps = times[0] + dt * np.array(
-        [(start - 1, stop) for start, stop in lost], np.float64
-    ).reshape(-1, 2)
-    steps = np.diff(times) / dt
-    jitter = float(steps[steps <= FAR * max(1.0, float(np.quantile(steps, 0.9)))].std())
-    return {
-        "times": clock.seconds(table),
-        "rate": 1 / dt,
-        "by": clock.name,
-        "jitter": jitter,
-        "gaps": gaps,
-    }
+    dt = timing.dt or 1.0 / schema.rate
+    return Inspection(
+        name=name,
+        table=table,
+        columns=columns,
+        times=clock.times(table).seconds,
+        rate=1 / dt,
+        clock=clock.name,
+        jitter=_jitter(timing, dt),
+        gaps=_gaps(timing, dt),
+    )
 
 
-def _facts(column: Column) -> dict[str, Any]:
-    """What the values of a column are like."""
-    values = column.values if is_numeric(column.values) else np.zeros(0)
-    known = values[np.isfinite(values) & (values != column.code)]
-    different, missing = len(np.unique(known)), len(values) - len(known)
-    remarks = {
-        "commanded, by its name": column.role == "command",
-        column.why: bool(column.why),
-        f"hardly moves: {different} values; its spread has a floor": column.role == "sense"
-        and 1 < different < FEW_VALUES,
-        "missing numbers: bridged, or cut there": column.role == "sense" and missing > 0,
-    }
+def _column_of(header: str, schema: LogSchema) -> LogColumn:
+    """Return what is done with a column."""
+    name = split_unit(header)[0]
+    for column in schema.columns:
+        if column.name == name:
+            return column
+    return LogColumn(name=name, role=IGNORED, reason="the schema of the first logs lacks it")
+
+
+def _jitter(timing: Timing, dt: float) -> float:
+    """Return the spread of steps that are no gaps, as a share of the period."""
+    steps = np.diff(timing.times.seconds) / dt
+    if not len(steps):
+        return 0.0
+    longest = FAR * max(1.0, float(np.quantile(steps, 0.9)))
+    return float(steps[steps <= longest].std())
+
+
+def _gaps(timing: Timing, dt: float) -> NDArray[np.float64]:
+    """Return from when to when (N, 2) nothing came, as ``fit`` and ``watch`` see it [s]."""
+    times = timing.times.seconds
+    rows = evenly(np.ones((len(times), 1)), times, dt)[:, 0]
+    ends = [(start - 1, stop) for start, stop in spans(np.isnan(rows))]
+    return times[0] + dt * np.array(ends, np.float64).reshape(-1, 2)
+
+
+def _facts(column: LogColumn, values: NDArray[Any]) -> dict[str, Any]:
+    """Return what the values (T,) of a column are like."""
+    if not is_numeric(values):
+        values = np.zeros(0)
+    known = values[np.isfinite(values) & (values != column.missing)]
+    different = len(np.unique(known))
+    missing = len(values) - len(known)
+
+    remarks = [column.reason] if column.reason else []
+    if column.role == SENSE and 1 < different < FEW_VALUES:
+        remarks.append(f"hardly moves: {different} values; its spread has a floor")
+    if column.role == SENSE and missing:
+        remarks.append("missing numbers: bridged, or cut there")
     return {
         "channel": column.name,
         "unit": column.unit,
@@ -132,6 +165,5 @@ def _facts(column: Column) -> dict[str, Any]:
         "resolution": resolution(values),
         "repeats": float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0,
         "missing": missing,
-        "what is done": "; ".join(line for line, holds in remarks.items() if holds)
-        or "read as it is",
+        "what is done": "; ".join(remarks) or "read as it is",
     }

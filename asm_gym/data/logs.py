@@ -1,15 +1,15 @@
 """Read recordings of any kind as episodes, one after another: run folders, datasets, and logs from elsewhere.
 
-A new format is one row of ``FILES``: a function from a file to its columns, by the suffix. What the columns of a folder
-are is decided once, by its first tables, and all others are read so.
+    files ► sources (a table each) ► schema, inferred from the first ► episodes
+
+A new format is one row of ``FILES``: a function from a file to its columns, by the suffix.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -17,47 +17,35 @@ from typing import NamedTuple
 from asm_gym.checkpoint import read_arrays
 from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
-from asm_gym.data.channels import RESAMPLED, clock_of, read_recorded
-from asm_gym.data.columns import LogLayout
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot_datasets import INFO, read_lerobot
 from asm_gym.data.minari_datasets import METADATA, read_dataset
-from asm_gym.data.names import is_label
+from asm_gym.data.names import is_label, split_unit
 from asm_gym.data.reader_notes import UNREAD, note
+from asm_gym.data.schema import LogSchema
+from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns, recordings_in
 from asm_gym.data.tables import Columns, laid_out
 from asm_gym.data.text import read_json_lines, read_text
-from asm_gym.data.timing import recordings, timing_of
 from asm_gym.files import regular_file
 from asm_gym.validation import typed
 
-FILES: dict[str, Callable[[Path, LogLayout], Columns]] = {
-    ".npz": lambda path, layout: read_arrays(path),
-    ".npy": lambda path, layout: read_array(path, layout.columns),
-    ".parquet": lambda path, layout: read_parquet(path),
-    ".mat": lambda path, layout: read_mat(path),
-    **dict.fromkeys(
-        (".csv", ".tsv", ".txt", ".dat", ".data", ".log"),
-        lambda path, layout: read_text(path, layout.columns),
-    ),
-    **dict.fromkeys(
-        (".jsonl", ".ndjson"), lambda path, layout: read_json_lines(path, layout.columns)
-    ),
-    **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, layout: read_bag(path)),
+Names = Sequence[str]
+FILES: dict[str, Callable[[Path, Names], Columns]] = {
+    ".npz": lambda path, columns: read_arrays(path),
+    ".npy": read_array,
+    ".parquet": lambda path, columns: read_parquet(path),
+    ".mat": lambda path, columns: read_mat(path),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".data", ".log"), read_text),
+    **dict.fromkeys((".jsonl", ".ndjson"), read_json_lines),
+    **dict.fromkeys((".mcap", ".db3", ".bag"), lambda path, columns: read_bag(path)),
 }
-"""Reader of a file's columns, by its suffix."""
+"""Reader of a file's columns by its suffix; it takes the names of columns without a header."""
 
 HDF5 = (".hdf5", ".h5")  # files of several demonstrations, as robomimic writes them
-# read where they are named, and not in a folder: most are no logs
-ASKED_FOR = (
-    ".txt",
-    ".dat",
-    ".data",
-    ".log",
-)
+NOT_IN_FOLDERS = (".txt", ".dat", ".data", ".log")  # most are no logs: read if they are named
 POINTER = b"version https://git-lfs.github.com"
-FIRST_TABLES = 20  # by how many of a folder's tables it is decided what columns are,
-FIRST_NUMBERS = 20_000_000  # or by how many numbers of these
-LIKE = "--like FILE reads only logs with the columns and the rate of FILE"
+FIRST_TABLES = 20  # how many tables of a folder tell what its columns are,
+FIRST_NUMBERS = 20_000_000  # or how many numbers of these
 
 
 class Log(NamedTuple):
@@ -67,165 +55,190 @@ class Log(NamedTuple):
     episode: Episode
 
 
-class Source(NamedTuple):
-    """A recording as it was found: a table, or an episode of our own."""
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A recording as it was found: a table, or an episode of our own.
+
+    Args:
+        name: in its folder.
+        columns: a column a sense, a row a moment.
+        episode: of our own.
+        stated_rate: rows a second that its file states [Hz].
+        success: the task was solved; who hands over a log means that.
+        file: it was read from.
+    """
 
     name: str
-    columns: Columns
+    columns: Columns = field(default_factory=dict)
     episode: Episode | None = None
-    rate: float | None = None  # that somebody meant it to have [Hz]
-    success: bool = True  # for somebody handed it over as one
-    file: str = ""  # it was read from
+    stated_rate: float | None = None
+    success: bool = True
+    file: str = ""
 
 
 @typed
-def read_logs(path: str | Path, layout: LogLayout | None = None) -> Iterator[Log]:
+def read_logs(
+    path: str | Path,
+    hints: SchemaHints | None = None,
+    schema: LogSchema | None = None,
+) -> Iterator[Log]:
     """Yield the episodes at ``path``, in the order of their names, each read when it is asked for.
 
-    ``path`` is a file, a folder of files at any depth, that of a run, or one with a LeRobot or a Minari dataset. Raises
-    FileNotFoundError where there is nothing of the kind, ValueError where a log makes no sense; the message names it.
+    Args:
+        path: a file, a folder of files at any depth, a run's folder, or one with a LeRobot or a
+            Minari dataset.
+        hints: what the user says of the logs.
+        schema: how they are read; by default it is inferred from the first of them.
+
+    Raises:
+        FileNotFoundError: there is nothing of the kind.
+        ValueError: a log cannot be read; the message names it.
     """
-    layout = layout or LogLayout()
-    if (Path(path) / INFO).is_file():
-        layout = replace(layout, action=layout.action or ("action*",))
-    sources, first = first_tables(read_tables(path, layout))
-    robot, known, one = layout.spec, list(first[0]) if first else [], ""
+    hints = hints or SchemaHints()
+    sources = read_sources(path, hints)
+    if schema is None:
+        sources, schema = inferred_schema(sources, hints)
+    else:
+        schema = hints.apply(schema)
     for source in sources:
-        episode = source.episode
-        if episode is None:
-            try:
-                others = (
-                    [] if layout.spec else [other for other in first if other is not source.columns]
-                )
-                found = read_recorded(source.columns, replace(layout, nominal=source.rate), others)
-            except ValueError as error:
-                hint = (
-                    f"; {LIKE}, such as {one} or {source.file}" if layout.spec is not robot else ""
-                )
-                raise ValueError(f"{source.file or source.name}: {error}{hint}") from error
-            if robot is None and (
-                more := [name for name in source.columns if not (name in known or is_label(name))]
-            ):
-                note(f"not read, as the first log lacks it: {', '.join(more)[:120]}; {LIKE}")
-            episode = Episode(found.stream, found.spec, success=source.success, faults=found.faults)
-        # others are read as it
-        layout, one = (
-            replace(layout, spec=layout.spec or episode.spec),
-            one or source.file,
-        )
-        yield Log(source.name, episode)
+        if source.episode is not None:
+            yield Log(source.name, source.episode)
+            continue
+        assert schema is not None
+        yield from _episodes_of(source, schema)
 
 
-def first_tables(sources: Iterator[Source]) -> tuple[Iterator[Source], list[Columns]]:
-    """Return the sources, and the tables of the first of them, by which it is decided what columns are."""
-    first, numbers = list[Source](), 0
+def _episodes_of(source: Source, schema: LogSchema) -> Iterator[Log]:
+    """Yield the episodes of a table, which is cut where its clock begins anew."""
+    try:
+        parts = recordings_in(source.columns, schema.clock_in(source.columns))
+        _note_unknown(source.columns, schema)
+        for number, part in enumerate(parts, 1):
+            name = source.name if len(parts) == 1 else f"{source.name} part {number}"
+            yield Log(name, Episode.read(part, schema, success=source.success))
+    except ValueError as error:
+        raise ValueError(f"{source.file or source.name}: {error}") from error
+
+
+def _note_unknown(table: Columns, schema: LogSchema) -> None:
+    """Tell the user of columns that the schema of the first logs does not have."""
+    if schema.memory_spec is not None:
+        return
+    known = {name for column in schema.columns for name in (column.name, column.label)}
+    unknown = [name for name in table if not is_label(name) and split_unit(name)[0] not in known]
+    if unknown:
+        note(f"not read, as the schema of the first logs lacks it: {', '.join(unknown)[:120]}")
+
+
+def inferred_schema(
+    sources: Iterator[Source], hints: SchemaHints
+) -> tuple[Iterator[Source], LogSchema | None]:
+    """Return the sources, and the schema of the first of them; None if these are episodes of ours."""
+    sources, first = first_sources(sources)
+    if not first:
+        return sources, None
+    hints = replace(hints, stated_rate=first[0].stated_rate)
+    try:
+        schema = infer_schema([source.columns for source in first], hints)
+        schema.check()
+    except ValueError as error:
+        raise ValueError(f"{first[0].file or first[0].name}: {error}") from error
+    note_columns(schema)
+    return sources, schema
+
+
+def first_sources(sources: Iterator[Source]) -> tuple[Iterator[Source], list[Source]]:
+    """Return the sources, and the first tables of them, which tell what columns are."""
+    first: list[Source] = []
+    numbers = 0
     for source in islice(sources, FIRST_TABLES):
         first.append(source)
         numbers += sum(values.size for values in source.columns.values())
         if numbers > FIRST_NUMBERS or source.episode is not None:
             break
-    return chain(first, sources), [source.columns for source in first if source.episode is None]
+    return chain(first, sources), [source for source in first if source.columns]
 
 
-def read_tables(path: str | Path, layout: LogLayout) -> Iterator[Source]:
-    """Yield the recordings at ``path`` as they are in their files: a column a sense, a row a moment.
+def read_sources(path: str | Path, hints: SchemaHints) -> Iterator[Source]:
+    """Yield the recordings at ``path`` as they are in their files.
 
-    A file that cannot be read is left out, and said; a ValueError is raised where none of them can.
+    A file that cannot be read is left out, and the user is told.
+
+    Raises:
+        FileNotFoundError: there is nothing of the kind.
+        ValueError: no file can be read.
     """
     path = Path(path)
     files = _files_at(path)
-    if layout.like is not None:
-        like, layout = layout.like, replace(layout, like=None)
-        robot = next(read_tables(like, layout))
-        yield from (source for source in read_tables(path, layout) if _alike(source, robot, layout))
-        return
     if (path / INFO).is_file():
-        for n, (columns, rate, success) in enumerate(read_lerobot(path)):
-            yield from _parts(Source(f"episode {n}", columns, None, rate, success), layout)
-        return
-    if not files:
+        for number, (columns, rate, success) in enumerate(read_lerobot(path)):
+            yield Source(
+                name=f"episode {number}",
+                columns=laid_out(columns),
+                stated_rate=rate,
+                success=success,
+            )
+    elif not files:
         if next(path.rglob(METADATA), None) is None:
             known = ", ".join((*FILES, *HDF5))
             raise FileNotFoundError(
                 f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset"
             )
-        yield from (
-            Source(f"episode {n}", {}, episode) for n, episode in enumerate(read_dataset(path))
-        )
-    troubles = []
+        for number, episode in enumerate(read_dataset(path)):
+            yield Source(name=f"episode {number}", episode=episode)
+    else:
+        yield from _sources_of_files(files, hints)
+
+
+def _sources_of_files(files: dict[str, Path], hints: SchemaHints) -> Iterator[Source]:
+    """Yield the recordings in files by their names."""
+    damaged = 0
     for name, file in files.items():
         try:
-            parts = [
-                part for source in _read(name, file, layout) for part in _parts(source, layout)
-            ]
+            sources = list(_sources_in(name, file, hints))
         except (ImportError, MemoryError):
             raise
         except Exception as error:  # each format's reader raises whatever the damage leads to
-            damaged = "" if isinstance(error, ValueError) else "it is damaged: "
-            troubles.append(
-                f"{file}: {damaged}{' '.join(str(error).split()) or type(error).__name__}"
-            )
-            if len(troubles) == len(files):
-                raise ValueError(troubles[0]) from error
-            note(UNREAD + troubles[-1])
+            damaged += 1
+            message = f"{file}: {_said(error)}"
+            if damaged == len(files):
+                raise ValueError(message) from error
+            note(UNREAD + message)
         else:
-            yield from parts
+            yield from sources
 
 
-def _alike(source: Source, other: Source, layout: LogLayout) -> bool:
-    """Whether two recordings may be of one robot: they have the same columns, and come at about the same rate."""
-    own, its = _period(source, layout), _period(other, layout)
-    at_one_rate = own is None or its is None or 1 / RESAMPLED <= own / its <= RESAMPLED
-    return at_one_rate and set(source.columns) == set(other.columns)
+def _said(error: Exception) -> str:
+    """Return the message of an error in a line."""
+    message = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, ValueError):
+        return message
+    return f"it is damaged: {message}"
 
 
-def _period(source: Source, layout: LogLayout) -> float | None:
-    """How far apart rows are [s]; None where no clock tells."""
-    with suppress(ValueError):
-        clock = clock_of(source.columns, layout)
-        return None if clock is None else timing_of(source.columns, clock).dt
-    return None
-
-
-def _read(name: str, file: Path, layout: LogLayout) -> Iterator[Source]:
-    """The recordings in a file."""
+def _sources_in(name: str, file: Path, hints: SchemaHints) -> Iterator[Source]:
+    """Yield the recordings in a file."""
     regular_file(file)
     with file.open("rb") as opened:
         if opened.read(len(POINTER)) == POINTER:
             raise ValueError("it is a pointer of Git LFS and not the file itself: run git lfs pull")
     if file.suffix == ".npz" and "header.json" in zipfile.ZipFile(file).namelist():
-        yield Source(name, {}, load_episode(file))
+        yield Source(name=name, episode=load_episode(file))
     elif file.suffix in HDF5:
-        for part, (columns, often) in read_hdf5(file).items():
-            yield Source(f"{name} {part}".strip(), columns, rate=often, file=str(file))
+        for part, (columns, rate) in read_hdf5(file).items():
+            yield Source(
+                name=f"{name} {part}".strip(),
+                columns=laid_out(columns),
+                stated_rate=rate,
+                file=str(file),
+            )
     else:
-        yield Source(name, FILES[file.suffix](file, layout), file=str(file))
-
-
-def _parts(source: Source, layout: LogLayout) -> Iterator[Source]:
-    """The recordings in a table: it is cut where its clock begins anew, or leaps."""
-    if source.episode is not None:
-        yield source
-        return
-    table = laid_out(source.columns)
-    try:
-        clock = clock_of(table, layout)
-        parts = recordings(clock.seconds(table)) if clock is not None else []
-    except ValueError:
-        parts = []
-    if len(parts) < 2:
-        yield source._replace(columns=table)
-        return
-    note(
-        f"{source.name}: time begins anew or leaps {len(parts) - 1} times, and the log is cut there"
-    )
-    for n, (start, stop) in enumerate(parts, 1):
-        part = {name: values[start:stop] for name, values in table.items()}
-        yield source._replace(name=f"{source.name} part {n}", columns=part)
+        columns = FILES[file.suffix](file, hints.columns)
+        yield Source(name=name, columns=laid_out(columns), file=str(file))
 
 
 def _files_at(path: Path) -> dict[str, Path]:
-    """The file, or those in a folder that can be read and are not half-written, by their names."""
+    """Return the file, or the files in a folder that can be read and are whole, by their names."""
     if not path.exists():
         raise FileNotFoundError(f"there is no {path}")
     known = (*FILES, *HDF5)
@@ -233,14 +246,12 @@ def _files_at(path: Path) -> dict[str, Path]:
         if path.suffix not in known:
             raise ValueError(f"{path}: files that can be read end in {', '.join(known)}")
         return {path.name: path}
+
     root = path / "episodes" if (path / "episodes").is_dir() else path
-    found = {
-        f.relative_to(root): f
-        for f in sorted(root.rglob("*"))
-        if f.suffix in known and f.suffix not in ASKED_FOR
-    }
-    return {
-        str(name): f
-        for name, f in found.items()
-        if not any(part.startswith(".") for part in name.parts)
-    }
+    files = {}
+    for file in sorted(root.rglob("*")):
+        name = file.relative_to(root)
+        is_hidden = any(part.startswith(".") for part in name.parts)
+        if file.suffix in known and file.suffix not in NOT_IN_FOLDERS and not is_hidden:
+            files[str(name)] = file
+    return files

@@ -23,10 +23,11 @@ import numpy as np
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
+from asm_gym.control_period import control_period
 from asm_gym.data.arrays import check_hdf5
 from asm_gym.data.episode import Episode, check_recorded
 from asm_gym.extras import require
-from asm_gym.spec import StreamSpec, control_period, flat_rows
+from asm_gym.spec import StreamSpec, flat_rows
 from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 

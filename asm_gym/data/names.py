@@ -67,7 +67,7 @@ _OF = (
     r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|recording|record|recv|"
     r"receive|received|publish|device|sim|wall)"
 )
-_WHAT = r"(?:time[ _]?stamps?|time|stamp|date[ _]?time|date)"
+_WHAT = r"(?:time[ _]?stamps?|time|stamp|date[ _]?time|date|zeit(?:stempel)?|uhrzeit)"
 _UNIT = "|".join(sorted(map(re.escape, SECONDS), key=len, reverse=True))
 CLOCK = re.compile(
     rf"[%_#\s]*(?:(?:.*[./])?(?:header[._])?(?:{_OF}[ _]?)?{_WHAT}|t)(?:[ _.]*[\[(]?\s*(?P<unit>{_UNIT})\s*[\])]?)?",
@@ -88,7 +88,7 @@ _SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
 _PLACES = "pos|position|positions|angles?|q|qpos|joint_pos"
 SPEED, POSITION = _word(_SPEEDS), _word(_PLACES)
 
-SENSE = _word(
+SENSE_NAME = _word(
     f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|temperatures?|voltages?|pressures?"
 )
 

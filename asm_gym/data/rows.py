@@ -1,11 +1,10 @@
-"""Read lines of a live source as rows of a stream, at the rate of the memory.
+"""Read lines of a live source as rows of a memory's stream.
 
-A JSON line is a list of numbers, or an object by channel or by number; CSV begins with a header. A row of each joint
-makes one row of all, once the last of them came; so do objects of several publishers. Where there is a time,
+    line ► cells by name ► one row of all joints ► one row of all publishers ► numbers (D,) and stamp
 
-own      median step of the newest 32 rows [s]
-right    dt/1.5 <= own <= 1.5 dt    every row is read; (step / dt) - 1 rows were lost before it
-wrong    elsewhere                  nothing is judged: a memory cannot judge steps of another length
+A JSON line is a list of numbers, or an object by channel or by number; CSV begins with a header. A
+row of each joint makes one row of all, once the last of them came; so do objects of several
+publishers.
 """
 
 from __future__ import annotations
@@ -13,345 +12,341 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from statistics import median
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import RESAMPLED, ColumnPlan
-from asm_gym.data.clock import (
-    EPOCHS,
-    SLOWEST_WITHOUT_UNIT,
-    UNITS,
-    Clock,
-    clock_called,
-    clocks_among,
-)
+from asm_gym.data.live_clock import LEAP_S, ClockWentBack, LiveClock, Pace
 from asm_gym.data.names import element_name, is_clock, split_unit
+from asm_gym.data.schema import ColumnMatch, LogSchema
 from asm_gym.data.tables import Named, is_key, named_columns, named_row
 from asm_gym.data.text import DOUBLED, Dialect, check_cells, flat_row, header_of
-from asm_gym.spec import StreamSpec
 
-NEWEST = 32  # rows that tell the rate, and after which it is told again
-LEAP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
+NO_DIALECT = Dialect(",", comma=False)
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
     """Nothing came for longer than a source may be silent."""
 
 
-class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
-    """A row is older than the one before it, or much newer."""
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A row as it came.
 
+    Args:
+        numbers: (D,) NaN where one was lost.
+        lost: how many rows should have come before it.
+        read: it stands where the memory reads one.
+        stamp: by the robot's own clock; None without one [s].
+        change: how the rate changed.
+        problem: why the line is no row, or no successor of the one before.
+    """
 
-class Pace:
-    """Follow the clock of a source for a memory whose rows are ``dt`` [s] apart; ``change`` says a change of rate."""
-
-    def __init__(self, dt: float) -> None:
-        self.dt, self.right, self.change = dt, True, ""
-        self._steps: deque[float] = deque(maxlen=NEWEST)
-        self._rows = 0
-        self._before: float | None = None
-
-    def lost(self, stamp: float) -> int | None:
-        """Return how many rows were lost before the one of this time [s]; None where it is not to be read.
-
-        Raises ValueError where it is not finite, ClockWentBack where it is not up to ``LEAP_S`` later than the last.
-        """
-        if not math.isfinite(stamp):
-            raise ValueError(f"its time is {stamp}")
-        before, self.change = self._before, ""
-        step = self.dt if before is None else stamp - before
-        if not 0 < step <= LEAP_S:
-            what = "leapt" if step > 0 else "must increase"
-            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
-        self._before, self._rows = stamp, self._rows + 1
-        if before is None:
-            return 0
-        self._steps.append(step)
-        if self._rows % NEWEST == 1:
-            own = median(self._steps)
-            right = self.dt / RESAMPLED <= own <= self.dt * RESAMPLED
-            if right != self.right:
-                consequence = " again" if right else f", and the memory reads {1 / self.dt:.4g}"
-                self.change = f"rows come at {1 / own:.4g} a second{consequence}"
-            self.right = right
-        return max(0, round(step / self.dt) - 1) if self.right else None
+    numbers: NDArray[np.float64]
+    lost: int = 0
+    read: bool = True
+    stamp: float | None = None
+    change: str = ""
+    problem: str = ""
 
 
 class Publishers:
-    """Join messages that hold different numbers: a row is a message of most numbers, with the newest of the others."""
+    """Join messages that hold different numbers.
+
+    A row is a message of most numbers, with the newest of the others.
+
+    Args:
+        silence: after which the numbers of a publisher are missing [s].
+    """
 
     def __init__(self, silence: float) -> None:
-        self.silence = silence  # after which the numbers of a publisher are missing [s]
-        self._newest = dict[
-            frozenset[str], tuple[float, bool, Mapping[str, Any]]
-        ]()  # messages by their numbers
+        self.silence = silence
+        # Arrival, whether it may make a row, and the newest message, by its numbers.
+        self._newest: dict[frozenset[str], tuple[float, bool, Mapping[str, Any]]] = {}
 
     def row(
         self, message: Mapping[str, Any], numbers: Iterable[str], now: float, leads: bool = True
-    ) -> Any:
-        """Return the row that a message makes at the time ``now`` [s], or None; only one that ``leads`` may make one.
+    ) -> dict[str, Any] | None:
+        """Return the row that a message makes, or None.
 
-        A message with some of the numbers of another one is of the same publisher, and lacks the others.
+        A message with some of the numbers of another one is of the same publisher, and lacks the
+        others.
+
+        Args:
+            message: values by name.
+            numbers: the names that are read.
+            now: when it came [s].
+            leads: it may make a row.
         """
         own = frozenset(numbers)
-        own = own.union(*(of for of in self._newest if of & own))
-        kept = {of: said for of, said in self._newest.items() if of == own or not of & own}
-        kept[own] = now, leads, message
-        self._newest = {of: said for of, said in kept.items() if now - said[0] <= self.silence}
-        if own != max((of for of, said in self._newest.items() if said[1]), key=len, default=None):
+        for others in self._newest:
+            if others & own:
+                own |= others
+        kept = {names: newest for names, newest in self._newest.items() if not names & own}
+        kept[own] = (now, leads, message)
+        self._newest = {
+            names: newest for names, newest in kept.items() if now - newest[0] <= self.silence
+        }
+        leaders = [names for names, newest in self._newest.items() if newest[1]]
+        if own != max(leaders, key=len, default=None):
             return None
-        return {
-            name: value for _, _, other in self._newest.values() for name, value in other.items()
-        } | dict(message)
-
-
-class Row(NamedTuple):
-    """A row as it came."""
-
-    numbers: NDArray[np.float64]  # (D,) NaN where one was lost
-    lost: int = 0  # rows that should have come before it
-    read: bool = True  # it stands where the memory reads one
-    change: str = ""  # how the rate changed
-    problem: str = ""  # why the line is no row, or no successor of the one before
+        row: dict[str, Any] = {}
+        for _, _, values in self._newest.values():
+            row |= values
+        return row | dict(message)
 
 
 class RowReader:
     """Read lines as rows of the stream of a memory.
 
-    ``clock`` is the column of times, by default the first one; after ``silence`` [s] a publisher's numbers are missing.
+    Args:
+        schema: how the memory reads logs.
+        clock: the column of times; by default the schema's, or the first.
+        silence: after which the numbers of one of several publishers are missing [s].
     """
 
-    def __init__(self, spec: StreamSpec, clock: str = "", silence: float = 2.0) -> None:
-        self.spec, self.line, self._wanted = spec, 0, clock
-        self._dialect = Dialect(",", comma=False)
-        self._header: list[str] | None = (
-            None  # of CSV, as a file's: a name that comes again has a number
-        )
-        # names with a number, and without
-        self._header_line, self._doubled = (
-            "",
-            list[tuple[str, str]](),
-        )
-        self._plan: ColumnPlan | None = None  # of rows by name
-        self._named: Named = {}  # columns that name others
-        self._joint = ""  # column that says whose numbers a row holds
-        # of the joints that came, where a row is one of a joint
-        self._gathered: dict[str, Any] = {}
+    def __init__(self, schema: LogSchema, clock: str = "", silence: float = 2.0) -> None:
+        self.line = 0
+        self._schema = schema
+        self._spec = schema.spec
+        self._clock = LiveClock(schema, clock)
+        self._pace = Pace(self._spec.dt)
         self._publishers = Publishers(silence)
-        # when the newest line came, and the first that lacks columns
-        self._now, self._since = (
-            0.0,
-            math.inf,
-        )
+        self._match: ColumnMatch | None = None  # of rows by name
+        self._is_known = False  # a row was read
+
+        # The header of CSV, as in a file: a name that comes again has a number.
+        self._dialect = NO_DIALECT
+        self._header: list[str] | None = None
+        self._header_line = ""
+        self._doubled: dict[str, str] = {}  # names without the number, by those with it
+        self._named: Named = {}  # columns that name others
+
+        # A row of each joint.
+        self._joint = ""  # the column that says whose numbers a row holds
+        self._gathered: dict[str, Any] = {}  # of the joints that came
+
+        self._now = 0.0  # when the newest line came
+        self._lacks_since = math.inf  # when the first line came that lacks columns
         self._lacking: ValueError | None = None  # what all publishers lack up to now
-        self._clock: Clock | None = None
-        self._first: float | None = None  # number of a clock whose unit is not known yet
-        self._pace = Pace(spec.dt)
-        self._known = False  # a row was read
-        self._aside: float | None = (
-            None  # time of the last row, where that is no successor of the one before [s]
-        )
+        self._aside: float | None = None  # stamp of the last row, if it was left out [s]
 
     def begin(self) -> None:
         """Begin anew with the clock; columns stay."""
-        self._pace = Pace(self.spec.dt)
+        self._pace = Pace(self._spec.dt)
 
     def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
-        """Yield each row, and when its line came, by ``time.perf_counter``; a line that is none has a ``problem``."""
+        """Yield each row, and when its line came, by ``time.perf_counter`` [s].
+
+        A line that is no row has a ``problem``: whatever somebody sends, it must not end a watch.
+        """
         for line in filter(str.strip, lines):
-            arrived = self._now = time.perf_counter()
+            arrival = self._now = time.perf_counter()
             self.line += 1
             try:
-                if self._begins_with(line):
-                    continue
-                found = self._row(line)
-                if found is None:
-                    continue
-                row = found
-            except (
-                Exception
-            ) as error:  # anybody may have sent it: deep, huge or broken, it must not end a watch
+                row = self._row_of(line)
+            except Exception as error:
                 row = self._problem(error)
-            yield row, arrived
-        if self._lacking is not None and not self._known:
+            if row is not None:
+                yield row, arrival
+        if self._lacking is not None and not self._is_known:
             yield self._problem(self._lacking), self._now
 
     def _problem(self, error: Exception) -> Row:
-        kind = "no row of numbers" + (
-            ", and no header" if self._header is None and not self._known else ""
-        )
-        return Row(
-            np.full(self.spec.size, np.nan),
-            read=False,
-            problem=f"line {self.line} is {kind}: {error}",
-        )
+        """Return a line that is no row."""
+        kind = "no row of numbers"
+        if self._header is None and not self._is_known:
+            kind += ", and no header"
+        missing = np.full(self._spec.size, np.nan)
+        return Row(numbers=missing, read=False, problem=f"line {self.line} is {kind}: {error}")
 
-    def _begins_with(self, line: str) -> bool:
-        """Tell whether a line is the header of CSV, for the first time or once more, and take it up."""
-        if self._header is not None:
-            return line.strip() == self._header_line
-        if self._known or line.lstrip()[0] in "[{":
-            return False
-        self._dialect = Dialect.of(line)
-        header, self._header_line = list[str](), line.strip()
-        for k, name in enumerate(given := header_of(self._dialect.cells(line))):
-            header.append(f"{name}{DOUBLED}{given[:k].count(name) + 1}" if name in header else name)
-        self._doubled = [
-            (own, name) for own, name in zip(header, given, strict=True) if own != name
-        ]
-        self._named = named_columns(header)
-        if not self._named and not any(map(is_key, header)):
-            self._match(header)
-        self._header = header
-        return True
+    def _row_of(self, line: str) -> Row | None:
+        """Return the row of a line; None of a header, or if more joints or publishers are to come.
 
-    def _row(self, line: str) -> Row | None:
-        """Return the row of a line, None where more joints are to come; ValueError where it is none."""
-        found = self._numbers(line)
-        if found is None:
+        Raises:
+            ValueError: it is no row.
+        """
+        if self._is_header(line):
             return None
-        numbers, stamp = found
-        if numbers.shape != (self.spec.size,):
+        given = self._numbers_and_stamp(line)
+        if given is None:
+            return None
+        numbers, stamp = given
+        if numbers.shape != (self._spec.size,):
             raise ValueError(
-                f"it must hold {self.spec.size} numbers, got the shape {numbers.shape}"
+                f"it must hold {self._spec.size} numbers, got the shape {numbers.shape}"
             )
-        self._known = True
+        self._is_known = True
         if stamp is None:
-            return Row(numbers)
-        aside, self._aside = self._aside, None
+            return Row(numbers=numbers)
+        return self._stamped(numbers, stamp)
+
+    def _stamped(self, numbers: NDArray[np.float64], stamp: float) -> Row:
+        """Return a row at its place in time; one that came late is left out."""
+        aside = self._aside
+        self._aside = None
+        problem = ""
         try:
             lost = self._pace.lost(stamp)
         except ClockWentBack as error:
-            if (
-                aside is None or not 0 < stamp - aside <= LEAP_S
-            ):  # one row that came late is left out
+            problem = str(error)
+            if aside is None or not 0 < stamp - aside <= LEAP_S:
                 self._aside = stamp
-                return Row(
-                    numbers,
-                    read=False,
-                    problem=f"{error}: the row is left out (--clock NAME chooses)",
-                )
+                problem += ": the row is left out (--clock NAME chooses)"
+                return Row(numbers=numbers, read=False, stamp=stamp, problem=problem)
             self.begin()
-            self._pace.lost(stamp)
-            return Row(numbers, problem=str(error))
-        return Row(numbers, lost or 0, lost is not None, self._pace.change)
+            lost = self._pace.lost(stamp)
+        return Row(
+            numbers=numbers,
+            lost=lost or 0,
+            read=lost is not None,
+            stamp=stamp,
+            change=self._pace.change,
+            problem=problem,
+        )
 
-    def _match(self, names: Iterable[str]) -> ColumnPlan:
-        """Find the column of each label, and the clock. Raises ValueError where a column is missing."""
-        names = list(names)
-        plan = ColumnPlan(names, self.spec)
-        self._lacking = None
-        found = [clock_called(self._wanted, names)] if self._wanted else clocks_among(names)
-        self._clock = next((c for c in found if not set(plan.columns) & set(c.columns)), None)
-        self._plan = plan
-        return plan
-
-    def _numbers(self, line: str) -> tuple[NDArray[np.float64], float | None] | None:
-        """The numbers of a row (D,), and its time [s] where it has one; None where more joints are to come."""
+    def _is_header(self, line: str) -> bool:
+        """Return whether a line is the header of CSV, and take it up if it is the first."""
         if self._header is not None:
-            cells = self._dialect.cells(line)
-            check_cells(cells, len(self._header), "it has")
-            given = dict(zip(self._header, map(self._dialect.plain, cells), strict=False))
-            for name, first in self._doubled:
-                if (
-                    given[name] != given[first]
-                    and self._plan is not None
-                    and name not in self._plan.columns
-                ):
-                    raise ValueError(f"its columns of the same name differ: {first!r}")
-            return self._by_name(given, self._dialect.number)
+            return line.strip() == self._header_line
+        if self._is_known or line.lstrip()[0] in "[{":
+            return False
+
+        self._dialect = Dialect.of(line)
+        self._header_line = line.strip()
+        names = header_of(self._dialect.cells(line))
+        header: list[str] = []
+        for place, name in enumerate(names):
+            unique = name
+            if name in header:
+                unique = f"{name}{DOUBLED}{names[:place].count(name) + 1}"
+                self._doubled[unique] = name
+            header.append(unique)
+        self._named = named_columns(header)
+        if not self._named and not any(map(is_key, header)):
+            ColumnMatch(self._schema, header)  # refuses a header that lacks columns at once
+        self._header = header
+        return True
+
+    def _numbers_and_stamp(self, line: str) -> tuple[NDArray[np.float64], float | None] | None:
+        """Return the numbers of a row (D,) and its stamp [s], None without one; or None: more is to come."""
+        if self._header is not None:
+            return self._read_cells(self._cells_of_csv(line), self._dialect.number)
         row: Any = json.loads(line)
         if isinstance(row, list):
             return np.asarray(row, np.float64), None
-        flat = flat_row(row)
-        for channel in self.spec.channels:
+        cells = flat_row(row)
+        for channel in self._spec.channels:
             part = row.get(channel.name)
-            if (
-                isinstance(part, list)
-                and len(part) != channel.size
-                and f"{channel.name}[0]" in flat
-            ):
+            is_list = isinstance(part, list) and f"{channel.name}[0]" in cells
+            if is_list and len(part) != channel.size:
                 raise ValueError(
                     f"{channel.name} must hold {channel.size} numbers, got {len(part)}"
                 )
-        return self._by_name(flat, lambda value: float("nan" if value is None else value))
+        return self._read_cells(cells, _number)
 
-    def _by_name(
-        self, row: Mapping[str, Any], number: Callable[[Any], float]
+    def _cells_of_csv(self, line: str) -> dict[str, str]:
+        """Return the cells of a line by the names of the header."""
+        assert self._header is not None
+        cells = self._dialect.cells(line)
+        check_cells(cells, len(self._header), "it has")
+        given = dict(zip(self._header, map(self._dialect.plain, cells), strict=False))
+        for name, first in self._doubled.items():
+            is_read = self._match is not None and name in self._match.headers
+            if given[name] != given[first] and not is_read:
+                raise ValueError(f"its columns of the same name differ: {first!r}")
+        return given
+
+    def _read_cells(
+        self, cells: Mapping[str, Any], number: Callable[[Any], float]
     ) -> tuple[NDArray[np.float64], float | None] | None:
-        """The numbers and the time of a row by name; a number that the row lacks is NaN."""
-        row = named_row(row, self._named) if self._named else row
-        if self._plan is None:
-            joints = {
-                label.rpartition("[")[2].rstrip("]") for label in self.spec.labels if "[" in label
-            }
-            self._joint = next((n for n in row if is_key(n) and str(row[n]).strip() in joints), "")
-        message = self._gather(row) if self._joint else row
+        """Return the numbers and the stamp of a row by name; a number that it lacks is NaN."""
+        message = self._all_joints(named_row(cells, self._named) if self._named else cells)
         if message is None:
             return None
-        numbers = (
-            ColumnPlan(message, self.spec, whole=False).columns
-            if self._plan is None
-            else self._plan.columns
-        )
-        whole = self._publishers.row(
-            message, (name for name in numbers if name in message), self._now
-        )
-        plan = self._plan if whole is None else self._plan or self._whole_plan(whole, bool(numbers))
-        if whole is None or plan is None:
+        match = self._match or ColumnMatch(self._schema, message, whole=False)
+        present = [name for name in match.headers if name in message]
+        row = self._publishers.row(message, present, self._now)
+        if row is None or not self._is_whole(row, bool(present)):
             return None
-        return plan.row(
-            {name: number(whole[name]) for name in plan.columns if name in whole}
-        ), self._moment(whole)
+        assert self._match is not None
+        numbers = {name: number(row[name]) for name in self._match.headers if name in row}
+        stamp = self._clock.stamp(row)
+        if stamp is not None:
+            first = self._clock.told_unit(stamp)
+            if first is not None:
+                self.begin()
+                self._pace.lost(first)
+                stamp = self._clock.stamp(row)
+        return self._match.row(numbers), stamp
 
-    def _whole_plan(self, row: Mapping[str, Any], some: bool) -> ColumnPlan | None:
-        """Return the plan of a row with all columns; None while another publisher may add some, ValueError later."""
-        self._since = min(self._since, self._now)
+    def _is_whole(self, row: Mapping[str, Any], has_numbers: bool) -> bool:
+        """Return whether all columns of the schema are there; another publisher may add some.
+
+        Raises:
+            ValueError: columns are missing, and no publisher can add them any more.
+        """
+        if self._match is not None:
+            return True
+        self._lacks_since = min(self._lacks_since, self._now)
         try:
-            return self._match(row)
+            match = ColumnMatch(self._schema, row)
         except ValueError as error:
-            if not some or self._now - self._since > self._publishers.silence:
+            if not has_numbers or self._now - self._lacks_since > self._publishers.silence:
                 raise
             self._lacking = error
-            return None
+            return False
+        self._clock.find(row, match.headers)
+        self._match = match
+        self._lacking = None
+        return True
+
+    def _all_joints(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
+        """Return the row of all joints, if rows are of one joint each; None while more are to come."""
+        if self._match is None:
+            labels = self._spec.labels
+            joints = {label.partition("[")[2].rstrip("]") for label in labels if "[" in label}
+            keys = [name for name in row if is_key(name) and str(row[name]).strip() in joints]
+            self._joint = keys[0] if keys else ""
+        if not self._joint:
+            return row
+        return self._gather(row)
 
     def _gather(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
-        """The row of all joints, once it is complete, or one of a later moment comes; None before."""
-        joint, before = str(row[self._joint]).strip(), self._gathered
-        own = {
-            n if is_clock(n) else element_name(n, joint): v
-            for n, v in row.items()
-            if n != self._joint
-        }
-        stamps = [clock.moment(each) for clock in clocks_among(row)[:1] for each in (before, row)]
-        later = bool(stamps) and None not in stamps and stamps[1] - stamps[0] > 0.5 * self.spec.dt  # type: ignore[operator]
-        if later or any(n in before and not is_clock(n) for n in own):
+        """Return the row of all joints once it is complete, or one of a later moment comes."""
+        joint = str(row[self._joint]).strip()
+        own = {}
+        for name, value in row.items():
+            if name != self._joint:
+                own[name if is_clock(name) else element_name(name, joint)] = value
+
+        before = self._gathered
+        has_joint = any(name in before and not is_clock(name) for name in own)
+        if has_joint or self._is_later(before, row):
             self._gathered = own
             return before
         self._gathered = own | before  # the time is that of the first
-        if not set(self.spec.labels) <= {split_unit(n)[0] for n in self._gathered}:
+        if not set(self._spec.labels) <= {split_unit(name)[0] for name in self._gathered}:
             return None
-        whole, self._gathered = self._gathered, {}
+        whole = self._gathered
+        self._gathered = {}
         return whole
 
-    def _moment(self, row: Mapping[str, Any]) -> float | None:
-        """The time of a row [s]; the unit of a clock that says none is the one that fits the memory's rate best."""
-        if self._clock is None or (stamp := self._clock.moment(row)) is None:
-            return None
-        first, self._first = self._first, stamp if self._first is None else self._first
-        if first is None or self._clock.units != (None,) or stamp >= EPOCHS[-1][0]:
-            return stamp
-        step = stamp - first
-        unit = 1.0
-        if step >= SLOWEST_WITHOUT_UNIT:
-            unit = min(UNITS, key=lambda unit: abs(np.log(step * unit / self.spec.dt)))
-        self._clock = Clock(self._clock.columns, (unit,))
-        if unit != 1.0:
-            self.begin()
-            self._pace.lost(first * unit)
-        return stamp * unit
+    def _is_later(self, before: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
+        """Return whether a row is of a later moment than the joints before it."""
+        clock = LiveClock(self._schema, "")
+        clock.find(row, ())
+        stamps = [clock.stamp(before), clock.stamp(row)]
+        if stamps[0] is None or stamps[1] is None:
+            return False
+        return stamps[1] - stamps[0] > 0.5 * self._spec.dt
+
+
+def _number(value: Any) -> float:
+    """Return a number of JSON, NaN of null."""
+    if value is None:
+        return math.nan
+    return float(value)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.channels import with_noise
 from asm_gym.data.episode import Episode
+from asm_gym.data.log_comparison import refuse_unlike
 from asm_gym.data.logs import Log
-from asm_gym.readings import noise_of, spans
+from asm_gym.data.schema import LOG_SCHEMA
+from asm_gym.readings import spans
 
 SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
 AROUND_S = 5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is no normal motion
@@ -28,21 +28,32 @@ def normal_episodes(
 
     ``progress`` is called with the number of logs so far. A table with marked rows is left out, or with
     ``between_marks`` learned from where none of them is near.
+
+    Raises:
+        ValueError: logs are copies of each other, or of different scale.
     """
-    kept, left_out = list[Episode](), Counter[str]()
-    for n, (_, episode) in enumerate(logs, 1):
+    kept: list[Episode] = []
+    names: list[str] = []
+    left_out = Counter[str]()
+    for n, (name, episode) in enumerate(logs, 1):
         progress(n, n)  # how many there are is known at the end
-        role = episode.label.role if episode.label is not None else ""
+        role = ""
+        if episode.label is not None:
+            role = episode.label.role
         if between_marks and episode.spec.source == "table" and episode.faults.any():
             near = round(AROUND_S / episode.spec.dt)
             close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
-            kept.extend(_parts(episode, ~close))
+            parts = _parts(episode, ~close)
+            kept += parts
+            names += [f"{name} part {part}" for part in range(len(parts))]
         elif episode.faults.any() or role == "faulty":
             left_out["with a fault"] += 1
         elif not episode.success:
             left_out["failed"] += 1
         else:
             kept.append(episode)
+            names.append(name)
+    refuse_unlike(kept, names)
     return kept, left_out
 
 
@@ -55,30 +66,22 @@ def complete_parts(episode: Episode) -> list[Episode]:
 def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
     """The stretches of rows that are wanted (T,), but for short ones."""
     least = max(2, round(SHORTEST_S / episode.spec.dt))
-    stretches = [(start, stop) for start, stop in spans(wanted) if stop - start >= least]
     return [
-        Episode.from_stream(episode.stream[start:stop], episode.spec, success=True)
-        for start, stop in stretches
+        _stretch(episode, start, stop) for start, stop in spans(wanted) if stop - start >= least
     ]
 
 
-def with_shared_noise(episodes: list[Episode]) -> list[Episode]:
-    """Return episodes of logs whose spec holds the median noise of all of them, and not that of the first."""
-    spec = episodes[0].spec
-    if spec.source != "table" or len(episodes) == 1:
-        return episodes
-    noise = np.array([[noise_of(column) for column in e.stream.T] for e in episodes])  # (N, D)
-    whole = with_noise(spec, noise)
-    return [replace(episode, spec=whole) for episode in episodes]
+def _stretch(episode: Episode, start: int, stop: int) -> Episode:
+    """Return some rows of a log as an episode of their own."""
+    info = {key: value for key, value in episode.info.items() if key == LOG_SCHEMA}
+    return Episode.from_stream(episode.stream[start:stop], episode.spec, success=True, info=info)
 
 
 def pieces(episode: Episode, seconds: float) -> list[Episode]:
     """Cut an episode into pieces of one length; a rest that is shorter is left out."""
     rows = max(1, round(seconds / episode.spec.dt))
     ends = range(rows, len(episode) + 1, rows)
-    return [
-        Episode.from_stream(episode.stream[n - rows : n], episode.spec, success=True) for n in ends
-    ]
+    return [_stretch(episode, end - rows, end) for end in ends]
 
 
 def split_in_time(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from asm_gym.data.clock import date_of
 from asm_gym.data.episode import spans
 from asm_gym.data.logs import Log
 from asm_gym.data.timing import TOGETHER_S, blamed, bridged, reason
@@ -25,6 +26,7 @@ class Alarm(NamedTuple):
     channel: str  # the most surprising number when the alarm was raised; empty where a whole row was missing
     why: str  # surprise, missing data, or not finite
     excess: float  # surprise of the worst row, in thresholds
+    stamp: float | None = None  # of its first row, by the robot's own clock [s]
 
     def cells(self) -> tuple[str, ...]:
         """Format for a table."""
@@ -35,6 +37,8 @@ class Alarm(NamedTuple):
             self.channel,
             self.why,
             f"{self.excess:.2f}",
+            "" if self.stamp is None else f"{self.stamp:.3f}",
+            "" if self.stamp is None else date_of(self.stamp),
         )
 
 
@@ -46,17 +50,24 @@ def plain_cell(text: str) -> str:
     return f"'{text}" if text[:1] in FORMULA and text else text
 
 
-HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds")
+HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "clock [s]", "date")
 
 
-def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
-    """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one."""
+def alarms_of(trace: ScoredEpisode, origin: float | None = None) -> list[Alarm]:
+    """Return every alarm of an episode, in order; those of one kind that are TOGETHER_S apart are one.
+
+    Args:
+        trace: the scored episode.
+        origin: stamp of its first row, by the robot's own clock; None without one [s].
+    """
     assert trace.attribution is not None
     assert trace.stream is not None
-    found, newest = list[Alarm](), dict[str, int]()
+    found: list[Alarm] = []
+    newest: dict[str, int] = {}  # place of the newest alarm in ``found``, by its reason
     for first, stop in spans(trace.alarm):
         row = trace.stream[first]
-        why, start = reason(row), (first + 1) * trace.dt
+        why = reason(row)
+        start = (first + 1) * trace.dt
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
         before = found[newest[why]] if why in newest else None
         if before is not None and start - before.end <= TOGETHER_S:
@@ -65,15 +76,16 @@ def alarms_of(trace: ScoredEpisode) -> list[Alarm]:
             )
             continue
         newest[why] = len(found)
-        at = blamed(row, trace.attribution[first])
+        column = blamed(row, trace.attribution[first])
         found.append(
             Alarm(
-                trace.kind,
-                start,
-                stop * trace.dt,
-                "" if at is None else trace.channels[at],
-                why,
-                excess,
+                log=trace.kind,
+                start=start,
+                end=stop * trace.dt,
+                channel="" if column is None else trace.channels[column],
+                why=why,
+                excess=excess,
+                stamp=None if origin is None else origin + first * trace.dt,
             )
         )
     return found

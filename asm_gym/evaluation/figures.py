@@ -19,10 +19,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import NDArray
 
-from asm_gym.data.columns import Column, is_constant
+from asm_gym.data.column_behaviour import is_constant
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
+from asm_gym.data.schema import LogColumn
+from asm_gym.data.tables import is_numeric
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.files import written_whole
 
@@ -187,7 +190,11 @@ LOG_COLOURS = {"sense": BLUE, "command": GREEN, "label": VERMILLION}
 
 def log_figure(found: Inspection) -> Figure:
     """Draw a panel per channel, with its gaps shaded."""
-    drawn = [c for c in found.columns if c.role in LOG_COLOURS and c.values.dtype.kind in "biuf"]
+    drawn = [
+        (column, found.table[header])
+        for header, column in found.columns.items()
+        if column.role in LOG_COLOURS and is_numeric(found.table[header])
+    ]
     more = (
         f"; {len(drawn) - MOST_PANELS} more channels are in the table"
         if len(drawn) > MOST_PANELS
@@ -197,8 +204,8 @@ def log_figure(found: Inspection) -> Figure:
     down = math.ceil(max(len(drawn), 1) / ACROSS)
     with figure(height=0.7 + 1.25 * down, width=11.0) as fig:
         panels = fig.subplots(down, ACROSS, squeeze=False).ravel()
-        for ax, column in zip(panels, drawn, strict=False):
-            _column_panel(ax, found, column)
+        for ax, (column, values) in zip(panels, drawn, strict=False):
+            _column_panel(ax, found, column, values)
         for ax in panels:
             ax.title.set_fontsize(7)
             ax.tick_params(labelsize=6)
@@ -209,8 +216,8 @@ def log_figure(found: Inspection) -> Figure:
     return fig
 
 
-def _column_panel(ax: Axes, found: Inspection, column: Column) -> None:
-    values = column.values
+def _column_panel(ax: Axes, found: Inspection, column: LogColumn, values: NDArray[Any]) -> None:
+    """Draw the values (T,) of a column over time."""
     every = max(1, len(values) // MOST_POINTS)
     times, shown = found.times[::every], values[::every].astype(np.float64)
     after_gap = np.searchsorted(times, found.gaps[:, 1])  # no line is drawn across a gap

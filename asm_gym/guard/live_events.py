@@ -1,4 +1,4 @@
-"""Say alarms, notes and a summary of a live watch: as text, as JSON, or to the user's command."""
+"""Say alarms, notes and a summary of a watch: as text, as JSON, or to the user's command."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ CLOCK = "clock"
 RATE = "rate"
 WATCHDOG = "watchdog"
 
+SAME_TIME_S = 1.0  # stamps this near to the time of the rows are not said apart from it [s]
+
 
 @dataclass(frozen=True, slots=True)
 class LiveEvent:
@@ -33,11 +35,19 @@ class LiveEvent:
     channel: str = ""  # that an alarm points to
     thresholds: float | None = None  # surprise over its threshold; infinite for missing numbers
     latency_ms: float | None = None  # from the arrival of the row to the alarm [ms]
+    stamp: float | None = None  # of the row, by the robot's own clock [s]
+    date: str = (
+        ""  # wall clock, ISO 8601: when it happened, or by a clock of dates; empty if unknown
+    )
+    log: str = ""  # the recording; empty of a live source
 
     def __str__(self) -> str:
         if self.kind == SUMMARY:
             return self.text
-        return f"{self.time:.3f} s  {self.text}"
+        at = f"{self.time:.3f} s"
+        if self.stamp is not None and abs(self.stamp - self.time) > SAME_TIME_S:
+            at += f"  (its clock: {self.stamp:.3f})"
+        return f"{at}  {self.text}"
 
     def to_json(self) -> str:
         """Return one line of JSON; a number that is not finite is text: ``"inf"``, ``"nan"``."""

@@ -14,6 +14,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import chain
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.rows import Row, RowReader, SourceDied
+from asm_gym.data.schema import LogSchema
 from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.adapter import Adapter, SensedRows
@@ -62,6 +64,7 @@ class WatchSettings:
     beat: Callable[[], bool] | None = None  # tells a watchdog of a row; whether the watchdog lives
     clock: str = ""  # column of times; by default the first that has a clock's name
     silence_s: float = 2.0  # after which the numbers of one of several publishers are missing [s]
+    schema: LogSchema | None = None  # how lines are read; by default that of the memory
 
 
 USUAL = WatchSettings()
@@ -128,11 +131,13 @@ class LiveWatch(Adapter):
         self._say = say
         self._settings = settings
         self._spec = spec
-        self._reader = RowReader(spec, settings.clock, settings.silence_s)
+        schema = settings.schema or LogSchema.kept_in(getattr(monitor, "about", {}), spec)
+        self._reader = RowReader(schema, settings.clock, settings.silence_s)
         options = GuardOptions("monitor", contact_limits=None)
         self._guard = Guard(RobotFacts.unknown(spec), monitor, options)
         self._no_action = np.zeros((1, spec.motor.size), np.float32)
         self._beat = settings.beat
+        self._stamp: float | None = None  # of the newest row, by the robot's own clock [s]
         self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
         self._unreadable_lines = 0
         self._unreadable_at = -math.inf  # arrival of the newest unreadable line [s]
@@ -186,6 +191,7 @@ class LiveWatch(Adapter):
         Raises:
             ValueError: the first line of a source that cannot be opened anew is no row.
         """
+        self._stamp = row.stamp
         self._check_reading(row, arrival)
         if not row.read:
             return
@@ -234,7 +240,7 @@ class LiveWatch(Adapter):
 
         # A source that loses rows again and again is one alarm.
         if is_alarm and not self._lost_before:
-            self._alarm(f"{_counted(lost, 'row')} lost: an alarm ({LATE})", LATE)
+            self._alarm(f"{counted(lost, 'row')} lost: an alarm ({LATE})", LATE)
         self.rows += lost
 
     def _judge(self, numbers: NDArray[np.float64], is_bridged: bool) -> RowReport:
@@ -300,7 +306,15 @@ class LiveWatch(Adapter):
 
     def _note(self, text: str, kind: str = NOTE, **details: Any) -> None:
         """Say an event of the newest row."""
-        self._say(LiveEvent(kind, self.rows * self._spec.dt, text, **details))
+        event = LiveEvent(
+            kind=kind,
+            time=self.rows * self._spec.dt,
+            text=text,
+            stamp=self._stamp,
+            date=datetime.now(UTC).isoformat(timespec="milliseconds"),
+            **details,
+        )
+        self._say(event)
 
     def summarise(self) -> None:
         """Say how many rows and alarms there were, and how long a row took.
@@ -310,9 +324,9 @@ class LiveWatch(Adapter):
         """
         if not (self.rows or self._unreadable_lines):
             raise ValueError("no row came")
-        text = f"{self.rows} rows, {_counted(self.alarms, 'alarm')}"
+        text = f"{self.rows} rows, {counted(self.alarms, 'alarm')}"
         if self._unreadable_lines:
-            text += f", {_counted(self._unreadable_lines, 'line')} that could not be read"
+            text += f", {counted(self._unreadable_lines, 'line')} that could not be read"
         if self._latencies:
             median, slow = np.percentile(self._latencies, [50, 99])
             text += f"; a row took {median:.2f} ms, 99 % of the newest under {slow:.2f} ms"
@@ -328,7 +342,7 @@ def _opened(reopen: Callable[[float], Iterator[str]], first_s: float) -> Iterabl
         return None
 
 
-def _counted(count: int, noun: str) -> str:
+def counted(count: int, noun: str) -> str:
     """Return a number of things: ``1 row``, ``2 rows``."""
     if count == 1:
         return f"1 {noun}"

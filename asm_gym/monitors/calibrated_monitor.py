@@ -15,6 +15,7 @@ from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.action_identification import found_meaning
 from asm_gym.data.action_meaning import ACTIONS
 from asm_gym.data.episode import CONTROLLER, Episode
+from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
@@ -162,9 +163,10 @@ class CalibratedMonitor:
         new = self._copy()  # an interrupt leaves this one as it was
         new._learn(episodes, progress or (lambda done, total: None), warm_start)
         new.about = {**self.about, "specialised_on": len(episodes)} if warm_start else {}
-        controllers = {episode.info.get(CONTROLLER, "") for episode in episodes}
-        if len(controllers) == 1 and controllers != {""}:
-            new.about[CONTROLLER] = controllers.pop()
+        for key in (CONTROLLER, LOG_SCHEMA):
+            first = episodes[0].info.get(key)
+            if first and all(episode.info.get(key) == first for episode in episodes):
+                new.about[key] = first
         if len(self.spec.motor) and not warm_start:
             new.about[ACTIONS] = found_meaning(episodes).to_json()
         vars(self).update(vars(new))

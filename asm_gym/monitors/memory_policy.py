@@ -21,10 +21,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.control_period import control_period
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.base import State
 from asm_gym.policies.base import StatefulPolicy
-from asm_gym.spec import StreamSpec, control_period
+from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
 FORGETS = 1.6  # τ [s]

@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from asm_gym.control_period import control_period
 from asm_gym.data.episode import CONTROLLER, Episode, save_episode
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.scored_episode import (
@@ -34,7 +35,6 @@ from asm_gym.rollouts.parallel import Progress, parallel_map
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import PASSING, PolicySource, RolloutConfig, Settings, Trial
-from asm_gym.spec import control_period
 from asm_gym.tasks import env_spec
 from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from asm_gym.control_period import control_period
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
@@ -18,7 +19,6 @@ from asm_gym.faults.anywhere import FaultyInterface
 from asm_gym.faults.suite import KINDS, kinds_of, possible
 from asm_gym.policies import Policy, make_policy
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
-from asm_gym.spec import control_period
 
 Settings = tuple[tuple[str, Any], ...]  # arguments by name, in a fixed order
 PolicySource = str | Path | Policy | Callable[[gym.Env[Any, Any]], Policy]

@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.control_period import control_period
 from asm_gym.policies.base import StatefulPolicy
-from asm_gym.spec import control_period
 
 Floats = NDArray[np.float64]
 

@@ -1,0 +1,150 @@
+"""The clock of a live source: the stamp of each row, and which rows were lost before it.
+
+own      median step of the newest 32 rows [s]
+right    dt/1.5 <= own <= 1.5 dt    each row is read; step/dt - 1 rows were lost before it
+wrong    elsewhere                  nothing is judged: a memory cannot judge steps of another length
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection, Mapping
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from asm_gym.data.clock import NUMBER, SINCE_1970, LogClock
+from asm_gym.data.clock_inference import UNNAMED_UNITS, clock_called, clocks_among, resolve
+from asm_gym.data.schema import RESAMPLED, LogSchema
+
+NEWEST = 32  # rows that tell the rate, and after which it is told again
+LEAP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
+
+
+class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
+    """A row is older than the one before it, or much newer."""
+
+
+class Pace:
+    """Follow the stamps of a source for a memory whose rows are ``dt`` [s] apart.
+
+    Attributes:
+        right: rows come at the memory's rate.
+        change: how the rate changed with the newest row; empty if it did not.
+    """
+
+    def __init__(self, dt: float) -> None:
+        self.dt = dt
+        self.right = True
+        self.change = ""
+        self._steps: deque[float] = deque(maxlen=NEWEST)
+        self._rows = 0
+        self._before: float | None = None
+
+    def lost(self, stamp: float) -> int | None:
+        """Return how many rows were lost before the one of this stamp [s]; None if it is not to be read.
+
+        Raises:
+            ValueError: the stamp is not finite.
+            ClockWentBack: it is not later than the last one, or more than ``LEAP_S`` later.
+        """
+        if not math.isfinite(stamp):
+            raise ValueError(f"its time is {stamp}")
+        self.change = ""
+        before = self._before
+        step = self.dt
+        if before is not None:
+            step = stamp - before
+        if not 0 < step <= LEAP_S:
+            what = "leapt" if step > 0 else "must increase"
+            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
+        self._before = stamp
+        self._rows += 1
+        if before is None:
+            return 0
+
+        self._steps.append(step)
+        if self._rows % NEWEST == 1:
+            self._check_rate()
+        if not self.right:
+            return None
+        return max(0, round(step / self.dt) - 1)
+
+    def _check_rate(self) -> None:
+        """Compare the newest steps with the memory's."""
+        own = median(self._steps)
+        right = self.dt / RESAMPLED <= own <= self.dt * RESAMPLED
+        if right != self.right:
+            self.change = f"rows come at {1 / own:.4g} a second"
+            self.change += " again" if right else f", and the memory reads {1 / self.dt:.4g}"
+        self.right = right
+
+
+class LiveClock:
+    """Tell the stamps of rows by the schema's clock, by the one that is asked for, or by the first.
+
+    Args:
+        schema: of the memory.
+        wanted: name of the column of times, perhaps with a unit; empty for the schema's.
+    """
+
+    def __init__(self, schema: LogSchema, wanted: str) -> None:
+        self._schema = schema
+        self._wanted = wanted
+        self._clock: LogClock | None = None
+        self._first: float | None = None  # a number of a clock whose unit is not known yet
+
+    def find(self, row: Mapping[str, Any], read: Collection[str]) -> None:
+        """Find the clock among the columns of a row that are not ``read`` as numbers.
+
+        Raises:
+            ValueError: the one that is asked for is not there.
+        """
+        self._first = None
+        own = self._schema.clock
+        if own is not None and not self._wanted and set(own.columns) <= set(row):
+            self._clock = own
+            return
+
+        candidates = clocks_among(row)
+        if self._wanted:
+            candidates = [clock_called(self._wanted, list(row))]
+        self._clock = None
+        for named in candidates:
+            if set(read).isdisjoint(named.columns):
+                cells = {name: np.array([row[name]], object) for name in named.columns}
+                self._clock = resolve(named, cells, None, "")
+                if named.units == (None,) and self._clock.kind == NUMBER:
+                    self._first = self._clock.moment(row)
+                return
+
+    def stamp(self, row: Mapping[str, Any]) -> float | None:
+        """Return the stamp of a row [s]; None if it has none.
+
+        Raises:
+            ValueError: it is no time.
+        """
+        if self._clock is None:
+            return None
+        return self._clock.moment(row)
+
+    def told_unit(self, stamp: float) -> float | None:
+        """Return the first stamp again if this one tells that the clock counts in another unit.
+
+        The unit of a clock that says none is the one that fits the memory's rate best.
+        """
+        first = self._first
+        if self._clock is None or first is None or stamp == first:
+            return None
+        self._first = None
+        step = stamp - first
+        if step < 1.0 or stamp >= SINCE_1970:
+            return None
+        dt = 1.0 / self._schema.rate
+        unit = min(UNNAMED_UNITS.values(), key=lambda unit: abs(math.log(step * unit / dt)))
+        if unit == 1.0:
+            return None
+        self._clock = LogClock(self._clock.columns, (unit,))
+        return first * unit

@@ -1,0 +1,136 @@
+"""Compare logs with each other before they are learned from: copies, and columns of another scale.
+
+    scale of a log    s = std of the numbers of a channel, m = 95 % quantile of |x|
+    another scale     both the medians of s and of m are FACTOR times larger in some logs than in others
+
+Radians beside degrees differ 57 times, metres beside millimetres 1,000 times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.episode import Episode
+from asm_gym.data.schema import LOG_SCHEMA, LogColumn, LogSchema
+
+Floats = NDArray[np.float64]
+
+FACTOR = 20.0  # logs of one robot differ less in the range and in the spread of a column
+STANDS = 10.0  # noises that a channel must spread over to be compared: a still arm has no scale
+KNOWN_FACTORS = {
+    "degrees beside radians": 180 / np.pi,
+    "units beside thousandths": 1000.0,
+}
+SHOWN_LOGS = 6
+
+
+class _OtherScale(NamedTuple):
+    """A channel of which some logs have another scale."""
+
+    column: LogColumn
+    factor: float
+    logs: list[int]
+
+
+def refuse_unlike(episodes: Sequence[Episode], names: Sequence[str]) -> None:
+    """Raise ValueError if logs are copies of each other, or a column of some has another scale.
+
+    Args:
+        episodes: read from logs with one schema.
+        names: of the logs.
+    """
+    _refuse_copies(episodes, names)
+    if len(episodes) > 1 and LOG_SCHEMA in episodes[0].info:
+        _refuse_other_scales(episodes, names)
+
+
+def _refuse_copies(episodes: Sequence[Episode], names: Sequence[str]) -> None:
+    """Raise ValueError if two logs hold the same rows."""
+    first_with: dict[bytes, str] = {}
+    for episode, name in zip(episodes, names, strict=True):
+        rows = episode.stream.tobytes()
+        original = first_with.setdefault(rows, name)
+        if original != name:
+            raise ValueError(
+                f"{name} is a copy of {original}: a threshold from rows that were learned from "
+                "promises too much; leave one of them out"
+            )
+
+
+def _refuse_other_scales(episodes: Sequence[Episode], names: Sequence[str]) -> None:
+    """Raise ValueError with the columns of another scale, the logs, and what to change."""
+    schema = LogSchema.from_json(episodes[0].info[LOG_SCHEMA])
+    unlike = _other_scales(episodes, schema)
+    if not unlike:
+        return
+    found = []
+    for other in unlike:
+        guess = [
+            f" ({said}?)"
+            for said, factor in KNOWN_FACTORS.items()
+            if 0.6 < other.factor / factor < 1.6
+        ]
+        found.append(f"{other.column.name} {other.factor:.2g} times{''.join(guess)}")
+    logs = [names[k] for k in unlike[0].logs]
+    more = f" and {len(logs) - SHOWN_LOGS} others" if len(logs) > SHOWN_LOGS else ""
+    column = unlike[0].column.name
+    raise ValueError(
+        f"columns without a unit differ in scale between logs: {', '.join(found)}, in "
+        f"{', '.join(logs[:SHOWN_LOGS])}{more}. Say the units in their headers, such as "
+        f"'{column} [deg]', or leave these logs out; if they are right, write varies = true in the "
+        f"line of {column} of a schema (asm-gym inspect --schema FILE)"
+    )
+
+
+def _other_scales(episodes: Sequence[Episode], schema: LogSchema) -> list[_OtherScale]:
+    """Return the channels without a unit of which some logs have another scale."""
+    unlike = []
+    compared = {column.stream_channel for column in schema.read_columns if column.varies}
+    for column in schema.read_columns:
+        channel = column.stream_channel
+        if channel in compared or column.unit or column.wrap:
+            continue
+        compared.add(channel)
+        place = schema.spec.slices[channel]
+        scales = [_scale(episode.stream[:, place], column.noise) for episode in episodes]
+        found = _split_by_scale(np.array(scales))
+        if found is not None:
+            factor, logs = found
+            unlike.append(_OtherScale(column, factor, logs))
+    return unlike
+
+
+def _scale(numbers: NDArray[np.float32], noise: float) -> tuple[float, float]:
+    """Return spread and range of the numbers (T, k) of a channel; NaN if it stands."""
+    known = np.asarray(numbers[np.isfinite(numbers).all(axis=1)], np.float64)
+    if len(known) < 2:
+        return np.nan, np.nan
+    spread = float(known.std(axis=0).max())
+    if spread <= STANDS * noise or spread == 0:
+        return np.nan, np.nan
+    return spread, float(np.quantile(np.abs(known), 0.95))
+
+
+def _split_by_scale(scales: Floats) -> tuple[float, list[int]] | None:
+    """Return by what factor some logs differ from the others, and which; None if they are alike.
+
+    Args:
+        scales: (N, 2) spread and range of a channel in each log; NaN if it stands.
+    """
+    moving = np.flatnonzero(np.isfinite(scales).all(axis=1))
+    if len(moving) < 2:
+        return None
+    order = moving[np.argsort(scales[moving, 0])]
+    steps = np.diff(np.log(scales[order, 0]))
+    split = int(np.argmax(steps)) + 1
+    small = order[:split]
+    large = order[split:]
+    factors = np.median(scales[large], axis=0) / np.median(scales[small], axis=0)
+    if factors.min() < FACTOR:
+        return None
+    odd = large if len(large) <= len(small) else small
+    return float(factors[0]), sorted(odd.tolist())
