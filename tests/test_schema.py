@@ -277,3 +277,57 @@ def test_alarms_of_a_recording_carry_the_stamp_of_the_row_and_the_date(tmp_path,
 def test_the_period_of_a_schema_is_that_of_its_rate():
     schema = LogSchema.infer([arm_table(0)])
     assert replace(schema, rate=100.0).spec.dt == pytest.approx(0.01)
+
+
+# ------------------------------------------------------------------ six folders
+
+
+def write_logs(shape: Any, folder: Path, seeds: range, fault: bool = False) -> Path:
+    """Write a log of each seed; with a fault its first joint jumps."""
+    for seed in seeds:
+        m = motion(shape.hz, seed=seed)
+        if fault:
+            m.q[100:, 0] += 1.0
+        (folder / f"{seed:02}").mkdir(parents=True)
+        shape.write(folder / f"{seed:02}", m)
+    return folder
+
+
+SIX = {
+    "rostopic echo -p": "field.velocity",
+    "UR RTDE": "actual_current",
+    "JSON of ros2 topic echo": "effort",
+    "LeRobot 0.7": "observation.state",
+    "libfranka": "state.dq",
+    "rosbag 2, MCAP": "joint_states.effort",
+}
+"""Public shapes, and the channel whose line is edited."""
+
+
+@pytest.mark.parametrize("name", SIX)
+def test_a_schema_is_written_edited_and_read_by_fit_and_watch(name, tmp_path):
+    shape = SHAPES[name]
+    logs = write_logs(shape, tmp_path / "logs", range(24))
+    bad = write_logs(shape, tmp_path / "bad", range(30, 31), fault=True)
+    good = write_logs(shape, tmp_path / "good", range(40, 41))
+    split = []
+    if name.startswith("LeRobot"):  # a data set is a folder of its own
+        logs, bad, good = logs / "00" / "x", bad / "30" / "x", good / "40" / "x"
+        split = ["--split", "0.5", "--false-alarm-rate", "0.4"]
+
+    schema_file = tmp_path / "logs.toml"
+    assert main(["inspect", str(logs), "--schema", str(schema_file), "--out", str(tmp_path)]) == 0
+    lines = schema_file.read_text().splitlines()
+    edited = [n for n, line in enumerate(lines) if f'channel = "{SIX[name]}"' in line]
+    lines[edited[0]] = lines[edited[0]].replace('role = "sense"', 'role = "sense", unit = "1"')
+    schema_file.write_text("\n".join(lines))
+
+    out = tmp_path / "m.asm"
+    fit = ["fit", str(logs), "--out", str(out), *FAST, *split, "--schema", str(schema_file)]
+    assert main(fit) == 0
+    spec = load_monitor(out).spec
+    assert set(spec.labels) == set(shape.senses)
+    assert 1 / spec.dt == pytest.approx(shape.hz, rel=1e-3)
+    watch = ["--monitor", str(out), "--out", str(tmp_path / "w"), "--bridge", "1"]
+    assert main(["watch", str(bad), *watch]) == 1
+    assert main(["watch", str(good), *watch]) in (0, 1)
