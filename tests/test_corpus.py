@@ -114,7 +114,7 @@ def pushed(tmp_path, monkeypatch):
     wanted = [replace(t, onset=20) if t.role == "faulty" else t for t in wanted]
 
     def record(trial, config):
-        (episode,) = sine_episodes(1, trial.seed % 1000, steps=(60, 60))
+        (episode,) = sine_episodes(1, trial.seed, steps=(60, 60))
         stream, onset = episode.stream.copy(), trial.onset or 60
         stream[onset:, :12] += 3.0
         return replace(
