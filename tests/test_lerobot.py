@@ -233,6 +233,67 @@ def test_what_it_cannot_guard_is_refused(monitor):
         LeRobotGuard(monitor)({"observation": {}, "action": np.zeros(6)})
 
 
+@pytest.mark.filterwarnings("ignore:.*(range|action must be finite)")
+@pytest.mark.parametrize("times", [1.6, 5.0, 1e6, 3e38])
+@pytest.mark.parametrize("joints", [slice(0, 1), slice(0, 5)])
+def test_a_command_beyond_the_healthy_range_is_an_alarm_and_is_not_sent(monitor, times, joints):
+    guard, arm = LeRobotGuard(monitor), Arm(209)
+    run(guard, arm, rows=60, jam=-1)
+    action = arm.policy(60)
+    for name in MOTORS[joints]:
+        action[name] = min(30.0 * times, 3e38)
+    sent = guard({"observation": arm.get_observation(), "action": action})["action"]
+    assert guard.alarm
+    assert guard.intervened
+    assert guard.last_alarm["reason"] == "out_of_range"
+    assert max(abs(value) for value in sent.values()) < 45
+
+
+@pytest.mark.filterwarnings("ignore:.*range")
+def test_a_command_that_leaps_within_the_range_is_not_sent(monitor):
+    guard, arm = LeRobotGuard(monitor), Arm(210)
+    run(guard, arm, rows=60, jam=-1)
+    last = np.array(list(arm.policy(59).values()))
+    leap = dict(zip(MOTORS, np.where(last > 0, -28.0, 28.0).tolist(), strict=True))
+    sent = guard({"observation": arm.get_observation(), "action": leap})["action"]
+    assert guard.alarm
+    assert np.abs(np.array([sent[m] for m in MOTORS]) - last).max() < 20
+
+
+@pytest.mark.filterwarnings("ignore:.*range")
+def test_a_slow_drift_out_of_the_healthy_range_is_an_alarm(monitor):
+    for response in ("hold", "monitor"):
+        guard, arm = LeRobotGuard(monitor, response), Arm(211)
+        run(guard, arm, rows=60, jam=-1)
+        start = np.array(list(arm.policy(59).values()))
+        for k in range(400):
+            drift = start + 0.4 * k
+            arm.send_action(
+                guard(
+                    {
+                        "observation": arm.get_observation(),
+                        "action": dict(zip(MOTORS, drift.tolist(), strict=True)),
+                    }
+                )["action"]
+            )
+            if guard.alarm:
+                break
+        assert guard.alarm
+        assert np.abs(arm.q).max() < 60
+
+
+def test_names_that_the_memory_does_not_know_and_numbers_that_are_none_are_refused(monitor):
+    guard, arm = LeRobotGuard(monitor), Arm(212)
+    with pytest.raises(ValueError, match=r"no action called thumb\.pos"):
+        guard({"observation": arm.get_observation(), "action": arm.policy(0) | {"thumb.pos": 1e30}})
+    run(guard, arm, rows=60, jam=-1)
+    action = arm.policy(60) | {"elbow_flex.pos": 10**400}
+    with pytest.warns(UserWarning, match="finite"):
+        sent = guard({"observation": arm.get_observation(), "action": action})["action"]
+    assert guard.intervened
+    assert np.isfinite(list(sent.values())).all()
+
+
 def test_lerobots_own_pipeline_takes_it(monitor):
     processor = needs("lerobot.processor")
     converters = needs("lerobot.processor.converters")

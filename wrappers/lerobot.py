@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 from asm_gym.data.action_meaning import ActionMeans
 from asm_gym.data.live_clock import ClockWentBack, Pace
 from asm_gym.data.timing import blamed, reason
+from asm_gym.detection.commands import command_limits
 from asm_gym.guard.adapter import Adapter, SensedRows
-from asm_gym.guard.alarm_terms import FAILURE
+from asm_gym.guard.alarm_terms import FAILURE, OUT_OF_RANGE
 from asm_gym.guard.fitted_monitor import check_monitor
 from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarmName
@@ -185,10 +186,34 @@ class LeRobotGuard(Adapter):
 
     def sense_rows(self, given: LoopStep) -> SensedRows:
         """Return the row of a step, and tell the watchdog of it."""
-        failures = {}
+        row = row_of(given, self._columns)
+        failure = self._beyond_range(row[0], given)
         if self._watchdog is not None and not self._watchdog.beat():
-            failures[0] = "watchdog: it has died"
-        return SensedRows(row_of(given, self._columns), failures=failures)
+            failure = "watchdog: it has died"
+        return SensedRows(row, failures={0: failure} if failure else {})
+
+    def _beyond_range(self, row: Floats32, step: LoopStep) -> str:
+        """Return which position is beyond what healthy policies command, or which command; else empty.
+
+        An arm that pursues its targets goes where they are. A command is checked before it is sent,
+        but for ``"monitor"``, which sends all.
+        """
+        if self._healthy is None:
+            return ""
+        least, most, _ = self._healthy
+        sensed = self._meaning.sensed_target(row)
+        values = {"is at": sensed}
+        if self.on_alarm == "monitor":
+            values["is commanded"] = self._numbers(step.command)[0]
+        for what, numbers in values.items():
+            beyond = np.flatnonzero((numbers < least) | (numbers > most))
+            if len(beyond):
+                k = int(beyond[0])
+                range_text = f"{least[k]:.4g} to {most[k]:.4g}"
+                return (
+                    f"range: {self._names[k]} {what} {numbers[k]:.4g}, and healthy is {range_text}"
+                )
+        return ""
 
     def send_command(self, command: Mapping[str, Any]) -> dict[str, Any]:
         """Return and remember the finite numbers of a command, for LeRobot to send."""
@@ -212,11 +237,21 @@ class LeRobotGuard(Adapter):
             _log.warning("%(channel)s %(surprise).3g thresholds", self.last_alarm)
 
     def _guard_for(self, action: Mapping[str, Any]) -> Guard:
-        """Return the guard, which is made for the names of the first action."""
+        """Return the guard, which is made with the first action.
+
+        Raises:
+            ValueError: the action has names that the memory does not know.
+        """
         if self._guard is None:
             commanded = [column.motor for column in self._columns if column.group == COMMANDED]
-            self._names = tuple(dict.fromkeys([*commanded, *action]))
+            self._names = tuple(dict.fromkeys(commanded or action))
             self._guard = self._new_guard()
+        unknown = [name for name in action if name not in self._names]
+        if unknown:
+            raise ValueError(
+                f"the memory knows no action called {', '.join(map(str, unknown[:6]))}; it knows "
+                f"{', '.join(self._names)}"
+            )
         return self._guard
 
     def _new_guard(self) -> Guard:
@@ -228,6 +263,11 @@ class LeRobotGuard(Adapter):
         """
         dt = self._spec.dt
         meaning = meaning_of(self._names, self._spec.labels, self._action_means)
+        self._meaning = meaning
+        commands = getattr(self.monitor, "commands_", None)
+        self._healthy = None  # (3, A) least, most and greatest step of healthy commands
+        if commands is not None and commands.shape[1] == len(self._names):
+            self._healthy = command_limits(commands)
         reaction: OnAlarmName = "monitor"
         if self.on_alarm != "monitor":
             meaning.check_stays("this robot", self._names)
@@ -264,6 +304,8 @@ class LeRobotGuard(Adapter):
         cause = reason(row)
         if report.failures:
             cause = FAILURE
+        if robot["out_of_range"] or report.failures.get(0, "").startswith("range"):
+            cause = OUT_OF_RANGE
         channel = ""
         motor = ""
         column = blamed(row, report.attribution[0])

@@ -8,6 +8,7 @@ A motor's name ends in what is read or commanded: ``elbow_flex.pos`` is a positi
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from asm_gym.guard.robot_facts import RobotFacts
 
 SENSED = "observation.state"
 COMMANDED = "action"
+LARGEST = float(np.finfo(np.float32).max)
 
 _LABEL = re.compile(r"(observation\.state|action)\[(.*\D.*)\]")
 _GRIPPER = re.compile("gripper|hand|jaw", re.IGNORECASE)
@@ -60,11 +62,14 @@ def servo_of(motor: str) -> str:
 
 
 def number_of(values: Mapping[str, Any], name: str) -> float:
-    """Return a number by name; NaN where there is none."""
+    """Return a number by name, infinite beyond what a float32 holds; NaN where there is none."""
     try:
-        return float(values.get(name, np.nan))
-    except (TypeError, ValueError):
+        number = float(values.get(name, np.nan))
+    except (TypeError, ValueError, OverflowError):  # 10**400 is no number that a servo can take
         return np.nan
+    if abs(number) > LARGEST:
+        return math.copysign(math.inf, number)
+    return number
 
 
 def row_of(step: LoopStep, columns: Sequence[MotorColumn]) -> NDArray[np.float32]:

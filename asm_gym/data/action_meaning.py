@@ -131,8 +131,8 @@ class ActionMeaning:
         Returns:
             (A,) the action.
         """
-        target = self._sensed_target(row)
-        previous = self._sensed_target(before)
+        target = self.sensed_target(row)
+        previous = self.sensed_target(before)
         low = np.minimum(previous, executed)
         high = np.maximum(previous, executed)
         between = np.clip(target, low, high)
@@ -142,7 +142,7 @@ class ActionMeaning:
         stays = np.isin(self.means, (TARGET, KEPT))
         return np.where(stays, target, 0.0).astype(np.float32)
 
-    def _sensed_target(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    def sensed_target(self, row: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Return the targets (A,) that are reached at a row (D,); NaN where no sense is known."""
         senses = np.array(self.senses, np.intp)
         target = np.array(self.offsets) + np.array(self.slopes) * row[senses]

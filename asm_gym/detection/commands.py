@@ -1,6 +1,9 @@
 """How hands move by commands, and what healthy policies commanded.
 
 v_t = [v_{t-1}, u_t] M        by least squares, of the velocities v_t of all hands and the action u_t
+
+A command u_t is healthy    least - m <= u_t <= most + m    and |u_t - u_{t-1}| <= s
+                            m = RANGE_MARGIN (most - least),  s = STEP_FACTOR (greatest step) + m
 """
 
 from __future__ import annotations
@@ -15,7 +18,8 @@ from asm_gym.spec import StreamSpec
 
 PLACE = "place"  # a hand where none was, or a command out of range
 PACE = "pace"  # a hand or a command faster than any
-MARGIN = 0.05  # a command may be out of range by this share of the range
+RANGE_MARGIN = 0.25  # a command may be out of the healthy range by this share of it
+STEP_FACTOR = 2.0  # a command may change so many times as much in a row as healthy ones did
 
 Floats = NDArray[np.floating[Any]]
 
@@ -62,21 +66,29 @@ def healthy_commands(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.
     return np.stack(limits)
 
 
-def out_of_range(
-    commands: Floats,
-    before: Floats,
-    action: Floats,
-) -> str:
-    """Return what of an action (A,), after another, no healthy one was: in range, or so small a change; else empty."""
-    least, most, change = commands.astype(np.float64)
-    size = change.size
-    now = action[:size]
-    margin = MARGIN * (most - least)
-    too_small = now < least - margin
-    too_large = now > most + margin
-    if too_small.any() or too_large.any():
+def command_limits(commands: Floats) -> NDArray[np.float64]:
+    """Return (3, A) the least and the most that may be commanded, and the greatest step of a row.
+
+    Args:
+        commands: (3, A) of healthy policies, as ``healthy_commands`` returns them.
+    """
+    least, most, step = commands.astype(np.float64)
+    margin = RANGE_MARGIN * (most - least)
+    return np.stack([least - margin, most + margin, STEP_FACTOR * step + margin])
+
+
+def out_of_range(commands: Floats, before: Floats, action: Floats) -> str:
+    """Return what of an action no healthy one was: ``PLACE``, out of range, or ``PACE``, too large a step.
+
+    Args:
+        commands: (3, A) of healthy policies.
+        before: (A,) the action before; a number that is not finite allows any step.
+        action: (A,).
+    """
+    least, most, step = command_limits(commands)
+    now = action[: step.size]
+    if (now < least).any() or (now > most).any():
         return PLACE
-    changed = np.abs(now - before[:size])
-    if (changed > change + margin).any():
+    if (np.abs(now - before[: step.size]) > step).any():
         return PACE
     return ""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
+from asm_gym.detection.commands import command_limits
 from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import FeltMotion, Motion
@@ -19,8 +20,6 @@ from asm_gym.guard.robot_table import REFLEX, RobotTable
 from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold, HoldingActions
 from asm_gym.validation import as_float32, short_repr
-
-ABSURD = 1.0  # an unbounded action further out of the range of healthy commands than this share of it is not executed
 
 Floats32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -76,8 +75,8 @@ class Commander:
             if motion is None
             else motion.holding
         )
-        self._bounds = np.stack([facts.low, facts.high])  # (2, A)
-        self._likely = _likely_range(facts, commands)  # (2, A)
+        self._limits = _limits(facts, commands)  # (5, A)
+        self._proposed = np.full((facts.count, facts.rest.size), np.nan, np.float32)  # last
         self._executed = np.zeros((facts.count, facts.rest.size), np.float32)  # last
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._policy_states: dict[int, Any] = {}  # of policies that act in an override
@@ -86,6 +85,7 @@ class Commander:
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
         self._executed[which] = self._facts.rest
+        self._proposed[which] = np.nan
         self.holding.begin(which)
         if self._motion is not None:
             self._motion.begin(which)
@@ -115,7 +115,9 @@ class Commander:
             observe: returns the observation of a robot.
         """
         executed = np.empty_like(proposed)
-        if clip_actions(self._records, proposed, self._bounds, self._likely, idle, executed):
+        before = self._proposed
+        self._proposed = proposed.copy()
+        if clip_actions(self._records, proposed, before, self._limits, idle, executed):
             return self._choose_each(proposed, executed, idle, reflexes, observe)
         self._executed = executed.copy()  # who asked may write to the other
         return Command(executed, brakes=self._nobody, overridden=self._nobody)
@@ -199,46 +201,56 @@ class Commander:
         return Motion(action, keeps_grip=False)
 
 
-def _likely_range(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None) -> Floats32:
-    """Return (2, A) the range beyond which an action is absurd: that of healthy commands, where there are no bounds."""
-    likely = np.stack([facts.low, facts.high])
+def _limits(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None) -> Floats32:
+    """Return (5, A) the bounds of actions, and beyond which of them, and at which step, one is not executed.
+
+    Numbers with bounds may be anything within them; others stay near healthy ``commands`` (3, A).
+    """
+    limits = np.stack(
+        [facts.low, facts.high, facts.low, facts.high, np.full_like(facts.low, np.inf)]
+    )
     if commands is None or commands.shape[1] != facts.rest.size:
-        return likely
-    least, most = commands[0], commands[1]
-    margin = ABSURD * (most - least)
-    unbounded = ~(np.isfinite(facts.low) & np.isfinite(facts.high))
-    wide = np.stack([least - margin, most + margin])
-    return np.where(unbounded, wide, likely).astype(np.float32)
+        return limits
+    is_unbounded = ~(np.isfinite(facts.low) & np.isfinite(facts.high))
+    limits[2:, is_unbounded] = command_limits(commands)[:, is_unbounded]
+    return limits.astype(np.float32)
 
 
 @partial(compiled, calls=(".",))
 def clip_actions(
-    robots: Any, proposed: Any, bounds: Any, likely: Any, idle: Any, executed: Any
+    robots: Any, proposed: Any, before: Any, limits: Any, idle: Any, executed: Any
 ) -> bool:
-    """Write the proposed actions (n, A) within their ``bounds`` (2, A), and mark those that cannot be executed.
+    """Write the proposed actions (n, A) within their bounds, and mark those that cannot be executed.
 
-    An action is refused where a number is not finite, or out of a ``likely`` range (2, A) that is within the bounds.
+    Args:
+        robots: (n,) records.
+        proposed: (n, A).
+        before: (n, A) proposed a step before; NaN at the beginning.
+        limits: (5, A) as ``_limits`` returns them.
+        idle: (n,) nothing is done.
+        executed: (n, A) written to.
 
     Returns:
-        Whether any robot is overridden, refused or ``idle`` (n,).
+        Whether any robot is overridden, refused or idle.
     """
     more = False
     for n in range(len(robots)):
         robot = robots[n]
-        usable = clip_action(robot, proposed[n], bounds, likely, executed[n])
+        usable = clip_action(robot, proposed[n], before[n], limits, executed[n])
         more = more or not usable or robot.state == REFLEX or idle[n]
     return more
 
 
 @inner
-def clip_action(robot: Any, proposed: Any, bounds: Any, likely: Any, executed: Any) -> bool:
+def clip_action(robot: Any, proposed: Any, before: Any, limits: Any, executed: Any) -> bool:
     """Write one action (A,) within its bounds, and mark it; return whether it can be executed."""
     finite = True
     absurd = False
     for i in range(len(proposed)):
-        executed[i] = min(max(proposed[i], bounds[0, i]), bounds[1, i])
+        executed[i] = min(max(proposed[i], limits[0, i]), limits[1, i])
         finite = finite and np.isfinite(proposed[i])
-        absurd = absurd or executed[i] < likely[0, i] or executed[i] > likely[1, i]
+        absurd = absurd or executed[i] < limits[2, i] or executed[i] > limits[3, i]
+        absurd = absurd or np.abs(executed[i] - before[i]) > limits[4, i]
     acts = robot.state != REFLEX
     robot.out_of_range = acts and finite and absurd
     robot.refused = acts and (absurd or not finite)
