@@ -5,7 +5,8 @@ udp:PORT (datagrams from this machine; udp:PORT@ADDRESS:PORT from one sender), d
 lines (a list of numbers, or an object with a key for each channel) or CSV with a header, one row a line. Every alarm is
 printed at once; a line that cannot be read is an alarm too.
 
-Exit codes: 0 no alarm, 1 alarms, 2 an error or a file in a folder that cannot be read.
+Exit codes: 0 no alarm, 1 alarms, 2 an error, a file in a folder that cannot be read, or standard output that cannot be
+written: then hook and topic are told, and the watch goes on.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for
 from asm_gym.files import writable, write_text
+from asm_gym.guard.alarm_outlets import AlarmOutlets, LineWriter, say_aside
 from asm_gym.guard.live_events import (
     ALARM,
     NOTE,
@@ -50,7 +52,7 @@ from asm_gym.guard.live_watch import WatchSettings, counted, follow
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
-from asm_gym.scripts.command import BAD_NEWS, DONE, option, origin, run
+from asm_gym.scripts.command import BAD_NEWS, DONE, REFUSED, option, origin, run
 from asm_gym.scripts.log_options import LogOptions, ended
 from asm_gym.validation import check_number
 
@@ -268,15 +270,15 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
     reopen: Callable[[float], Iterator[str]] | None = None
     if returns:
         reopen = opened
-    say = printer(args, console)
     lines = opened(max(args.wait, args.silence))
     guarded = ""
     beat = None
+    outlets = outlets_of(args, console)
     with _watchdog(args, monitor.spec.dt) as watchdog:
         if watchdog is not None:
             guarded = ", guarded by a watchdog"
             beat = watchdog.beat
-        print(f"asm-gym: watching {args.source}{guarded}", file=sys.stderr)
+        say_aside(f"watching {args.source}{guarded}")
         settings = WatchSettings(
             bridge_s=bridge_of(args.bridge, monitor.spec.dt),
             reopen=reopen,
@@ -287,31 +289,26 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
             silence_s=args.silence,
             schema=schema_of(args, monitor),
         )
-        alarms = follow(lines, monitor, say, settings)
+        try:
+            alarms = follow(lines, monitor, outlets.say, settings)
+        finally:
+            outlets.close()
+    if outlets.output_failed:
+        return REFUSED
     if alarms:
         return BAD_NEWS
     return DONE
 
 
-def printer(args: Args, console: Console) -> Callable[[LiveEvent], None]:
-    """Return a function that prints each event, publishes each alarm and runs the hook on it."""
-    publish_alarm = None
+def outlets_of(args: Args, console: Console) -> AlarmOutlets:
+    """Return what runs the hook, publishes alarms and prints events, in this order."""
+    outlets: list[Callable[[LiveEvent], object]] = []
+    if args.hook:
+        outlets.append(partial(run_hook, args.hook))
     if args.topic:
-        publish_alarm = publisher(args.topic)
-
-    def say(event: LiveEvent) -> None:
-        text = str(event)
-        if args.json:
-            text = event.to_json()
-        console.print(text, soft_wrap=True, highlight=False, markup=False)
-        if event.kind != ALARM:
-            return
-        if publish_alarm is not None:
-            publish_alarm(event.to_json())
-        if args.hook:
-            run_hook(args.hook, event)
-
-    return say
+        publish_text = publisher(args.topic)
+        outlets.append(lambda event: publish_text(event.to_json()))
+    return AlarmOutlets(outlets, LineWriter(console.file), args.json)
 
 
 def _watchdog(args: Args, dt: float) -> Watchdog | nullcontext[None]:

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.data.live import SourceDied, lines_from, live_source, record
+from asm_gym.data import live
+from asm_gym.data.live import SourceDied, live_source, record
 from asm_gym.data.live_clock import NEWEST, Pace
 from asm_gym.data.logs import read_logs
 from asm_gym.data.rows import Publishers, RowReader
@@ -22,6 +23,12 @@ from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
+
+
+def lines_from(*source):
+    """Lines of a source without the empty ones, which say that time goes on."""
+    return filter(str.strip, live.lines_from(*source))
+
 
 SPEC = StreamSpec(
     (Channel("q", 2, "rad"), Channel("torque", 1), Channel("cmd", 1, group=MOTOR)), dt=0.02

@@ -9,6 +9,7 @@ import itertools
 import json
 import shlex
 import socket
+import subprocess
 import sys
 import time
 from functools import partial
@@ -24,6 +25,7 @@ from asm_gym.data.timing import bridge_of
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
+from asm_gym.guard.alarm_outlets import AlarmOutlets, LineWriter
 from asm_gym.guard.live_events import LiveEvent
 from asm_gym.guard.live_watch import WatchSettings, follow
 from asm_gym.monitors import make_monitor
@@ -343,3 +345,134 @@ def test_a_source_is_watched_anew_after_its_death_and_after_its_clock_went_back(
 
     said = watched(lines(rows, dies=True), monitor, reopen=never, wait_s=0.3)[1]
     assert "the source did not come back within 0.3 s" in said
+
+
+# ------------------------------------------------------------------ what must not silence a watch
+
+
+def junk(kind: str, rows: list[str], good: int):
+    """Lines of a source that goes on to send something, but no rows."""
+    yield from rows[:good]
+    while True:
+        time.sleep(0.01)
+        yield {"blank": " ", "no line": "", "garbage": "garbage", "other keys": '{"x": 1}'}[kind]
+
+
+@pytest.mark.parametrize("kind", ["blank", "no line", "garbage", "other keys"])
+def test_a_source_without_rows_has_died_whatever_else_it_sends(kind, monitor):
+    events = []
+    settings = WatchSettings(silence_s=0.3)
+    rows = list(lines(episode(500).stream[:20]))
+    follow(junk(kind, rows, 20), monitor, events.append, settings)
+    died = [event for event in events if event.reason == "source died"]
+    assert len(died) == 1
+    assert "no row came for 0.3 s" in died[0].text
+
+
+class Stuck(io.StringIO):
+    """A pipe that nobody reads: writing never ends."""
+
+    def write(self, text):
+        time.sleep(60)
+        return 0
+
+
+class Closed(io.StringIO):
+    """A pipe whose reader has gone."""
+
+    def write(self, text):
+        raise BrokenPipeError
+
+
+def events_of(count):
+    return [LiveEvent("alarm", float(k), "an alarm", reason="surprise") for k in range(count)]
+
+
+@pytest.mark.parametrize("file", [Stuck(), Closed(), None])
+def test_every_alarm_reaches_the_hook_though_nobody_reads_standard_output(file, capsys):
+    told = []
+    outlets = AlarmOutlets([told.append], LineWriter(file), as_json=True)
+    start = time.monotonic()
+    for event in events_of(2000):
+        outlets.say(event)
+    assert time.monotonic() - start < 2.0
+    outlets.close()
+    assert outlets.output_failed
+    assert [event.time for event in told if event.reason == "surprise"] == list(range(2000))
+    assert [event.reason for event in told].count("output") == 1
+    assert "standard output" in capsys.readouterr().err
+
+
+def test_a_hook_that_fails_stops_neither_the_topic_nor_the_print(capsys):
+    told = []
+    printed = io.StringIO()
+    outlets = AlarmOutlets([lambda event: 1 / 0, told.append], LineWriter(printed), as_json=False)
+    for event in events_of(3):
+        outlets.say(event)
+    outlets.close()
+    assert len(told) == 3
+    assert len(printed.getvalue().splitlines()) == 3
+    assert not outlets.output_failed
+    assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("reader", ["gone", "asleep"])
+def test_a_watch_in_a_pipe_that_nobody_reads_calls_its_hook(reader, monitor, tmp_path):
+    """Two faults: standard output fails at the first one, and the second is told all the same."""
+    rows = episode(500).stream.copy()
+    rows[30, 2] += 100.0
+    rows[65, 2] += 100.0
+    monitor.save(tmp_path / "m.asm")
+    heard = tmp_path / "heard"
+    hook = f"cat >> {shlex.quote(str(heard))}"
+    command = [sys.executable, "-m", "asm_gym", "watch", "-", "--monitor", str(tmp_path / "m.asm")]
+    process = subprocess.Popen(
+        [*command, "--hook", hook, "--json"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if reader == "gone":
+        process.stdout.close()
+    for line in lines(rows):
+        process.stdin.write(line + "\n")
+    process.stdin.close()
+    error = process.stderr.read()
+    code = process.wait(60)
+    said = [json.loads(line) for line in heard.read_text().splitlines()]
+    times = [round(event["time"] / DT) for event in said if event["reason"] == "surprise"]
+    assert times == [31, 66]
+    if reader == "gone":
+        assert code == 2
+        assert "standard output" in error
+
+
+def test_a_header_of_a_stray_sender_does_not_make_the_watch_deaf(monitor):
+    good = list(lines(episode(500).stream))
+    datagrams = {"reopen": lambda first: iter(())}
+    count, _ = watched(["a,b,c,d", *good], monitor, **datagrams)
+    assert count == 1  # the stray line alone
+    header = "time,q[0],q[1],torque,cmd"
+    csv_rows = [
+        ",".join(map(str, [k * DT, *row])) for k, row in enumerate(episode(500).stream.tolist())
+    ]
+    count, said = watched(["name,joint", header, *csv_rows], monitor, **datagrams)
+    assert f"{len(csv_rows)} rows" in said
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"a": [' + "1, " * 300_000 + "1]}",
+        json.dumps({f"key {k}": k for k in range(60_000)}),
+        "1," * 400_000 + "1",
+    ],
+)
+def test_a_huge_line_is_an_alarm_at_once(line, monitor):
+    good = list(lines(episode(500).stream))
+    start = time.perf_counter()
+    events = []
+    follow([*good[:30], line, *good[30:]], monitor, events.append)
+    assert time.perf_counter() - start < 2.0
+    assert [event.reason for event in events if event.kind == "alarm"] == ["unreadable"]

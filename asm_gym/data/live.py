@@ -25,7 +25,8 @@ from asm_gym.validation import check_number
 
 POLL_S = 0.002  # how often a source is looked at for more [s]
 LARGEST = 65_535  # bytes of a datagram
-LONGEST = 100 * LARGEST  # bytes of a line: more than a row of any robot
+LONGEST = 1_000_000  # bytes of a line: more than a row of any robot
+TICK_S = 0.02  # how often an empty line says that no line came [s]
 UDP = re.compile(r"(\d+)(?:@([^:]+)(?::(\d+))?)?")  # PORT, PORT@ADDRESS or PORT@ADDRESS:PORT
 
 
@@ -140,26 +141,45 @@ LIVE = {
 
 
 def _lines(more: Callable[[], bytes | None], silence: float, first: float) -> Iterator[str]:
-    """Lines of what ``more`` returns: bytes, none at the end, or None where there are none yet."""
+    """Yield the lines of what ``more`` returns, and an empty one every ``TICK_S`` in which none came.
+
+    Who reads them can tell by these that time goes on, whatever comes in place of rows.
+
+    Args:
+        more: returns bytes, none at the end, or None while there are none.
+        silence: time without bytes after which the source has died [s].
+        first: the same before the first bytes [s].
+
+    Raises:
+        SourceDied: nothing came for too long.
+    """
     rest = b""
     limit = first
-    newest = time.monotonic()
+    newest = ticked = time.monotonic()
     while (chunk := more()) != b"":
-        if chunk is None:
-            if time.monotonic() - newest > limit:
-                raise SourceDied(f"nothing came for {limit:g} s")
-            continue
-        newest = time.monotonic()
-        limit = silence
-        *whole, rest = (rest + chunk).split(b"\n")
-        rest = rest[: LONGEST + 1]  # what is longer is no row, and costs no memory
-        for line in whole:
-            if len(line) > LONGEST:
-                yield f"a line of more than {LONGEST} bytes"
-            else:
-                yield decoded(line)[0]
+        now = time.monotonic()
+        lines: list[bytes] = []
+        if chunk is not None:
+            newest = now
+            limit = silence
+            *lines, rest = (rest + chunk).split(b"\n")
+            rest = rest[: LONGEST + 1]  # what is longer is no row, and costs no memory
+        elif now - newest > limit:
+            raise SourceDied(f"nothing came for {limit:g} s")
+        for line in lines:
+            yield _text_of(line)
+        if not lines and now - ticked > TICK_S:
+            ticked = now
+            yield ""
     if rest.strip():
-        yield decoded(rest)[0]
+        yield _text_of(rest)
+
+
+def _text_of(line: bytes) -> str:
+    """Return a line as text; one that is too long says so."""
+    if len(line) > LONGEST:
+        return f"a line of more than {LONGEST} bytes"
+    return decoded(line)[0]
 
 
 def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from asm_gym.data.live_clock import LEAP_S, ClockWentBack, LiveClock, Pace
 from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.schema import ColumnMatch, LogSchema
-from asm_gym.data.tables import Named, is_key, named_columns, named_row
+from asm_gym.data.tables import MOST_COLUMNS, Named, is_key, named_columns, named_row
 from asm_gym.data.text import DOUBLED, Dialect, check_cells, flat_row, header_of
 
 NO_DIALECT = Dialect(",", comma=False)
@@ -138,22 +138,41 @@ class RowReader:
         """Begin anew with the clock; columns stay."""
         self._pace = Pace(self._spec.dt)
 
-    def rows(self, lines: Iterable[str]) -> Iterator[tuple[Row, float]]:
+    def rows(self, lines: Iterable[str], first_s: float = math.inf) -> Iterator[tuple[Row, float]]:
         """Yield each row, and when its line came, by ``time.perf_counter`` [s].
 
         A line that is no row has a ``problem``: whatever somebody sends, it must not end a watch.
+
+        Args:
+            lines: of a source; empty ones say that time goes on.
+            first_s: how long the first row may take [s]; each other may take as long as the silence.
+
+        Raises:
+            SourceDied: lines came, and no row for too long.
         """
-        for line in filter(str.strip, lines):
-            arrival = self._now = time.perf_counter()
-            self.line += 1
-            try:
-                row = self._row_of(line)
-            except Exception as error:
-                row = self._problem(error)
-            if row is not None:
-                yield row, arrival
+        newest = time.monotonic()
+        limit = first_s
+        for line in lines:
+            if line.strip():
+                arrival = self._now = time.perf_counter()
+                row = self._row_or_problem(line)
+                if row is not None:
+                    yield row, arrival
+                if row is not None and not row.problem:
+                    newest = time.monotonic()
+                    limit = self._publishers.silence
+            if time.monotonic() - newest > limit:
+                raise SourceDied(f"no row came for {limit:g} s")
         if self._lacking is not None and not self._is_known:
             yield self._problem(self._lacking), self._now
+
+    def _row_or_problem(self, line: str) -> Row | None:
+        """Return the row of a line, or what is wrong with it; None if more is to come."""
+        self.line += 1
+        try:
+            return self._row_of(line)
+        except Exception as error:  # anybody may have sent it: deep, huge or broken
+            return self._problem(error)
 
     def _problem(self, error: Exception) -> Row:
         """Return a line that is no row."""
@@ -210,30 +229,50 @@ class RowReader:
 
     def _is_header(self, line: str) -> bool:
         """Return whether a line is the header of CSV, and take it up if it is the first."""
-        if self._header is not None:
-            return line.strip() == self._header_line
-        if self._is_known or line.lstrip()[0] in "[{":
+        if line.strip() == self._header_line:
+            return True
+        if line.lstrip()[0] in "[{":
+            return False
+        if (self._header is not None or self._is_known) and not self._fits_schema(line):
             return False
 
-        self._dialect = Dialect.of(line)
-        self._header_line = line.strip()
-        names = header_of(self._dialect.cells(line))
+        dialect = Dialect.of(line)
+        names = header_of(dialect.cells(line))
         header: list[str] = []
+        self._doubled = {}
         for place, name in enumerate(names):
             unique = name
             if name in header:
                 unique = f"{name}{DOUBLED}{names[:place].count(name) + 1}"
                 self._doubled[unique] = name
             header.append(unique)
-        self._named = named_columns(header)
-        if not self._named and not any(map(is_key, header)):
+        named = named_columns(header)
+        if not named and not any(map(is_key, header)):
             ColumnMatch(self._schema, header)  # refuses a header that lacks columns at once
         self._header = header
+        self._header_line = line.strip()
+        self._dialect = dialect
+        self._named = named
+        self._match = None
+        return True
+
+    def _fits_schema(self, line: str) -> bool:
+        """Return whether a line is a header with all columns of the schema: another logger began."""
+        dialect = Dialect.of(line)
+        cells = dialect.cells(line)
+        if any(dialect.is_number(cell) for cell in cells if cell.strip()):
+            return False
+        try:
+            ColumnMatch(self._schema, header_of(cells))
+        except ValueError:
+            return False
         return True
 
     def _numbers_and_stamp(self, line: str) -> tuple[NDArray[np.float64], float | None] | None:
         """Return the numbers of a row (D,) and its stamp [s], None without one; or None: more is to come."""
-        if self._header is not None:
+        if line.count(",") > MOST_COLUMNS:
+            raise ValueError(f"it holds more than {MOST_COLUMNS} values")
+        if line.lstrip()[0] not in "[{" and self._header is not None:
             return self._read_cells(self._cells_of_csv(line), self._dialect.number)
         row: Any = json.loads(line)
         if isinstance(row, list):
@@ -269,6 +308,8 @@ class RowReader:
             return None
         match = self._match or ColumnMatch(self._schema, message, whole=False)
         present = [name for name in match.headers if name in message]
+        if not present and self._match is not None:
+            return None  # of a publisher whose numbers are not read
         row = self._publishers.row(message, present, self._now)
         if row is None or not self._is_whole(row, bool(present)):
             return None

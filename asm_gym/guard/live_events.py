@@ -20,6 +20,7 @@ UNREADABLE = "unreadable"
 CLOCK = "clock"
 RATE = "rate"
 WATCHDOG = "watchdog"
+OUTPUT = "output"
 
 SAME_TIME_S = 1.0  # stamps this near to the time of the rows are not said apart from it [s]
 
@@ -59,11 +60,15 @@ class LiveEvent:
 
 
 def run_hook(command: str, event: LiveEvent) -> None:
-    """Run a shell command with an event as JSON on its standard input; do not wait for it."""
+    """Run a shell command with an event as JSON on its standard input; do not wait for it.
+
+    What it prints is left out: a pipe that nobody reads would stop it.
+    """
     process = subprocess.Popen(
         command,
         shell=True,
         stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
         text=True,
         start_new_session=True,
     )

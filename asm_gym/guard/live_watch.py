@@ -12,7 +12,7 @@ import math
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import chain
@@ -155,12 +155,15 @@ class LiveWatch(Adapter):
 
     def rows_of(self, lines: Iterable[str] | None) -> Iterator[tuple[Row, float]]:
         """Yield each row and its arrival [s], of a source and of the same opened anew."""
+        settings = self._settings
         while lines is not None:
             try:
-                yield from self._reader.rows(lines)
+                yield from self._reader.rows(lines, max(settings.wait_s, settings.silence_s))
                 return
             except SourceDied as error:
                 self._alarm(f"the source has died, {error}: an alarm", DIED)
+            if isinstance(lines, Generator):
+                lines.close()  # the port of a source that died can be opened again
             lines = self._reopened()
 
     def _reopened(self) -> Iterable[str] | None:
@@ -337,7 +340,7 @@ def _opened(reopen: Callable[[float], Iterator[str]], first_s: float) -> Iterabl
     """Return the lines of a source; None where it is not there, or sends none in ``first_s``."""
     try:
         lines = reopen(first_s)
-        return chain([next(lines)], lines)
+        return chain([next(filter(str.strip, lines))], lines)
     except (OSError, SourceDied, StopIteration):
         return None
 
