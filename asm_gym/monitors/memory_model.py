@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.association import Association, association_shapes, no_doubt
+from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.learning import Schedule, Trajectory
@@ -123,8 +123,6 @@ class MemoryModel(ScaledModel):
         senses = StreamScaler.of(self.spec, learned, self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
-        if "R" not in learned:  # made before leverage was learned
-            learned = {**learned, **no_doubt(senses.inputs, X)}
         if (found := dynamics_of(learned)) != self.dynamics:
             raise ValueError(
                 f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}"

@@ -22,7 +22,6 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
-from asm_gym.monitors.arm_inputs import Derived, judged_by_values
 from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
@@ -32,8 +31,7 @@ from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
-from asm_gym.monitors.values import PREFIX as VALUES
-from asm_gym.monitors.values import Values
+from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, typed
@@ -55,10 +53,10 @@ class NeuralASM(CalibratedMonitor):
             the temporal predictive coding network of the papers, whose state is inferred on every row.
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
-        values: judge values, such as torques, beside changes (``monitors.values``), if other senses predict them: for
+        values: judge values, such as torques, beside changes (``monitors.torque``), if other senses predict them: for
             lasting pushes. None judges them where torques, currents or efforts are among the senses
-            (``arm_inputs.judged_by_values``).
-        urdf: text of the arm's body model, from ``body_model.read_urdf``, to predict torques from the weight and the
+            (``torque.arm_features.judged_by_values``).
+        urdf: text of the arm's body model, from ``torque.urdf.read_urdf``, to predict torques from the weight and the
             inertia of its links, where values are judged.
         seed: of the initial weights and of the order of the episodes.
         config: all other hyperparameters.
@@ -116,7 +114,7 @@ class NeuralASM(CalibratedMonitor):
             "free_running_probability", free_running_probability, low=0.0, high=1.0
         )
         if values is None:
-            values = judged_by_values(spec)
+            values = ValueJudge.suits(spec)
         self.values = check_flag("values", values)
         self.excuses = check_flag("excuses", excuses)
         if urdf and not self.values:
@@ -124,7 +122,7 @@ class NeuralASM(CalibratedMonitor):
                 "a body model predicts torques, and values are not judged: "
                 "the stream has none, or values=False was given; leave urdf out"
             )
-        Derived.of(spec, urdf)  # refuses a body model that does not fit
+        ValueJudge.check_body(spec, urdf)
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         evidence = EvidenceDetection(
@@ -136,7 +134,7 @@ class NeuralASM(CalibratedMonitor):
         self.config, self.habituates = replace(config, **checked), evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = BenignEvents(spec) if excuses else None
-        self.values_: Values | None = None
+        self.values_: ValueJudge | None = None
         self._diagnosis: Diagnosis | None = None
         self._kernel: RowKernel | None = None
         self._kernel_of: tuple[Any, ...] = ()
@@ -190,7 +188,7 @@ class NeuralASM(CalibratedMonitor):
         excuses = (
             EventState.start(batch, 0) if self.excuses_ is None else self.excuses_.start(batch)
         )
-        values = () if self.values_ is None else self.values_.monitor.initial_state(batch)
+        values = () if self.values_ is None else self.values_.start(batch)
         return state._replace(excuses=excuses, values=values)
 
     def observe(
@@ -237,9 +235,8 @@ class NeuralASM(CalibratedMonitor):
         return other
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        super().with_learned({n: a for n, a in arrays.items() if not n.startswith(VALUES)}, skills)
-        values = {n.removeprefix(VALUES): a for n, a in arrays.items() if n.startswith(VALUES)}
-        self.values_ = Values.found(self.spec, values, self.seed, self.urdf) if values else None
+        super().with_learned(without_values(arrays), skills)
+        self.values_ = ValueJudge.found(self.spec, arrays, self.seed, self.urdf)
         return self
 
     def _row_kernel(self) -> RowKernel | None:
@@ -260,10 +257,12 @@ class NeuralASM(CalibratedMonitor):
         if self.values_ is None:
             return self
         other = self._copy()
-        other.values_ = self.values_._replace(balance=0.0)  # changes alone
+        other.values_ = self.values_.of_changes_alone()
         other.values_ = self.values_.balanced(other.score_episodes(episodes), episodes)
         return other
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         super()._learn(episodes, progress, warm_start)
-        self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else None
+        self.values_ = None
+        if self.values:
+            self.values_ = ValueJudge.learned(episodes, self.seed, self.urdf)

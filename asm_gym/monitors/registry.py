@@ -88,11 +88,11 @@ class MonitorKind:
 _RIVALS = {
     "logpzo": ("baselines.networks:LogpZO", "moving_mean"),
     "gru": ("baselines.networks:GRU", "mahalanobis"),
-    "kalman": ("baselines.linear:Kalman", "mahalanobis"),
-    "association_linear": ("baselines.linear:LinearAssociation", "mahalanobis"),
-    "association_values": ("value_association:ValueAssociation", "largest"),
-    "external_torque_limit": ("baselines.linear:ExternalTorqueLimit", "largest"),
-    "force_limit": ("baselines.linear:ForceLimit", "squares"),
+    "kalman": ("baselines.kalman:Kalman", "mahalanobis"),
+    "association_linear": ("baselines.linear_association:LinearAssociation", "mahalanobis"),
+    "association_values": ("torque.value_association:ValueAssociation", "largest"),
+    "external_torque_limit": ("baselines.fixed_limits:ExternalTorqueLimit", "largest"),
+    "force_limit": ("baselines.fixed_limits:ForceLimit", "squares"),
 }
 """The model of each rival, and the detection that its authors judged it by."""
 

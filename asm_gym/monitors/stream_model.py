@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any, Self
@@ -80,6 +80,15 @@ class ScaledModel(StreamModel):
 
     def start(self, batch: int) -> Any:
         return RowHistory.empty(batch, self.lag, self.spec.size)
+
+
+def require_arrays(learned: Arrays, names: Iterable[str]) -> None:
+    """Raise ValueError unless a file, perhaps of an earlier release, holds all arrays of these names."""
+    missing = [name for name in names if name not in learned]
+    if missing:
+        raise ValueError(
+            f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble"
+        )
 
 
 def error_places(columns: NDArray[np.intp], spec: StreamSpec) -> NDArray[np.float64]:
