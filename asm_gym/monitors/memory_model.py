@@ -23,7 +23,7 @@ from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, uninitialised
-from asm_gym.monitors.stream_model import ScaledModel
+from asm_gym.monitors.stream_model import ScaledModel, require_arrays
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_shapes
@@ -133,10 +133,7 @@ class MemoryModel(ScaledModel):
         shapes["R"] = (senses.inputs if len(learned["R"]) else 0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
-        if missing := [name for name in shapes if name not in learned]:
-            raise ValueError(
-                f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble"
-            )
+        require_arrays(learned, shapes)
         check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
         association = Association(**{n: arrays[n] for n in Association._fields})

@@ -23,15 +23,17 @@ from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.base import Progress, Surprise
-from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.files import restored, rounded
 from asm_gym.monitors.memory_config import MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
+from asm_gym.monitors.monitor_files import restored
+from asm_gym.monitors.monitor_state import MonitorState, checked_rows
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
 from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
+from asm_gym.monitors.weight_packing import rounded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, typed
@@ -201,7 +203,7 @@ class NeuralASM(CalibratedMonitor):
         kernel = self._row_kernel()
         if kernel is None:
             self._require_fitted()
-        rows = self._rows(state, stream)
+        rows = checked_rows(state, stream, self.spec)
         if kernel is None:
             now, surprise = super().observe(state, rows)
             now, divisor = now._replace(excuses=state.excuses), np.ones(len(rows))

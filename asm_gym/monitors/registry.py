@@ -10,7 +10,7 @@ from asm_gym.checkpoint import read_checkpoint, read_header
 from asm_gym.detection import EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.files import restored
+from asm_gym.monitors.monitor_files import restored
 from asm_gym.monitors.stream_model import StreamModel, made, parameter_names
 from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode
+from asm_gym.data.action_identification import found_meaning
+from asm_gym.data.action_meaning import ACTIONS
+from asm_gym.data.episode import CONTROLLER, Episode
+from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.spec import StreamSpec
 
 WILD = 1e6  # largest distance of a number from its channel's median, in ranges of the channel
@@ -52,6 +56,29 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
                 f"episode {n}, step {step}, {spec.labels[column]} is {value:g}, where 98 % of all lie between "
                 f"{low[column]:g} and {high[column]:g}: leave the episode out"
             )
+
+
+def with_held_out(
+    episodes: Sequence[Episode], one_in: int, rng: np.random.Generator
+) -> tuple[list[Episode], list[Episode]]:
+    """Return the episodes to learn and those held out: ``one_in`` so many, in random order; none for 0."""
+    if not one_in:
+        return list(episodes), []
+    shuffled = [episodes[n] for n in rng.permutation(len(episodes))]
+    count = len(episodes) // one_in
+    return shuffled[count:], shuffled[:count]
+
+
+def about_episodes(episodes: Sequence[Episode], with_actions: bool) -> dict[str, Any]:
+    """Return the facts to save with a monitor: controller and schema that all share, and what actions mean."""
+    about: dict[str, Any] = {}
+    for key in (CONTROLLER, LOG_SCHEMA):
+        first = episodes[0].info.get(key)
+        if first and all(episode.info.get(key) == first for episode in episodes):
+            about[key] = first
+    if with_actions and len(episodes[0].spec.motor):
+        about[ACTIONS] = found_meaning(episodes).to_json()
+    return about
 
 
 def mute_channels(episodes: Sequence[Episode]) -> list[str]:
