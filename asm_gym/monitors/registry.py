@@ -89,7 +89,7 @@ _RIVALS = {
     "logpzo": ("baselines.networks:LogpZO", "moving_mean"),
     "gru": ("baselines.networks:GRU", "mahalanobis"),
     "kalman": ("baselines.kalman:Kalman", "mahalanobis"),
-    "association_linear": ("baselines.linear_association:LinearAssociation", "mahalanobis"),
+    "association_linear": ("baselines.change_regression:LinearAssociation", "mahalanobis"),
     "association_values": ("torque.value_association:ValueAssociation", "largest"),
     "external_torque_limit": ("baselines.fixed_limits:ExternalTorqueLimit", "largest"),
     "force_limit": ("baselines.fixed_limits:ForceLimit", "squares"),
