@@ -22,7 +22,7 @@ from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, uninitialised
+from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, unwritten
 from asm_gym.monitors.stream_model import ScaledModel, require_arrays
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
@@ -56,11 +56,9 @@ class MemoryModel(ScaledModel):
     ) -> None:
         super().__init__(spec, rows_apart(spec.dt))
         self.dynamics = dynamics
-        self.hidden_size, self.association_size, self.schedule = (
-            hidden_size,
-            association_size,
-            schedule,
-        )
+        self.hidden_size = hidden_size
+        self.association_size = association_size
+        self.schedule = schedule
         self.network_: TemporalNetwork | None = None
         self.compiled_: RowWeights | None = None
         self.motor_: Motor | None = None
@@ -73,9 +71,11 @@ class MemoryModel(ScaledModel):
         return self.network_
 
     def _take(self, network: TemporalNetwork) -> None:
-        nameless = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
-        names = {name: self.learned_[name] for name in nameless} if self.skills_ else nameless
-        self.network_, self.compiled_ = network, row_weights(network, self.senses_, names)
+        names: Arrays = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
+        if self.skills_:
+            names = self.learned_
+        self.network_ = network
+        self.compiled_ = row_weights(network, self.senses_, names)
 
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
@@ -123,14 +123,16 @@ class MemoryModel(ScaledModel):
         senses = StreamScaler.of(self.spec, learned, self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
-        if (found := dynamics_of(learned)) != self.dynamics:
+        kept = dynamics_of(learned)
+        if kept != self.dynamics:
             raise ValueError(
-                f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}"
+                f"this is a memory of dynamics={kept!r}, which cannot be loaded as {self.dynamics!r}"
             )
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
-        shapes["R"] = (senses.inputs if len(learned["R"]) else 0, senses.inputs)
+        if not len(learned.get("R", ())):  # leverage was not learned, from few rows
+            shapes["R"] = (0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         require_arrays(learned, shapes)
@@ -143,10 +145,8 @@ class MemoryModel(ScaledModel):
             self.schedule.sensory_precision,
         )
         super().restore(learned, skills)
-        self.motor_, self.completion_ = (
-            Motor.found(learned, self.senses_),
-            Completion.found(learned, self.senses_),
-        )
+        self.motor_ = Motor.found(learned, self.senses_)
+        self.completion_ = Completion.found(learned, self.senses_)
         self._take(
             dynamics.network(
                 dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how
@@ -155,16 +155,18 @@ class MemoryModel(ScaledModel):
         return self
 
     def start(self, batch: int) -> MemoryState:
-        state, named = (
-            np.zeros((batch, n), np.float32) for n in (self.network.hidden_size, len(self.skills_))
+        return MemoryState(
+            traces=self.network.at_rest(batch),
+            expected=np.zeros((batch, self.network.hidden_size), np.float32),
+            history=super().start(batch),
+            skill=np.zeros((batch, len(self.skills_)), np.float32),
         )
-        return MemoryState(self.network.at_rest(batch), state, super().start(batch), named)
 
     def predict(
         self, state: MemoryState, rows: NDArray[np.float64]
     ) -> tuple[MemoryState, ModelOutput]:
         assert self.compiled_ is not None
-        new: MemoryState = uninitialised(state)
+        new: MemoryState = unwritten(state)
         errors = expected_errors(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64))
         return new, ModelOutput(errors, new.expected)
 
@@ -172,7 +174,8 @@ class MemoryModel(ScaledModel):
         """Return the likely next command (B, A), by the motor association or else by the temporal network."""
         if self.motor_ is not None:
             return self.motor_.command(situation(self.senses_, state.history.before[:, -1]))
-        motor, senses = self.spec.motor, self.senses_
+        motor = self.spec.motor
+        senses = self.senses_
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 

@@ -100,13 +100,15 @@ class NeuralASM(CalibratedMonitor):
         config: MemoryConfig | None = None,
     ) -> None:
         check_choice("dynamics", dynamics, DYNAMICS)
-        usual, config = DYNAMICS[dynamics], config or MemoryConfig()
-        self.config = config = replace(
+        usual = DYNAMICS[dynamics]
+        config = config or MemoryConfig()
+        self.config = replace(
             config,
             iterations=config.iterations or usual.iterations,
             prior_precision=config.prior_precision or usual.prior_precision,
         )
-        self.dynamics, self.urdf = dynamics, urdf
+        self.dynamics = dynamics
+        self.urdf = urdf
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
         self.association_size = check_number(
             "association_size", association_size, low=1, whole=True
@@ -128,18 +130,26 @@ class NeuralASM(CalibratedMonitor):
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         evidence = EvidenceDetection(
-            spec, config.gains, config.bound, config.shrinkage, habituates, config.tail_index
+            spec,
+            gains=config.gains,
+            bound=config.bound,
+            shrinkage=config.shrinkage,
+            habituates=habituates,
+            tail_index=config.tail_index,
         )
-        checked = {
-            name: getattr(evidence, name) for name in ("gains", "bound", "shrinkage", "tail_index")
-        }
-        self.config, self.habituates = replace(config, **checked), evidence.habituates
+        self.config = replace(
+            self.config,
+            gains=evidence.gains,
+            bound=evidence.bound,
+            shrinkage=evidence.shrinkage,
+            tail_index=evidence.tail_index,
+        )
+        self.habituates = evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = BenignEvents(spec) if excuses else None
         self.values_: ValueJudge | None = None
         self._diagnosis: Diagnosis | None = None
         self._kernel: RowKernel | None = None
-        self._kernel_of: tuple[Any, ...] = ()
 
     def _param(self, name: str) -> Any:
         """Return a hyperparameter, of the memory or of its config."""
@@ -152,9 +162,8 @@ class NeuralASM(CalibratedMonitor):
     @typed
     def load(cls, path: str | Path) -> Self:
         """Read what ``save`` wrote. Raises FileNotFoundError, or ValueError for a file that is damaged or foreign."""
-        return restored(
-            path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how)
-        )
+        saved = read_checkpoint(path, cls.kind)
+        return restored(path, saved, lambda spec, **parameters: made(cls, spec, parameters))
 
     @classmethod
     @typed
@@ -183,15 +192,18 @@ class NeuralASM(CalibratedMonitor):
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
-        return super().learned_ | ({} if self.values_ is None else self.values_.arrays)
+        learned = super().learned_
+        if self.values_ is not None:
+            learned |= self.values_.arrays
+        return learned
 
     def initial_state(self, batch: int = 1) -> MonitorState:
-        state = super().initial_state(batch)
-        excuses = (
-            EventState.start(batch, 0) if self.excuses_ is None else self.excuses_.start(batch)
-        )
-        values = () if self.values_ is None else self.values_.start(batch)
-        return state._replace(excuses=excuses, values=values)
+        state = super().initial_state(batch)._replace(excuses=EventState.start(batch, 0))
+        if self.excuses_ is not None:
+            state = state._replace(excuses=self.excuses_.start(batch))
+        if self.values_ is not None:
+            state = state._replace(values=self.values_.start(batch))
+        return state
 
     def observe(
         self,
@@ -205,18 +217,19 @@ class NeuralASM(CalibratedMonitor):
             self._require_fitted()
         rows = checked_rows(state, stream, self.spec)
         if kernel is None:
-            now, surprise = super().observe(state, rows)
-            now, divisor = now._replace(excuses=state.excuses), np.ones(len(rows))
+            new, surprise = super().observe(state, rows)
+            new = new._replace(excuses=state.excuses)
+            divisor = np.ones(len(rows))
         else:
-            now, surprise, divisor = kernel(state, rows, out)
+            new, surprise, divisor = kernel(state, rows, out)
+
         if self.values_ is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
-            now = now._replace(values=values)
+            new = new._replace(values=values)
         if self.model.skills_:
-            surprise = surprise._replace(
-                skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)]
-            )
-        return now, surprise
+            likeliest = new.model.skill.argmax(axis=1)
+            surprise = surprise._replace(skill=np.array(self.skills_)[likeliest])
+        return new, surprise
 
     def compiled_row(self) -> RowKernel | None:
         """Return the kernel that does all that ``observe`` does; None where Python takes part in a row."""
@@ -243,16 +256,11 @@ class NeuralASM(CalibratedMonitor):
 
     def _row_kernel(self) -> RowKernel | None:
         """Return the kernel of the weights as they are; None under another detection than that of evidence."""
-        evidence, memory = self.detection, self.model.compiled_
-        if not isinstance(evidence, EvidenceDetection) or memory is None:
+        memory = self.model.compiled_
+        if not isinstance(self.detection, EvidenceDetection) or memory is None:
             return None
-        now = memory, evidence.detector_
-        if (
-            not self._kernel_of
-            or self._kernel_of[0] is not now[0]
-            or self._kernel_of[1] is not now[1]
-        ):
-            self._kernel, self._kernel_of = RowKernel(memory, evidence, self.excuses_), now
+        if self._kernel is None or not self._kernel.is_of(memory, self.detection):
+            self._kernel = RowKernel(memory, self.detection, self.excuses_)
         return self._kernel
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:

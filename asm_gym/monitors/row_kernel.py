@@ -40,8 +40,6 @@ from asm_gym.monitors.base import Surprise
 from asm_gym.monitors.monitor_state import MonitorState
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
 
-__all__ = ["JUDGED", "RowKernel", "expected_errors", "observe_rows", "row_weights", "unwritten"]
-
 
 class RowWeights(NamedTuple):
     """What a memory computes with; one kind of network has weights of zero, as its memory has the other."""
@@ -121,11 +119,18 @@ class RowKernel:
                 "asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr
             )
         self._arguments = (memory, detection, events)
+        self._memory = memory
+        self._detector = detection.fitted_detector
         self._excuses = events is not None
         senses = NO_SENSES if events is None else events.senses
-        detector = detection.fitted_detector
-        wants_context = bool(detector.context_quantile[:-1].any())
-        self._learned = bind(memory, wants_context, detector, detection.fitted_repetition, senses)
+        wants_context = bool(self._detector.context_quantile[:-1].any())
+        self._learned = bind(
+            memory, wants_context, self._detector, detection.fitted_repetition, senses
+        )
+
+    def is_of(self, memory: RowWeights, detection: EvidenceDetection) -> bool:
+        """Return whether the kernel computes with these weights, and with what a detection has learned."""
+        return self._memory is memory and self._detector is detection.detector_
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle by the arguments: what is bound lies in memory that is not Python's."""
@@ -172,8 +177,9 @@ def expected_errors(
         evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0)
     )
     events = EventState.start(len(rows), 0)
-    states = [MonitorState(memory, detection, events) for memory in (before, after)]
-    bound = bind_states(learned, *arrays_of(states[0]), *arrays_of(states[1]))
+    arrays = arrays_of(MonitorState(before, detection, events))
+    arrays += arrays_of(MonitorState(after, detection, events))
+    bound = bind_states(learned, *arrays)
     return observe_rows(bound, rows, np.empty(len(rows), JUDGED), np.empty(rows.shape))
 
 
@@ -216,20 +222,13 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
     return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
 
 
-def unwritten(state: MonitorState) -> MonitorState:
-    """Return a state of as many streams, whose arrays are yet to be written."""
-    arrays = [np.empty(array.shape, array.dtype) for array in arrays_of(state)]
-    make: Any = state_of
-    return make.py_func(arrays)  # as Python runs it
-
-
-def uninitialised(state: Any) -> Any:
+def unwritten(state: Any) -> Any:
     """Return a state of the same arrays, in whatever nesting, that are yet to be written."""
     if isinstance(state, np.ndarray):
         return np.empty(state.shape, state.dtype)
     if not state:
         return state
-    return type(state)._make(map(uninitialised, state))
+    return type(state)._make(map(unwritten, state))
 
 
 @partial(compiled, calls=("memory", "detection", "."))
@@ -249,7 +248,7 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
     reading = read(weights, before.model.history, after.model.history, rows)
     carry_on(weights, before.model, after.model, reading, wants_context)
     errors, units = associate(weights, reading)
-    doubt_first_rows(before.model.history, errors)
+    weigh_first_rows(before.model.history, errors)
     name_skills(weights, before.model, after.model, units)
 
     if detector.whitening.size:
@@ -264,7 +263,7 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
 
 
 @inner
-def doubt_first_rows(history: RowHistory, errors: Any) -> None:
+def weigh_first_rows(history: RowHistory, errors: Any) -> None:
     """Weigh the errors (B, X) of the first rows less: nothing came before them, so that no change is known."""
     lag = history.before.shape[1]
     for n in range(len(errors)):

@@ -172,11 +172,12 @@ def _predicted(
 ) -> tuple[State, ModelOutput]:
     result: Any = model.predict(state, rows)
     rule = f"predict of {model.kind} must give"
-    parts = result if type(result) is tuple else (result,)
-    if len(parts) != 2 or not isinstance(parts[1], ModelOutput):
+    is_pair = isinstance(result, tuple) and len(result) == 2
+    if not is_pair or not isinstance(result[1], ModelOutput):
+        parts = result if type(result) is tuple else (result,)
         types = ", ".join(type(part).__name__ for part in parts)
         raise ValueError(f"{rule} a state and a ModelOutput, got {types}")
-    output = parts[1]
+    output = result[1]
     shape = (len(rows), len(model.error_columns))
     if np.shape(output.errors) != shape:
         raise ValueError(f"{rule} errors {shape}, got {np.shape(output.errors)}")

@@ -43,10 +43,13 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
             raise ValueError(
                 f"episode {n}, step {step}, {spec.labels[column]} must be finite, got {value}"
             )
-    # Beside a number out of all proportion its channel would look constant.
-    if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
-        return
-    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
+    if max(float(np.abs(episode.stream).max()) for episode in episodes) > WILD / 2:
+        _check_proportions(episodes, spec)
+
+
+def _check_proportions(episodes: Sequence[Episode], spec: StreamSpec) -> None:
+    """Raise ValueError for a number out of all proportion, beside which its channel would look constant."""
+    rows = np.concatenate([episode.stream for episode in episodes]).astype(np.float64)
     low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
     reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
     for n, episode in enumerate(episodes):
@@ -86,10 +89,8 @@ def mute_channels(episodes: Sequence[Episode]) -> list[str]:
     rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
     labels = np.array(episodes[0].spec.labels)
     moves = np.ptp(rows, axis=0) > 0
-    notes = [
-        f"{label} never moves in these episodes: its motion will be an alarm"
-        for label in labels[~moves]
-    ]
+    still = "never moves in these episodes: its motion will be an alarm"
+    notes = [f"{label} {still}" for label in labels[~moves]]
     moving = labels[moves]
     correlation = np.corrcoef(rows[:, moves], rowvar=False).reshape(len(moving), -1)
     for column, own in enumerate(np.abs(correlation) > ALIKE):
@@ -118,11 +119,13 @@ def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
     """
     hashes = hashes_of(episodes)
     for known in learned:
-        seen = np.flatnonzero(np.isin(hashes, [] if known is None else known))
-        if len(seen):
+        if known is None:
+            continue
+        stale = np.flatnonzero(np.isin(hashes, known))
+        if len(stale):
             raise ValueError(
                 "calibrate() needs episodes that were not learned from, as the surprise of others is "
-                f"too low to set a threshold: leave out episodes {shortened(seen)}, or replace them"
+                f"too low to set a threshold: leave out episodes {shortened(stale)}, or replace them"
             )
     _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
     original = first[group]  # (N,) number of the first episode with the same rows
