@@ -303,17 +303,16 @@ class CalibratedMonitor:
     ) -> float:
         """Return the threshold for another rate, from the episodes of ``calibrate``; raises as that does."""
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
-        kept = self.blocks_ if asked.per == HOUR else self.maxima_
-        if kept is None or self.maxima_ is None:
+        if self.maxima_ is None or self.blocks_ is None:
             raise self._lacking("calibration")
         return asked.threshold(self.maxima_, self.blocks_)
 
     @property
     def promise(self) -> Promise:
         """The promised rate of alarms in nominal operation. Raises RuntimeError before ``calibrate``."""
-        if self.maxima_ is None:
+        if self.maxima_ is None or self.blocks_ is None:
             raise self._lacking("calibration")
-        if self.promised_ == HOUR and self.blocks_ is not None:
+        if self.promised_ == HOUR:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
 

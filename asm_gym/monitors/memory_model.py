@@ -80,14 +80,17 @@ class MemoryModel(ScaledModel):
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        streams, lag = [e.stream for e in episodes], self.lag
+        streams = [episode.stream for episode in episodes]
+        lag = self.lag
         senses = StreamScaler.fit(self.spec, streams, lag)
         check_inputs(senses.inputs)
-        readings = [senses.read_episode(s) for s in streams]
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
-        trajectories = [
-            Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings
-        ]
+        trajectories = []
+        for stream in streams:
+            read = senses.read_episode(stream)
+            trajectories.append(
+                Trajectory(read.senses[::lag], read.commands[::lag], read.inputs[lag:])
+            )
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
         trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
         learned = {**senses.arrays, "energy": trained.energy}
@@ -95,13 +98,14 @@ class MemoryModel(ScaledModel):
         ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
         for episode, errors in zip(episodes, np.split(trained.errors, ends), strict=True):
             errors[:lag] *= UNSURE
-            self.crossfitted[id(episode)] = np.vstack(
-                [np.zeros_like(errors[:1]).repeat(lag, 0), errors]
-            )
-        network, completion = trained.network, Completion.fit(senses, streams)
-        filled = completion.named() if completion is not None else {}
+            unknown = np.zeros((lag, errors.shape[1]), errors.dtype)
+            self.crossfitted[id(episode)] = np.vstack([unknown, errors])
+        network = trained.network
+        completion = Completion.fit(senses, streams)
+        if completion is not None:
+            learned |= completion.named()
         return self.restore(
-            {**learned, **network.weights._asdict(), **network.association._asdict(), **filled}
+            {**learned, **network.weights._asdict(), **network.association._asdict()}
         )
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:

@@ -83,36 +83,31 @@ class MonitorKind:
         return issubclass(self.model_class, CalibratedMonitor)
 
 
+def _rival(model: str, detection: str) -> MonitorKind:
+    """Return a rival, by its model in this folder and the detection that its authors judged it by."""
+    return MonitorKind(f"asm_gym.monitors.{model}", own=detection, detection=detection)
+
+
 RIVALS = {
-    "logpzo": ("baselines.networks:LogpZO", "moving_mean"),
-    "gru": ("baselines.networks:GRU", "mahalanobis"),
-    "kalman": ("baselines.kalman:Kalman", "mahalanobis"),
-    "association_linear": ("baselines.change_regression:LinearAssociation", "mahalanobis"),
-    "association_values": ("torque.value_association:ValueAssociation", "largest"),
-    "external_torque_limit": ("baselines.fixed_limits:ExternalTorqueLimit", "largest"),
-    "force_limit": ("baselines.fixed_limits:ForceLimit", "squares"),
+    "logpzo": _rival("baselines.networks:LogpZO", "moving_mean"),
+    "gru": _rival("baselines.networks:GRU", "mahalanobis"),
+    "kalman": _rival("baselines.kalman:Kalman", "mahalanobis"),
+    "association_linear": _rival("baselines.change_regression:LinearAssociation", "mahalanobis"),
+    "association_values": _rival("torque.value_association:ValueAssociation", "largest"),
+    "external_torque_limit": _rival("baselines.fixed_limits:ExternalTorqueLimit", "largest"),
+    "force_limit": _rival("baselines.fixed_limits:ForceLimit", "squares"),
 }
-"""The model of each rival, and the detection that its authors judged it by."""
 
-
-def _kinds() -> dict[str, MonitorKind]:
-    """Return every monitor, and the rivals under the detection of the Neural ASM."""
-    memory = MonitorKind("asm_gym.monitors.neural_asm:NeuralASM")
-    rivals = {}
-    for name, (model, detection) in RIVALS.items():
-        rivals[name] = MonitorKind(f"asm_gym.monitors.{model}", detection, detection)
-    by_evidence = {
-        name + EVIDENCE: replace(kind, detection="evidence")
-        for name, kind in rivals.items()
-        if "limit" not in name
-    }
-    return {"neural_asm": memory, **rivals, **by_evidence}
-
+BY_EVIDENCE = {
+    name + EVIDENCE: replace(kind, detection="evidence")
+    for name, kind in RIVALS.items()
+    if "limit" not in name
+}
 
 MONITORS: Registry[MonitorKind] = Registry(
     "monitor",
     "asm_gym.monitors.registry:MONITORS",
-    _kinds(),
+    {"neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"), **RIVALS, **BY_EVIDENCE},
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
 as those of the Neural ASM are. ``+`` and the name of any other detection will do as well."""

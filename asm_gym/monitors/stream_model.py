@@ -76,6 +76,12 @@ class ScaledModel(StreamModel):
         self.lag = lag
         self.shortest = 1 + lag
 
+    def read_nominal(self, episodes: Sequence[Episode]) -> list[ScaledRows]:
+        """Learn the scale of nominal episodes, and read all of their rows."""
+        streams = [episode.stream for episode in episodes]
+        self.senses_ = StreamScaler.fit(self.spec, streams, self.lag)
+        return [self.senses_.read_episode(stream) for stream in streams]
+
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
         return super().restore(learned, skills)
@@ -117,6 +123,11 @@ def read_next(
     reading = senses.read(rows, before, earlier)
     known = (reading.whole * (history.steps >= senses.lag)[:, None]).astype(np.float32)
     return history.followed_by(rows), reading, known
+
+
+def zero_unless_finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values with 0 for those that are not finite."""
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def no_context(rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from asm_gym.memory.linear import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
-from asm_gym.scaling import StreamScaler, rows_apart
+from asm_gym.scaling import rows_apart
 from asm_gym.spec import StreamSpec
 
 LEAST_SPREAD = 1e-4  # of what is left of a standardised number
@@ -38,10 +38,10 @@ class LinearAssociation(ScaledModel):
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        streams = [episode.stream for episode in episodes]
-        senses = StreamScaler.fit(self.spec, streams, self.lag)
+        readings = self.read_nominal(episodes)
+        senses = self.senses_
         check_inputs(senses.inputs)
-        inputs = np.concatenate([senses.read_episode(s).inputs[self.lag :] for s in streams])
+        inputs = np.concatenate([reading.inputs[self.lag :] for reading in readings])
         D = learn_linear(inputs, senses.groups, senses.changes)
         squares = (inputs[:, senses.changes] - inputs @ D.T) ** 2
         remainder = np.maximum(np.sqrt(np.mean(squares, axis=0)), LEAST_SPREAD)

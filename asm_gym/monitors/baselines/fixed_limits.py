@@ -21,7 +21,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel, no_context
+from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.spec import StreamSpec
 
 LEAST_SPREAD = 1e-6  # of a channel [its unit]
@@ -66,7 +66,7 @@ class FixedLimit(StreamModel):
     ) -> tuple[RowHistory, ModelOutput]:
         distance = rows[:, self._columns] - self.learned_["limit_centre"]
         error = distance / self.learned_["limit_scale"]
-        return state, ModelOutput(np.where(np.isfinite(error), error, 0.0), no_context(rows))
+        return state, ModelOutput(zero_unless_finite(error), no_context(rows))
 
 
 class ForceLimit(FixedLimit):

@@ -20,7 +20,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.linear import check_inputs
 from asm_gym.monitors.base import Progress
-from asm_gym.monitors.stream_model import StreamModel, no_context
+from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
@@ -86,15 +86,11 @@ class Kalman(StreamModel):
     def predict(self, state: KalmanState, rows: Floats) -> tuple[KalmanState, ModelOutput]:
         learned = self.learned_
         y = (rows[:, self.spec.sensory] - learned["mean"]) / learned["spread"]
-        measured = np.isfinite(y)
-        u = rows[:, self.spec.motor]
-        commands = np.where(np.isfinite(u), u, 0.0)
+        commands = zero_unless_finite(rows[:, self.spec.motor])
         inputs = np.hstack([state.estimate, commands, np.ones((len(rows), 1))])
-
         begun = (state.steps > 0)[:, None]
-        first = np.where(measured, y, 0.0)
-        expected = np.where(begun, inputs @ learned["weights"], first)
-        innovation: Floats = np.where(measured, y - expected, 0.0)
+        expected = np.where(begun, inputs @ learned["weights"], zero_unless_finite(y))
+        innovation = zero_unless_finite(y - expected)
         estimate = expected + innovation @ learned["gain"].T
         error = innovation / learned["deviation"]
         return KalmanState(estimate, state.steps + 1), ModelOutput(error, no_context(rows))

@@ -39,7 +39,7 @@ from asm_gym.monitors.torque.crossfitting import (
     folds_of,
     quadratic_form,
 )
-from asm_gym.scaling import ScaledRows, StreamScaler, rows_apart
+from asm_gym.scaling import ScaledRows, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
@@ -134,11 +134,8 @@ class ValueAssociation(ScaledModel):
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        streams = [episode.stream for episode in episodes]
-        self.senses_ = StreamScaler.fit(self.spec, streams, self.lag)
-        readings = [self.senses_.read_episode(stream) for stream in streams]
-        rows = self._regressors(rows_after(self.lag, readings))
-        lengths = [len(stream) - self.lag for stream in streams]
+        rows = self._regressors(rows_after(self.lag, self.read_nominal(episodes)))
+        lengths = [len(episode) - self.lag for episode in episodes]
         fit = self._best_fit(rows, folds_of(lengths))
 
         judged = self.judged(fit.regression.R2)
