@@ -52,7 +52,9 @@ class CommandReadout:
     """Makes actions of expected commands: kept in the space of ``env``, and each gripper at one end of its range."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._space: Any = env.action_space
+        space: Any = env.action_space
+        self._low = space.low
+        self._high = space.high
         self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
         self._dt = control_period(env)
         # However long a step lasts, one must not be enough for what is less likely than not.
@@ -62,10 +64,10 @@ class CommandReadout:
         self, expected: NDArray[np.float32], before: Grip | None
     ) -> tuple[NDArray[np.float32], Grip]:
         """Return the action (A,) for expected commands (A,), and the grip to pass in next time; None at first."""
-        action = np.clip(np.nan_to_num(expected), self._space.low, self._space.high)
-        action = action.astype(np.float32)
-        low = self._space.low[self._grip]
-        high = self._space.high[self._grip]
+        clipped = np.clip(np.nan_to_num(expected), self._low, self._high)
+        action: NDArray[np.float32] = clipped.astype(np.float32)
+        low = self._low[self._grip]
+        high = self._high[self._grip]
 
         # (G,) 1 where the upper end is certain
         share = ((action[self._grip] - low) / (high - low)).astype(np.float64)

@@ -159,12 +159,10 @@ class RowKernel:
         with one_thread_for(len(rows)):
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
-        raw = None
-        excuse = None
+        surprise = Surprise(judged["surprise"].copy(), attribution)
         if self._excuses:
             raw = judged["raw_surprise"].copy()
-            excuse = judged["excuse"].copy()
-        surprise = Surprise(judged["surprise"].copy(), attribution, raw=raw, excuse=excuse)
+            surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
         return out, surprise, judged["divisor"].copy()
 
 

@@ -19,7 +19,7 @@ from asm_gym.detection import ModelOutput
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context
-from asm_gym.monitors.torque.arm_features import WIDTHS, ArmFeatures, forces, speed_columns
+from asm_gym.monitors.torque.arm_features import WIDTHS, ArmFeatures, forces
 from asm_gym.monitors.torque.body_model import joint_weights
 from asm_gym.scaling import rows_apart
 from asm_gym.spec import StreamSpec
@@ -52,7 +52,7 @@ class FrictionRule(StreamModel):
         self.urdf = urdf
         self._arm = ArmFeatures.of(spec, urdf)
         torques = forces(spec)
-        speeds = speed_columns(spec)
+        speeds = spec.sensory[self._arm.speeds]
         joints = min(len(torques), len(speeds))
         if not joints:
             raise ValueError(
@@ -73,8 +73,8 @@ class FrictionRule(StreamModel):
     ) -> Self:
         streams = [episode.stream.astype(np.float64) for episode in episodes]
         pairs = [(rows[self.lag :], rows[: -self.lag]) for rows in streams]
-        speeds = np.concatenate([self._speed(rows, before) for rows, before in pairs])
-        width = np.maximum(speeds.std(axis=0), LEAST_SPREAD)
+        speeds = [self._speed(rows, before) for rows, before in pairs]
+        width = np.maximum(np.concatenate(speeds).std(axis=0), LEAST_SPREAD)
         torques = [rows[:, self._torques] for rows, _ in pairs]
         inputs = [self._inputs(rows, before, width) for rows, before in pairs]
         weights = joint_weights(np.concatenate(inputs), np.concatenate(torques))

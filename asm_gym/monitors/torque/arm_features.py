@@ -76,10 +76,14 @@ class ArmFeatures:
         Raises:
             ValueError: the text ``urdf`` is no body model of the joints that are sensed.
         """
-        moving = speed_columns(spec)
-        angles = named_columns(spec, POSITION)
-        if len(angles) > MOST_ANGLES:
-            angles = angles[:0]
+        positions = named_columns(spec, POSITION)
+        moving = named_columns(spec, SPEED)
+        from_changes = not len(moving)
+        if from_changes:
+            moving = positions
+        angles = positions
+        if len(positions) > MOST_ANGLES:
+            angles = positions[:0]
         units = [channel.unit for channel in spec.channels for _ in channel.labels]
         body = None
         if urdf:
@@ -89,7 +93,7 @@ class ArmFeatures:
             senses=len(spec.sensory),
             speeds=np.searchsorted(spec.sensory, moving),
             angles=np.searchsorted(spec.sensory, angles),
-            from_changes=lacks_speeds(spec),
+            from_changes=from_changes,
             radians=np.array([ratio(units[i], "rad") or 1.0 for i in angles]),
             body=body,
         )
@@ -167,16 +171,6 @@ def named_columns(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp
         if pattern.fullmatch(name.lower()):
             columns += range(spec.size)[place]
     return spec.sensory[np.isin(spec.sensory, columns)]
-
-
-def speed_columns(spec: StreamSpec) -> NDArray[np.intp]:
-    """Return the columns of speeds; of positions, where there are none."""
-    return named_columns(spec, POSITION if lacks_speeds(spec) else SPEED)
-
-
-def lacks_speeds(spec: StreamSpec) -> bool:
-    """Return whether a stream has positions, and no speeds."""
-    return not len(named_columns(spec, SPEED)) and len(named_columns(spec, POSITION)) > 0
 
 
 def forces(spec: StreamSpec) -> NDArray[np.intp]:
