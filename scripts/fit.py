@@ -30,7 +30,7 @@ from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
 from asm_gym.monitors.calibration import AlarmRate
-from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.monitors.monitor_registry import check_monitor_name
 from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.monitors.training_data import mute_channels

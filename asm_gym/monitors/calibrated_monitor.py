@@ -19,7 +19,6 @@ from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibration import (
     AlarmRate,
     apart_for_ceilings,
@@ -36,6 +35,7 @@ from asm_gym.monitors.stream_model import (
     require_arrays,
     side_by_side,
 )
+from asm_gym.monitors.surprise import Progress, Surprise
 from asm_gym.monitors.training_data import (
     Hashes,
     about_episodes,

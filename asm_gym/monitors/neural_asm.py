@@ -22,7 +22,6 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
-from asm_gym.monitors.base import Progress, Surprise
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_config import MemoryConfig
@@ -32,6 +31,7 @@ from asm_gym.monitors.monitor_state import MonitorState, checked_rows
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
+from asm_gym.monitors.surprise import Progress, Surprise
 from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
 from asm_gym.monitors.weight_packing import rounded
 from asm_gym.scaling import StreamScaler

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.temporal import RowHistory
-from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
+from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 
 LEAST_SPREAD = 1e-6  # of a channel [its unit]

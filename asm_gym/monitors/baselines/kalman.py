@@ -19,8 +19,8 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.linear import check_inputs
-from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
+from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 

@@ -106,7 +106,7 @@ BY_EVIDENCE = {
 
 MONITORS: Registry[MonitorKind] = Registry(
     "monitor",
-    "asm_gym.monitors.registry:MONITORS",
+    "asm_gym.monitors.monitor_registry:MONITORS",
     {"neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"), **RIVALS, **BY_EVIDENCE},
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
