@@ -8,7 +8,6 @@ Further functions take a memory as an argument: ``skills``, ``shipped``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,7 +23,7 @@ from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.memory_config import MemoryConfig
+from asm_gym.monitors.memory_config import OF_EVIDENCE, MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor_files import restored
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows
@@ -100,13 +99,8 @@ class NeuralASM(CalibratedMonitor):
         config: MemoryConfig | None = None,
     ) -> None:
         check_choice("dynamics", dynamics, DYNAMICS)
-        usual = DYNAMICS[dynamics]
         config = config or MemoryConfig()
-        self.config = replace(
-            config,
-            iterations=config.iterations or usual.iterations,
-            prior_precision=config.prior_precision or usual.prior_precision,
-        )
+        self.config = config.with_defaults_of(DYNAMICS[dynamics])
         self.dynamics = dynamics
         self.urdf = urdf
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
@@ -129,21 +123,9 @@ class NeuralASM(CalibratedMonitor):
         ValueJudge.check_body(spec, urdf)
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
-        evidence = EvidenceDetection(
-            spec,
-            gains=config.gains,
-            bound=config.bound,
-            shrinkage=config.shrinkage,
-            habituates=habituates,
-            tail_index=config.tail_index,
-        )
-        self.config = replace(
-            self.config,
-            gains=evidence.gains,
-            bound=evidence.bound,
-            shrinkage=evidence.shrinkage,
-            tail_index=evidence.tail_index,
-        )
+        of_evidence = {name: getattr(config, name) for name in OF_EVIDENCE}
+        evidence = EvidenceDetection(spec, habituates=habituates, **of_evidence)
+        self.config = self.config.as_checked_by(evidence)
         self.habituates = evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = BenignEvents(spec) if excuses else None

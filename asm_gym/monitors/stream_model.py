@@ -185,9 +185,7 @@ def _predicted(
     rule = f"predict of {model.kind} must give"
     is_pair = isinstance(result, tuple) and len(result) == 2
     if not is_pair or not isinstance(result[1], ModelOutput):
-        parts = result if type(result) is tuple else (result,)
-        types = ", ".join(type(part).__name__ for part in parts)
-        raise ValueError(f"{rule} a state and a ModelOutput, got {types}")
+        raise ValueError(f"{rule} a state and a ModelOutput, got {type(result).__name__}")
     output = result[1]
     shape = (len(rows), len(model.error_columns))
     if np.shape(output.errors) != shape:
