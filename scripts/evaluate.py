@@ -24,7 +24,7 @@ from asm_gym.evaluation.scoring import benchmark
 from asm_gym.faults import anywhere
 from asm_gym.faults.suite import SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
-from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.monitors.monitor_registry import check_monitor_name
 from asm_gym.rollouts.collect import record_missing
 from asm_gym.rollouts.corpus import SKILLS, VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map

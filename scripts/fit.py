@@ -29,11 +29,11 @@ from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
 from asm_gym.files import writable
 from asm_gym.monitors import MONITORS, CalibratedMonitor, NeuralASM, make_monitor, monitor_class
-from asm_gym.monitors.body_model import read_urdf
 from asm_gym.monitors.calibration import AlarmRate
-from asm_gym.monitors.registry import check_monitor_name
+from asm_gym.monitors.monitor_registry import check_monitor_name
+from asm_gym.monitors.torque.urdf import read_urdf
+from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.monitors.training_data import mute_channels
-from asm_gym.monitors.value_association import ValueAssociation
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import option, run
 from asm_gym.scripts.log_options import LogOptions, ended

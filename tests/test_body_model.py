@@ -12,8 +12,9 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
-from asm_gym.monitors.body_model import BodyModel, read_urdf
-from asm_gym.monitors.value_association import ValueAssociation
+from asm_gym.monitors.torque.body_model import BodyModel
+from asm_gym.monitors.torque.urdf import read_urdf
+from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.scripts.cli import main
 
 
@@ -245,7 +246,7 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
     )
     asm.fit(cut[:20]).calibrate(cut[20:], 0.1).save(tmp_path / "x.asm")
     assert isinstance(asm.values_.monitor.model, ValueAssociation)
-    assert asm.values_.monitor.model._derived.links is not None
+    assert asm.values_.monitor.model.links is not None
     (tmp_path / "arm.urdf").unlink()
     again = load_monitor(tmp_path / "x.asm")
     np.testing.assert_array_equal(again.score(cut[25]).value, asm.score(cut[25]).value)

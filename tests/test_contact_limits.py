@@ -15,7 +15,7 @@ from asm_gym.envs.speed_limit import BESIDE
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import NeuralASM, make_monitor
-from asm_gym.monitors.registry import load_monitor
+from asm_gym.monitors.monitor_registry import load_monitor
 from asm_gym.policies import make_policy
 from asm_gym.spec import Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety

@@ -15,7 +15,12 @@ from asm_gym.data.episode import Episode
 from asm_gym.memory import motor
 from asm_gym.memory.motor import FINE, PLACED, fineness, learn_motor, situation
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.memory_policy import ENOUGH, FORGETS, CommandReadout, NeuralASMPolicy
+from asm_gym.monitors.memory_policy import (
+    CHANGE_AFTER,
+    FORGETTING_TIME,
+    CommandReadout,
+    NeuralASMPolicy,
+)
 from asm_gym.monitors.skills import learn_to_act, lessons
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scaling import StreamScaler
@@ -154,8 +159,8 @@ def told(shares: list[float], dt: float = 0.05) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("sure", [1.0, 0.5, 0.2, 0.1])
 def test_a_gripper_changes_once_the_sum_of_what_speaks_for_it_reaches_the_bound(sure):
-    ratio = np.exp(-0.05 / FORGETS)
-    reached = np.cumsum(0.05 * sure * ratio ** np.arange(200)) > ENOUGH  # a geometric series
+    ratio = np.exp(-0.05 / FORGETTING_TIME)
+    reached = np.cumsum(0.05 * sure * ratio ** np.arange(200)) > CHANGE_AFTER  # a geometric series
     waits = int(np.argmax(reached))
     found = told([1.0] + [1.0 - 2 * sure] * (waits + 1))[1:]
     np.testing.assert_array_equal(found, [1.0] * waits + [-1.0])

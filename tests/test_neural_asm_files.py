@@ -10,7 +10,7 @@ import pytest
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.files import unpacked
+from asm_gym.monitors.weight_packing import unpacked
 from tests.memories import learned_bytes, sine_memory
 from tests.streams import sine_episodes
 
@@ -72,7 +72,7 @@ def tampered(asm, path, arrays=None, **header):
 def test_a_checkpoint_without_what_the_detector_needs_is_refused(asm, tmp_path):
     asm.save(tmp_path / "m.asm")
     rewritten(tmp_path / "m.asm", tmp_path / "older.asm", without("tail"))
-    with pytest.raises(ValueError, match="has no tail, so fit it anew"):
+    with pytest.raises(ValueError, match="has no tail: make it anew"):
         NeuralASM.load(tmp_path / "older.asm")
     rewritten(tmp_path / "m.asm", tmp_path / "oldest.asm", without("remainder", "span_S"))
     older = "this memory has no span_S, remainder: make it anew, by asm-gym fit or asm-gym babble"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asm_gym.data.episode import Episode
-from asm_gym.monitors.body_model import BodyModel
+from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import real_arms
 from asm_gym.scripts.reproduce.real_arms import (

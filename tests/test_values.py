@@ -14,12 +14,12 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
 from asm_gym.detection.scores import Largest
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
-from asm_gym.monitors.arm_inputs import forces, judged_by_values, motion
-from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.baselines.linear import FrictionRule
+from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.stream_model import model_outputs
-from asm_gym.monitors.value_association import ValueAssociation, averaged
-from asm_gym.monitors.values import Values
+from asm_gym.monitors.surprise import Surprise
+from asm_gym.monitors.torque.arm_features import forces, judged_by_values, motion
+from asm_gym.monitors.torque.value_association import ValueAssociation, averaged
+from asm_gym.monitors.torque.value_judge import ValueJudge
 from asm_gym.scripts.cli import main
 from asm_gym.spec import Channel
 from asm_gym.synthetic_arm import SyntheticArm
@@ -61,7 +61,7 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
     state, found, left = model.start(1), [], []
     for row in cut[25].stream.astype(np.float64):
         state, output = model.predict(state, row[None])
-        left.append(state.left[0, -1])
+        left.append(state.errors[0, -1])
         found.append(output.errors[0])
     padded = np.vstack([np.zeros((9, 2)), left])
     expected = [padded[t : t + 10].sum(axis=0) / 10 / model.learned_["largest"] for t in range(100)]
@@ -95,7 +95,7 @@ def test_values_pass_the_threshold_as_often_as_changes_do(centre, spread, seed):
             return [Surprise(np.array([v]), np.zeros((1, 2))) for v in values]
 
     scores = [Surprise(np.array([c]), np.zeros((1, 2))) for c in changes]
-    now = Values(Told()).balanced(scores, [])
+    now = ValueJudge(Told(), np.zeros((0, 0))).balanced(scores, [])
     weighted = now.balance * values**now.power
     assert np.median(weighted) == pytest.approx(np.median(changes), rel=0.02)
     if spread[0] < 2.5 * spread[1]:
@@ -139,7 +139,7 @@ def test_a_memory_judges_values_beside_changes_and_keeps_both(tmp_path):
 
 def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_says():
     cut = pieces(Episode.from_table(pendulum_columns(3000)), 1.0)
-    values = Values.learned(cut[:20], seed=0)
+    values = ValueJudge.learned(cut[:20], seed=0)
     assert values is not None
     senses = values.monitor.model.senses_
     z = [
@@ -160,11 +160,13 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     lag = senses.lag
     np.testing.assert_allclose(found[:lag], 1.0)  # no change is known yet
     np.testing.assert_allclose(found[lag:], root[lag:], rtol=1e-4)
-    arrays = {name.removeprefix("values."): array for name, array in values.arrays.items()}
-    again = Values.found(cut[0].spec, arrays, seed=0)
+    again = ValueJudge.found(cut[0].spec, values.arrays, seed=0)
     np.testing.assert_array_equal(again.leverage, values.leverage)
     with pytest.raises(ValueError, match="the leverage of values should be of shape"):
-        Values.found(cut[0].spec, arrays | {"leverage": np.eye(3)}, seed=0)
+        ValueJudge.found(cut[0].spec, values.arrays | {"values.leverage": np.eye(3)}, seed=0)
+    old = {name: array for name, array in values.arrays.items() if name != "values.far"}
+    with pytest.raises(ValueError, match="has no far: make it anew"):
+        ValueJudge.found(cut[0].spec, old, seed=0)
 
 
 def test_the_rule_takes_friction_from_torque_and_needs_a_speed():

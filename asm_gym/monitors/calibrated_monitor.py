@@ -5,50 +5,46 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
-from asm_gym.data.action_identification import found_meaning
-from asm_gym.data.action_meaning import ACTIONS
-from asm_gym.data.episode import CONTROLLER, Episode
-from asm_gym.data.schema import LOG_SCHEMA
+from asm_gym.data.episode import Episode
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.monitors.base import Progress, State, Surprise
 from asm_gym.monitors.calibration import (
     AlarmRate,
     apart_for_ceilings,
     require_sight,
     with_ceilings,
 )
-from asm_gym.monitors.files import saved_parts, threshold_below, write_monitor
+from asm_gym.monitors.monitor_files import read_monitor, threshold_below, write_monitor
+from asm_gym.monitors.monitor_state import MonitorState, checked_rows, surprise_of_stream
 from asm_gym.monitors.stream_model import (
     StreamModel,
-    batch_of,
     error_places,
     model_outputs,
     parameter_names,
+    require_arrays,
     side_by_side,
 )
-from asm_gym.monitors.training_data import Hashes, check_fresh, check_nominal, hashes_of
-from asm_gym.validation import check_choice, check_flag, check_number, short_repr, typed
-
-
-class MonitorState(NamedTuple):
-    """State of a monitor, one row a stream; a value, never changed in place."""
-
-    model: State
-    detection: State
-    excuses: State = ()  # of knocks and stops
-    values: State = ()  # of the monitor of values
+from asm_gym.monitors.surprise import Progress, Surprise
+from asm_gym.monitors.training_data import (
+    Hashes,
+    about_episodes,
+    check_fresh,
+    check_nominal,
+    hashes_of,
+    with_held_out,
+)
+from asm_gym.validation import check_choice, check_flag, check_number, typed
 
 
 class CalibratedMonitor:
@@ -85,8 +81,10 @@ class CalibratedMonitor:
         if not detections:
             raise ValueError("a monitor needs a detection, got none")
         self.seed = check_number("seed", seed, low=0, whole=True)
-        self.spec, self.model, self.detection = model.spec, model, detections[0]
-        self.detections = {d.name: d for d in detections}
+        self.spec = model.spec
+        self.model = model
+        self.detection = detections[0]
+        self.detections = {detection.name: detection for detection in detections}
         self._uncalibrate()
         self.learned_from_: Hashes | None = None
         self.ceilings_from_: Hashes | None = None
@@ -94,17 +92,22 @@ class CalibratedMonitor:
 
     def __repr__(self) -> str:
         """Return name, body and threshold in one line."""
-        name = f"{self.about['name']!r}, " if "name" in self.about else ""
-        limit = "no threshold" if self.threshold_ is None else f"threshold {self.threshold_:.4g}"
-        return f"<{type(self).__name__} {name}{self.spec.source or 'a stream'} at {1 / self.spec.dt:g} Hz, {limit}>"
+        parts = [f"{self.spec.source or 'a stream'} at {1 / self.spec.dt:g} Hz"]
+        if "name" in self.about:
+            parts.insert(0, repr(self.about["name"]))
+        if self.threshold_ is None:
+            parts.append("no threshold")
+        else:
+            parts.append(f"threshold {self.threshold_:.4g}")
+        return f"<{type(self).__name__} {', '.join(parts)}>"
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
         """All arrays that ``fit`` has found, by name; empty before."""
-        found = dict(self.model.learned_)
+        learned = dict(self.model.learned_)
         for detection in self.detections.values():
-            found |= detection.learned_
-        return found
+            learned |= detection.learned_
+        return learned
 
     @property
     def skills_(self) -> tuple[str, ...]:
@@ -113,9 +116,11 @@ class CalibratedMonitor:
 
     def get_params(self) -> dict[str, Any]:
         """Return the hyperparameters by name, in one order whichever detection is in use."""
-        parts = (self.model, *(self.detections[name] for name in sorted(self.detections)))
-        found = {n: getattr(p, n) for p in parts for n in parameter_names(type(p)) if n != "seed"}
-        return found | {"seed": self.seed}
+        params: dict[str, Any] = {}
+        for part in (self.model, *(self.detections[name] for name in sorted(self.detections))):
+            names = [name for name in parameter_names(type(part)) if name != "seed"]
+            params |= {name: getattr(part, name) for name in names}
+        return params | {"seed": self.seed}
 
     @typed
     def with_threshold(self, value: float) -> Self:
@@ -131,7 +136,8 @@ class CalibratedMonitor:
         if isinstance(detection, str):
             check_choice(f"detection of this {self._name}", detection, self.detections)
             detection = other.detections[detection]
-        other.detection = other.detections[detection.name] = detection
+        other.detection = detection
+        other.detections[detection.name] = detection
         other._uncalibrate()
         return other
 
@@ -162,59 +168,51 @@ class CalibratedMonitor:
         check_nominal(episodes, self.spec, self.model.shortest)
         new = self._copy()  # an interrupt leaves this one as it was
         new._learn(episodes, progress or (lambda done, total: None), warm_start)
-        new.about = {**self.about, "specialised_on": len(episodes)} if warm_start else {}
-        for key in (CONTROLLER, LOG_SCHEMA):
-            first = episodes[0].info.get(key)
-            if first and all(episode.info.get(key) == first for episode in episodes):
-                new.about[key] = first
-        if len(self.spec.motor) and not warm_start:
-            new.about[ACTIONS] = found_meaning(episodes).to_json()
+        new.about = about_episodes(episodes, with_actions=not warm_start)
+        if warm_start:
+            new.about = {**self.about, "specialised_on": len(episodes), **new.about}
         vars(self).update(vars(new))
         return self
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
-        rng = np.random.default_rng(self.seed)
-        order = list(range(len(episodes)))
-        kept = 0
-        if self.model.held_out:
-            order = rng.permutation(len(episodes)).tolist()
-            kept = len(episodes) // self.model.held_out
-        held_out = [episodes[n] for n in order[:kept]]
-        learned = [episodes[n] for n in order[kept:]]
-
         self._uncalibrate()
         hashes = hashes_of(episodes)
         if warm_start and self.learned_from_ is not None:
             hashes = np.union1d(self.learned_from_, hashes)
         self.learned_from_ = hashes
-        if not warm_start:
-            self.ceilings_from_ = None
 
-        model: Any = self.model
         with threadpool_limits(1):  # products this small are slower on several threads
             if warm_start:
+                model: Any = self.model
                 model.specialise(episodes)
                 self._place_errors()
                 return
-            self.model.fit(learned, rng, progress)
-            self._place_errors()
-            nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
-            for detection in self.detections.values():
-                taken = self.model.learned_.keys() & set(detection.arrays)
-                if taken:
-                    raise ValueError(
-                        f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}"
-                    )
-                detection.fit(nominal, rng)
-            model.crossfitted = {}
+            self.ceilings_from_ = None
+            self._learn_anew(episodes, progress)
+
+    def _learn_anew(self, episodes: Sequence[Episode], progress: Progress) -> None:
+        rng = np.random.default_rng(self.seed)
+        learned, held_out = with_held_out(episodes, self.model.held_out, rng)
+        self.model.fit(learned, rng, progress)
+        self._place_errors()
+        nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
+        for detection in self.detections.values():
+            taken = self.model.learned_.keys() & set(detection.arrays)
+            if taken:
+                raise ValueError(
+                    f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}"
+                )
+            detection.fit(nominal, rng)
+        self.model.crossfitted = {}
 
     def _nominal_outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
         """Return the model's outputs, with the cross-fitted errors of what it has learned."""
-        known, found = self.model.crossfitted, model_outputs(self.model, episodes)
-        return [
-            o._replace(errors=known.get(id(e), o.errors))
-            for e, o in zip(episodes, found, strict=True)
-        ]
+        outputs = model_outputs(self.model, episodes)
+        for n, episode in enumerate(episodes):
+            if id(episode) in self.model.crossfitted:
+                errors = self.model.crossfitted[id(episode)]
+                outputs[n] = outputs[n]._replace(errors=errors)
+        return outputs
 
     @typed
     def calibrate(
@@ -305,17 +303,16 @@ class CalibratedMonitor:
     ) -> float:
         """Return the threshold for another rate, from the episodes of ``calibrate``; raises as that does."""
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
-        kept = self.blocks_ if asked.per == HOUR else self.maxima_
-        if kept is None or self.maxima_ is None:
+        if self.maxima_ is None or self.blocks_ is None:
             raise self._lacking("calibration")
         return asked.threshold(self.maxima_, self.blocks_)
 
     @property
     def promise(self) -> Promise:
         """The promised rate of alarms in nominal operation. Raises RuntimeError before ``calibrate``."""
-        if self.maxima_ is None:
+        if self.maxima_ is None or self.blocks_ is None:
             raise self._lacking("calibration")
-        if self.promised_ == HOUR and self.blocks_ is not None:
+        if self.promised_ == HOUR:
             return hourly_promise(self.blocks_, self.threshold, len(self.maxima_))
         return Promise.of(self.maxima_, self.threshold)
 
@@ -341,15 +338,14 @@ class CalibratedMonitor:
         afterwards. The old state does not change.
         """
         self._require_fitted()
-        rows = self._rows(state, stream)
+        rows = checked_rows(state, stream, self.spec)
         model, output = self.model.predict(state.model, rows)
         detection, attribution = self.detection.attribute_step(
-            state.detection, output, rows, lambda x: x @ self._places
+            state.detection, output, rows, lambda shares: shares @ self._places
         )
         finite = np.isfinite(rows)
         broken = ~finite.all(axis=1)
-        if broken.any():
-            attribution[broken] = np.where(finite[broken], 0.0, np.inf)
+        attribution[broken] = np.where(finite[broken], 0.0, np.inf)
         return MonitorState(model, detection), Surprise(attribution.sum(axis=1), attribution)
 
     @typed
@@ -373,7 +369,7 @@ class CalibratedMonitor:
                 for stream, number in enumerate(group):
                     own = steps[: len(episodes[number])]
                     if own:
-                        scores[number] = _of_stream(own, stream)
+                        scores[number] = surprise_of_stream(own, stream)
         return scores
 
     @typed
@@ -390,21 +386,20 @@ class CalibratedMonitor:
         Raises:
             ValueError: something is missing, or does not fit together.
         """
-        arrays, kept, calibrated = saved_parts(saved)
-        self.with_learned(arrays, tuple(saved.header["skills"]))
-        vars(self).update(kept)
+        kept = read_monitor(saved)
+        self.with_learned(kept.learned, tuple(saved.header["skills"]))
+        vars(self).update(kept.attributes)
         if saved.header["detection"] == self.detection.name:
             self.threshold_ = threshold_below(saved.header["threshold"], self.detection.reach)
-            vars(self).update(calibrated)
+            vars(self).update(kept.calibration)
         return self
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
         """Take over the arrays that ``learned_`` gave, without a threshold, and return it."""
-        theirs = {n for d in self.detections.values() for n in d.arrays}
-        missing = [n for n in self.detection.arrays if n not in arrays]
-        if missing:
-            raise ValueError(f"the checkpoint has no {', '.join(missing)}, so fit it anew")
-        self.model.restore({n: a for n, a in arrays.items() if n not in theirs}, skills)
+        require_arrays(arrays, self.detection.arrays)
+        of_detections = {n for detection in self.detections.values() for n in detection.arrays}
+        of_model = {n: a for n, a in arrays.items() if n not in of_detections}
+        self.model.restore(of_model, skills)
         self._place_errors()
         for detection in self.detections.values():
             if arrays.keys() >= set(detection.arrays):
@@ -445,33 +440,6 @@ class CalibratedMonitor:
                 f"this {self._name} has learned nothing yet: call fit(episodes) first"
             )
 
-    def _rows(self, state: MonitorState, stream: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-        """Return the rows (B, D) in one piece. Raises where they or the state are not what ``observe`` takes."""
-        if not isinstance(state, MonitorState):
-            raise TypeError(
-                f"state must be what initial_state or observe gave, got {short_repr(state)}"
-            )
-        try:
-            rows = np.ascontiguousarray(stream, np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"stream must be rows of numbers, got {short_repr(stream)}") from error
-        batch = batch_of(state)
-        if rows.shape != (batch, self.spec.size):
-            self.spec.check_row(rows)
-            raise ValueError(
-                f"stream must have the shape {(batch, self.spec.size)}, got {rows.shape}"
-            )
-        return rows
-
     def _place_errors(self) -> None:
         """Find the columns of errors, once the model knows them."""
         self._places = error_places(self.model.error_columns, self.spec)
-
-
-def _of_stream(steps: Sequence[Surprise], stream: int) -> Surprise:
-    """Return the surprise over T steps of one of several streams that were observed together."""
-    fields = {}
-    for name in Surprise._fields:
-        if getattr(steps[0], name) is not None:
-            fields[name] = np.array([getattr(step, name)[stream] for step in steps])
-    return Surprise(**fields)

@@ -33,11 +33,10 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("asm_gym.monitors")
 
-# one in so many episodes sets ceilings, the first that leaves enough for the threshold
 ONE_IN = (
     3,
     10,
-)
+)  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
 AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 
@@ -51,21 +50,22 @@ class AlarmRate(NamedTuple):
     @classmethod
     def of(cls, false_alarm_rate: float | None, false_alarms_per_hour: float | None) -> Self:
         """Return the one of two that is given. Raises ValueError unless exactly one is, and is a rate."""
-        if (false_alarm_rate is None) == (false_alarms_per_hour is None):
-            raise ValueError(
-                "give either false_alarm_rate (such as 0.01, of episodes) or false_alarms_per_hour (such as 1.0), got "
-                f"{'neither' if false_alarm_rate is None else 'both'}"
-            )
-        if false_alarms_per_hour is not None:
+        rule = "give either false_alarm_rate (such as 0.01, of episodes) or false_alarms_per_hour (such as 1.0)"
+        if false_alarm_rate is None:
+            if false_alarms_per_hour is None:
+                raise ValueError(f"{rule}, got neither")
             return cls(check_per_hour(false_alarms_per_hour), HOUR)
-        assert false_alarm_rate is not None
+        if false_alarms_per_hour is not None:
+            raise ValueError(f"{rule}, got both")
         conformal_episodes(false_alarm_rate)
         return cls(false_alarm_rate, EPISODE)
 
     @property
     def named(self) -> dict[str, float]:
         """The argument of ``calibrate``."""
-        return {"false_alarms_per_hour" if self.per == HOUR else "false_alarm_rate": self.rate}
+        if self.per == HOUR:
+            return {"false_alarms_per_hour": self.rate}
+        return {"false_alarm_rate": self.rate}
 
     def possible(self, episodes: Sequence[Episode]) -> bool:
         """Return whether so many nominal episodes are enough to promise this rate."""
@@ -87,9 +87,10 @@ class AlarmRate(NamedTuple):
 
     def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
         """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups."""
-        threshold = self.threshold(np.array([v.max() for v in values]), Blocks.of(values, dt, each))
+        maxima = np.array([value.max() for value in values])
+        threshold = self.threshold(maxima, Blocks.of(values, dt, each))
         for name in dict.fromkeys(each):
-            own = [v for v, of in zip(values, each, strict=True) if of == name]
+            own = [value for value, group in zip(values, each, strict=True) if group == name]
             try:
                 threshold = max(threshold, self.threshold_of(own, dt))
             except ValueError as error:
@@ -107,7 +108,8 @@ def blind_to(
     """
     if not hasattr(detection, "reach_of"):
         return []
-    reach, own = np.zeros(spec.size), np.flatnonzero(errors >= 0)
+    own = np.flatnonzero(errors >= 0)
+    reach = np.zeros(spec.size)
     np.maximum.at(reach, errors[own], detection.reach_of(own))
     return [spec.labels[i] for i in np.unique(errors[own]) if not reach[i] > threshold]
 
@@ -140,10 +142,10 @@ def apart_for_ceilings(
     for n, name in enumerate(each or [""] * len(episodes)):
         groups[name].append(n)
     for one_in in ONE_IN:
-        apart = {n for own in groups.values() for n in own[::one_in]}
-        others = ([episodes[n] for n in own if n not in apart] for own in groups.values())
-        if len(apart) >= FEWEST_EPISODES and all(map(asked.possible, others)):
-            return apart
+        chosen = {n for own in groups.values() for n in own[::one_in]}
+        others = ([episodes[n] for n in own if n not in chosen] for own in groups.values())
+        if len(chosen) >= FEWEST_EPISODES and all(map(asked.possible, others)):
+            return chosen
     if len(episodes) >= ONE_IN[0] * FEWEST_EPISODES:
         LOG.warning(
             "the rate that is asked for takes all %d episodes, so that none say how far each sense goes at its worst, "
@@ -171,14 +173,13 @@ def _worst_of(
 
     Surprise is v to a power of a half or less, so that v is divided by the square of what divides surprise.
     """
-    detector, excuses = detection.detector_, getattr(monitor, "excuses_", None)
-    assert detector is not None
-    found = []
+    excuses = getattr(monitor, "excuses_", None)
+    maxima = []
     for first in range(0, len(episodes), AT_ONCE):
-        some = episodes[first : first + AT_ONCE]
-        for episode, output in zip(some, model_outputs(monitor.model, some), strict=True):
-            strengths, _ = detector.strengths(output)
+        part = episodes[first : first + AT_ONCE]
+        for episode, output in zip(part, model_outputs(monitor.model, part), strict=True):
+            strengths, _ = detection.fitted_detector.strengths(output)
             if isinstance(excuses, BenignEvents):
                 strengths /= excuses.divisors(episode.stream)[:, None, None] ** 2
-            found.append(strengths.max(axis=0))
-    return np.array(found)
+            maxima.append(strengths.max(axis=0))
+    return np.array(maxima)

@@ -11,7 +11,8 @@ Source: Alcala and Qin 2009 (Automatica 45(7)) for contributions by reconstructi
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import resources
 from typing import Any, NamedTuple, Self
@@ -22,55 +23,62 @@ from scipy.special import softmax
 
 from asm_gym.blas import ONE_THREAD
 from asm_gym.memory.completion import Completion
-from asm_gym.spec import MOTOR
+from asm_gym.spec import MOTOR, StreamSpec
 
 FAMILIES = ("sensor", "contact", "actuator", "action", "object", "unknown")
 """Of causes: a sensor; a contact of the body; a joint or gripper; an action that is not carried out; a handled object;
 none of these, or none for sure."""
 
-CLASSES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "sensor": ("sensor", ("sensor",)),
-    "force sensor": ("sensor", ("force sensor",)),
-    "torque sensor": ("sensor", ("measured torque",)),
-    "contact": ("contact", ("external torque",)),
-    "joint": ("actuator", ("joint",)),
-    "gripper": ("actuator", ("gripper",)),
-    "command": ("action", ("command",)),
-    "object": ("object", ("gripper",)),
-    "unknown": ("unknown", ()),
+
+class CauseClass(NamedTuple):
+    """A class of causes."""
+
+    family: str  # one of ``FAMILIES``
+    kinds: tuple[str, ...]  # of the hypotheses that name its part
+
+
+CLASSES = {
+    "sensor": CauseClass("sensor", ("sensor",)),
+    "force sensor": CauseClass("sensor", ("force sensor",)),
+    "torque sensor": CauseClass("sensor", ("measured torque",)),
+    "contact": CauseClass("contact", ("external torque",)),
+    "joint": CauseClass("actuator", ("joint",)),
+    "gripper": CauseClass("actuator", ("gripper",)),
+    "command": CauseClass("action", ("command",)),
+    "object": CauseClass("object", ("gripper",)),
+    "unknown": CauseClass("unknown", ()),
 }
-"""Classes of causes: the family of each, and the kinds of hypotheses that name its part."""
 
 WINDOW = 3  # last rows that a diagnosis rests on
 
+TORQUES = ("commanded", "measured", "external")
+
 KINDS = (
-    *(
-        "sensor",
-        "force sensor",
-        "commanded torque",
-        "measured torque",
-        "external torque",
-        "joint",
-        "contact",
-    ),
-    *("wrist", "gripper", "hand", "command"),
+    "sensor",
+    "force sensor",
+    "commanded torque",
+    "measured torque",
+    "external torque",
+    "joint",
+    "contact",
+    "wrist",
+    "gripper",
+    "hand",
+    "command",
 )
 """Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
 
-# of channels, whose share of the surprise is evidence
-GROUPS = (
-    "joint",
-    "torque",
-    "hand",
-    "wrench",
-    "gripper",
-)
+GROUPS = ("joint", "torque", "hand", "wrench", "gripper")
+"""Of channels, whose share of the surprise is evidence."""
 
 EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
 """In order: how much the best hypothesis of each kind explains; the energy; the largest share of the surprise in one
 sensor, and the share in each group of channels."""
 
-SETTLED, SETTLED_AFTER = 0.9, 3  # a belief of so much, after so many diagnoses, is final
+SETTLED = 0.9  # a belief of so much, after so many diagnoses, is final
+SETTLED_AFTER = 3
+LEAST_NEWEST = 0.1  # share of the newest diagnosis in a belief
+LEAST_SURPRISE = 1e-12  # that is shared among senses
 REPEATS = 3  # equal readings of a noisy sensor after which it is stuck
 
 
@@ -92,6 +100,13 @@ class Hypothesis(NamedTuple):
     columns: NDArray[np.intp]
 
 
+class FreedEntries(NamedTuple):
+    """The entries of y that a hypothesis frees."""
+
+    entries: NDArray[np.intp]  # E (e,)
+    inverse: NDArray[np.float64]  # (P_EE)⁻¹ (e, e)
+
+
 @dataclass(frozen=True)
 class Readout:
     """Softmax regression of the class of a cause on evidence."""
@@ -108,13 +123,9 @@ class Readout:
     @classmethod
     def shipped(cls) -> Self:
         """Return the readout that was learned from faults of an arm in simulation."""
-        text = (
-            resources.files("asm_gym.monitors").joinpath("causes.json").read_text(encoding="utf-8")
-        )
-        saved = json.loads(text)
-        return cls(
-            **{name: np.array(saved[name]) for name in ("mean", "spread", "weights", "bias")}
-        )
+        file = resources.files("asm_gym.monitors").joinpath("causes.json")
+        saved = json.loads(file.read_text(encoding="utf-8"))
+        return cls(**{field.name: np.array(saved[field.name]) for field in fields(cls)})
 
 
 def averaged(
@@ -126,7 +137,7 @@ def averaged(
     """
     if diagnoses > SETTLED_AFTER and belief.max() >= SETTLED:
         return belief
-    return belief + max(1 / diagnoses, 0.1) * (newest - belief)
+    return belief + max(1 / diagnoses, LEAST_NEWEST) * (newest - belief)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,45 +154,57 @@ class Diagnosis:
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """All that may be wrong."""
-        return _hypotheses(self.completion)
+        """All that may be wrong, by the names of the stream's channels."""
+        sensors = [
+            Hypothesis(_kind_of_sensor(name, self._groups[columns[0]]), name, columns)
+            for name, columns in self.completion.sensors
+        ]
+        return (*sensors, *_torque_joints(sensors), *_regions(self.completion.spec, self._groups))
 
     @cached_property
-    def _freed(self) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
-        """Of each hypothesis the columns of y in it, and the inverse of their precision."""
-        found = []
-        for h in self.hypotheses:
+    def _groups(self) -> NDArray[np.str_]:
+        """The group (D,) of each column."""
+        channels = self.completion.spec.channels
+        return np.array([channel.group for channel in channels for _ in channel.labels])
+
+    @cached_property
+    def _freed(self) -> list[FreedEntries]:
+        """Of each hypothesis the entries of y in it."""
+        freed = []
+        for hypothesis in self.hypotheses:
             missing = np.zeros(self.completion.spec.size, bool)
-            missing[h.columns] = True
-            E = np.flatnonzero(self.completion.involved(missing))
-            found.append(
-                (E, np.linalg.inv(self.completion.precision[np.ix_(E, E)]).astype(np.float64))
-            )
-        return found
+            missing[hypothesis.columns] = True
+            entries = np.flatnonzero(self.completion.involved(missing))
+            precision = self.completion.precision[np.ix_(entries, entries)]
+            freed.append(FreedEntries(entries, np.linalg.inv(precision).astype(np.float64)))
+        return freed
 
     def evidence(
         self,
         lifted: NDArray[np.float64],
         attribution: NDArray[np.float64],
         missing: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[np.float64], dict[str, int]]:
+    ) -> tuple[NDArray[np.float64], dict[str, Hypothesis]]:
         """Return the evidence (F,) in y (T, Y), and the best hypothesis of each kind; see ``__call__``."""
-        energy, left = self._explained(lifted[-WINDOW:])
-        usual = len(self.completion.covariance)
-        total, rest = energy.mean() + 1.0, np.maximum(left.mean(axis=0), 0.0) + 1.0
-        explains = np.log(total / rest)
-        best: dict[str, int] = {}
-        for i, h in enumerate(self.hypotheses):
-            if missing is not None and missing[h.columns].all():
+        energy, rest = self._explained(lifted[-WINDOW:])
+        total = energy.mean() + 1.0
+        explains = np.log(total / (np.maximum(rest.mean(axis=0), 0.0) + 1.0))
+        explained = dict.fromkeys(KINDS, 0.0)
+        best: dict[str, Hypothesis] = {}
+        for hypothesis, share in zip(self.hypotheses, explains, strict=True):
+            kind = hypothesis.evidence
+            if missing is not None and missing[hypothesis.columns].all():
                 continue
-            if h.evidence not in best or explains[i] > explains[best[h.evidence]]:
-                best[h.evidence] = i
-        found = [explains[best[name]] if name in best else 0.0 for name in KINDS]
-        shares = np.nan_to_num(attribution) / max(float(np.nan_to_num(attribution).sum()), 1e-12)
+            if kind not in best or share > explained[kind]:
+                best[kind] = hypothesis
+                explained[kind] = share
+
+        surprise = np.nan_to_num(attribution)
+        shares = surprise / max(float(surprise.sum()), LEAST_SURPRISE)
         alone = max(float(shares[columns].sum()) for _, columns in self.completion.sensors)
-        names = np.array([c.group for c in self.completion.spec.channels for _ in range(c.size)])
-        groups = [float(shares[names == group].sum()) for group in GROUPS]
-        return np.array([*found, np.log(total / usual), alone, *groups]), best
+        groups = [float(shares[self._groups == group].sum()) for group in GROUPS]
+        energy_share = np.log(total / len(self.completion.covariance))
+        return np.array([*explained.values(), energy_share, alone, *groups]), best
 
     def _explained(
         self, lifted: NDArray[np.float64]
@@ -190,8 +213,11 @@ class Diagnosis:
         y = lifted - self.completion.centre
         g = y @ self.completion.precision
         energy = np.einsum("ty,ty->t", y, g)
-        left = [energy - np.einsum("te,te->t", g[:, E] @ Q, g[:, E]) for E, Q in self._freed]
-        return energy, np.stack(left, axis=1)
+        rest = []
+        for freed in self._freed:
+            g_E = g[:, freed.entries]
+            rest.append(energy - np.einsum("te,te->t", g_E @ freed.inverse, g_E))
+        return energy, np.stack(rest, axis=1)
 
     def __call__(
         self,
@@ -208,84 +234,92 @@ class Diagnosis:
         """
         stuck = self._stuck(rows, attribution)
         if stuck is not None:
-            certain = {name: float(name == "sensor") for name in FAMILIES}
-            return Cause("sensor", stuck[0], 1.0, certain, stuck[1])
+            return stuck
         with ONE_THREAD:  # the same to the last bit on any machine with these libraries
             evidence, best = self.evidence(self.completion.lift(rows), attribution, missing)
-            p = self.readout(evidence[None])[0]
+            of_classes = self.readout(evidence[None])[0]
+
+        by_class = dict(zip(CLASSES, of_classes.tolist(), strict=True))
         probabilities = dict.fromkeys(FAMILIES, 0.0)
-        for (family, _), q in zip(CLASSES.values(), p, strict=True):
-            probabilities[family] += float(q)
-        family = max(probabilities, key=lambda name: probabilities[name])
-        which = max(
-            (q, name)
-            for (name, (own, _)), q in zip(CLASSES.items(), p, strict=True)
-            if own == family
-        )[1]
-        able = [kind for kind in CLASSES[which][1] if kind in best]
-        most = max(able, key=lambda kind: evidence[EVIDENCE.index(kind)], default="")
-        named = self.hypotheses[best[most]] if most else Hypothesis("", "", np.zeros(0, np.intp))
-        columns = named.columns if family == "sensor" else np.zeros(0, np.intp)
-        return Cause(family, named.part, probabilities[family], probabilities, columns)
+        for name, probability in by_class.items():
+            probabilities[CLASSES[name].family] += probability
+        family = max(FAMILIES, key=lambda name: probabilities[name])
+        classes = [name for name, of_class in CLASSES.items() if of_class.family == family]
+        likeliest = max(classes, key=lambda name: (by_class[name], name))
+
+        kinds = [kind for kind in CLASSES[likeliest].kinds if kind in best]
+        part = ""
+        columns = np.zeros(0, np.intp)
+        if kinds:
+            named = best[max(kinds, key=lambda kind: evidence[EVIDENCE.index(kind)])]
+            part = named.part
+            if family == "sensor":
+                columns = named.columns
+        return Cause(family, part, probabilities[family], probabilities, columns)
 
     def _stuck(
         self, rows: NDArray[np.floating[Any]], attribution: NDArray[np.float64]
-    ) -> tuple[str, NDArray[np.intp]] | None:
+    ) -> Cause | None:
         """Return the sensor with most of the surprise, where it repeats itself though it has noise."""
         if len(rows) < REPEATS:
             return None
-        same = (np.ptp(rows[-REPEATS:], axis=0) == 0) & (self.completion.spec.noise > 0)
-        most = max(self.completion.sensors, key=lambda sensor: float(attribution[sensor[1]].sum()))
-        return most if same[most[1]].any() else None
+        name, columns = max(
+            self.completion.sensors, key=lambda sensor: float(attribution[sensor[1]].sum())
+        )
+        repeats = (np.ptp(rows[-REPEATS:], axis=0) == 0) & (self.completion.spec.noise > 0)
+        if not repeats[columns].any():
+            return None
+        certain = dict.fromkeys(FAMILIES, 0.0) | {"sensor": 1.0}
+        return Cause("sensor", name, 1.0, certain, columns)
 
 
-def _hypotheses(completion: Completion) -> tuple[Hypothesis, ...]:
-    """Return all that may be wrong in a stream, by the names of its channels."""
-    spec = completion.spec
-    groups = {label: c.group for c in spec.channels for label in c.labels}
-    labels = np.array(spec.labels)
-    found: list[Hypothesis] = []
+def _kind_of_sensor(name: str, group: str) -> str:
+    """Return the kind of the hypothesis that a sensor, such as ``measured_torque[3]``, is wrong."""
+    bare = name.split("[")[0]
+    if group == "torque" and bare.endswith("torque"):
+        for kind in TORQUES:
+            if f"{kind}_torque" in bare:
+                return f"{kind} torque"
+        return "measured torque"
+    if group == "wrench" or bare.endswith("force"):
+        return "force sensor"
+    return "sensor"
+
+
+def _torque_joints(sensors: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return for each joint that all of its torques are wrong together."""
     joints: dict[str, list[int]] = {}
-    for name, columns in completion.sensors:
-        bare = name.split("[")[0]
-        group = groups[labels[columns[0]]]
-        if bare.endswith("torque") and group == "torque":
-            joints.setdefault("joint" + name[len(bare) :], []).extend(columns.tolist())
-            kind = next(
-                (k for k in ("commanded", "measured", "external") if f"{k}_torque" in bare),
-                "measured",
-            )
-            found.append(Hypothesis(f"{kind} torque", name, columns))
-        else:
-            kind = "force sensor" if group == "wrench" or bare.endswith("force") else "sensor"
-            found.append(Hypothesis(kind, name, columns))
-    found += [
-        Hypothesis("joint", name, np.array(columns, np.intp)) for name, columns in joints.items()
-    ]
+    for sensor in sensors:
+        if sensor.evidence.endswith("torque"):
+            element = sensor.part.removeprefix(sensor.part.split("[")[0])
+            joints.setdefault("joint" + element, []).extend(sensor.columns.tolist())
+    return [Hypothesis("joint", name, np.array(own, np.intp)) for name, own in joints.items()]
 
-    wrist = np.array([groups[label] == "wrench" for label in labels])
-    external = np.array(["external_torque" in label for label in labels])
-    regions = {
-        ("contact", "body"): wrist | external if external.any() else external,
-        ("wrist", "wrist"): wrist,
-        ("gripper", "gripper"): np.array([groups[label] == "gripper" for label in labels]),
-        ("hand", "hand"): np.array([groups[label] == "hand" for label in labels]),
-        ("command", "command"): np.array([groups[label] == MOTOR for label in labels]),
-    }
-    found += [
-        Hypothesis(*named, np.flatnonzero(chosen))
-        for named, chosen in regions.items()
+
+def _regions(spec: StreamSpec, groups: NDArray[np.str_]) -> list[Hypothesis]:
+    """Return the parts of a robot whose columns, of these groups (D,), may be wrong together."""
+    wrist = groups == "wrench"
+    contact = np.array(["external_torque" in label for label in spec.labels])
+    if contact.any():
+        contact |= wrist
+    regions = [
+        ("contact", "body", contact),
+        ("wrist", "wrist", wrist),
+        ("gripper", "gripper", groups == "gripper"),
+        ("hand", "hand", groups == "hand"),
+        ("command", "command", groups == MOTOR),
+    ]
+    return [
+        Hypothesis(kind, part, np.flatnonzero(chosen))
+        for kind, part, chosen in regions
         if chosen.any()
     ]
-    return tuple(found)
 
 
 def as_info(cause: Cause | None) -> dict[str, Any]:
     """Return ``info["asm"]["cause"]``; all empty where there is none."""
-    family, part, probability, probabilities, _ = cause or ("", "", 0.0, {}, None)
-    return {
-        "family": family,
-        "part": part,
-        "probability": probability,
-        "probabilities": probabilities,
-    }
+    if cause is None:
+        return {"family": "", "part": "", "probability": 0.0, "probabilities": {}}
+    info = cause._asdict()
+    del info["columns"]
+    return info

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from asm_gym.detection.detector import BOUND, GAINS
 from asm_gym.detection.evidence import TAIL_INDEX
+from asm_gym.detection.evidence_detection import EvidenceDetection
+from asm_gym.memory.dynamics import Dynamics
 from asm_gym.validation import check_number
 
 MOST_ITERATIONS = 1000
 """Of inference in a row: twenty are enough, and a damaged file must not ask for a thousand million."""
+
+OF_EVIDENCE = ("gains", "bound", "shrinkage", "tail_index")  # that the detection takes and checks
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,18 @@ class MemoryConfig:
     shrinkage: float = 1e-3
     tail_index: float = TAIL_INDEX
 
+    def with_defaults_of(self, dynamics: Dynamics) -> Self:
+        """Return the config with the defaults of a kind of temporal network, where nothing else was given."""
+        return replace(
+            self,
+            iterations=self.iterations or dynamics.iterations,
+            prior_precision=self.prior_precision or dynamics.prior_precision,
+        )
+
+    def as_checked_by(self, evidence: EvidenceDetection) -> Self:
+        """Return the config with the numbers that the detection has made of it."""
+        return replace(self, **{name: getattr(evidence, name) for name in OF_EVIDENCE})
+
     def __post_init__(self) -> None:
         checked: dict[str, Any] = {
             "learning_rate": check_number("learning_rate", self.learning_rate, above=0.0),
@@ -51,7 +67,7 @@ class MemoryConfig:
             "sensory_precision": check_number(
                 "sensory_precision", self.sensory_precision, above=0.0
             ),
-            "gains": tuple(self.gains),  # checked by EvidenceDetection, as are all that follow
+            "gains": tuple(self.gains),  # EvidenceDetection checks all of ``OF_EVIDENCE``
         }
         if self.iterations is not None:
             checked["iterations"] = check_number(

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.association import Association, association_shapes, no_doubt
+from asm_gym.memory.association import Association, association_shapes
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
-from asm_gym.monitors.base import Progress
-from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, uninitialised
-from asm_gym.monitors.stream_model import ScaledModel
+from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, unwritten
+from asm_gym.monitors.stream_model import ScaledModel, require_arrays
+from asm_gym.monitors.surprise import Progress
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_shapes
@@ -56,11 +56,9 @@ class MemoryModel(ScaledModel):
     ) -> None:
         super().__init__(spec, rows_apart(spec.dt))
         self.dynamics = dynamics
-        self.hidden_size, self.association_size, self.schedule = (
-            hidden_size,
-            association_size,
-            schedule,
-        )
+        self.hidden_size = hidden_size
+        self.association_size = association_size
+        self.schedule = schedule
         self.network_: TemporalNetwork | None = None
         self.compiled_: RowWeights | None = None
         self.motor_: Motor | None = None
@@ -73,21 +71,26 @@ class MemoryModel(ScaledModel):
         return self.network_
 
     def _take(self, network: TemporalNetwork) -> None:
-        nameless = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
-        names = {name: self.learned_[name] for name in nameless} if self.skills_ else nameless
-        self.network_, self.compiled_ = network, row_weights(network, self.senses_, names)
+        names: Arrays = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
+        if self.skills_:
+            names = self.learned_
+        self.network_ = network
+        self.compiled_ = row_weights(network, self.senses_, names)
 
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        streams, lag = [e.stream for e in episodes], self.lag
+        streams = [episode.stream for episode in episodes]
+        lag = self.lag
         senses = StreamScaler.fit(self.spec, streams, lag)
         check_inputs(senses.inputs)
-        readings = [senses.read_episode(s) for s in streams]
         # Nothing came before the first ``lag`` rows, so that no change in them is known.
-        trajectories = [
-            Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings
-        ]
+        trajectories = []
+        for stream in streams:
+            read = senses.read_episode(stream)
+            trajectories.append(
+                Trajectory(read.senses[::lag], read.commands[::lag], read.inputs[lag:])
+            )
         layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
         trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
         learned = {**senses.arrays, "energy": trained.energy}
@@ -95,13 +98,14 @@ class MemoryModel(ScaledModel):
         ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
         for episode, errors in zip(episodes, np.split(trained.errors, ends), strict=True):
             errors[:lag] *= UNSURE
-            self.crossfitted[id(episode)] = np.vstack(
-                [np.zeros_like(errors[:1]).repeat(lag, 0), errors]
-            )
-        network, completion = trained.network, Completion.fit(senses, streams)
-        filled = completion.named() if completion is not None else {}
+            unknown = np.zeros((lag, errors.shape[1]), errors.dtype)
+            self.crossfitted[id(episode)] = np.vstack([unknown, errors])
+        network = trained.network
+        completion = Completion.fit(senses, streams)
+        if completion is not None:
+            learned |= completion.named()
         return self.restore(
-            {**learned, **network.weights._asdict(), **network.association._asdict(), **filled}
+            {**learned, **network.weights._asdict(), **network.association._asdict()}
         )
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
@@ -123,22 +127,19 @@ class MemoryModel(ScaledModel):
         senses = StreamScaler.of(self.spec, learned, self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
-        if "R" not in learned:  # made before leverage was learned
-            learned = {**learned, **no_doubt(senses.inputs, X)}
-        if (found := dynamics_of(learned)) != self.dynamics:
+        kept = dynamics_of(learned)
+        if kept != self.dynamics:
             raise ValueError(
-                f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}"
+                f"this is a memory of dynamics={kept!r}, which cannot be loaded as {self.dynamics!r}"
             )
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
-        shapes["R"] = (senses.inputs if len(learned["R"]) else 0, senses.inputs)
+        if not len(learned.get("R", ())):  # leverage was not learned, from few rows
+            shapes["R"] = (0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
-        if missing := [name for name in shapes if name not in learned]:
-            raise ValueError(
-                f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble"
-            )
+        require_arrays(learned, shapes)
         check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
         association = Association(**{n: arrays[n] for n in Association._fields})
@@ -148,10 +149,8 @@ class MemoryModel(ScaledModel):
             self.schedule.sensory_precision,
         )
         super().restore(learned, skills)
-        self.motor_, self.completion_ = (
-            Motor.found(learned, self.senses_),
-            Completion.found(learned, self.senses_),
-        )
+        self.motor_ = Motor.found(learned, self.senses_)
+        self.completion_ = Completion.found(learned, self.senses_)
         self._take(
             dynamics.network(
                 dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how
@@ -160,16 +159,18 @@ class MemoryModel(ScaledModel):
         return self
 
     def start(self, batch: int) -> MemoryState:
-        state, named = (
-            np.zeros((batch, n), np.float32) for n in (self.network.hidden_size, len(self.skills_))
+        return MemoryState(
+            traces=self.network.at_rest(batch),
+            expected=np.zeros((batch, self.network.hidden_size), np.float32),
+            history=super().start(batch),
+            skill=np.zeros((batch, len(self.skills_)), np.float32),
         )
-        return MemoryState(self.network.at_rest(batch), state, super().start(batch), named)
 
     def predict(
         self, state: MemoryState, rows: NDArray[np.float64]
     ) -> tuple[MemoryState, ModelOutput]:
         assert self.compiled_ is not None
-        new: MemoryState = uninitialised(state)
+        new: MemoryState = unwritten(state)
         errors = expected_errors(self.compiled_, state, new, np.ascontiguousarray(rows, np.float64))
         return new, ModelOutput(errors, new.expected)
 
@@ -177,7 +178,8 @@ class MemoryModel(ScaledModel):
         """Return the likely next command (B, A), by the motor association or else by the temporal network."""
         if self.motor_ is not None:
             return self.motor_.command(situation(self.senses_, state.history.before[:, -1]))
-        motor, senses = self.spec.motor, self.senses_
+        motor = self.spec.motor
+        senses = self.senses_
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 

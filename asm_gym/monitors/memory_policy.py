@@ -14,6 +14,7 @@ Source: Usher and McClelland 2001 (Psychological Review 108(3)), without their m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -23,47 +24,61 @@ from numpy.typing import NDArray
 
 from asm_gym.control_period import control_period
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.base import State
+from asm_gym.monitors.surprise import State
 from asm_gym.policies.base import StatefulPolicy
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
-FORGETS = 1.6  # τ [s]
-ENOUGH = 0.15  # θ: so long a command must be expected without a doubt [s]
+FORGETTING_TIME = 1.6  # τ [s]
+CHANGE_AFTER = 0.15  # θ: time for which a command that is certain must be expected [s]
 
 
 class Grip(NamedTuple):
-    """What the G grippers are told; a value."""
+    """Commands of G grippers; a value."""
 
-    high: NDArray[np.bool_]  # (G,) told the upper end of the action's range, else the lower
+    high: NDArray[np.bool_]  # (G,) the upper end of the action's range is commanded, else the lower
     evidence: NDArray[np.float64]  # (G,) E [s]
+
+
+class PolicyState(NamedTuple):
+    """State of a policy between two steps; a value."""
+
+    memory: State
+    action: NDArray[np.float32]  # (A,) the last one
+    grip: Grip | None  # None before the first step
 
 
 class CommandReadout:
     """Makes actions of expected commands: kept in the space of ``env``, and each gripper at one end of its range."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._space: Any = env.action_space
+        space: Any = env.action_space
+        self._low = space.low
+        self._high = space.high
         self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
         self._dt = control_period(env)
         # However long a step lasts, one must not be enough for what is less likely than not.
-        self._enough = max(ENOUGH, 0.5 * self._dt)
+        self._change_after = max(CHANGE_AFTER, 0.5 * self._dt)
 
     def __call__(
         self, expected: NDArray[np.float32], before: Grip | None
     ) -> tuple[NDArray[np.float32], Grip]:
         """Return the action (A,) for expected commands (A,), and the grip to pass in next time; None at first."""
-        low, high = self._space.low, self._space.high
-        action = np.clip(np.nan_to_num(expected), low, high).astype(np.float32)
-        g = self._grip
+        clipped = np.clip(np.nan_to_num(expected), self._low, self._high)
+        action: NDArray[np.float32] = clipped.astype(np.float32)
+        low = self._low[self._grip]
+        high = self._high[self._grip]
+
         # (G,) 1 where the upper end is certain
-        share = ((action - low)[g] / (high - low)[g]).astype(np.float64)
-        before = before or Grip(share > 0.5, np.zeros(len(share)))
+        share = ((action[self._grip] - low) / (high - low)).astype(np.float64)
+        if before is None:
+            before = Grip(share > 0.5, np.zeros(len(share)))
         other = np.where(before.high, 1.0 - share, share)
-        evidence = np.exp(-self._dt / FORGETS) * before.evidence + self._dt * other
-        changes = evidence > self._enough
+        decay = np.exp(-self._dt / FORGETTING_TIME)
+        evidence = decay * before.evidence + self._dt * other
+        changes = evidence > self._change_after
         grip = Grip(before.high ^ changes, np.where(changes, 0.0, evidence))
-        action[g] = np.where(grip.high, high[g], low[g])
+        action[self._grip] = np.where(grip.high, high, low)
         return action, grip
 
 
@@ -86,57 +101,66 @@ class NeuralASMPolicy(StatefulPolicy):
 
     @typed
     def __init__(self, memory: NeuralASM, env: gym.Env[Any, Any]) -> None:
+        _check_actions(memory.spec, env.action_space)
+        dt = control_period(env)
         inner: Any = env.unwrapped
-        self._measures = inner if hasattr(inner, "measured_spec") else None
-        spec, dt, space = memory.spec, control_period(env), env.action_space
-        if not isinstance(space, spaces.Box):
-            raise ValueError(f"a memory drives a Box action space, got {space}")
-        if not len(spec.motor):
-            raise ValueError(
-                f"this memory predicts no command: its stream has no action, only {list(spec.slices)}"
-            )
-        if len(spec.motor) != int(np.prod(space.shape)):
-            raise ValueError(
-                f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}"
-            )
-        if self._measures and spec.dt != dt:
-            raise ValueError(
-                f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s"
-            )
-        theirs = (
-            inner.measured_spec
-            if self._measures
-            else StreamSpec.from_spaces(env.observation_space, space, dt)
-        )
-        _check_fit(spec, theirs)
-        shared = [name for name in spec.slices if name in theirs.slices]
-        self._from, self._to = (
-            np.array([i for n in shared for i in range(s.size)[s.slices[n]]], np.intp)
-            for s in (theirs, spec)
-        )
+        self._measuring_env: Any = None  # that measures a row by itself
+        if hasattr(inner, "measured_spec"):
+            self._measuring_env = inner
+            theirs = inner.measured_spec
+            if memory.spec.dt != dt:
+                raise ValueError(
+                    f"the memory reads a row every {memory.spec.dt} s, and is asked to act every {dt} s"
+                )
+        else:
+            theirs = StreamSpec.from_spaces(env.observation_space, env.action_space, dt)
+        _check_fit(memory.spec, theirs)
+
+        shared = [name for name in memory.spec.slices if name in theirs.slices]
+        self._measured_columns = _columns_of(shared, theirs)
+        self._memory_columns = _columns_of(shared, memory.spec)
         self.memory = memory
         self._readout = CommandReadout(env)
         memory.initial_state()
 
-    def begin(self, observation: Any) -> tuple[State, NDArray[np.float32], Grip | None]:
-        """Return the memory's state, the last command (A,), and what grippers are told."""
-        return self.memory.initial_state(), np.zeros(len(self.memory.spec.motor), np.float32), None
+    def begin(self, observation: Any) -> PolicyState:
+        """Return the state before the first step."""
+        action = np.zeros(len(self.memory.spec.motor), np.float32)
+        return PolicyState(self.memory.initial_state(), action, grip=None)
 
     def act(
-        self, observation: Any, state: Any, deterministic: bool
-    ) -> tuple[NDArray[np.float32], Any]:
+        self, observation: Any, state: PolicyState, deterministic: bool
+    ) -> tuple[NDArray[np.float32], PolicyState]:
         """Return the action (A,) that the memory expects, and the next state; nothing is drawn at random."""
-        memory, last, grip = state
-        measured = (
-            self._measures.measured
-            if self._measures
-            else np.concatenate([np.ravel(observation), last])
-        )
+        if self._measuring_env is None:
+            measured = np.concatenate([np.ravel(observation), state.action])
+        else:
+            measured = self._measuring_env.measured
         row = np.zeros((1, self.memory.spec.size), np.float32)
-        row[0, self._to] = measured[self._from]
-        memory, _ = self.memory.observe(memory, row)
-        action, grip = self._readout(self.memory.expected_action(memory)[0], grip)
-        return action, (memory, action, grip)
+        row[0, self._memory_columns] = measured[self._measured_columns]
+        memory, _ = self.memory.observe(state.memory, row)
+        action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
+        return action, PolicyState(memory, action, grip)
+
+
+def _columns_of(channels: Sequence[str], spec: StreamSpec) -> NDArray[np.intp]:
+    """Return the columns of channels in a stream, in their order."""
+    every = np.arange(spec.size)
+    return np.concatenate([every[:0], *(every[spec.slices[name]] for name in channels)])
+
+
+def _check_actions(spec: StreamSpec, space: spaces.Space[Any]) -> None:
+    """Raise ValueError unless a memory of ``spec`` predicts the commands of an action space."""
+    if not isinstance(space, spaces.Box):
+        raise ValueError(f"a memory drives a Box action space, got {space}")
+    if not len(spec.motor):
+        raise ValueError(
+            f"this memory predicts no command: its stream has no action, only {list(spec.slices)}"
+        )
+    if len(spec.motor) != int(np.prod(space.shape)):
+        raise ValueError(
+            f"this memory predicts {len(spec.motor)} commands, the environment takes {space.shape}"
+        )
 
 
 def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
@@ -144,13 +168,10 @@ def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
 
     Further channels, another order, and objects of other tasks do not matter.
     """
-    objects = [c.name for c in spec.channels if c.group == "object"]
+    objects = [channel.name for channel in spec.channels if channel.group == "object"]
     harmless = ("order: ", "dt: ", *(f"{name}: missing" for name in objects))
-    lines = [
-        line
-        for line in spec.difference(theirs)
-        if not line.startswith(harmless) and not line.endswith(": new")
-    ]
+    misfits = [line for line in spec.difference(theirs) if not line.startswith(harmless)]
+    lines = [line for line in misfits if not line.endswith(": new")]
     if spec.source and theirs.source and spec.source != theirs.source:
         lines.append(f"robot: {spec.source} against {theirs.source}")
     if objects and not any(name in theirs.slices for name in objects):

@@ -8,7 +8,6 @@ Further functions take a memory as an argument: ``skills``, ``shipped``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,18 +21,18 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.benign_events import BenignEvents, EventState
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule
-from asm_gym.monitors.arm_inputs import Derived, judged_by_values
-from asm_gym.monitors.base import Progress, Surprise
-from asm_gym.monitors.calibrated_monitor import CalibratedMonitor, MonitorState
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.diagnosis import Diagnosis, Readout
-from asm_gym.monitors.files import restored, rounded
-from asm_gym.monitors.memory_config import MemoryConfig
+from asm_gym.monitors.memory_config import OF_EVIDENCE, MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
+from asm_gym.monitors.monitor_files import restored
+from asm_gym.monitors.monitor_state import MonitorState, checked_rows
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
-from asm_gym.monitors.values import PREFIX as VALUES
-from asm_gym.monitors.values import Values
+from asm_gym.monitors.surprise import Progress, Surprise
+from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
+from asm_gym.monitors.weight_packing import rounded
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_flag, check_number, typed
@@ -55,10 +54,10 @@ class NeuralASM(CalibratedMonitor):
             the temporal predictive coding network of the papers, whose state is inferred on every row.
         excuses: do not count knocks, joints at their stops and moving fingers as faults
             (``detection.benign_events``): for a memory that watches any policy, including policies that hit things.
-        values: judge values, such as torques, beside changes (``monitors.values``), if other senses predict them: for
+        values: judge values, such as torques, beside changes (``monitors.torque``), if other senses predict them: for
             lasting pushes. None judges them where torques, currents or efforts are among the senses
-            (``arm_inputs.judged_by_values``).
-        urdf: text of the arm's body model, from ``body_model.read_urdf``, to predict torques from the weight and the
+            (``torque.arm_features.judged_by_values``).
+        urdf: text of the arm's body model, from ``torque.urdf.read_urdf``, to predict torques from the weight and the
             inertia of its links, where values are judged.
         seed: of the initial weights and of the order of the episodes.
         config: all other hyperparameters.
@@ -100,13 +99,10 @@ class NeuralASM(CalibratedMonitor):
         config: MemoryConfig | None = None,
     ) -> None:
         check_choice("dynamics", dynamics, DYNAMICS)
-        usual, config = DYNAMICS[dynamics], config or MemoryConfig()
-        self.config = config = replace(
-            config,
-            iterations=config.iterations or usual.iterations,
-            prior_precision=config.prior_precision or usual.prior_precision,
-        )
-        self.dynamics, self.urdf = dynamics, urdf
+        config = config or MemoryConfig()
+        self.config = config.with_defaults_of(DYNAMICS[dynamics])
+        self.dynamics = dynamics
+        self.urdf = urdf
         self.hidden_size = check_number("hidden_size", hidden_size, low=1, whole=True)
         self.association_size = check_number(
             "association_size", association_size, low=1, whole=True
@@ -116,7 +112,7 @@ class NeuralASM(CalibratedMonitor):
             "free_running_probability", free_running_probability, low=0.0, high=1.0
         )
         if values is None:
-            values = judged_by_values(spec)
+            values = ValueJudge.suits(spec)
         self.values = check_flag("values", values)
         self.excuses = check_flag("excuses", excuses)
         if urdf and not self.values:
@@ -124,22 +120,18 @@ class NeuralASM(CalibratedMonitor):
                 "a body model predicts torques, and values are not judged: "
                 "the stream has none, or values=False was given; leave urdf out"
             )
-        Derived.of(spec, urdf)  # refuses a body model that does not fit
+        ValueJudge.check_body(spec, urdf)
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
-        evidence = EvidenceDetection(
-            spec, config.gains, config.bound, config.shrinkage, habituates, config.tail_index
-        )
-        checked = {
-            name: getattr(evidence, name) for name in ("gains", "bound", "shrinkage", "tail_index")
-        }
-        self.config, self.habituates = replace(config, **checked), evidence.habituates
+        of_evidence = {name: getattr(config, name) for name in OF_EVIDENCE}
+        evidence = EvidenceDetection(spec, habituates=habituates, **of_evidence)
+        self.config = self.config.as_checked_by(evidence)
+        self.habituates = evidence.habituates
         super().__init__(model, evidence, seed=seed)
         self.excuses_ = BenignEvents(spec) if excuses else None
-        self.values_: Values | None = None
+        self.values_: ValueJudge | None = None
         self._diagnosis: Diagnosis | None = None
         self._kernel: RowKernel | None = None
-        self._kernel_of: tuple[Any, ...] = ()
 
     def _param(self, name: str) -> Any:
         """Return a hyperparameter, of the memory or of its config."""
@@ -152,9 +144,8 @@ class NeuralASM(CalibratedMonitor):
     @typed
     def load(cls, path: str | Path) -> Self:
         """Read what ``save`` wrote. Raises FileNotFoundError, or ValueError for a file that is damaged or foreign."""
-        return restored(
-            path, read_checkpoint(path, cls.kind), lambda spec, **how: made(cls, spec, how)
-        )
+        saved = read_checkpoint(path, cls.kind)
+        return restored(path, saved, lambda spec, **parameters: made(cls, spec, parameters))
 
     @classmethod
     @typed
@@ -183,15 +174,18 @@ class NeuralASM(CalibratedMonitor):
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
-        return super().learned_ | ({} if self.values_ is None else self.values_.arrays)
+        learned = super().learned_
+        if self.values_ is not None:
+            learned |= self.values_.arrays
+        return learned
 
     def initial_state(self, batch: int = 1) -> MonitorState:
-        state = super().initial_state(batch)
-        excuses = (
-            EventState.start(batch, 0) if self.excuses_ is None else self.excuses_.start(batch)
-        )
-        values = () if self.values_ is None else self.values_.monitor.initial_state(batch)
-        return state._replace(excuses=excuses, values=values)
+        state = super().initial_state(batch)._replace(excuses=EventState.start(batch, 0))
+        if self.excuses_ is not None:
+            state = state._replace(excuses=self.excuses_.start(batch))
+        if self.values_ is not None:
+            state = state._replace(values=self.values_.start(batch))
+        return state
 
     def observe(
         self,
@@ -203,20 +197,21 @@ class NeuralASM(CalibratedMonitor):
         kernel = self._row_kernel()
         if kernel is None:
             self._require_fitted()
-        rows = self._rows(state, stream)
+        rows = checked_rows(state, stream, self.spec)
         if kernel is None:
-            now, surprise = super().observe(state, rows)
-            now, divisor = now._replace(excuses=state.excuses), np.ones(len(rows))
+            new, surprise = super().observe(state, rows)
+            new = new._replace(excuses=state.excuses)
+            divisor = np.ones(len(rows))
         else:
-            now, surprise, divisor = kernel(state, rows, out)
+            new, surprise, divisor = kernel(state, rows, out)
+
         if self.values_ is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
-            now = now._replace(values=values)
+            new = new._replace(values=values)
         if self.model.skills_:
-            surprise = surprise._replace(
-                skill=np.array(self.skills_)[now.model.skill.argmax(axis=1)]
-            )
-        return now, surprise
+            likeliest = new.model.skill.argmax(axis=1)
+            surprise = surprise._replace(skill=np.array(self.skills_)[likeliest])
+        return new, surprise
 
     def compiled_row(self) -> RowKernel | None:
         """Return the kernel that does all that ``observe`` does; None where Python takes part in a row."""
@@ -237,33 +232,29 @@ class NeuralASM(CalibratedMonitor):
         return other
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
-        super().with_learned({n: a for n, a in arrays.items() if not n.startswith(VALUES)}, skills)
-        values = {n.removeprefix(VALUES): a for n, a in arrays.items() if n.startswith(VALUES)}
-        self.values_ = Values.found(self.spec, values, self.seed, self.urdf) if values else None
+        super().with_learned(without_values(arrays), skills)
+        self.values_ = ValueJudge.found(self.spec, arrays, self.seed, self.urdf)
         return self
 
     def _row_kernel(self) -> RowKernel | None:
         """Return the kernel of the weights as they are; None under another detection than that of evidence."""
-        evidence, memory = self.detection, self.model.compiled_
-        if not isinstance(evidence, EvidenceDetection) or memory is None:
+        memory = self.model.compiled_
+        if not isinstance(self.detection, EvidenceDetection) or memory is None:
             return None
-        now = memory, evidence.detector_
-        if (
-            not self._kernel_of
-            or self._kernel_of[0] is not now[0]
-            or self._kernel_of[1] is not now[1]
-        ):
-            self._kernel, self._kernel_of = RowKernel(memory, evidence, self.excuses_), now
+        if self._kernel is None or not self._kernel.is_of(memory, self.detection):
+            self._kernel = RowKernel(memory, self.detection, self.excuses_)
         return self._kernel
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
         if self.values_ is None:
             return self
         other = self._copy()
-        other.values_ = self.values_._replace(balance=0.0)  # changes alone
+        other.values_ = self.values_.of_changes_alone()
         other.values_ = self.values_.balanced(other.score_episodes(episodes), episodes)
         return other
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:
         super()._learn(episodes, progress, warm_start)
-        self.values_ = Values.learned(episodes, self.seed, self.urdf) if self.values else None
+        self.values_ = None
+        if self.values:
+            self.values_ = ValueJudge.learned(episodes, self.seed, self.urdf)

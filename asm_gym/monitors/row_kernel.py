@@ -36,11 +36,9 @@ from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
 from asm_gym.memory.traces import Weights, carry, weight_shapes
-from asm_gym.monitors.base import Surprise
-from asm_gym.monitors.calibrated_monitor import MonitorState
+from asm_gym.monitors.monitor_state import MonitorState
+from asm_gym.monitors.surprise import Surprise
 from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
-
-__all__ = ["JUDGED", "RowKernel", "expected_errors", "observe_rows", "row_weights", "unwritten"]
 
 
 class RowWeights(NamedTuple):
@@ -121,11 +119,18 @@ class RowKernel:
                 "asm-gym: compiling the memory, once on this machine (about 20 s)", file=sys.stderr
             )
         self._arguments = (memory, detection, events)
+        self._memory = memory
+        self._detector = detection.fitted_detector
         self._excuses = events is not None
         senses = NO_SENSES if events is None else events.senses
-        detector = detection.fitted_detector
-        wants_context = bool(detector.context_quantile[:-1].any())
-        self._learned = bind(memory, wants_context, detector, detection.fitted_repetition, senses)
+        wants_context = bool(self._detector.context_quantile[:-1].any())
+        self._learned = bind(
+            memory, wants_context, self._detector, detection.fitted_repetition, senses
+        )
+
+    def is_of(self, memory: RowWeights, detection: EvidenceDetection) -> bool:
+        """Return whether the kernel computes with these weights, and with what a detection has learned."""
+        return self._memory is memory and self._detector is detection.detector_
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle by the arguments: what is bound lies in memory that is not Python's."""
@@ -154,12 +159,10 @@ class RowKernel:
         with one_thread_for(len(rows)):
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
-        raw = None
-        excuse = None
+        surprise = Surprise(judged["surprise"].copy(), attribution)
         if self._excuses:
             raw = judged["raw_surprise"].copy()
-            excuse = judged["excuse"].copy()
-        surprise = Surprise(judged["surprise"].copy(), attribution, raw=raw, excuse=excuse)
+            surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
         return out, surprise, judged["divisor"].copy()
 
 
@@ -172,8 +175,9 @@ def expected_errors(
         evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0)
     )
     events = EventState.start(len(rows), 0)
-    states = [MonitorState(memory, detection, events) for memory in (before, after)]
-    bound = bind_states(learned, *arrays_of(states[0]), *arrays_of(states[1]))
+    arrays = arrays_of(MonitorState(before, detection, events))
+    arrays += arrays_of(MonitorState(after, detection, events))
+    bound = bind_states(learned, *arrays)
     return observe_rows(bound, rows, np.empty(len(rows), JUDGED), np.empty(rows.shape))
 
 
@@ -216,20 +220,13 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
     return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
 
 
-def unwritten(state: MonitorState) -> MonitorState:
-    """Return a state of as many streams, whose arrays are yet to be written."""
-    arrays = [np.empty(array.shape, array.dtype) for array in arrays_of(state)]
-    make: Any = state_of
-    return make.py_func(arrays)  # as Python runs it
-
-
-def uninitialised(state: Any) -> Any:
+def unwritten(state: Any) -> Any:
     """Return a state of the same arrays, in whatever nesting, that are yet to be written."""
     if isinstance(state, np.ndarray):
         return np.empty(state.shape, state.dtype)
     if not state:
         return state
-    return type(state)._make(map(uninitialised, state))
+    return type(state)._make(map(unwritten, state))
 
 
 @partial(compiled, calls=("memory", "detection", "."))
@@ -249,7 +246,7 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
     reading = read(weights, before.model.history, after.model.history, rows)
     carry_on(weights, before.model, after.model, reading, wants_context)
     errors, units = associate(weights, reading)
-    doubt_first_rows(before.model.history, errors)
+    weigh_first_rows(before.model.history, errors)
     name_skills(weights, before.model, after.model, units)
 
     if detector.whitening.size:
@@ -264,7 +261,7 @@ def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any
 
 
 @inner
-def doubt_first_rows(history: RowHistory, errors: Any) -> None:
+def weigh_first_rows(history: RowHistory, errors: Any) -> None:
     """Weigh the errors (B, X) of the first rows less: nothing came before them, so that no change is known."""
     lag = history.before.shape[1]
     for n in range(len(errors)):

@@ -47,13 +47,12 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
     for name, path in pretrained().items():
         header = read_header(path)
         known = StreamSpec.from_json(header["spec"])
-        bodies = (
-            ("robot", known.source, spec.source),
-            ("controller", header["about"].get("controller", ""), controller),
-        )
-        misfits = [
-            f"{what}: {mine} against {theirs}" for what, mine, theirs in bodies if mine != theirs
-        ]
+        own_controller = header["about"].get("controller", "")
+        misfits = []
+        if known.source != spec.source:
+            misfits.append(f"robot: {known.source} against {spec.source}")
+        if own_controller != controller:
+            misfits.append(f"controller: {own_controller} against {controller}")
         misfits += known.difference(spec)
         if not misfits:
             return name
@@ -64,13 +63,14 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
             "of this environment, recorded by StreamRecorder(env), and pass it as monitor"
         )
     rate = round(1.0 / spec.dt)
-    make = f"asm-gym babble --robot {spec.source or 'ROBOT'}" + (
-        f" --stream-freq {rate}" if rate != USUAL else ""
-    )
+    command = f"asm-gym babble --robot {spec.source or 'ROBOT'}"
+    if rate != USUAL:
+        command += f" --stream-freq {rate}"
+    body = f"{spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
+    if controller:
+        body += f" under {controller}"
+    listed = "\n".join(lines)
     raise ValueError(
-        f"no shipped memory fits this stream of {spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
-        f"{f' under {controller}' if controller else ''}. There are:\n"
-        + "\n".join(lines)
-        + f"\nFit your own: "
-        f"{make} for an arm of robosuite, asm-gym fit DATA for recordings, and pass it as monitor"
+        f"no shipped memory fits this stream of {body}. There are:\n{listed}\nFit your own: "
+        f"{command} for an arm of robosuite, asm-gym fit DATA for recordings, and pass it as monitor"
     )

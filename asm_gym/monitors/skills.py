@@ -30,21 +30,27 @@ def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
     """
     memory._require_fitted()
     check_nominal(episodes, memory.spec, memory.model.shortest)
-    names, model = [str(episode.info.get("skill", "")) for episode in episodes], memory.model
+    names = [str(episode.info.get("skill", "")) for episode in episodes]
     if not all(names):
         raise ValueError(f"episode {names.index('')} does not say its skill: set info['skill']")
-    known, skills = np.unique(np.repeat(names, [len(e) for e in episodes]), return_inverse=True)
+    rows = [len(episode) for episode in episodes]
+    known, skills = np.unique(np.repeat(names, rows), return_inverse=True)
     if len(known) < 2:
         raise ValueError(f"naming skills needs at least two of them, got {', '.join(known)}")
-    inputs = np.concatenate([model.senses_.read_episode(e.stream).inputs for e in episodes])
+
+    model = memory.model
+    readings = [model.senses_.read_episode(episode.stream) for episode in episodes]
+    inputs = np.concatenate([reading.inputs for reading in readings])
     V = model.network.association.V
+    rng = np.random.default_rng(memory.seed)
     with threadpool_limits(1):
-        states = np.concatenate([o.contexts for o in model_outputs(model, episodes)])
+        outputs = model_outputs(model, episodes)
+        states = np.concatenate([output.contexts for output in outputs])
 
         def units(chosen: NDArray[np.intp]) -> NDArray[np.float32]:
             return np.hstack([hidden_units(inputs[chosen], V), states[chosen]])
 
-        W_K, b_K = learn_readout(units, skills, len(known), np.random.default_rng(memory.seed))
+        W_K, b_K = learn_readout(units, skills, len(known), rng)
     model.restore({**model.learned_, "W_K": W_K, "b_K": b_K}, tuple(map(str, known)))
     return memory
 
@@ -62,10 +68,10 @@ def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 51
     memory._require_fitted()
     check_nominal(episodes, memory.spec, memory.model.shortest)
     model = memory.model
+    rng = np.random.default_rng(memory.seed)
     with threadpool_limits(1):
-        motor = learn_motor(
-            *lessons(model.senses_, episodes), units, np.random.default_rng(memory.seed)
-        )
+        situations, commands = lessons(model.senses_, episodes)
+        motor = learn_motor(situations, commands, units, rng)
     model.restore({**model.learned_, **motor.named()}, model.skills_)
     return memory
 
@@ -82,12 +88,14 @@ def lessons(
         raise ValueError(
             f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}"
         )
-    m, commands = [], []
-    for e in episodes:
-        intended = e.actions if len(e.actions) == len(e) else e.stream[:, motor]
-        m.append(situation(senses, e.stream[:-1]))
+    situations = [situation(senses, episode.stream[:-1]) for episode in episodes]
+    commands = []
+    for episode in episodes:
+        intended = episode.actions
+        if len(intended) != len(episode):
+            intended = episode.stream[:, motor]
         commands.append(intended[1:].astype(np.float32))
-    return np.concatenate(m), np.concatenate(commands)
+    return np.concatenate(situations), np.concatenate(commands)
 
 
 def recall(memory: NeuralASM, cue: NDArray[np.floating[Any]], steps: int) -> NDArray[np.float64]:

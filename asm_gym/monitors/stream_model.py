@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
 from typing import Any, Self
@@ -16,7 +16,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.temporal import RowHistory
-from asm_gym.monitors.base import Progress, State
+from asm_gym.monitors.surprise import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -53,7 +53,8 @@ class StreamModel:
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         """Take over learned arrays. Raises ValueError where they do not fit together."""
-        self.learned_, self.skills_ = learned, skills
+        self.learned_ = learned
+        self.skills_ = skills
         return self
 
     @abstractmethod
@@ -72,7 +73,14 @@ class ScaledModel(StreamModel):
 
     def __init__(self, spec: StreamSpec, lag: int = 1) -> None:
         super().__init__(spec)
-        self.lag, self.shortest = lag, 1 + lag
+        self.lag = lag
+        self.shortest = 1 + lag
+
+    def read_nominal(self, episodes: Sequence[Episode]) -> list[ScaledRows]:
+        """Learn the scale of nominal episodes, and read all of their rows."""
+        streams = [episode.stream for episode in episodes]
+        self.senses_ = StreamScaler.fit(self.spec, streams, self.lag)
+        return [self.senses_.read_episode(stream) for stream in streams]
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         self.senses_ = StreamScaler.of(self.spec, learned, self.lag)
@@ -82,12 +90,22 @@ class ScaledModel(StreamModel):
         return RowHistory.empty(batch, self.lag, self.spec.size)
 
 
+def require_arrays(learned: Arrays, names: Iterable[str]) -> None:
+    """Raise ValueError unless a file, perhaps of an earlier release, holds all arrays of these names."""
+    missing = [name for name in names if name not in learned]
+    if missing:
+        raise ValueError(
+            f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble"
+        )
+
+
 def error_places(columns: NDArray[np.intp], spec: StreamSpec) -> NDArray[np.float64]:
     """Return the share of each error (X,) that each number of the stream has (X, D).
 
     ``columns`` (X,) are those of the errors; -1 for an error that all senses share.
     """
-    shares, own = np.zeros((len(columns), spec.size)), columns >= 0
+    shares = np.zeros((len(columns), spec.size))
+    own = columns >= 0
     shares[own, columns[own]] = 1.0
     shares[np.ix_(~own, spec.sensory)] = 1.0 / len(spec.sensory)
     return shares
@@ -101,9 +119,15 @@ def read_next(
     Returns:
         The new history, what was read, and 1 (B, 1) where all is known that a change is predicted from, else 0.
     """
-    reading = senses.read(rows, *history.past(rows))
+    before, earlier = history.past(rows)
+    reading = senses.read(rows, before, earlier)
     known = (reading.whole * (history.steps >= senses.lag)[:, None]).astype(np.float32)
     return history.followed_by(rows), reading, known
+
+
+def zero_unless_finite(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values with 0 for those that are not finite."""
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def no_context(rows: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -116,25 +140,29 @@ def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
 
     Of a class with a ``config_class``, the fields of that stand for the argument ``config``.
     """
-    taken = inspect.signature(kind).parameters.values()
-    names = [
-        p.name
-        for p in taken
-        if p.name not in ("spec", "config") and p.kind is p.POSITIONAL_OR_KEYWORD
-    ]
-    config = getattr(kind, "config_class", None)
-    return (*names, *(() if config is None else (f.name for f in fields(config))))
+    parameters = inspect.signature(kind).parameters
+    named = [name for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+    names = [name for name in named if name not in ("spec", "config")]
+    return (*names, *_config_names(kind))
+
+
+def _config_names(kind: Callable[..., Any]) -> list[str]:
+    """Return the fields of the ``config_class`` of a class; empty where it has none."""
+    if not hasattr(kind, "config_class"):
+        return []
+    return [field.name for field in fields(kind.config_class)]
 
 
 def made(kind: Callable[..., Any], spec: StreamSpec, parameters: Mapping[str, Any]) -> Any:
     """Return what a class makes with some of its hyperparameters, by name. Raises TypeError for any other name."""
-    if unknown := sorted(parameters.keys() - set(parameter_names(kind))):
+    unknown = sorted(parameters.keys() - set(parameter_names(kind)))
+    if unknown:
         raise TypeError(f"{kind.__name__} has no hyperparameter {', '.join(unknown)}")
-    known, config = dict(parameters), getattr(kind, "config_class", None)
-    if config is None:
-        return kind(spec, **known)
-    own = {f.name: known.pop(f.name) for f in fields(config) if f.name in known}
-    return kind(spec, **known, config=config(**own))
+    own = dict(parameters)
+    if hasattr(kind, "config_class"):
+        names = [name for name in _config_names(kind) if name in own]
+        own["config"] = kind.config_class(**{name: own.pop(name) for name in names})
+    return kind(spec, **own)
 
 
 def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[ModelOutput]:
@@ -142,9 +170,10 @@ def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[Model
     outputs: dict[int, ModelOutput] = {}
     for group, steps in side_by_side(episodes, model.start, partial(_predicted, model)):
         for n, i in enumerate(group):
-            mine = steps[: len(episodes[i])]
+            own = steps[: len(episodes[i])]
             outputs[i] = ModelOutput(
-                np.array([s.errors[n] for s in mine]), np.array([s.contexts[n] for s in mine])
+                errors=np.array([step.errors[n] for step in own]),
+                contexts=np.array([step.contexts[n] for step in own]),
             )
     return [outputs[i] for i in range(len(episodes))]
 
@@ -152,19 +181,20 @@ def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[Model
 def _predicted(
     model: StreamModel, state: State, rows: NDArray[np.float64]
 ) -> tuple[State, ModelOutput]:
-    found: Any = model.predict(state, rows)
-    asked, wanted = f"predict of {model.kind} must give", (len(rows), len(model.error_columns))
-    if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], ModelOutput):
-        got = [type(part).__name__ for part in (found if type(found) is tuple else [found])]
-        raise ValueError(f"{asked} a state and a ModelOutput, got {', '.join(got)}")
-    errors, contexts = found[1]
-    if np.shape(errors) != wanted:
-        raise ValueError(f"{asked} errors {wanted}, got {np.shape(errors)}")
-    if not np.isfinite(errors).all():
-        raise ValueError(f"{asked} errors that are finite where the rows are")
-    if np.ndim(contexts) != 2 or len(contexts) != len(rows):
-        raise ValueError(f"{asked} contexts ({len(rows)}, C), got {np.shape(contexts)}")
-    return found
+    result: Any = model.predict(state, rows)
+    rule = f"predict of {model.kind} must give"
+    is_pair = isinstance(result, tuple) and len(result) == 2
+    if not is_pair or not isinstance(result[1], ModelOutput):
+        raise ValueError(f"{rule} a state and a ModelOutput, got {type(result).__name__}")
+    output = result[1]
+    shape = (len(rows), len(model.error_columns))
+    if np.shape(output.errors) != shape:
+        raise ValueError(f"{rule} errors {shape}, got {np.shape(output.errors)}")
+    if not np.isfinite(output.errors).all():
+        raise ValueError(f"{rule} errors that are finite where the rows are")
+    if np.ndim(output.contexts) != 2 or len(output.contexts) != len(rows):
+        raise ValueError(f"{rule} contexts ({len(rows)}, C), got {np.shape(output.contexts)}")
+    return result
 
 
 def side_by_side(
@@ -179,12 +209,12 @@ def side_by_side(
     order = sorted(range(len(episodes)), key=lambda i: -len(episodes[i]))
     for first in range(0, len(order), AT_ONCE):
         group = order[first : first + AT_ONCE]
-        state, steps = start(len(group)), []
-        for t in range(len(episodes[group[0]])):
-            rows = np.stack([episodes[i].stream[t] for i in group if t < len(episodes[i])]).astype(
-                np.float64
-            )
-            state, step = advance(first_of(state, len(rows)), rows)
+        streams = [episodes[i].stream for i in group]
+        state = start(len(group))
+        steps = []
+        for t in range(len(streams[0])):
+            rows = np.stack([stream[t] for stream in streams if t < len(stream)])
+            state, step = advance(first_of(state, len(rows)), rows.astype(np.float64))
             steps.append(step)
         yield group, steps
 

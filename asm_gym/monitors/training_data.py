@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.episode import Episode
+from asm_gym.data.action_identification import found_meaning
+from asm_gym.data.action_meaning import ACTIONS
+from asm_gym.data.episode import CONTROLLER, Episode
+from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.spec import StreamSpec
 
 WILD = 1e6  # largest distance of a number from its channel's median, in ranges of the channel
@@ -39,10 +43,13 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
             raise ValueError(
                 f"episode {n}, step {step}, {spec.labels[column]} must be finite, got {value}"
             )
-    # Beside a number out of all proportion its channel would look constant.
-    if max(float(np.abs(e.stream).max()) for e in episodes) <= WILD / 2:
-        return
-    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
+    if max(float(np.abs(episode.stream).max()) for episode in episodes) > WILD / 2:
+        _check_proportions(episodes, spec)
+
+
+def _check_proportions(episodes: Sequence[Episode], spec: StreamSpec) -> None:
+    """Raise ValueError for a number out of all proportion, beside which its channel would look constant."""
+    rows = np.concatenate([episode.stream for episode in episodes]).astype(np.float64)
     low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
     reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
     for n, episode in enumerate(episodes):
@@ -54,15 +61,36 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
             )
 
 
+def with_held_out(
+    episodes: Sequence[Episode], one_in: int, rng: np.random.Generator
+) -> tuple[list[Episode], list[Episode]]:
+    """Return the episodes to learn and those held out: ``one_in`` so many, in random order; none for 0."""
+    if not one_in:
+        return list(episodes), []
+    shuffled = [episodes[n] for n in rng.permutation(len(episodes))]
+    count = len(episodes) // one_in
+    return shuffled[count:], shuffled[:count]
+
+
+def about_episodes(episodes: Sequence[Episode], with_actions: bool) -> dict[str, Any]:
+    """Return the facts to save with a monitor: controller and schema that all share, and what actions mean."""
+    about: dict[str, Any] = {}
+    for key in (CONTROLLER, LOG_SCHEMA):
+        first = episodes[0].info.get(key)
+        if first and all(episode.info.get(key) == first for episode in episodes):
+            about[key] = first
+    if with_actions and len(episodes[0].spec.motor):
+        about[ACTIONS] = found_meaning(episodes).to_json()
+    return about
+
+
 def mute_channels(episodes: Sequence[Episode]) -> list[str]:
     """Say, a line each, which numbers of the stream never move, and which are copies of others."""
     rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
     labels = np.array(episodes[0].spec.labels)
     moves = np.ptp(rows, axis=0) > 0
-    notes = [
-        f"{label} never moves in these episodes: its motion will be an alarm"
-        for label in labels[~moves]
-    ]
+    still = "never moves in these episodes: its motion will be an alarm"
+    notes = [f"{label} {still}" for label in labels[~moves]]
     moving = labels[moves]
     correlation = np.corrcoef(rows[:, moves], rowvar=False).reshape(len(moving), -1)
     for column, own in enumerate(np.abs(correlation) > ALIKE):
@@ -91,11 +119,13 @@ def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
     """
     hashes = hashes_of(episodes)
     for known in learned:
-        seen = np.flatnonzero(np.isin(hashes, [] if known is None else known))
-        if len(seen):
+        if known is None:
+            continue
+        stale = np.flatnonzero(np.isin(hashes, known))
+        if len(stale):
             raise ValueError(
                 "calibrate() needs episodes that were not learned from, as the surprise of others is "
-                f"too low to set a threshold: leave out episodes {shortened(seen)}, or replace them"
+                f"too low to set a threshold: leave out episodes {shortened(stale)}, or replace them"
             )
     _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
     original = first[group]  # (N,) number of the first episode with the same rows

@@ -28,8 +28,9 @@ from asm_gym.detection.scores import Largest
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import require
 from asm_gym.monitors import MONITORS, CalibratedMonitor, make_monitor
-from asm_gym.monitors.baselines.linear import FrictionRule
-from asm_gym.monitors.body_model import BodyModel, read_urdf
+from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.torque.body_model import BodyModel
+from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings, Record, where

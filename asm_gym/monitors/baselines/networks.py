@@ -32,21 +32,27 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.learning import shuffled
 from asm_gym.memory.temporal import RowHistory
-from asm_gym.monitors.base import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
+from asm_gym.monitors.surprise import Progress
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
-EPOCHS, BATCH = 200, 16  # passes at most over whole episodes, and episodes side by side
+EPOCHS = 200  # passes at most over whole episodes
+BATCH = 16  # episodes side by side
 FRESH = 5  # one in so many episodes is not trained on, but says when to stop
 
-PATIENCE, SLOWER, SLOWEST = 5, 0.3, 3e-5
-"""Epochs without a gain after which the step size is cut to a share; below the smallest, training has converged."""
+RATE = 1e-3  # first step size
+PATIENCE = 5  # epochs without a gain after which the step size is cut
+SLOWER = 0.3  # share that it is cut to
+SLOWEST = 3e-5  # step size below which training has converged
 
 LARGEST_ERROR = 20.0
 """Largest error in training, in standard deviations, that has its full weight; contacts would drown all else."""
 
+LOG_VARIANCE = (-12.0, 8.0)  # limits of what the GRU predicts
+
+LAYERS = 3  # hidden ones of the flow
 ROWS = 256  # of a batch of the flow
 STAGES = 10  # steps of the flow
 FARTHEST = 30.0  # where standardised numbers are cut off: networks of this kind diverge far from what they have seen
@@ -74,31 +80,27 @@ class TorchModel(ScaledModel):
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        streams = [e.stream for e in episodes]
-        senses = StreamScaler.fit(self.spec, streams)
+        readings = self.read_nominal(episodes)
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # as for every other monitor, so that times compare
         try:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(int(rng.integers(2**31)))
-                module = self.module(senses)
-                self.train(module, [senses.read_episode(s) for s in streams], rng, progress)
+                module = self.module(self.senses_)
+                self.train(module, readings, rng, progress)
         finally:
             torch.set_num_threads(threads)
-        return self.restore(
-            {**senses.arrays, **{name: t.numpy() for name, t in module.state_dict().items()}}
-        )
+        weights = {name: tensor.numpy() for name, tensor in module.state_dict().items()}
+        return self.restore({**self.senses_.arrays, **weights})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler.of(self.spec, learned)
         with torch.random.fork_rng(devices=[]):
             module = self.module(senses)
-        state = {
-            name: torch.from_numpy(np.array(learned[name], np.float32))
-            for name in module.state_dict()
-        }
+        names = module.state_dict()
+        weights = {name: torch.tensor(learned[name], dtype=torch.float32) for name in names}
         try:
-            module.load_state_dict(state)
+            module.load_state_dict(weights)
         except RuntimeError as error:
             raise ValueError(f"the weights of this {self.kind} do not fit: {error}") from error
         self.module_ = module.eval().requires_grad_(False)
@@ -118,12 +120,14 @@ def train_on_episodes(
     """
     order = rng.permutation(episodes).astype(np.intp)
     kept = episodes // FRESH
-    trained, fresh = order[kept:], order[:kept] if kept else order
-    optimiser = torch.optim.Adam(module.parameters(), 1e-3)
+    trained = order[kept:]
+    fresh = order[:kept] if kept else order
+    optimiser = torch.optim.Adam(module.parameters(), RATE)
     plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(
         optimiser, factor=SLOWER, patience=PATIENCE
     )
-    least, best = math.inf, copy.deepcopy(module.state_dict())
+    least = math.inf
+    best = copy.deepcopy(module.state_dict())
     for epoch in range(EPOCHS):
         progress(epoch, EPOCHS)
         order = rng.permutation(trained)
@@ -132,14 +136,15 @@ def train_on_episodes(
         with torch.no_grad():
             now = float(loss(fresh, False))
         if now < least:
-            least, best = now, copy.deepcopy(module.state_dict())
+            least = now
+            best = copy.deepcopy(module.state_dict())
         plateaus.step(now)
         if optimiser.param_groups[0]["lr"] < SLOWEST:
             break
     module.load_state_dict(best)
 
 
-def adam(module: nn.Module, updates: int, rate: float = 1e-3) -> tuple[torch.optim.Optimizer, Any]:
+def adam(module: nn.Module, updates: int, rate: float = RATE) -> tuple[torch.optim.Optimizer, Any]:
     """Return Adam and its cosine decay, the default of those who publish such models."""
     optimiser = torch.optim.Adam(module.parameters(), rate)
     return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
@@ -151,7 +156,8 @@ def descend(
     """Update once, with the gradient cut off at ``clip``."""
     optimiser.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
-    nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], clip)
+    for group in optimiser.param_groups:
+        nn.utils.clip_grad_norm_(group["params"], clip)
     optimiser.step()
     if schedule is not None:
         schedule.step()
@@ -181,7 +187,7 @@ class _GRUModule(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         states, _ = self.cell(inputs, hidden)
         mean, log_variance = self.out(states).chunk(2, dim=-1)
-        return mean, log_variance.clamp(-12.0, 8.0), states
+        return mean, log_variance.clamp(*LOG_VARIANCE), states
 
 
 class GRU(TorchModel):
@@ -196,7 +202,10 @@ class GRU(TorchModel):
 
     def module(self, senses: StreamScaler) -> nn.Module:
         return _GRUModule(
-            senses.size, len(self.spec.motor) + 1, len(self.spec.sensory), self.hidden_size
+            senses=senses.size,
+            commands=len(self.spec.motor) + 1,
+            changes=len(self.spec.sensory),
+            hidden=self.hidden_size,
         )
 
     def train(
@@ -206,39 +215,42 @@ class GRU(TorchModel):
         rng: np.random.Generator,
         progress: Progress,
     ) -> None:
-        inputs = [
-            np.hstack([np.vstack([r.senses[:1], r.senses[:-1]]), r.commands]) for r in readings
-        ]
+        inputs = []
+        for reading in readings:
+            last = np.vstack([reading.senses[:1], reading.senses[:-1]])
+            inputs.append(np.hstack([last, reading.commands]))
 
         def loss(chosen: NDArray[np.intp], training: bool) -> Tensor:
             x, real = padded([inputs[i] for i in chosen])
+            changes, _ = padded([readings[i].changes for i in chosen])
             mean, log_variance, _ = module(x)
-            off = (padded([readings[i].changes for i in chosen])[0] - mean) * torch.exp(
-                -0.5 * log_variance
-            )
+            error = (changes - mean) * torch.exp(-0.5 * log_variance)
             huber = nn.functional.huber_loss(
-                off, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR
+                error, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR
             )
             return ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
 
         train_on_episodes(module, loss, len(readings), rng, progress)
 
     def start(self, batch: int) -> _GRUState:
-        hidden, rows = (
-            np.zeros((batch, self.hidden_size), np.float32),
-            np.zeros((batch, self.spec.size)),
+        rows = np.zeros((batch, self.spec.size))
+        return _GRUState(
+            hidden=np.zeros((batch, self.hidden_size), np.float32),
+            last=self.senses_.read(rows, rows, rows).senses,
+            history=super().start(batch),
         )
-        last = self.senses_.read(rows, rows, rows).senses
-        return _GRUState(hidden, last, super().start(batch))
 
     def predict(self, state: _GRUState, rows: NDArray[np.float64]) -> tuple[_GRUState, ModelOutput]:
-        history, r, _ = read_next(self.senses_, state.history, rows)
-        last = np.where(state.history.steps[:, None] > 0, state.last, r.senses)
-        inputs = torch.as_tensor(np.hstack([last, r.commands]))[:, None]
-        found = self.module_(inputs, torch.as_tensor(np.ascontiguousarray(state.hidden))[None])
-        mean, log_variance, hidden = (y.numpy()[:, 0] for y in found)
-        error = r.whole * (r.changes - mean) * np.exp(-0.5 * log_variance)
-        return _GRUState(hidden, r.senses, history), ModelOutput(error, hidden)
+        history, reading, _ = read_next(self.senses_, state.history, rows)
+        begun = state.history.steps[:, None] > 0
+        last = np.where(begun, state.last, reading.senses)
+        inputs = torch.as_tensor(np.hstack([last, reading.commands]))[:, None]
+        before = torch.as_tensor(np.ascontiguousarray(state.hidden))[None]
+        mean, log_variance, states = self.module_(inputs, before)
+        hidden = states.numpy()[:, 0]
+        error = reading.whole * (reading.changes - mean.numpy()[:, 0])
+        error = error * np.exp(-0.5 * log_variance.numpy()[:, 0])
+        return _GRUState(hidden, reading.senses, history), ModelOutput(error, hidden)
 
 
 class LogpZO(TorchModel):
@@ -258,8 +270,9 @@ class LogpZO(TorchModel):
 
     def module(self, senses: StreamScaler) -> nn.Module:
         size = senses.size + len(self.spec.motor)
-        widths = [size + 1, *[self.width] * 3]
-        layers = [part for n, m in pairwise(widths) for part in (nn.Linear(n, m), nn.SiLU())]
+        layers: list[nn.Module] = []
+        for inputs, outputs in pairwise([size + 1, *[self.width] * LAYERS]):
+            layers += [nn.Linear(inputs, outputs), nn.SiLU()]
         return nn.Sequential(*layers, nn.Linear(self.width, size))
 
     def train(
@@ -270,11 +283,12 @@ class LogpZO(TorchModel):
         progress: Progress,
     ) -> None:
         optimiser, schedule = adam(module, self.updates)
-        rows = np.concatenate([_features(r) for r in readings])
+        rows = np.concatenate([_features(reading) for reading in readings])
         for n, chosen in zip(range(self.updates), shuffled(len(rows), ROWS, rng), strict=False):
             progress(n, self.updates)
             x = torch.as_tensor(rows[chosen])
-            noise, s = torch.randn_like(x), torch.rand(len(x), 1)
+            noise = torch.randn_like(x)
+            s = torch.rand(len(x), 1)
             flow = module(torch.cat([(1.0 - s) * x + s * noise, s], dim=1))
             descend(((flow - (noise - x)) ** 2).mean(), optimiser, schedule)
 
@@ -291,4 +305,5 @@ class LogpZO(TorchModel):
 
 def _features(reading: ScaledRows) -> NDArray[np.float32]:
     """Return values, changes of slow channels, and the action (B, N)."""
-    return np.clip(np.hstack([reading.senses, reading.commands[:, :-1]]), -FARTHEST, FARTHEST)
+    features = np.hstack([reading.senses, reading.commands[:, :-1]])
+    return np.clip(features, -FARTHEST, FARTHEST)

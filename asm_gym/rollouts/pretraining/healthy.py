@@ -14,8 +14,8 @@ from asm_gym.detection.conformal import HOUR
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.base import Progress
 from asm_gym.monitors.calibration import AlarmRate
+from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 
 HELD_OUT = 3  # one in so many lessons of a task sets the threshold, and is not learned from

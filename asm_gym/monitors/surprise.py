@@ -44,38 +44,44 @@ class Surprise(NamedTuple):
 
     def of(self, stream: int) -> Surprise:
         """Return the surprise of one stream, as a batch of one."""
-        at = slice(stream, stream + 1)
-        return Surprise(*(None if part is None else part[at] for part in self))  # type: ignore[arg-type]
+        own = {name: a[stream : stream + 1] for name, a in self._asdict().items() if a is not None}
+        return Surprise(**own)
 
     @property
     def excused_by_event(self) -> dict[str, NDArray[np.float64]]:
         """``raw`` (B,) of rows excused by a knock, and by a stop, 0 elsewhere; empty where nothing is excused."""
         if self.raw is None:
             return {}
-        return {
-            event: np.where(self.excuse == EVENTS.index(event), self.raw, 0.0)
-            for event in (KNOCK, STOP)
-        }
+        by_event = {}
+        for event in (KNOCK, STOP):
+            by_event[event] = np.where(self.excuse == EVENTS.index(event), self.raw, 0.0)
+        return by_event
 
     def silenced(self, where: NDArray[np.bool_]) -> Surprise:
         """Return it with no surprise ``where`` (B,) nothing is judged."""
-        shares = np.where(where[:, None], 0.0, self.attribution)
-        raw = None if self.raw is None else np.where(where, 0.0, self.raw)
-        return self._replace(value=np.where(where, 0.0, self.value), attribution=shares, raw=raw)
+        silent = self._replace(
+            value=np.where(where, 0.0, self.value),
+            attribution=np.where(where[:, None], 0.0, self.attribution),
+        )
+        if self.raw is None:
+            return silent
+        return silent._replace(raw=np.where(where, 0.0, self.raw))
 
     def without(self, columns: NDArray[np.bool_]) -> Surprise:
         """Return what is left of it where the precision of ``columns`` (D,) is 0."""
         if not columns.any():
             return self
-        shares = np.where(columns, 0.0, self.attribution)
-        left = np.ones(len(self.value))
         judged = np.isfinite(self.value) & (self.value > 0)
-        left[judged] -= self.attribution[judged][:, columns].sum(axis=1) / self.value[judged]
-        left = np.clip(left, 0.0, 1.0)
-        raw = None if self.raw is None else np.where(judged, left * self.raw, self.raw)
-        return self._replace(
-            value=np.where(judged, left * self.value, self.value), attribution=shares, raw=raw
+        taken = self.attribution[judged][:, columns].sum(axis=1)
+        share = np.ones(len(self.value))
+        share[judged] = np.clip(1.0 - taken / self.value[judged], 0.0, 1.0)
+        rest = self._replace(
+            value=np.where(judged, share * self.value, self.value),
+            attribution=np.where(columns, 0.0, self.attribution),
         )
+        if self.raw is None:
+            return rest
+        return rest._replace(raw=np.where(judged, share * self.raw, self.raw))
 
 
 class Monitor(Protocol):

@@ -10,7 +10,7 @@ from asm_gym.checkpoint import read_checkpoint, read_header
 from asm_gym.detection import EvidenceDetection
 from asm_gym.extras import needed_for
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
-from asm_gym.monitors.files import restored
+from asm_gym.monitors.monitor_files import restored
 from asm_gym.monitors.stream_model import StreamModel, made, parameter_names
 from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec
@@ -44,36 +44,34 @@ class MonitorKind:
     def detection_classes(self) -> list[Any]:
         """Of its detections, the one in use first."""
         check_choice("detection", self.detection, DETECTIONS)
-        return [
-            target(DETECTIONS[name])
-            for name in dict.fromkeys((self.detection, self.own, "evidence"))
-        ]
+        names = dict.fromkeys((self.detection, self.own, "evidence"))
+        return [target(DETECTIONS[name]) for name in names]
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
         """Names that ``make_monitor`` takes beside the spec."""
-        parts = [self.model_class, *(() if self._whole else self.detection_classes)]
-        return tuple(dict.fromkeys([*(n for part in parts for n in parameter_names(part)), "seed"]))
+        parts = [self.model_class]
+        if not self._whole:
+            parts += self.detection_classes
+        names = [name for part in parts for name in parameter_names(part)]
+        return tuple(dict.fromkeys([*names, "seed"]))
 
     def __call__(self, spec: StreamSpec, **hyperparameters: Any) -> CalibratedMonitor:
         """Return the monitor, not yet fitted."""
 
         def part(kind: Any) -> Any:
-            return made(
-                kind,
-                spec,
-                {n: hyperparameters[n] for n in parameter_names(kind) if n in hyperparameters},
-            )
+            names = [name for name in parameter_names(kind) if name in hyperparameters]
+            return made(kind, spec, {name: hyperparameters[name] for name in names})
 
         own = part(self.model_class)
         if not self._whole:
-            return CalibratedMonitor(
-                own, *map(part, self.detection_classes), seed=hyperparameters.get("seed", 0)
-            )
-        used = (
-            self.detection if self.detection in own.detections else part(self.detection_classes[0])
-        )
-        return own if used == own.detection.name else own.with_detection(used)
+            detections = map(part, self.detection_classes)
+            return CalibratedMonitor(own, *detections, seed=hyperparameters.get("seed", 0))
+        if self.detection == own.detection.name:
+            return own
+        if self.detection in own.detections:
+            return own.with_detection(self.detection)
+        return own.with_detection(part(self.detection_classes[0]))
 
     def load(self, path: str | Path) -> CalibratedMonitor:
         """Read what a monitor of this model has saved, under any detection; raises as ``load_monitor``."""
@@ -85,32 +83,31 @@ class MonitorKind:
         return issubclass(self.model_class, CalibratedMonitor)
 
 
-_RIVALS = {
-    "logpzo": ("baselines.networks:LogpZO", "moving_mean"),
-    "gru": ("baselines.networks:GRU", "mahalanobis"),
-    "kalman": ("baselines.linear:Kalman", "mahalanobis"),
-    "association_linear": ("baselines.linear:LinearAssociation", "mahalanobis"),
-    "association_values": ("value_association:ValueAssociation", "largest"),
-    "external_torque_limit": ("baselines.linear:ExternalTorqueLimit", "largest"),
-    "force_limit": ("baselines.linear:ForceLimit", "squares"),
+def _rival(model: str, detection: str) -> MonitorKind:
+    """Return a rival, by its model in this folder and the detection that its authors judged it by."""
+    return MonitorKind(f"asm_gym.monitors.{model}", own=detection, detection=detection)
+
+
+RIVALS = {
+    "logpzo": _rival("baselines.networks:LogpZO", "moving_mean"),
+    "gru": _rival("baselines.networks:GRU", "mahalanobis"),
+    "kalman": _rival("baselines.kalman:Kalman", "mahalanobis"),
+    "association_linear": _rival("baselines.change_regression:LinearAssociation", "mahalanobis"),
+    "association_values": _rival("torque.value_association:ValueAssociation", "largest"),
+    "external_torque_limit": _rival("baselines.fixed_limits:ExternalTorqueLimit", "largest"),
+    "force_limit": _rival("baselines.fixed_limits:ForceLimit", "squares"),
 }
-"""The model of each rival, and the detection that its authors judged it by."""
+
+BY_EVIDENCE = {
+    name + EVIDENCE: replace(kind, detection="evidence")
+    for name, kind in RIVALS.items()
+    if "limit" not in name
+}
 
 MONITORS: Registry[MonitorKind] = Registry(
     "monitor",
-    "asm_gym.monitors.registry:MONITORS",
-    {
-        "neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"),
-        **{
-            n: MonitorKind(f"asm_gym.monitors.{model}", own, own)
-            for n, (model, own) in _RIVALS.items()
-        },
-        **{
-            n + EVIDENCE: MonitorKind(f"asm_gym.monitors.{m}", own)
-            for n, (m, own) in _RIVALS.items()
-            if "limit" not in n
-        },
-    },
+    "asm_gym.monitors.monitor_registry:MONITORS",
+    {"neural_asm": MonitorKind("asm_gym.monitors.neural_asm:NeuralASM"), **RIVALS, **BY_EVIDENCE},
 )
 """Every monitor by name. A baseline's plain name scores as its authors did; with ``+evidence``, its errors are judged
 as those of the Neural ASM are. ``+`` and the name of any other detection will do as well."""

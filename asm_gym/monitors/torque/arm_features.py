@@ -1,0 +1,198 @@
+"""Features of an arm for a linear model of its torques: friction by speed, and weight by the sines of angles.
+
+    tanh(v/w s)       w ∈ {0.01, 0.1, 1}, of each speed v of spread s
+    sin, cos          of angles q, of q_2 + q_3, …, and products of two of them
+    g, M q̈ + c        what the links weigh on each joint, by a body model in place of the sines (``body_model``)
+
+Motor current is torque plus what the sign of the speed says, and weight is a sum of products of sines of angles along
+the chain: a linear model can say neither without. Source: Stribeck friction smoothed by tanh: Makkar et al. 2005.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.names import POSITION, SPEED, ratio
+from asm_gym.monitors.torque.body_model import BodyModel
+from asm_gym.spec import StreamSpec
+
+Floats = NDArray[np.float64]
+
+FORCE = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
+COMMANDED = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
+
+WIDTHS = (0.01, 0.1, 1.0)  # w, shares of a speed's spread
+MOST_ANGLES = 12  # of more angles no sines are taken: their products would be too many
+CHAIN = 3  # angles from the second on that are summed: shoulder, elbow and wrist often turn about parallel axes
+
+
+class SensedRows(NamedTuple):
+    """N rows of the X senses, in their own units."""
+
+    values: Floats  # (N, X)
+    changes: Floats  # (N, X) standardised
+    spread: Floats  # (X,) of the values
+    rate: Floats  # (X,) rate of a change of 1 [1/s]
+
+
+class JointMotion(NamedTuple):
+    """Motion of J joints in N rows."""
+
+    angle: Floats  # (N, J) [rad]
+    speed: Floats  # (N, J) [rad/s]
+    acceleration: Floats  # (N, J) [rad/s²]; 0 where speeds are changes of angles
+
+
+@dataclass(frozen=True, eq=False)
+class ArmFeatures:
+    """Features that are derived from the speeds and angles among X senses.
+
+    Attributes:
+        senses: X.
+        speeds: (S,) senses that are speeds, or positions, whose changes are.
+        angles: (J,) senses that are angles, along the chain.
+        from_changes: speeds are changes of positions.
+        radians: (J,) each angle's unit [rad].
+        body: replaces the sines; None without a body model.
+    """
+
+    senses: int
+    speeds: NDArray[np.intp]
+    angles: NDArray[np.intp]
+    from_changes: bool
+    radians: Floats
+    body: BodyModel | None = None
+
+    @classmethod
+    def of(cls, spec: StreamSpec, urdf: str = "") -> Self:
+        """Return the features of a stream, by the names of its channels.
+
+        Raises:
+            ValueError: the text ``urdf`` is no body model of the joints that are sensed.
+        """
+        positions = named_columns(spec, POSITION)
+        moving = named_columns(spec, SPEED)
+        from_changes = not len(moving)
+        if from_changes:
+            moving = positions
+        angles = positions
+        if len(positions) > MOST_ANGLES:
+            angles = positions[:0]
+        units = [channel.unit for channel in spec.channels for _ in channel.labels]
+        body = None
+        if urdf:
+            _check_joints(len(angles), len(moving))
+            body = BodyModel.of(urdf, [spec.labels[i] for i in angles])
+        return cls(
+            senses=len(spec.sensory),
+            speeds=np.searchsorted(spec.sensory, moving),
+            angles=np.searchsorted(spec.sensory, angles),
+            from_changes=from_changes,
+            radians=np.array([ratio(units[i], "rad") or 1.0 for i in angles]),
+            body=body,
+        )
+
+    def with_body(self, body: BodyModel) -> Self:
+        """Return the features by another body model, or by another order of its joints."""
+        return replace(self, body=body)
+
+    @cached_property
+    def sources(self) -> NDArray[np.bool_]:
+        """(M, X) which senses each feature is made of."""
+        every_sense = np.arange(self.senses)
+        of_speed = self.speeds[:, None] == every_sense  # (S, X)
+        of_angle = self.angles[:, None] == every_sense  # (J, X)
+        friction = [of_speed] * len(WIDTHS)
+        joints = len(self.angles)
+
+        if self.body is not None:
+            weight = of_angle.any(axis=0)
+            motion = weight | of_speed.any(axis=0)
+            return np.vstack([*friction, *[weight] * joints, *[motion] * joints])
+
+        single = np.vstack([of_angle, of_angle])
+        sums = [of_angle[1:end].any(axis=0) for end in range(3, min(joints, CHAIN + 1) + 1)]
+        first, second = self._pairs
+        return np.vstack([*friction, single, *sums, *sums, single[first] | single[second]])
+
+    @cached_property
+    def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The sines and cosines of single angles that are multiplied (P,), (P,)."""
+        return np.triu_indices(2 * len(self.angles))
+
+    def __call__(self, rows: SensedRows) -> Floats:
+        """Return the features (N, M) of rows."""
+        if self.from_changes:
+            speed = rows.changes[:, self.speeds]
+        else:
+            speed = rows.values[:, self.speeds] / rows.spread[self.speeds]
+        parts = [np.tanh(speed / width) for width in WIDTHS]
+
+        if self.body is not None:
+            motion = self.motion(rows)
+            parts += self.body.torques(motion.angle, motion.speed, motion.acceleration)
+        elif len(self.angles):
+            angle = rows.values[:, self.angles] * self.radians
+            single = np.hstack([np.sin(angle), np.cos(angle)])
+            sums = np.cumsum(angle[:, 1 : CHAIN + 1], axis=1)[:, 1:]
+            first, second = self._pairs
+            parts += [single, np.sin(sums), np.cos(sums), single[:, first] * single[:, second]]
+        return np.hstack(parts)
+
+    def motion(self, rows: SensedRows) -> JointMotion:
+        """Return the motion of the joints in rows."""
+        angle = rows.values[:, self.angles] * self.radians
+        rate = (rows.changes * rows.rate)[:, self.speeds] * self.radians
+        if self.from_changes:
+            return JointMotion(angle, speed=rate, acceleration=np.zeros_like(angle))
+        speed = rows.values[:, self.speeds] * self.radians
+        return JointMotion(angle, speed=speed, acceleration=rate)
+
+
+def _check_joints(angles: int, speeds: int) -> None:
+    """Raise ValueError unless each joint has an angle and a speed."""
+    if not speeds == angles > 0:
+        raise ValueError(
+            f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; by their names "
+            f"{angles} numbers are angles and {speeds} are speeds; leave out others, as --ignore '*finger*' does"
+        )
+
+
+def named_columns(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
+    """Return the columns of senses whose channel's name matches."""
+    columns: list[int] = []
+    for name, place in spec.slices.items():
+        if pattern.fullmatch(name.lower()):
+            columns += range(spec.size)[place]
+    return spec.sensory[np.isin(spec.sensory, columns)]
+
+
+def forces(spec: StreamSpec) -> NDArray[np.intp]:
+    """Return the columns of measured torques or currents, by their names."""
+    return np.setdiff1d(named_columns(spec, FORCE), named_columns(spec, COMMANDED))
+
+
+def motion(spec: StreamSpec) -> NDArray[np.intp]:
+    """Return the columns of positions and speeds, by their names."""
+    return np.union1d(named_columns(spec, POSITION), named_columns(spec, SPEED))
+
+
+def judged_by_values(spec: StreamSpec) -> bool:
+    """Return whether a memory of this stream judges values by default.
+
+    It does where the stream has torques, currents or efforts, by the names of its channels. A
+    simulation that also measures contact itself, by a wrist sensor or as external torque, is left
+    to changes: there contact shows a held push. In a log (``spec.source`` of ``"table"``) such
+    channels are estimates of the robot's own controller, and values are judged beside them.
+    """
+    measures_contact = any(
+        channel.group == "wrench" or "external" in channel.name for channel in spec.channels
+    )
+    is_log = spec.source == "table"
+    return len(forces(spec)) > 0 and (is_log or not measures_contact)

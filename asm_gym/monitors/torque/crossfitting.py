@@ -1,0 +1,185 @@
+"""Ridge regression of values on the inputs of other senses, with penalties by errors in rows of other folds.
+
+    W    = (ZᵀZ/N + λ)⁻¹ ZᵀX/N           of all rows, for the λ that leaves the least in rows of other folds
+    R²   = 1 - Σ ε² / N var x            ε: cross-fitted errors
+    h    = zᵀ (ZᵀZ/N + λ_h)⁻¹ z          leverage; its median h̃ is cross-fitted
+
+There are five folds over episodes, or over blocks of rows where episodes are few.
+
+Sources: Hoerl and Kennard 1970; for h: Hoaglin and Welsch 1978 (The American Statistician 32).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
+
+FOLDS = 5
+ALL_ROWS = FOLDS  # index of the equations of all rows, after those without each fold
+PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # λ, of standardised inputs
+STIFFNESS = 1e-3  # λ_h
+LEAST_SPREAD = 1e-4  # of what is left of a standardised number
+
+
+def folds_of(lengths: Sequence[int]) -> Places:
+    """Return the fold (N,) of each row of episodes: whole episodes, or blocks where they are few."""
+    if len(lengths) >= FOLDS:
+        return np.repeat(np.arange(len(lengths)) % FOLDS, lengths)
+    rows = sum(lengths)
+    return np.arange(rows, dtype=np.intp) * FOLDS // max(rows, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class FoldEquations:
+    """Normal equations of N rows, without the rows of each fold, and at last of all rows.
+
+    Attributes:
+        inputs: Z (N, I).
+        values: X (N, X), to be predicted.
+        fold: (N,) of each row.
+        grams: ZᵀZ/N (FOLDS + 1, I, I).
+        products: ZᵀX/N (FOLDS + 1, I, X).
+    """
+
+    inputs: Floats
+    values: Floats
+    fold: Places
+    grams: Floats
+    products: Floats
+
+    @classmethod
+    def of(cls, inputs: Floats, values: Floats, fold: Places) -> Self:
+        """Return the equations of rows."""
+        return cls(
+            inputs=inputs,
+            values=values,
+            fold=fold,
+            grams=_mean_products(inputs, inputs, fold),
+            products=_mean_products(inputs, values, fold),
+        )
+
+    def weights(self, fold: int, used: Places, targets: Places, penalty: float) -> Floats:
+        """Return the weights (U, M) of the inputs ``used`` (U,) for the values ``targets`` (M,)."""
+        gram = self.grams[fold][np.ix_(used, used)] + penalty * np.eye(len(used))
+        return np.linalg.solve(gram, self.products[fold][np.ix_(used, targets)])
+
+    def errors(self, used: Places, targets: Places, penalty: float) -> Floats:
+        """Return the errors (N, M) in each row by the equations without its fold."""
+        errors = self.values[:, targets].copy()
+        for f in range(FOLDS):
+            rows = self.fold == f
+            errors[rows] -= self.inputs[rows][:, used] @ self.weights(f, used, targets, penalty)
+        return errors
+
+    def leverage(self, withheld: Places) -> Leverage:
+        """Return the leverage of rows by all inputs but those ``withheld``."""
+        size = self.inputs.shape[1]
+        used = np.setdiff1d(np.arange(size), withheld)
+        inverses = [regular_inverse(gram[np.ix_(used, used)]) for gram in self.grams]
+        h = np.zeros(len(self.fold))
+        for f in range(FOLDS):
+            rows = self.fold == f
+            h[rows] = quadratic_form(self.inputs[rows][:, used], inverses[f])
+        usual = np.median(h)
+        matrix = np.zeros((size, size))
+        matrix[np.ix_(used, used)] = inverses[ALL_ROWS] / usual
+        return Leverage(matrix=matrix, widening=np.sqrt(np.maximum(1.0, h / usual)))
+
+
+def _mean_products(z: Floats, x: Floats, fold: Places) -> Floats:
+    """Return ZᵀX/N without the rows of each fold, and of all rows at last (FOLDS + 1, I, X)."""
+    rows = np.append(len(z) - np.bincount(fold, minlength=FOLDS), len(z))
+    each = np.array([z[fold == f].T @ x[fold == f] for f in range(FOLDS)])
+    total = each.sum(axis=0)
+    return np.array([*(total - each), total]) / np.maximum(rows, 1)[:, None, None]
+
+
+class Leverage(NamedTuple):
+    """How unlike the rows that were learned from others are."""
+
+    matrix: Floats  # (I, I) zᵀ matrix z is h/h̃
+    widening: Floats  # (N,) cross-fitted √max(1, h/h̃)
+
+
+def regular_inverse(gram: Floats) -> Floats:
+    """Return (ZᵀZ/N + λ_h)⁻¹ of ZᵀZ/N (I, I)."""
+    return np.linalg.inv(gram + STIFFNESS * np.eye(len(gram))).astype(np.float64)
+
+
+def quadratic_form(z: Floats, matrix: Floats) -> Floats:
+    """Return zᵀ M z of each row (N,)."""
+    return ((z @ matrix) * z).sum(axis=1)
+
+
+class CrossFit:
+    """Weights of each value, and their cross-fitted errors.
+
+    Args:
+        equations: of the rows.
+        alone: inputs of each value that may be predicted from its own joint alone.
+        groups: (X,) the group of each value, by number.
+        withheld: of each group the inputs that it is not predicted from.
+
+    Attributes:
+        weights: (X, I).
+        errors: (N, X) cross-fitted.
+        joint_alone: (X,) 1 where a value is predicted from its own joint alone, else 0.
+    """
+
+    def __init__(
+        self,
+        equations: FoldEquations,
+        alone: Mapping[int, Places],
+        groups: Places,
+        withheld: Sequence[Places],
+    ) -> None:
+        rows, size = equations.inputs.shape
+        values = equations.values.shape[1]
+        self.equations = equations
+        self.weights = np.zeros((values, size))
+        self.errors = np.zeros((rows, values))
+        self.joint_alone = np.zeros(values)
+        for value, used in alone.items():
+            self._fit_alone(np.array([value]), used)
+        for group, own in enumerate(withheld):
+            used = np.setdiff1d(np.arange(size), own)
+            self._fit_group(np.flatnonzero(groups == group), used)
+
+    def _fit_alone(self, value: Places, used: Places) -> None:
+        self.errors[:, value] = self.equations.errors(used, value, PENALTIES[0])
+        self.joint_alone[value] = 1.0
+        weights = self.equations.weights(ALL_ROWS, used, value, PENALTIES[0])
+        self.weights[value, used] = weights[:, 0]
+
+    def _fit_group(self, targets: Places, used: Places) -> None:
+        """Fit a group by the penalty that leaves the least; a value stays alone where that leaves less."""
+        errors = np.array(
+            [self.equations.errors(used, targets, penalty) for penalty in PENALTIES]
+        )  # (P, N, M)
+        squares = (errors**2).sum(axis=1)  # (P, M)
+        squares_alone = (self.errors[:, targets] ** 2).sum(axis=0)
+        to_beat = np.where(self.joint_alone[targets] > 0, squares_alone, np.inf)
+        better = squares.min(axis=0) < to_beat
+        for n, penalty in enumerate(PENALTIES):
+            chosen = np.flatnonzero(better & (squares.argmin(axis=0) == n))
+            if not len(chosen):
+                continue
+            values = targets[chosen]
+            self.errors[:, values] = errors[n][:, chosen]
+            self.joint_alone[values] = 0.0
+            self.weights[values] = 0.0
+            weights = self.equations.weights(ALL_ROWS, used, values, penalty)
+            self.weights[np.ix_(values, used)] = weights.T
+
+    @property
+    def R2(self) -> Floats:  # noqa: N802
+        """(X,) share of each value's variance that is predicted in rows of other folds."""
+        variance = np.maximum(self.equations.values.var(axis=0), LEAST_SPREAD**2)
+        return 1.0 - (self.errors**2).mean(axis=0) / variance

@@ -1,0 +1,339 @@
+r"""Ridge regression of values: each group of senses from the values and changes of the others, without its own past.
+
+    x̂_g,t = D_g [x_{¬g,t}, Δ_{¬g,t}, φ_{¬g,t}, u_t, 1]       judged: torques, and what a cross-fitted R² of 1/2 tells
+    φ      friction and weight, see ``arm_features``
+    r_t    = (x_t - x̂_t) / √max(1, h/h̃)
+    ε_t    = (r_t + … + r_{t-w+1}) / w q                      w: rows of a tenth of a second
+    q      the largest |r_t + … + r_{t-w+1}| / w of each x in nominal episodes, cross-fitted
+    h, h̃   leverage and its cross-fitted median, see ``crossfitting``
+
+A push that is held is explained after one step where a value is predicted from its own last one; where it is predicted
+from the others, it is not. A torque is always judged; positions and speeds, beside torques, are left to their changes,
+for no other sense predicts where an arm may go. Where few rows were learned from, h is large and an error counts for
+less.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.episode import Episode
+from asm_gym.detection import ModelOutput
+from asm_gym.detection.base import Arrays
+from asm_gym.memory.linear import check_inputs
+from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next, require_arrays
+from asm_gym.monitors.surprise import Progress
+from asm_gym.monitors.torque.arm_features import WIDTHS, ArmFeatures, SensedRows, forces, motion
+from asm_gym.monitors.torque.body_model import BodyModel
+from asm_gym.monitors.torque.crossfitting import (
+    LEAST_SPREAD,
+    CrossFit,
+    FoldEquations,
+    folds_of,
+    quadratic_form,
+)
+from asm_gym.scaling import ScaledRows, rows_apart
+from asm_gym.spec import StreamSpec
+from asm_gym.validation import typed
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
+
+ALIKE_S = 0.1  # time that errors are averaged over [s]
+PREDICTED = 0.5  # R² from which on a value is judged
+MOST_INPUTS = 1024  # with more inputs no leverage is computed: the matrices would be too large
+
+LEARNED = (
+    "derived_mean",  # (M,) of the features φ
+    "derived_spread",  # (M,)
+    "body",  # (J,) the column of each joint of the body model; empty where none is used
+    "judged_values",  # (V,) of the X values
+    "R2_values",  # (X,) cross-fitted
+    "D",  # (V, I)
+    "joint_alone",  # (V,) 1 where a value is predicted from its own joint alone, else 0
+    "largest",  # (V,) q
+    "far",  # (G, I, I) leverage of each group that is judged; of no group with very many inputs
+)
+
+
+class RegressionRows(NamedTuple):
+    """Rows as regression reads them, all standardised."""
+
+    values: Floats  # (N, X)
+    changes: Floats  # (N, X)
+    before: Floats  # (N, X) values l rows before
+    commands: Floats  # (N, A + 1) with a 1
+
+
+class AveragedErrors(NamedTuple):
+    """State of B streams; never changed in place."""
+
+    history: RowHistory
+    errors: Floats  # (B, w, V) r, the newest last; 0 where nothing could be predicted
+
+
+class FeatureFit(NamedTuple):
+    """Regression on the features of an arm."""
+
+    features: ArmFeatures
+    mean: Floats  # (M,) of the features
+    spread: Floats  # (M,)
+    withheld: list[Places]  # of each group the inputs that it is not predicted from
+    regression: CrossFit
+
+
+class ValueAssociation(ScaledModel):
+    """Ridge regression of values; it has no context. Where nothing predicts a value, all are judged.
+
+    A body model, the text ``urdf`` as ``read_urdf`` reads it, takes the place of sines where it explains held-out
+    torques better: ``left_by_body`` is what it leaves, as a share of what is left without it. Where columns do not name
+    its joints, they are taken in the order that explains the torques best.
+    """
+
+    kind = "association_values"
+    held_out = 0  # what it learns of errors is cross-fitted
+
+    @typed
+    def __init__(self, spec: StreamSpec, urdf: str = "") -> None:
+        super().__init__(spec, rows_apart(spec.dt))
+        self.urdf = urdf
+        self.window = max(1, round(ALIKE_S / spec.dt))
+        self.left_by_body = math.nan
+        self._by_sines = ArmFeatures.of(spec)
+        self._by_body = ArmFeatures.of(spec, urdf)
+        self._features = self._by_body
+        self._torques = np.searchsorted(spec.sensory, forces(spec))
+
+    @property
+    def error_columns(self) -> Places:
+        if not self.learned_:
+            return self.spec.sensory
+        return self.spec.sensory[self._judged]
+
+    @property
+    def links(self) -> BodyModel | None:
+        """The body model in use."""
+        return self._features.body
+
+    @property
+    def joints(self) -> list[tuple[str, str]]:
+        """The angles that a body model is told, and the joint that each is taken for."""
+        body = self.links
+        if body is None:
+            return []
+        labels = [self.spec.labels[self.spec.sensory[i]] for i in self._features.angles]
+        return [(labels[body.columns[k]], body.names[k]) for k in np.argsort(body.columns)]
+
+    def fit(
+        self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
+    ) -> Self:
+        rows = self._regressors(rows_after(self.lag, self.read_nominal(episodes)))
+        lengths = [len(episode) - self.lag for episode in episodes]
+        fit = self._best_fit(rows, folds_of(lengths))
+
+        judged = self.judged(fit.regression.R2)
+        if not len(judged):
+            judged = np.arange(len(self.spec.sensory))
+        errors, leverages = self._weighed_errors(fit, judged)
+        episode_ends = np.cumsum(lengths)[:-1]
+        means = [averaged(part, self.window) for part in np.split(errors, episode_ends)]
+        largest = np.max([np.abs(mean).max(axis=0) for mean in means], axis=0)
+
+        columns = np.zeros(0)
+        if fit.features.body is not None:
+            columns = fit.features.body.columns.astype(np.float64)
+        progress(1, 1)
+        learned = {
+            "derived_mean": fit.mean,
+            "derived_spread": fit.spread,
+            "body": columns,
+            "judged_values": judged.astype(np.float64),
+            "R2_values": fit.regression.R2,
+            "D": fit.regression.weights[judged],
+            "joint_alone": fit.regression.joint_alone[judged],
+            "largest": np.maximum(largest, LEAST_SPREAD),
+            "far": leverages,
+        }
+        return self.restore({**self.senses_.arrays, **learned})
+
+    def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
+        require_arrays(learned, LEARNED)
+        self._judged = learned["judged_values"].astype(np.intp)
+        self._features = self._by_sines
+        body = self._by_body.body
+        if len(learned["body"]) and body is not None:
+            body = replace(body, columns=learned["body"].astype(np.intp))
+            self._features = self._by_body.with_body(body)
+        return super().restore(learned, skills)
+
+    def start(self, batch: int) -> AveragedErrors:
+        errors = np.zeros((batch, self.window, len(self._judged)))
+        return AveragedErrors(super().start(batch), errors)
+
+    def predict(self, state: AveragedErrors, rows: Floats) -> tuple[AveragedErrors, ModelOutput]:
+        history, reading, known = read_next(self.senses_, state.history, rows)
+        scaled = self._regressors(reading)
+        features = self._features(self._sensed(scaled))
+        features = (features - self.learned_["derived_mean"]) / self.learned_["derived_spread"]
+        inputs = inputs_of(scaled, features)
+
+        expected = inputs @ self.learned_["D"].T
+        error = known * (scaled.values[:, self._judged] - expected) / self._widening(inputs)
+        errors = np.concatenate([state.errors[:, 1:], error[:, None]], axis=1)
+        mean = errors.mean(axis=1) / self.learned_["largest"]
+        return AveragedErrors(history, errors), ModelOutput(mean, no_context(rows))
+
+    def judged(self, R2: Floats) -> Places:
+        """Return which values are judged, by their cross-fitted R² (X,)."""
+        judged = R2 > PREDICTED
+        moves = np.searchsorted(self.spec.sensory, motion(self.spec))
+        if len(self._torques) and len(moves):
+            judged[moves] = False
+            judged[self._torques] = True
+        return np.flatnonzero(judged)
+
+    def _regressors(self, reading: ScaledRows) -> RegressionRows:
+        senses = len(self.spec.sensory)
+        return RegressionRows(
+            values=np.asarray(reading.senses[:, :senses], np.float64),
+            changes=np.asarray(reading.inputs[:, self.senses_.changes], np.float64),
+            before=np.asarray(reading.inputs[:, self.spec.sensory], np.float64),
+            commands=np.asarray(reading.commands, np.float64),
+        )
+
+    def _sensed(self, rows: RegressionRows) -> SensedRows:
+        """Return rows in the units of their senses."""
+        sensory = self.spec.sensory
+        spread = self.senses_.spread[sensory]
+        return SensedRows(
+            values=rows.values * spread + self.senses_.mean[sensory],
+            changes=rows.changes,
+            spread=spread,
+            rate=self.senses_.change[sensory] / (self.lag * self.spec.dt),
+        )
+
+    def _best_fit(self, rows: RegressionRows, fold: Places) -> FeatureFit:
+        """Return the fit by sines; or by the body model, where that leaves less of the torques."""
+        by_sines = self._fit_on(self._by_sines, rows, fold)
+        if not self.urdf:
+            return by_sines
+        by_body = self._fit_on(self._ordered_body(rows), rows, fold)
+        before = self._unexplained(by_sines)
+        self.left_by_body = float(self._unexplained(by_body) / max(before, LEAST_SPREAD))
+        return by_body if self.left_by_body < 1.0 else by_sines
+
+    def _unexplained(self, fit: FeatureFit) -> float:
+        """Return what is left of the torques, as a sum of shares."""
+        return float((1.0 - fit.regression.R2[self._torques]).sum())
+
+    def _ordered_body(self, rows: RegressionRows) -> ArmFeatures:
+        """Return the features by the body model, with its joints in the order that explains the torques best."""
+        features = self._by_body
+        body = features.body
+        assert body is not None
+        if body.by_name or len(self._torques) != len(features.angles):
+            return features
+        sensed = self._sensed(rows)
+        moved = features.motion(sensed)
+        torque = sensed.values[:, self._torques]
+        return features.with_body(
+            body.in_best_order(moved.angle, moved.speed, moved.acceleration, torque)
+        )
+
+    def _fit_on(self, features: ArmFeatures, rows: RegressionRows, fold: Places) -> FeatureFit:
+        derived = features(self._sensed(rows))
+        mean = derived.mean(axis=0)
+        spread = np.maximum(derived.std(axis=0), LEAST_SPREAD)
+        inputs = inputs_of(rows, (derived - mean) / spread)
+        check_inputs(inputs.shape[1])
+        withheld = self._withheld(features)
+        regression = CrossFit(
+            FoldEquations.of(inputs, rows.values, fold),
+            alone=self._joint_inputs(features, inputs.shape[1]),
+            groups=self.senses_.groups,
+            withheld=withheld,
+        )
+        return FeatureFit(features, mean, spread, withheld, regression)
+
+    def _withheld(self, features: ArmFeatures) -> list[Places]:
+        """Return the inputs of each group that hold its own values, which it is not predicted from."""
+        senses = len(self.spec.sensory)
+        groups = self.senses_.groups
+        before = 2 * senses + np.arange(senses)  # a value is predicted from this row alone
+        withheld = []
+        for group in range(int(groups.max()) + 1):
+            own = np.flatnonzero(groups == group)
+            derived = 3 * senses + np.flatnonzero(features.sources[:, own].any(axis=1))
+            withheld.append(np.unique(np.concatenate([own, senses + own, before, derived])))
+        return withheld
+
+    def _joint_inputs(self, features: ArmFeatures, inputs: int) -> dict[int, Places]:
+        """Return which inputs are of each torque's own joint: its speed, friction and body, and commands.
+
+        There are none where torques, speeds and angles of a body model do not belong together one by one.
+        """
+        senses = len(self.spec.sensory)
+        joints = len(features.speeds)
+        kinds = len(WIDTHS)
+        if len(self._torques) != joints:
+            return {}
+        if features.body is not None:
+            kinds += 2  # weight and motion
+            if len(features.angles) != joints:
+                return {}
+        first = 3 * senses + joints * np.arange(kinds)  # of each kind of feature
+        commands = np.arange(inputs - len(self.spec.motor) - 1, inputs)
+        speeds = features.speeds + senses * features.from_changes
+        return {
+            int(torque): np.concatenate([[speeds[n]], first + n, commands])
+            for n, torque in enumerate(self._torques)
+        }
+
+    def _weighed_errors(self, fit: FeatureFit, judged: Places) -> tuple[Floats, Floats]:
+        """Return cross-fitted errors (N, V), less where leverage is large, and the leverage (G, I, I) of each group."""
+        size = fit.regression.weights.shape[1]
+        errors = fit.regression.errors[:, judged]
+        groups = self.senses_.groups[judged]
+        if size > MOST_INPUTS:
+            return errors, np.zeros((0, size, size))
+        matrices = []
+        for group in np.unique(groups):
+            leverage = fit.regression.equations.leverage(fit.withheld[group])
+            matrices.append(leverage.matrix)
+            by_group = (groups == group) & (fit.regression.joint_alone[judged] == 0)
+            errors[:, by_group] /= leverage.widening[:, None]
+        return errors, np.array(matrices)
+
+    def _widening(self, inputs: Floats) -> Floats:
+        """Return √max(1, h/h̃) (N, V) of judged values, for inputs (N, I)."""
+        widening = np.ones((len(inputs), len(self._judged)))
+        groups = self.senses_.groups[self._judged]
+        by_group = self.learned_["joint_alone"] == 0
+        for group, matrix in zip(np.unique(groups), self.learned_["far"], strict=False):
+            h = quadratic_form(inputs, matrix)
+            widening[:, by_group & (groups == group)] = np.sqrt(np.maximum(1.0, h))[:, None]
+        return widening
+
+
+def rows_after(lag: int, readings: Sequence[ScaledRows]) -> ScaledRows:
+    """Return the rows of episodes without the first ``lag`` of each, before which nothing is known."""
+    trimmed = [[array[lag:] for array in reading] for reading in readings]
+    return ScaledRows._make(map(np.concatenate, zip(*trimmed, strict=True)))
+
+
+def inputs_of(rows: RegressionRows, features: Floats) -> Floats:
+    """Return the inputs (N, I) of regression for rows with standardised features (N, M)."""
+    return np.hstack([rows.values, rows.changes, rows.before, features, rows.commands])
+
+
+def averaged(errors: Floats, window: int) -> Floats:
+    """Return the mean (T, V) of the last rows of errors (T, V) of an episode; before the first they are 0."""
+    total = np.cumsum(np.vstack([np.zeros((window, errors.shape[1])), errors]), axis=0)
+    return (total[window:] - total[:-window]) / window

@@ -1,0 +1,215 @@
+"""Values beside changes: a push that is held is explained by its own past for changes, and not by the other senses.
+
+    s = max(s_changes / √f, b s_values^p)   log b + p log s: as log s_changes in centre and spread of nominal maxima
+    f = max(1, (1 + τ h)/(1 + τ h̃))         h: leverage of a row, h̃ its median in the episodes learned from
+    h = zᵀ (ZᵀZ + λ N)⁻¹ z                  z: inputs that changes are predicted from, and 1;  τ: rows of a tenth of a s
+
+``calibrate`` finds b and p, so that both are as likely to pass the one threshold: each has a threshold of its own so,
+and the promised rate is shared. A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each
+other are alike, so that those of a tenth of a second count as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.episode import Episode
+from asm_gym.detection import Blocks
+from asm_gym.detection.base import Arrays
+from asm_gym.detection.evidence import TINY
+from asm_gym.detection.scores import Largest
+from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.stream_model import read_next, require_arrays
+from asm_gym.monitors.surprise import State, Surprise
+from asm_gym.monitors.torque.arm_features import ArmFeatures, judged_by_values
+from asm_gym.monitors.torque.crossfitting import quadratic_form, regular_inverse
+from asm_gym.monitors.torque.value_association import ALIKE_S, MOST_INPUTS, ValueAssociation
+from asm_gym.scaling import StreamScaler
+from asm_gym.spec import StreamSpec
+
+Floats = NDArray[np.float64]
+
+PREFIX = "values."  # prefix of the names of its arrays in a checkpoint
+SCALARS = ("usual", "balance", "power")
+
+PRIOR_COUNT = 4  # maxima that p rests on before any
+PRIOR_SPREAD_OF_CHANGES = 0.3  # of the logarithms of these
+PRIOR_SPREAD_OF_VALUES = 0.15
+MOST_POWER = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class ValueJudge:
+    """A monitor of values, and how it counts beside the surprise of changes.
+
+    Attributes:
+        monitor: of values alone.
+        leverage: (I + 1, I + 1) zᵀ leverage z is τ h / (1 + τ h̃); (0, 0) for very many inputs.
+        usual: 1 / (1 + τ h̃).
+        balance: b; 1 before ``calibrate``.
+        power: p; before ``calibrate`` 2, as changes are judged by squares.
+    """
+
+    monitor: CalibratedMonitor
+    leverage: Floats
+    usual: float = 1.0
+    balance: float = 1.0
+    power: float = 2.0
+
+    @staticmethod
+    def suits(spec: StreamSpec) -> bool:
+        """Return whether a memory of this stream judges values by default, see ``judged_by_values``."""
+        return judged_by_values(spec)
+
+    @staticmethod
+    def check_body(spec: StreamSpec, urdf: str) -> None:
+        """Raise ValueError unless the text of a body model fits the joints of a stream."""
+        ArmFeatures.of(spec, urdf)
+
+    @classmethod
+    def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self | None:
+        """Fit it to nominal episodes; None where no value can be predicted. ``urdf`` is the text of a body model."""
+        spec = episodes[0].spec
+        monitor = _monitor(spec, seed, urdf).fit(episodes)
+        model = _model(monitor)
+        if not len(model.judged(monitor.learned_["R2_values"])):
+            return None
+        if model.senses_.inputs > MOST_INPUTS:
+            return cls(monitor, leverage=np.zeros((0, 0)))
+
+        readings = [model.senses_.read_episode(episode.stream) for episode in episodes]
+        z = np.concatenate([_with_one(reading.inputs) for reading in readings])
+        alike = ALIKE_S / spec.dt / len(z)  # τ / N
+        leverage = alike * regular_inverse(z.T @ z / len(z))
+        usual = 1.0 / (1.0 + float(np.median(quadratic_form(z, leverage))))
+        return cls(monitor, leverage=usual * leverage, usual=usual)
+
+    @classmethod
+    def found(cls, spec: StreamSpec, arrays: Arrays, seed: int, urdf: str = "") -> Self | None:
+        """Restore it from the arrays of a checkpoint; None where that has none of it.
+
+        Raises:
+            ValueError: something is missing, or does not fit.
+        """
+        own = {n.removeprefix(PREFIX): a for n, a in arrays.items() if n.startswith(PREFIX)}
+        if not own:
+            return None
+        require_arrays(own, ("leverage", *SCALARS))
+        leverage = own.pop("leverage")
+        scalars = {name: float(own.pop(name)) for name in SCALARS}
+        monitor = _monitor(spec, seed, urdf).with_learned(own)
+        size = _model(monitor).senses_.inputs + 1
+        if leverage.shape not in ((size, size), (0, 0)):
+            raise ValueError(
+                f"the leverage of values should be of shape {(size, size)}, found {leverage.shape}"
+            )
+        return cls(monitor, leverage=leverage, **scalars)
+
+    @property
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Arrays to keep in a checkpoint, by name."""
+        kept = {**self.monitor.learned_, "leverage": self.leverage}
+        kept |= {name: np.array(getattr(self, name)) for name in SCALARS}
+        return {PREFIX + name: array for name, array in kept.items()}
+
+    def of_changes_alone(self) -> Self:
+        """Return it with b of 0, so that values count for nothing."""
+        return replace(self, balance=0.0)
+
+    def balanced(self, changes: Sequence[Surprise], episodes: Sequence[Episode]) -> Self:
+        """Return it with b and p from nominal episodes.
+
+        Args:
+            changes: surprise of these episodes by changes alone.
+            episodes: nominal.
+        """
+        by_changes = self._log_maxima(changes)
+        by_values = self._log_maxima(self.monitor.score_episodes(episodes))
+        wanted = _variance(by_changes, PRIOR_SPREAD_OF_CHANGES)
+        given = _variance(by_values, PRIOR_SPREAD_OF_VALUES)
+        power = min(float(np.sqrt(wanted / given)), MOST_POWER)
+        balance = float(np.exp(np.median(by_changes) - power * np.median(by_values)))
+        return replace(self, balance=balance, power=power)
+
+    def _log_maxima(self, scores: Sequence[Surprise]) -> Floats:
+        """Return the logarithms (n,) of the maxima of blocks."""
+        blocks = Blocks.of([score.value for score in scores], self.monitor.spec.dt)
+        return np.log(np.maximum(blocks.maxima, TINY))
+
+    def start(self, batch: int) -> State:
+        """Return the state before the first row of ``batch`` streams."""
+        return self.monitor.initial_state(batch)
+
+    def join(
+        self, state: State, rows: Floats, changes: Surprise, divisor: Floats
+    ) -> tuple[State, Surprise]:
+        """Return the new state, and the greater surprise in each row, attributed as that one is.
+
+        Args:
+            state: before the rows.
+            rows: (B, D).
+            changes: the surprise that changes make.
+            divisor: (B,) by which knocks and stops excuse a surprise.
+        """
+        root = self.spread(state, rows)
+        new, values = self.monitor.observe(state, rows)
+        by_changes = changes.value / root
+        raw_by_values = self.balance * values.value**self.power
+        by_values = raw_by_values / divisor
+        held = by_values > by_changes
+
+        countable = np.isfinite(by_values) & (values.value > 0)
+        share = np.ones_like(by_values)
+        np.divide(by_values, values.value, out=share, where=countable)
+        attribution = np.where(
+            held[:, None],
+            share[:, None] * values.attribution,
+            changes.attribution / root[:, None],
+        )
+        joined = changes._replace(
+            value=np.where(held, by_values, by_changes), attribution=attribution
+        )
+        if changes.raw is not None:
+            joined = joined._replace(raw=np.maximum(changes.raw / root, raw_by_values))
+        return new, joined
+
+    def spread(self, state: State, rows: Floats) -> Floats:
+        """Return √f (B,) of the next rows (B, D)."""
+        if not len(self.leverage):
+            return np.ones(len(rows))
+        _, reading, known = read_next(self._senses, state.model.history, rows)
+        f = self.usual + quadratic_form(_with_one(reading.inputs), self.leverage)
+        return np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
+
+    @property
+    def _senses(self) -> StreamScaler:
+        return _model(self.monitor).senses_
+
+
+def without_values(arrays: Arrays) -> Arrays:
+    """Return the arrays of a checkpoint that are not of a judge of values."""
+    return {name: array for name, array in arrays.items() if not name.startswith(PREFIX)}
+
+
+def _monitor(spec: StreamSpec, seed: int, urdf: str) -> CalibratedMonitor:
+    return CalibratedMonitor(ValueAssociation(spec, urdf=urdf), Largest(spec), seed=seed)
+
+
+def _model(monitor: CalibratedMonitor) -> ValueAssociation:
+    assert isinstance(monitor.model, ValueAssociation)
+    return monitor.model
+
+
+def _variance(logs: Floats, prior_spread: float) -> float:
+    """Return the variance of logarithms (n,), with the prior's."""
+    total = len(logs) * np.var(logs) + PRIOR_COUNT * prior_spread**2
+    return float(total / (len(logs) + PRIOR_COUNT))
+
+
+def _with_one(inputs: NDArray[np.float32]) -> Floats:
+    return np.hstack([inputs, np.ones((len(inputs), 1))])
