@@ -64,7 +64,7 @@ CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
 
 def headline(rows: Sequence[DetectionMetrics]) -> str:
     """Return one sentence: detected of all faults, false alarms of all nominal episodes."""
-    detected = Share(sum(m.detected.k for m in rows), sum(m.detected.n for m in rows))
+    detected = Share.total([m.detected for m in rows])
     nominal = [trace for m in rows if m.name == NOMINAL for trace in m.watched]
     return (
         f"{count(detected)} faults detected; {count(metrics.false_alarms(nominal))} nominal "

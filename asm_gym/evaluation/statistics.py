@@ -39,6 +39,11 @@ class Share(NamedTuple):
         """Count the true outcomes."""
         return cls(int(np.count_nonzero(outcomes)), len(outcomes))
 
+    @classmethod
+    def total(cls, shares: Sequence[Share]) -> Share:
+        """Add the counts of several shares."""
+        return cls(sum(share.k for share in shares), sum(share.n for share in shares))
+
 
 class Rate(NamedTuple):
     """``k`` events in so many ``hours``."""
