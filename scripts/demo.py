@@ -33,7 +33,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
 from asm_gym.rollouts.run_trials import collect, watch_pair
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial
+from asm_gym.rollouts.trial import RolloutConfig, Trial, task_in
 from asm_gym.scripts.command import Options, option, origin, run
 from asm_gym.tasks import TASKS, env_id
 
@@ -120,7 +120,7 @@ def fit(args: Args, console: Console) -> tuple[Path, Share]:
     with stage("learning", console, {}) as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
     memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=FALSE_ALARM_RATE)
-    file = args.out / f"{Trial(env, args.seed).task.lower()}.asm"
+    file = args.out / f"{task_in(env).lower()}.asm"
     memory.save(file)
     return file, Share.of([e.success for e in episodes])
 

@@ -181,25 +181,31 @@ def _in_words(kind: Kind) -> str:
 def lead_table(result: BenchmarkResult) -> Table:
     """Return how far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
     first, *others = result.on_visible
-    promises = [result.promise, *(p for p in first.calibration.thresholds if p.per == HOUR)]
-    rows = []
-    for other in others:
-        auroc = interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc)
-        cells = [_lead(auroc, scale=1, digits=3)]
-        for promise in promises:
-            if promise not in first.draws.found.keys() & other.draws.found.keys():
-                cells.append("")
-                continue
-            difference = first.found[promise].value - other.found[promise].value
-            draws = first.draws.found[promise] - other.draws.found[promise]
-            cells.append(_lead(interval(difference, draws), scale=100, digits=1))
-        rows.append((other.name, *cells))
-    return Table(
+    caption = (
         f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference, which decide "
-        "between ahead, behind and within chance.",
-        ("Monitor", "AUROC", *(f"Found at {_rate(promise)} [points]" for promise in promises)),
-        rows,
+        "between ahead, behind and within chance."
     )
+    by_hour = [promise for promise in first.calibration.thresholds if promise.per == HOUR]
+    columns: dict[str, Callable[[DetectionMetrics], str]] = {
+        "Monitor": lambda m: m.name,
+        "AUROC": partial(_auroc_lead, first),
+    }
+    for promise in (result.promise, *by_hour):
+        columns[f"Found at {_rate(promise)} [points]"] = partial(_found_lead, promise, first)
+    return tabulate(caption, columns, others)
+
+
+def _auroc_lead(first: DetectionMetrics, other: DetectionMetrics) -> str:
+    lead = interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc)
+    return _lead(lead, scale=1, digits=3)
+
+
+def _found_lead(promise: AlarmRate, first: DetectionMetrics, other: DetectionMetrics) -> str:
+    if promise not in first.draws.found or promise not in other.draws.found:
+        return ""
+    difference = first.found[promise].value - other.found[promise].value
+    draws = first.draws.found[promise] - other.draws.found[promise]
+    return _lead(interval(difference, draws), scale=100, digits=1)
 
 
 def _lead(difference: Estimate, scale: float, digits: int) -> str:
@@ -221,26 +227,32 @@ def kept_table(result: BenchmarkResult) -> Table:
     every = {promise for m in monitors for promise in m.calibration.thresholds}
     by_episode = sorted(promise for promise in every if promise.per == EPISODE)
     by_hour = sorted((promise for promise in every if promise.per == HOUR), reverse=True)
-    promises = [*by_episode, *by_hour]
-    rows = [(m.name, *(_kept(m, promise) for promise in promises)) for m in monitors]
 
     nominal = monitors[0].nominal
     hours = sum(len(trace) * trace.dt for trace in nominal) / 3600
     unsafe = Share.of([trace.outcome.unsafe for trace in nominal if trace.outcome.success])
-    return Table(
+    caption = (
         f"False alarms in {len(nominal)} nominal test episodes of {hours:.2f} hours, by the promise of the "
         "threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in 40 (beta-binomial); by the hour, "
-        f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N.",
-        _headings(promises),
-        rows,
+        f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N."
     )
+    return _by_promise(caption, [*by_episode, *by_hour], _kept, monitors)
 
 
-def _headings(promises: Sequence[AlarmRate]) -> list[str]:
-    return ["Monitor", *(f"promised {_rate(promise)}" for promise in promises)]
+def _by_promise(
+    caption: str,
+    promises: Sequence[AlarmRate],
+    cell: Callable[[AlarmRate, DetectionMetrics], str],
+    monitors: Sequence[DetectionMetrics],
+) -> Table:
+    """Return a row for each monitor, with a cell for each promise."""
+    columns: dict[str, Callable[[DetectionMetrics], str]] = {"Monitor": lambda m: m.name}
+    for promise in promises:
+        columns[f"promised {_rate(promise)}"] = partial(cell, promise)
+    return tabulate(caption, columns, monitors)
 
 
-def _kept(m: DetectionMetrics, promise: AlarmRate) -> str:
+def _kept(promise: AlarmRate, m: DetectionMetrics) -> str:
     threshold = m.calibration.thresholds.get(promise)
     if threshold is None:
         return ""
@@ -277,26 +289,27 @@ def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str
 
 def splits_table(result: BenchmarkResult) -> Table:
     """Return what each promise comes to over random halves of the nominal episodes: set on one, kept on the other."""
-    promises = list(result.on_visible[0].calibration.thresholds)
-    rows = []
-    for m in result.on_visible:
-        episodes = np.array([trace.surprise.max() for trace in m.nominal])
-        maxima = np.concatenate([m.calibration.maxima, episodes])
-        blocks = Blocks.of([trace.surprise for trace in m.nominal], m.nominal[0].dt)
-        if m.calibration.blocks is not None:
-            known = m.calibration.blocks
-            blocks = Blocks(
-                np.concatenate([known.maxima, blocks.maxima]),
-                np.concatenate([known.hours, blocks.hours]),
-            )
-        units = {EPISODE: Blocks(maxima, np.ones(len(maxima))), HOUR: blocks}
-        rows.append((m.name, *(over_splits(m, units[p.per], p) for p in promises)))
-    return Table(
+    caption = (
         f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where {SPLITS} random halves "
-        "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD.",
-        _headings(promises),
-        rows,
+        "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD."
     )
+    promises = list(result.on_visible[0].calibration.thresholds)
+    return _by_promise(caption, promises, _over_own_splits, result.on_visible)
+
+
+def _over_own_splits(promise: AlarmRate, m: DetectionMetrics) -> str:
+    """Return ``over_splits`` of the nominal episodes for calibration and test."""
+    surprises = [trace.surprise for trace in m.nominal]
+    if promise.per == EPISODE:
+        peaks = [surprise.max() for surprise in surprises]
+        maxima = np.concatenate([m.calibration.maxima, peaks])
+        return over_splits(m, Blocks(maxima, np.ones(len(maxima))), promise)
+    blocks = Blocks.of(surprises, m.nominal[0].dt)
+    known = m.calibration.blocks
+    if known is not None:
+        maxima = np.concatenate([known.maxima, blocks.maxima])
+        blocks = Blocks(maxima, np.concatenate([known.hours, blocks.hours]))
+    return over_splits(m, blocks, promise)
 
 
 def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:

@@ -132,15 +132,13 @@ def judged(
     """Calibrate a fitted monitor, and score all other episodes."""
     monitor.calibrate(by_role["calibration"], rate)
     maxima = monitor.maxima_
-    if maxima is None:
-        maxima = np.zeros(0)
-    hours = 0.0
-    if monitor.blocks_ is not None:
-        hours = monitor.blocks_.total
+    blocks = monitor.blocks_
+    assert maxima is not None
+    assert blocks is not None
 
     possible = [r for r in RATES if len(maxima) >= conformal_episodes(r)]
     promises = [AlarmRate(r, EPISODE) for r in sorted({rate, *possible})]
-    promises += [AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0]
+    promises += [AlarmRate(r, HOUR) for r in PER_HOUR if r * blocks.total >= 1.0]
     thresholds = {promise: monitor.threshold_at(**promise.named) for promise in promises}
     threshold = thresholds[AlarmRate(rate, EPISODE)]
     return DetectionMetrics(
@@ -148,7 +146,7 @@ def judged(
         traces=traces_of(name, monitor, by_role.get("faulty", []), threshold),
         nominal=traces_of(name, monitor, by_role["nominal"], threshold),
         window_s=window_s,
-        calibration=Calibration(thresholds, maxima, monitor.blocks_),
+        calibration=Calibration(thresholds, maxima, blocks),
     )
 
 

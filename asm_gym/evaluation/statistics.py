@@ -99,12 +99,11 @@ class Spread(NamedTuple):
             deviation = float(np.std(values, ddof=1))
         return cls(float(np.mean(values)), deviation)
 
-    def text(self, scale: float = 1.0, digits: int = 3) -> str:
-        """``mean ± sd``, each times ``scale``; the mean alone without a deviation."""
-        mean = f"{scale * self.mean:.{digits}f}"
+    def text(self, digits: int = 3) -> str:
+        """``mean ± sd``; the mean alone without a deviation."""
         if math.isnan(self.sd):
-            return mean
-        return f"{mean} ± {scale * self.sd:.{digits}f}"
+            return f"{self.mean:.{digits}f}"
+        return f"{self.mean:.{digits}f} ± {self.sd:.{digits}f}"
 
 
 def auroc(positive: Floats, negative: Floats) -> float:

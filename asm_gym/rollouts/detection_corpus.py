@@ -134,21 +134,21 @@ def skill_files(folder: Path, fit: int | None = None, tasks: Sequence[str] = SKI
 def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
     """Return the trials of a source in a round; the first has all episodes to learn from and to calibrate on."""
     env_id = task_spec(source.task).id
-    place = f"{source.policy}/{source.task}"
-    wanted = []
+    name = f"{source.policy}/{source.task}"
+    planned = []
     if number == 0:
         for role, count in (("fit", source.fit), ("calibration", source.calibration)):
-            wanted += nominal_trials(env_id, role, role_seeds(SEED, place, role, count))
-    seeds = role_seeds(SEED, place, "nominal", source.nominal)[number::rounds]
-    wanted += nominal_trials(env_id, "nominal", seeds)
+            planned += nominal_trials(env_id, role, role_seeds(SEED, name, role, count))
+    seeds = role_seeds(SEED, name, "nominal", source.nominal)[number::rounds]
+    planned += nominal_trials(env_id, "nominal", seeds)
     if source.faults:
         env: Any = environment(env_id).unwrapped
         kinds = [kind for kind in kinds_of((TEST,)) if possible(kind, env)]
         horizon = task_spec(source.task).horizon
         # a scene each, as far as there are as many
         for (kind, severity), seed in zip(product(kinds, SEVERITIES), cycle(seeds), strict=False):
-            wanted.append(faulty_trial(env_id, kind, severity, seed, horizon))
-    return wanted
+            planned.append(faulty_trial(env_id, kind, severity, seed, horizon))
+    return planned
 
 
 def record_corpus(
@@ -161,6 +161,6 @@ def record_corpus(
 ) -> None:
     """Record what is missing of a round, source by source."""
     for source in sources:
-        wanted = trials(source, number, rounds)
+        planned = trials(source, number, rounds)
         config = RolloutConfig(source.policy)
-        record_missing(wanted, config, folder / source.policy, workers, progress)
+        record_missing(planned, config, folder / source.policy, workers, progress)

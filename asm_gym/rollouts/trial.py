@@ -64,8 +64,8 @@ class Trial:
 
     @property
     def task(self) -> str:
-        """The name in the id: ``"Lift"`` of ``asm_gym/Lift-v0``."""
-        return self.env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0]
+        """The task of the environment."""
+        return task_in(self.env_id)
 
     @property
     def label(self) -> EpisodeLabel:
@@ -102,6 +102,11 @@ class Trial:
         if self.after_s is None:
             return None
         return self.begins(env) + round(self.after_s / control_period(env))
+
+
+def task_in(env_id: str) -> str:
+    """Return the name in an id: ``"Lift"`` of ``asm_gym/Lift-v0``."""
+    return env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0]
 
 
 def nominal_trials(env_id: str, role: str, seeds: list[int]) -> list[Trial]:
