@@ -211,7 +211,7 @@ def promises_table(
         for own in severities.values():
             of_severity = [trace for trace in faults if trace.severity in own]
             row.append(_found(DetectionMetrics("", of_severity, [], window)))
-        rows.append(row)
+        rows.append(tuple(row))
     hours = hourly_alarms(healthy).hours
     caption = (
         f"By promise: alarms per hour in the {hours:.2f} healthy hours of these exams, with 95 % "
