@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from asm_gym.monitors import register_monitor as register_monitor
     from asm_gym.policies import make_policy as make_policy
     from asm_gym.policies.registry import register_policy as register_policy
-    from asm_gym.rollouts.collect import collect as collect
     from asm_gym.rollouts.pretraining.healthy import harmless as harmless
+    from asm_gym.rollouts.run_trials import collect as collect
     from asm_gym.spec import Channel as Channel
     from asm_gym.spec import StreamSpec as StreamSpec
     from asm_gym.tasks import register_task as register_task
@@ -44,7 +44,7 @@ _HOME = {
     ),
     **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
     "Episode": "data.episode",
-    "collect": "rollouts.collect",
+    "collect": "rollouts.run_trials",
     "harmless": "rollouts.pretraining.healthy",
     "make_policy": "policies",
     "register_fault": "faults.suite",

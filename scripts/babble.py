@@ -1,7 +1,7 @@
-"""Learn a memory of a body for any policy: record motor babbling, learn from it, and test the memory.
+"""Learn a memory of a body for any policy: record motor babbling, learn from it, and evaluate the memory.
 
-The memory is tested on policies and tasks that babbling never showed. A run can be killed at any time; the same command
-continues it.
+The memory is evaluated on policies and tasks that babbling never showed. A run can be killed at any time; the same
+command continues it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 from rich.console import Console
 
-from asm_gym.data.episode import load_episode
+from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import check_hours, check_per_hour
 from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import NOMINAL_ROLES
@@ -25,22 +25,22 @@ from asm_gym.files import write_text
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.shipped import USUAL
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
-from asm_gym.rollouts.collect import environment, record_missing
-from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.pretraining.babbling import curriculum, record_lesson
-from asm_gym.rollouts.pretraining.exam import (
+from asm_gym.rollouts.detection_corpus import Corpus
+from asm_gym.rollouts.pretraining.body_evaluation import (
     PROMISES,
-    Exam,
-    Marks,
-    card,
-    examine,
+    EvaluationCase,
+    Scores,
+    evaluate_case,
     promises_table,
+    scores_table,
     summary,
     usual_force,
 )
 from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.training_motions import curriculum, record_motion
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions
+from asm_gym.rollouts.run_trials import environment, record_missing
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, nominal_trials
 from asm_gym.scripts.command import Options, option, run
@@ -57,7 +57,9 @@ SHOWN = (
     "PickPlaceBread",
     "PickPlaceCereal",
 )
+"""Tasks to babble in."""
 LEFT_OUT = ("PickPlaceMilk", "NutAssemblyRound")
+"""Tasks for the evaluation alone."""
 HOURS_SEED = 11  # seed of the healthy hours
 _PANDAS = {"Door", "NutAssemblySquare", "NutAssemblyRound"}
 """Tasks whose experts often fail with other arms than the Panda."""
@@ -74,19 +76,19 @@ class Args(Options):
     robot: str = option("Panda", known=ROBOTS)
     """The arm."""
     episodes: int = option(60, quick=18, least=1)
-    """Babbling episodes (lessons) in each task; a second call with a larger number continues."""
+    """Babbling episodes in each task; a second call with a larger number continues."""
     reaching: bool = False
-    """Let hands reach for places instead of moving by noise alone, with one more lesson for each three that press."""
+    """Let hands reach for places instead of moving by noise alone, with one more episode for each three that press."""
     stream_freq: int | None = option(None, least=1, metavar="HZ")
     """Rows of the stream per second; by default one per control step."""
     healthy_episodes: int = option(60, quick=0, least=0)
-    """Expert episodes of each task to calibrate on, beside held-out lessons."""
+    """Expert episodes of each task to calibrate on, beside held-out babbling."""
     healthy_hours: float | None = option(None, least=0, metavar="HOURS")
     """Hours of each task in their place: fewer episodes of tasks that take longer."""
     corpus: Path | None = option(None, metavar="FOLDER")
     """Folder of asm-gym corpus, to calibrate also on its healthy hours of experts."""
     exam_episodes: int = option(60, quick=0, least=0)
-    """Healthy episodes of each test; 0 for no test."""
+    """Healthy episodes of each evaluation; 0 for none."""
     workers: int = option(2, least=1)
     """Number of processes."""
     out: Path = option(Path("runs/babble"), metavar="FOLDER")
@@ -102,8 +104,8 @@ class Args(Options):
             check_choice("task of one arm with a gripper", name, _GRIPPED)
         if not self.shown:
             raise ValueError("there must be at least one task to babble in")
-        lessons = sum(map(held_out, range(self.episodes)))
-        steps = sum((lessons + self.healthy(t)) * task_spec(t).horizon for t in self.shown)
+        motions = sum(map(held_out, range(self.episodes)))
+        steps = sum((motions + self.healthy(t)) * task_spec(t).horizon for t in self.shown)
         check_hours(self.false_alarms_per_hour, steps / USUAL / 3600)
 
     def healthy(self, task: str) -> int:
@@ -115,12 +117,16 @@ class Args(Options):
     @property
     def shown(self) -> tuple[str, ...]:
         """Tasks to babble in."""
-        return (
-            self.tasks if self.tasks is not None else self._able(SHOWN)[: 2 if self.quick else None]
-        )
+        if self.tasks is not None:
+            return self.tasks
+        if self.quick:
+            return self._able(SHOWN)[:2]
+        return self._able(SHOWN)
 
     def _able(self, tasks: Sequence[str]) -> tuple[str, ...]:
-        return tuple(t for t in tasks if self.robot == "Panda" or t not in _PANDAS)
+        if self.robot == "Panda":
+            return tuple(tasks)
+        return tuple(task for task in tasks if task not in _PANDAS)
 
     @property
     def config(self) -> RolloutConfig:
@@ -128,101 +134,119 @@ class Args(Options):
         return RolloutConfig(robot=self.robot, stream_freq=self.stream_freq)
 
     @property
-    def exams(self) -> list[Exam]:
-        """Policies and tasks to examine it on; shipped agents were trained with the Panda."""
-        homes = (
-            {p: task_spec(trained_in(p)).name for p in agents()} if self.robot == "Panda" else {}
-        )
-        return [
-            *(Exam(t, "scripted", known=True) for t in self.shown),
-            *(
-                Exam(t, "scripted", known=False)
-                for t in self._able(LEFT_OUT)
-                if t not in self.shown
-            ),
-            *(Exam(t, p, known=False) for p, t in homes.items()),
-        ]
+    def cases(self) -> list[EvaluationCase]:
+        """Policies and tasks to evaluate it on; shipped agents were trained with the Panda."""
+        unknown = [task for task in self._able(LEFT_OUT) if task not in self.shown]
+        cases = [EvaluationCase(task, "scripted", known=True) for task in self.shown]
+        cases += [EvaluationCase(task, "scripted", known=False) for task in unknown]
+        if self.robot == "Panda":
+            for policy in agents():
+                task = task_spec(trained_in(policy)).name
+                cases.append(EvaluationCase(task, policy, known=False))
+        return cases
 
 
-def learn(args: Args, console: Console) -> NeuralASM:
-    """Record what is missing of lessons and of the experts' healthy hours; fit, calibrate and save the memory."""
-    wanted = curriculum(args.shown, args.episodes, args.seed, args.reaching)
+def record_motions(args: Args, console: Console) -> list[Episode]:
+    """Record the training motions that are missing, and return all."""
+    motions = curriculum(args.shown, args.episodes, args.seed, args.reaching)
+    make = partial(record_motion, config=args.config, folder=args.out.resolve())
     with stage("babbling", console, {}) as progress:
-        make = partial(record_lesson, config=args.config, folder=args.out.resolve())
         files = make_missing(
-            make, wanted, lambda lesson: args.out / lesson.path, args.workers, progress
+            make, motions, lambda motion: args.out / motion.path, args.workers, progress
         )
-    # in whichever order tasks were named
-    lessons = healthy([load_episode(file) for file in sorted(files)])
-    seeds = {task: role_seeds(HOURS_SEED, task, "hours", args.healthy(task)) for task in args.shown}
-    trials = [
-        trial
-        for task, own in seeds.items()
-        for trial in nominal_trials(task_spec(task).id, "nominal", own)
-    ]
+    return [load_episode(file) for file in sorted(files)]  # in whichever order tasks were named
+
+
+def record_hours(args: Args, console: Console) -> list[Episode]:
+    """Record the healthy hours of the experts that are missing, and return all in which they succeed."""
+    trials = []
+    for task in args.shown:
+        seeds = role_seeds(HOURS_SEED, task, "hours", args.healthy(task))
+        trials += nominal_trials(task_spec(task).id, "nominal", seeds)
     with stage("healthy hours", console, {}) as progress:
         files = record_missing(trials, args.config, args.out / "hours", args.workers, progress)
-    found = [load_episode(file) for file in files]
+    hours = [load_episode(file) for file in files]
     if args.corpus is not None:
-        found += Corpus.open(args.corpus).episodes(
+        hours += Corpus.open(args.corpus).episodes(
             *NOMINAL_ROLES, policies=("scripted",), tasks=args.shown
         )
-    hours = [episode for episode in found if episode.success]
-    inner: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
+    return [episode for episode in hours if episode.success]
+
+
+def pretrain(args: Args, console: Console) -> NeuralASM:
+    """Record what is missing of training motions and healthy hours; fit, calibrate and save the memory."""
+    motions = healthy(record_motions(args, console))
+    hours = record_hours(args, console)
+    arm: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
     with stage("learning", console, {}) as progress:
-        memory = learn_body(lessons, inner.stream_spec, args.seed, progress)
-    calibrate_body(memory, lessons, hours, args.false_alarms_per_hour)
-    name = args.robot.lower() + (f"_{args.stream_freq}hz" if args.stream_freq else "")
+        memory = learn_body(motions, arm.stream_spec, args.seed, progress)
+    calibrate_body(memory, motions, hours, args.false_alarms_per_hour)
+    name = args.robot.lower()
+    if args.stream_freq:
+        name += f"_{args.stream_freq}hz"
     memory.about = {
         "name": name,
-        "controller": inner.controller,
+        "controller": arm.controller,
         "tasks": list(args.shown),
-        **{n: getattr(args, n) for n in ("reaching", "episodes", "seed", "false_alarms_per_hour")},
-        "lessons": len(lessons.fit),
-        "rows": sum(map(len, lessons.fit)),
-        "hours": sum(len(e) * e.spec.dt for e in [*lessons.whole, *hours]) / 3600,
+        "reaching": args.reaching,
+        "episodes": args.episodes,
+        "seed": args.seed,
+        "false_alarms_per_hour": args.false_alarms_per_hour,
+        "lessons": len(motions.fit),
+        "rows": sum(map(len, motions.fit)),
+        "hours": sum(len(e) * e.spec.dt for e in [*motions.whole, *hours]) / 3600,
         **versions(),
     }
     memory.save(args.out / f"{name}.asm")
     return memory
 
 
-def examined(args: Args, memory: NeuralASM, console: Console) -> list[Marks]:
-    """Record the missing episodes of each exam, and score them; faults happen where a policy or a task is unknown."""
-    marks = []
-    usual: dict[str, float] = {}  # of each task, by its expert, who comes first
-    for exam in args.exams:
-        config = replace(args.config, policy=exam.policy)
-        inner: Any = environment(task_spec(exam.task).id, config.settings).unwrapped
-        kinds = [] if exam.known else [k for k in kinds_of((TEST,)) if possible(k, inner)]
-        trials = exam.trials(args.exam_episodes, kinds, args.seed)
-        with stage(exam.name, console, {}) as progress:
-            files = record_missing(
-                trials, config, args.out / "exams" / exam.policy, args.workers, progress
-            )
+def evaluate(args: Args, memory: NeuralASM, console: Console) -> list[Scores]:
+    """Record the missing episodes of each case, and score them; faults happen where a policy or a task is unknown."""
+    scores = []
+    usual: dict[str, float] = {}  # force in each task, by its expert, who comes first
+    for case in args.cases:
+        config = replace(args.config, policy=case.policy)
+        arm: Any = environment(task_spec(case.task).id, config.settings).unwrapped
+        kinds = []
+        if not case.known:
+            kinds = [kind for kind in kinds_of((TEST,)) if possible(kind, arm)]
+        trials = case.trials(args.exam_episodes, kinds, args.seed)
+        folder = args.out / "exams" / case.policy
+        with stage(case.name, console, {}) as progress:
+            files = record_missing(trials, config, folder, args.workers, progress)
             recordings = [load_episode(file) for file in files]
-            expected = usual.setdefault(exam.task, usual_force(recordings))
-            marks.append(examine(memory, exam.name, recordings, WINDOW_S, expected))
-    return marks
+            force = usual.setdefault(case.task, usual_force(recordings))
+            scores.append(evaluate_case(memory, case.name, recordings, WINDOW_S, force))
+    return scores
 
 
 def babble(args: Args, console: Console) -> None:
-    """Record, learn, examine, and print the results."""
+    """Record, learn, evaluate, and print the results."""
     claim = {n: getattr(args, n) for n in ("robot", "stream_freq", "seed", "reaching")}
     with claimed(args.out, "babble.json", claim):
-        memory = learn(args, console)
-        marks = examined(args, memory, console) if args.exam_episodes else []
-        if marks:
-            own = args.false_alarms_per_hour
-            rates = [*(r for r in PROMISES if r > own), own]
-            thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in rates}
-            tables = card(marks, memory, WINDOW_S), promises_table(marks, thresholds, WINDOW_S)
-            said = f"{summary(marks)}\nWith an adaptive threshold: {summary([m.adapted(own) for m in marks])}"
-            write_text(args.out / "card.md", "\n\n".join([*map(markdown, tables), said]) + "\n")
-            console.print(*tables, said, sep="\n")
+        memory = pretrain(args, console)
+        if args.exam_episodes:
+            publish(args, memory, evaluate(args, memory, console), console)
     console.print(
         f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it"
     )
+
+
+def publish(args: Args, memory: NeuralASM, scores: Sequence[Scores], console: Console) -> None:
+    """Print the scores, and write them to a file."""
+    own = args.false_alarms_per_hour
+    rates = [*(rate for rate in PROMISES if rate > own), own]
+    thresholds = {rate: memory.threshold_at(false_alarms_per_hour=rate) for rate in rates}
+    tables = [
+        scores_table(scores, memory, WINDOW_S),
+        promises_table(scores, thresholds, WINDOW_S),
+    ]
+    adapted = summary([each.adapted(own) for each in scores])
+    result = f"{summary(scores)}\nWith an adaptive threshold: {adapted}"
+    text = "\n\n".join([*map(markdown, tables), result])
+    write_text(args.out / "card.md", text + "\n")
+    console.print(*tables, result, sep="\n")
 
 
 main = partial(run, "babble", Args, babble)

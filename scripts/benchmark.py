@@ -9,6 +9,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, repeat
@@ -18,7 +19,6 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium.vector import VectorEnv
 from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 from rich.console import Console
@@ -41,8 +41,9 @@ from asm_gym.validation import check_number
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.guarding import body_memory
 
-NAMES = "monitor", "safety", "env"
+NAMES = ("monitor", "safety", "env")
 SECOND = 20  # control steps of a second
+NEVER = 1e300  # threshold at which no step is overridden
 PARTS = 10  # parts of a measurement; a ratio's spread is that of the ratios of their medians
 Rivals = dict[str, Callable[[], Any]]
 
@@ -72,7 +73,8 @@ def take_turns(
     for call in rivals.values():
         call()
     seconds: dict[str, list[float]] = {name: [] for name in rivals}
-    order, rng = list(rivals), np.random.default_rng(seed)
+    order = list(rivals)
+    rng = np.random.default_rng(seed)
     for _ in track(range(turns), "measuring", console=console, transient=True):
         rng.shuffle(order)  # the call before decides what the caches hold
         for name in order:
@@ -85,26 +87,28 @@ def take_turns(
 def ratio(seconds: NDArray[np.float64], others: NDArray[np.float64]) -> Spread:
     """Return how many times as long a call takes as another: mean and spread over parts of the measurement."""
     parts = min(PARTS, len(seconds))
-    one, other = (
-        np.array([np.median(p) for p in np.array_split(s, parts)]) for s in (seconds, others)
-    )
-    return Spread.of((one / other).tolist())
+    ratios = [
+        np.median(own) / np.median(other)
+        for own, other in zip(
+            np.array_split(seconds, parts), np.array_split(others, parts), strict=True
+        )
+    ]
+    return Spread.of(ratios)
 
 
 def measure_monitor(args: Args, console: Console) -> Table:
     """Compare one call of ``observe`` with that of a GRU under the same detection, on one thread."""
-    senses = (Channel(f"sense_{k}", 12, noise=0.01, group=f"group_{k}") for k in range(5))
-    spec, rng = (
-        StreamSpec((*senses, Channel("action", 7, group=MOTOR)), dt=0.05),
-        np.random.default_rng(args.seed),
-    )
+    rng = np.random.default_rng(args.seed)
+    senses = [Channel(f"sense_{k}", 12, noise=0.01, group=f"group_{k}") for k in range(5)]
+    spec = StreamSpec((*senses, Channel("action", 7, group=MOTOR)), dt=0.05)
     # enough for all parts
     learned = [Episode.from_stream(rng.normal(size=(60, spec.size)), spec) for _ in range(60)]
     memory = NeuralASM(spec, epochs=1).fit(learned)
     gru = make_monitor("gru+evidence", spec, hidden_size=256).fit(learned[:8])
 
     def observing(monitor: Any, batch: int = 1) -> Callable[[], None]:
-        state, rows = monitor.initial_state(batch), rng.normal(size=(64, batch, spec.size))
+        state = monitor.initial_state(batch)
+        rows = rng.normal(size=(64, batch, spec.size))
 
         def call() -> None:
             nonlocal state
@@ -112,7 +116,8 @@ def measure_monitor(args: Args, console: Console) -> Table:
 
         return call
 
-    many, rival = "neural_asm, each of 64 streams", "gru+evidence"
+    many = "neural_asm, each of 64 streams"
+    rival = "gru+evidence"
     rivals = {
         "neural_asm, one stream": observing(memory),
         many: observing(memory, 64),
@@ -122,9 +127,9 @@ def measure_monitor(args: Args, console: Console) -> Table:
         seconds = take_turns(rivals, 5 * args.steps, args.seed, console)
     seconds[many] /= 64
     rows = []
-    for name, taken in seconds.items():
-        median, slow = np.quantile(taken, (0.5, 0.99)) * 1e6
-        against = f"{ratio(taken, seconds[rival]).text(digits=2)}× {rival}"
+    for name, own in seconds.items():
+        median, slow = np.quantile(own, (0.5, 0.99)) * 1e6
+        against = f"{ratio(own, seconds[rival]).text(digits=2)}× {rival}"
         rows.append((name, f"{median:.3g}", f"{slow:.3g}", against))
     return Table("observe(), 256 hidden units, 60 channels", ("", "µs", "p99", "against"), rows)
 
@@ -142,10 +147,10 @@ def vectors_of(
 
 def stepping(step: Callable[[Any], Any], actions: Iterable[Any]) -> Callable[[], None]:
     """Return a function that takes the steps of the next second."""
-    turns = iter(actions)
+    remaining = iter(actions)
 
     def second() -> None:
-        for action in islice(turns, SECOND):
+        for action in islice(remaining, SECOND):
             step(action)
 
     return second
@@ -154,8 +159,8 @@ def stepping(step: Callable[[Any], Any], actions: Iterable[Any]) -> Callable[[],
 def speeds(name: object, members: int, seconds: dict[str, NDArray[np.float64]]) -> tuple[str, ...]:
     """Return a row: steps a second of all members together, and the first's as a share of each other's."""
     ours, *others = seconds.values()
-    numbers = (f"{SECOND * members / np.median(taken):,.0f}" for taken in seconds.values())
-    return str(name), *numbers, *(ratio(other, ours).text(digits=2) for other in others)
+    rates = [f"{SECOND * members / np.median(own):,.0f}" for own in seconds.values()]
+    return str(name), *rates, *(ratio(other, ours).text(digits=2) for other in others)
 
 
 def observing_steps(env: Any, memory: NeuralASM, count: int) -> Callable[[Any], None]:
@@ -176,33 +181,22 @@ def measure_safety(args: Args, console: Console) -> Table:
     """Compare guarded steps with bare ones, and with those whose rows the memory observes without a guard."""
     rows = []
     turns = max(1, args.steps // SECOND)
-
-    def compare(name: str, count: int, bare: Any, inner: Any) -> None:
-        many = isinstance(inner, VectorEnv)
-        spec = inner.get_attr("stream_spec")[0] if many else StreamSource(inner).spec
-        memory = body_memory(inner, spec).with_threshold(1e300)  # no step is overridden
-        guard: Any = VectorNeuralASMSafety if many else NeuralASMSafety
-        guarded = guard(inner, memory)
-        steps = {
-            "guarded": guarded.step,
-            "memory alone": observing_steps(bare, memory, count),
-            "bare": bare.step,
-        }
-        action = np.zeros(bare.action_space.shape, np.float32)
-        for env in (guarded, bare):
-            env.reset(seed=args.seed)
-        rivals = {each: stepping(step, repeat(action)) for each, step in steps.items()}
-        rows.append(speeds(name, count, take_turns(rivals, turns, args.seed, console)))
-
     for rate, name in ((None, "one environment"), (100, "one, its stream at 100 Hz")):
-        bare, inner = _made(args.task, rate), _made(args.task, rate)
-        compare(name, 1, bare, inner)
-        bare.close()
-        inner.close()
-    envs = [[_made(args.task) for _ in range(max(args.members))] for _ in range(2)]
-    alone, watched = (vectors_of(own, args.members) for own in envs)
-    for n, within in watched.items():
-        compare(f"vector of {n}", n, alone[n], within)
+        with closing(_made(args.task, rate)) as bare, closing(_made(args.task, rate)) as inner:
+            memory = body_memory(inner, StreamSource(inner).spec).with_threshold(NEVER)
+            guarded = NeuralASMSafety(inner, memory)
+            rivals = _guarded_rivals(guarded, bare, memory, 1, args.seed)
+            rows.append(speeds(name, 1, take_turns(rivals, turns, args.seed, console)))
+
+    most = max(args.members)
+    alone = vectors_of([_made(args.task) for _ in range(most)], args.members)
+    watched = vectors_of([_made(args.task) for _ in range(most)], args.members)
+    for n, vector in watched.items():
+        memory = body_memory(vector, vector.get_attr("stream_spec")[0]).with_threshold(NEVER)
+        wrapped = VectorNeuralASMSafety(vector, memory)
+        rivals = _guarded_rivals(wrapped, alone[n], memory, n, args.seed)
+        seconds = take_turns(rivals, turns, args.seed, console)
+        rows.append(speeds(f"vector of {n}", n, seconds))
     headings = (
         "",
         "guarded",
@@ -212,6 +206,19 @@ def measure_safety(args: Args, console: Console) -> Table:
         "guarded / bare",
     )
     return Table(f"Control steps of {args.task} a second, shipped memory", headings, rows)
+
+
+def _guarded_rivals(guarded: Any, bare: Any, memory: NeuralASM, count: int, seed: int) -> Rivals:
+    """Return a second of ``count`` environments: guarded, bare, and bare with a memory that observes."""
+    steps = {
+        "guarded": guarded.step,
+        "memory alone": observing_steps(bare, memory, count),
+        "bare": bare.step,
+    }
+    action = np.zeros(bare.action_space.shape, np.float32)
+    for env in (guarded, bare):
+        env.reset(seed=seed)
+    return {name: stepping(step, repeat(action)) for name, step in steps.items()}
 
 
 def physics_alone(
@@ -224,14 +231,17 @@ def physics_alone(
     """
     simulations = [env.get_wrapper_attr("simulation") for env in envs]
     models = [simulation.model for simulation in simulations]
-    size = mujoco.mj_stateSize(models[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    size = mujoco.mj_stateSize(models[0], kind)
     recorded = []
     for start in range(0, len(actions), SECOND):
-        states, warm, controls = [], [], []
-        for i, (env, simulation) in enumerate(zip(envs, simulations, strict=True)):
-            data, torques = simulation.data, []  # type: Any, list[NDArray[np.float64]]
-            states.append(np.empty(size))
-            mujoco.mj_getState(models[i], data, states[i], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        states = np.empty((len(envs), size))
+        warm = []
+        controls = []
+        for i, env in enumerate(envs):
+            data = simulations[i].data
+            torques: list[NDArray[np.float64]] = []  # of each step of physics
+            mujoco.mj_getState(models[i], data, states[i], kind)
             warm.append(data.qacc_warmstart.copy())
             hooks = env.get_wrapper_attr("substep_hooks")
             hooks.append(lambda _, data=data, torques=torques: torques.append(data.ctrl.copy()))
@@ -239,34 +249,37 @@ def physics_alone(
                 env.step(action)
             hooks.clear()
             controls.append(torques)
-        recorded.append([np.array(part) for part in (states, controls, warm)])
-    turns, threads = iter(recorded), min(cores(), len(envs))
-    pool, data = (
-        Rollout(nthread=threads if threads > 1 else 0),
-        [mujoco.MjData(models[0]) for _ in range(threads)],
-    )
+        recorded.append((states, np.array(controls), np.array(warm)))
+    remaining = iter(recorded)
+    threads = min(cores(), len(envs))
+    pool = Rollout(nthread=threads if threads > 1 else 0)
+    buffers = [mujoco.MjData(models[0]) for _ in range(threads)]
 
     def second() -> None:
-        states, controls, warm = next(turns)
-        pool.rollout(models, data, states, controls, initial_warmstart=warm)
+        states, controls, warm = next(remaining)
+        pool.rollout(models, buffers, states, controls, initial_warmstart=warm)
 
     return second
 
 
 def measure_env(args: Args, console: Console) -> Table:
     """Compare vectors with MuJoCo's own threads, which simulate the same motion alone, and with robosuite's step."""
-    rows, turns = [], max(1, args.steps // SECOND)
+    rows = []
+    turns = max(1, args.steps // SECOND)
     envs = [_made(args.task) for _ in range(max(args.members))]
-    robosuite, robots = import_robosuite(), ["Panda"] * task_spec(args.task).arms
-    control = [robosuite.load_composite_controller_config(robot=robot) for robot in robots]
-    blind = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
+    robosuite = import_robosuite()
+    robots = ["Panda"] * task_spec(args.task).arms
     theirs = robosuite.make(
         args.task,
         robots,
-        controller_configs=control,
+        controller_configs=[
+            robosuite.load_composite_controller_config(robot=robot) for robot in robots
+        ],
         reward_shaping=True,
         ignore_done=True,
-        **blind,
+        has_renderer=False,
+        has_offscreen_renderer=False,
+        use_camera_obs=False,
     )
     for n, ours in vectors_of(envs, args.members).items():
         rng = np.random.default_rng(args.seed)
@@ -302,15 +315,15 @@ BENCHMARKS = {"monitor": measure_monitor, "safety": measure_safety, "env": measu
 def measure(args: Args, console: Console) -> None:
     """Print a table for each benchmark and write them to a file."""
     args.out.mkdir(parents=True, exist_ok=True)
-    texts = []
     machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+    tables = []
     for name in args.what:
         table = BENCHMARKS[name](args, console)
         table = replace(table, caption=f"{table.caption}. {machine}; ±: spread over {PARTS} parts.")
         console.print(table)
-        texts.append(markdown(table))
+        tables.append(markdown(table))
     file = args.out / "benchmark.md"
-    write_text(file, "\n\n".join(texts) + "\n")
+    write_text(file, "\n\n".join(tables) + "\n")
     console.print(f"Wrote {file}")
 
 

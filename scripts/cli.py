@@ -27,6 +27,8 @@ COMMANDS = {
     "benchmark": "measure speeds as ratios against named rivals",
 }
 
+MODULES = {"inspect": "inspect_log"}  # modules with another name than their command
+
 
 def usage(prog: str, lines: dict[str, str], *notes: str) -> str:
     """Return the help of a command that has parts, a line for each part."""
@@ -37,7 +39,9 @@ def usage(prog: str, lines: dict[str, str], *notes: str) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit code, as ``asm_gym.scripts.command`` lists them."""
-    name, *rest = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if argv is None:
+        argv = sys.argv[1:]
+    name, *rest = argv or ["--help"]
     if name == "--version":
         print(f"asm-gym {__version__}")
         return DONE
@@ -48,9 +52,8 @@ def main(argv: list[str] | None = None) -> int:
     def work() -> int:
         check_choice("command", name, COMMANDS)
         with needed_for("this command"):
-            module: Any = import_module(
-                "asm_gym.scripts." + ("inspect_log" if name == "inspect" else name)
-            )
+            module: Any = import_module(f"asm_gym.scripts.{MODULES.get(name, name)}")
         return module.main(rest)
 
-    return exit_code(name if name in COMMANDS else "", work)
+    known = name if name in COMMANDS else ""
+    return exit_code(known, work)

@@ -15,9 +15,9 @@ from rich.console import Console
 
 from asm_gym.data.episode import load_episode
 from asm_gym.data.minari_datasets import require_minari, write_dataset
-from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
+from asm_gym.rollouts.run_trials import check, collect_to
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import Options, option, run
@@ -53,14 +53,17 @@ def dataset_id(task: str, policy: str) -> str:
 def collect(args: Args, console: Console) -> None:
     """Record the episodes that are missing, and write the dataset of all."""
     require_minari()
-    task, config = env_id(args.task), RolloutConfig(args.policy, args.robot)
-    settings, name = dict(config.settings), dataset_id(args.task, args.policy)
+    task = env_id(args.task)
+    config = RolloutConfig(args.policy, args.robot)
+    settings = dict(config.settings)
+    name = dataset_id(args.task, args.policy)
     check(task, config)
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
         with stage("recording", console, {}) as progress:
-            seeds, workers = episode_seeds(args.seed, args.episodes), args.workers
-            files = collect_to(args.out / "episodes", task, config, seeds, workers, progress)
+            folder = args.out / "episodes"
+            seeds = episode_seeds(args.seed, args.episodes)
+            files = collect_to(folder, task, config, seeds, args.workers, progress)
         episodes = [load_episode(file) for file in files]
         kept = [e for e in episodes if e.success or not args.only_successful]
         if not kept:
@@ -69,9 +72,10 @@ def collect(args: Args, console: Console) -> None:
             )
         details = {"algorithm_name": args.policy, "versions": versions(), "settings": settings}
         with closing(gym.make(task, **settings)) as env:
-            folder = write_dataset(args.out, name, kept, env, details)
-    steps, solved = sum(map(len, kept)), sum(e.success for e in kept)
-    console.print(f"{len(kept)} episodes, {steps} steps, {solved} successful: {folder}")
+            dataset = write_dataset(args.out, name, kept, env, details)
+    steps = sum(map(len, kept))
+    successful = sum(episode.success for episode in kept)
+    console.print(f"{len(kept)} episodes, {steps} steps, {successful} successful: {dataset}")
     console.print(f"MINARI_DATASETS_PATH={args.out} lets minari.load_dataset({name!r}) find it")
 
 

@@ -21,7 +21,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, make_dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
@@ -35,15 +35,11 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Args = TypeVar("Args")
-DONE, BAD_NEWS, REFUSED = 0, 1, 2
+DONE = 0
+BAD_NEWS = 1
+REFUSED = 2
 # errors that a user can put right
-USAGE_ERRORS = (
-    ValueError,
-    TypeError,
-    OSError,
-    ImportError,
-    gym.error.Error,
-)
+USAGE_ERRORS = (ValueError, TypeError, OSError, ImportError, gym.error.Error)
 MOST_NAMES = 7  # that the help of an option lists; a wrong name lists all
 _SAME: Any = object()
 _ANNOTATED: Any = Annotated
@@ -63,14 +59,21 @@ def option(
     least: float | None = None,  # lowest number, or the least length of a tuple
     # names that the help lists; no others are accepted, unless ``check`` decides
     known: Iterable[str] = (),
-    check: Callable[[Any], object]
-    | None = None,  # raises for a value, or an element of a tuple, that is not accepted
+    # raises for a value, or an element of a tuple, that is not accepted
+    check: Callable[[Any], object] | None = None,
     metavar: str = "",  # placeholder of the value in the help
     positional: bool = False,  # whether the option is given without its name
 ) -> T:
     """Return a dataclass field that is an option of a command; without a default it is required."""
-    about = {"quick": quick, "least": least, "known": known, "check": check}
-    return field(default=default, metadata={**about, "metavar": metavar, "positional": positional})
+    metadata = {
+        "quick": quick,
+        "least": least,
+        "known": known,
+        "check": check,
+        "metavar": metavar,
+        "positional": positional,
+    }
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -79,21 +82,31 @@ class Checked:
 
     def __post_init__(self) -> None:
         for each in fields(self):
-            value, about = getattr(self, each.name), each.metadata
+            value = getattr(self, each.name)
             if value is None:
                 continue
-            if (least := about.get("least")) is not None:
-                many = isinstance(value, Sequence)
-                name, number = (
-                    (f"the number of {each.name}", len(value)) if many else (each.name, value)
-                )
-                if not number >= least:
-                    raise ValueError(f"{name} must be at least {least:g}, got {number}")
-            for one in value if isinstance(value, tuple) else (value,):
-                if check := about.get("check"):
-                    check(one)
-                elif known := about.get("known"):
-                    check_choice(each.name.removesuffix("s").replace("_", " "), one, known)
+            _check_least(each, value)
+            check = each.metadata.get("check")
+            known = each.metadata.get("known")
+            elements = value if isinstance(value, tuple) else (value,)
+            for element in elements:
+                if check:
+                    check(element)
+                elif known:
+                    check_choice(each.name.removesuffix("s").replace("_", " "), element, known)
+
+
+def _check_least(option: Field[Any], value: Any) -> None:
+    """Raise ValueError where a number is too small, or a tuple or string too short."""
+    least = option.metadata.get("least")
+    if least is None:
+        return
+    name = option.name
+    if isinstance(value, Sequence):
+        name = f"the number of {name}"
+        value = len(value)
+    if not value >= least:
+        raise ValueError(f"{name} must be at least {least:g}, got {value}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,18 +130,18 @@ def parse(name: str, kind: type[Args], argv: Sequence[str] | None = None) -> Arg
 
     args = list(sys.argv[1:] if argv is None else argv)
     text = inspect.cleandoc(sys.modules[kind.__module__].__doc__ or "").replace("`", "")
-    named = [
-        each.name.replace("_", "-")
-        for each in fields(cast(Any, kind))
-        if not each.metadata.get("positional")
-    ]
-    options = [f"--{name}" for name in (*named, "help")]
+    named = [each for each in fields(cast(Any, kind)) if not each.metadata.get("positional")]
+    options = ["--" + each.name.replace("_", "-") for each in named] + ["--help"]
     for word in args:
         if word.startswith("--") and not word.startswith("--tyro-"):
             check_choice("option", word.partition("=")[0].replace("_", "-"), options)
-    flags = (tyro.conf.FlagCreatePairsOff,)
-    readable = _readable(kind, "--quick" in args)
-    typed = tyro.cli(readable, args=args, prog=f"asm-gym {name}", description=text, config=flags)
+    typed = tyro.cli(
+        _readable(kind, "--quick" in args),
+        args=args,
+        prog=f"asm-gym {name}",
+        description=text,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
     return kind(**vars(typed))
 
 
@@ -138,36 +151,44 @@ def _readable(kind: type[Any], quick: bool) -> Any:
 
     hints: dict[str, Any] = get_type_hints(kind, include_extras=True)
     marks: Any = tyro.conf
-    made: list[Any] = []
+    annotated: list[Any] = []
     for each in fields(kind):
-        about, hint = each.metadata, hints[each.name]
+        about = each.metadata
         shown = marks.arg(metavar=about.get("metavar") or None, help_behavior_hint=_hint(about))
-        hint = _ANNOTATED[hint, shown]
-        hint = marks.Positional[hint] if about.get("positional") else hint
-        default = (
-            about["quick"] if quick and about.get("quick", _SAME) is not _SAME else each.default
-        )
-        made.append(
-            (each.name, hint, field(default=tyro.MISSING if default is MISSING else default))
-        )
+        hint = _ANNOTATED[hints[each.name], shown]
+        if about.get("positional"):
+            hint = marks.Positional[hint]
+        default = each.default
+        if quick and about.get("quick", _SAME) is not _SAME:
+            default = about["quick"]
+        elif default is MISSING:
+            default = tyro.MISSING
+        annotated.append((each.name, hint, field(default=default)))
     unchecked = {"__post_init__": lambda self: None}
-    return make_dataclass(kind.__name__, made, bases=(kind,), frozen=True, namespace=unchecked)
+    return make_dataclass(kind.__name__, annotated, bases=(kind,), frozen=True, namespace=unchecked)
 
 
 def _hint(about: Any) -> Callable[[str], str]:
     """Return what the help says after an option's text: known names, its default and its quick value."""
 
     def hint(default: str) -> str:
-        names, quick = [*about.get("known", ())], about.get("quick", _SAME)
-        more = ", …" if len(names) > MOST_NAMES else ""
-        parts = [f"known: {', '.join(names[:MOST_NAMES])}{more}"] if names else []
-        if default not in ("", "None", "True", "False"):
-            parts.append("required" if default == "(required)" else f"default: {default}")
+        parts = []
+        names = list(about.get("known", ()))
+        if names:
+            listed = ", ".join(names[:MOST_NAMES])
+            parts.append(f"known: {listed}" + ", …" * (len(names) > MOST_NAMES))
+        if default == "(required)":
+            parts.append("required")
+        elif default not in ("", "None", "True", "False"):
+            parts.append(f"default: {default}")
+        quick = about.get("quick", _SAME)
+        if isinstance(quick, tuple):
+            quick = " ".join(map(str, quick))
         if quick is not _SAME:
-            parts.append(
-                f"--quick: {' '.join(map(str, quick)) if isinstance(quick, tuple) else quick}"
-            )
-        return f"({'; '.join(parts)})" if parts else ""
+            parts.append(f"--quick: {quick}")
+        if not parts:
+            return ""
+        return f"({'; '.join(parts)})"
 
     return hint
 
@@ -213,11 +234,10 @@ def exit_code(name: str, work: Callable[[], int | None]) -> int:
 
 def origin() -> dict[str, str]:
     """Return how to make a report again: the whole command, the version, and when it was made."""
-    made = datetime.now(UTC).astimezone().isoformat(timespec="seconds")
     return {
         "command": shlex.join(["asm-gym", *sys.argv[1:]]),
         "version": f"asm-gym {__version__}",
-        "date": made,
+        "date": datetime.now(UTC).astimezone().isoformat(timespec="seconds"),
     }
 
 
@@ -228,7 +248,7 @@ def one_line(error: BaseException) -> str:
     head, *rest = [line.strip() for line in str(error).splitlines() if line.strip()] or [
         type(error).__name__
     ]
-    return " ".join([head, "; ".join(rest)]) if rest else head
+    return f"{head} {'; '.join(rest)}".strip()
 
 
 @contextmanager

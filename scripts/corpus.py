@@ -11,7 +11,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from asm_gym.rollouts.corpus import CLAIM, PARTS, QUICK, ROUNDS, VERSION, Corpus, record_corpus
+from asm_gym.rollouts.detection_corpus import (
+    CLAIM,
+    PARTS,
+    QUICK,
+    ROUNDS,
+    VERSION,
+    Corpus,
+    record_corpus,
+)
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
 from asm_gym.scripts.command import Options, option, run
@@ -34,16 +42,19 @@ class Args(Options):
 
 def make(args: Args, console: Console) -> None:
     """Record what is missing, part by part, and print how much there is."""
-    sources, total = (QUICK, 1) if args.quick else (PARTS, ROUNDS)
+    sources = PARTS
+    total = ROUNDS
+    if args.quick:
+        sources = QUICK
+        total = 1
     with claimed(args.out, CLAIM, {"corpus": VERSION, "quick": args.quick}):
         for part in args.part:
             for number in range(min(args.rounds, total)):
                 with stage(f"{part}, round {number + 1}", console, {}) as progress:
                     record_corpus(args.out, sources[part], number, total, args.workers, progress)
     files = Corpus.open(args.out).files
-    console.print(
-        f"Corpus {VERSION} in {args.out}: {len(files)} episodes, {(files.role != 'faulty').sum()} healthy"
-    )
+    healthy = (files.role != "faulty").sum()
+    console.print(f"Corpus {VERSION} in {args.out}: {len(files)} episodes, {healthy} healthy")
 
 
 main = partial(run, "corpus", Args, make)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -27,12 +28,12 @@ from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import tabulate
 from asm_gym.faults import Collision, Fault, FrozenEncoder, Push, WeakJoint
 from asm_gym.monitors import NeuralASM
-from asm_gym.rollouts.collect import collect, watch_pair
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import versions
+from asm_gym.rollouts.run_trials import collect, watch_pair
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig, Trial
+from asm_gym.rollouts.trial import RolloutConfig, Trial, task_in
 from asm_gym.scripts.command import Options, option, origin, run
 from asm_gym.tasks import TASKS, env_id
 
@@ -65,55 +66,61 @@ class Args(Options):
     """Training passes over the episodes."""
 
 
-def faults(seed: int, episodes: int) -> list[tuple[str, Fault]]:
-    """Return ``episodes`` faults of each kind, with random joints and directions.
+def faults(seed: int, episodes: int) -> dict[str, list[Fault]]:
+    """Return ``episodes`` faults of each kind by its name, with random joints and directions.
 
     Onsets fall between 0.5 s and 2.3 s, while the arm is on its way.
     """
     rng = np.random.default_rng([seed, 7])
-    made: dict[str, list[Fault]] = {
-        "frozen encoder": [],
-        "push": [],
-        "weak joint": [],
-        "collision": [],
-    }
+    frozen: list[Fault] = []
+    pushes: list[Fault] = []
+    weak: list[Fault] = []
+    collisions: list[Fault] = []
     for _ in range(episodes):
         onset = int(rng.integers(10, 46))
         direction = rng.standard_normal(3)
-        x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
-        made["push"].append(
+        x, y, z = (direction / np.linalg.norm(direction)).tolist()
+        pushes.append(
             Push(body=PUSHED, newtons=20.0, direction=(x, y, z), onset=onset, duration=10)
         )
-        made["weak joint"].append(WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset))
-        made["frozen encoder"].append(FrozenEncoder(joint=int(rng.integers(7)), onset=onset))
-        made["collision"].append(Collision(onset=onset, duration=20))
-    return [(name, fault) for name, kind in made.items() for fault in kind]
+        weak.append(WeakJoint(joint=int(rng.integers(7)), strength=0.5, onset=onset))
+        frozen.append(FrozenEncoder(joint=int(rng.integers(7)), onset=onset))
+        collisions.append(Collision(onset=onset, duration=20))
+    return {
+        "frozen encoder": frozen,
+        "push": pushes,
+        "weak joint": weak,
+        "collision": collisions,
+    }
 
 
 def trials(args: Args) -> list[Trial]:
     """Return every episode to test on."""
+    env = env_id(args.task)
+    nominal = args.nominal_episodes
     broken = faults(args.seed, args.faulty_episodes)
-    seeds = episode_seeds(args.seed, args.nominal_episodes + len(broken), stage=2)
-    cases = [(NOMINAL, ())] * args.nominal_episodes + [(name, (fault,)) for name, fault in broken]
-    return [
-        Trial(env_id(args.task), seed, name, faults=faulty, acting=args.on_alarm)
-        for (name, faulty), seed in zip(cases, seeds, strict=True)
+    seeds = iter(episode_seeds(args.seed, nominal + len(broken) * args.faulty_episodes, stage=2))
+    trials = [
+        Trial(env, seed, NOMINAL, faults=(), acting=args.on_alarm)
+        for seed in islice(seeds, nominal)
     ]
+    for name, kind in broken.items():
+        for fault, seed in zip(kind, seeds, strict=False):
+            trials.append(Trial(env, seed, name, faults=(fault,), acting=args.on_alarm))
+    return trials
 
 
 def fit(args: Args, console: Console) -> tuple[Path, Share]:
     """Fit, calibrate and save a memory of the task; return its file and how often the expert succeeded."""
+    env = env_id(args.task)
+    count = args.fit_episodes + args.calibration_episodes
     with stage("collecting nominal episodes", console, {}) as progress:
-        count = args.fit_episodes + args.calibration_episodes
-        episodes = collect(
-            env_id(args.task), "scripted", count, args.seed, args.workers, progress=progress
-        )
+        episodes = collect(env, "scripted", count, args.seed, args.workers, progress=progress)
     memory = NeuralASM(episodes[0].spec, epochs=args.epochs, seed=args.seed)
     with stage("learning", console, {}) as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
     memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=FALSE_ALARM_RATE)
-    name = env_id(args.task).rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
-    file = args.out / f"{name}.asm"
+    file = args.out / f"{task_in(env).lower()}.asm"
     memory.save(file)
     return file, Share.of([e.success for e in episodes])
 
@@ -122,12 +129,10 @@ def demonstrate(args: Args, console: Console) -> None:
     """Run the demo."""
     args.out.mkdir(parents=True, exist_ok=True)
     memory, expert = fit(args, console)
-    todo = trials(args)
+    work = partial(watch_pair, config=RolloutConfig(), memory=memory)
     with stage("testing, policy alone and wrapped", console, {}) as progress:
-        work = partial(watch_pair, config=RolloutConfig(), memory=memory)
-        traces = [
-            trace for pair in parallel_map(work, todo, args.workers, progress) for trace in pair
-        ]
+        pairs = parallel_map(work, trials(args), args.workers, progress)
+    traces = [trace for pair in pairs for trace in pair]
     rows = by_condition(traces, WINDOW_S)
     title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
     table = tabulate(title, CONDITION_COLUMNS, rows)
@@ -138,19 +143,19 @@ def demonstrate(args: Args, console: Console) -> None:
         f"nominal episodes raise an alarm by chance (95 %). The expert succeeded in {expert.k} of {expert.n} episodes."
     )
     console.print(result)
-    examples = [typical(m.watched) for m in rows]
-    details = origin() | asdict(args) | versions("numba") | {"window_s": WINDOW_S}
-    drawn = {
-        "Surprise over time in a typical episode of each condition": figures.surprise_figure(
-            examples
-        )
-    }
-    intro = (
-        f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
-        f"watched others, some of them faulty. {result}"
-    )
+    figure = figures.surprise_figure([typical(condition.watched) for condition in rows])
     report = args.out / "report.html"
-    write_report(report, f"asm-gym demo: {args.task}", intro, [table], drawn, details)
+    write_report(
+        report,
+        title=f"asm-gym demo: {args.task}",
+        intro=(
+            f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
+            f"watched others, some of them faulty. {result}"
+        ),
+        tables=[table],
+        drawn={"Surprise over time in a typical episode of each condition": figure},
+        details=origin() | asdict(args) | versions("numba") | {"window_s": WINDOW_S},
+    )
     console.print(f"Wrote {report} and {memory}")
 
 

@@ -48,49 +48,66 @@ class Check(NamedTuple):
     remedy: str = ""  # command that puts it right; empty where nothing is wrong
     needed: bool = False  # without it asm-gym does not run; else only a part of it, such as video
 
+    @property
+    def state(self) -> str:
+        """The state in a word, with its colour."""
+        if not self.remedy:
+            return "[green]ok"
+        if self.needed:
+            return "[red]needed"
+        return "[yellow]optional"
+
 
 def run_checks() -> list[Check]:
     """Return every check, in the order in which one remedy helps the next."""
+    return [*map(package, PACKAGES), cache(), rendering()]
+
+
+def rendering() -> Check:
+    """Check whether MuJoCo can draw, for video."""
     backend = rendering_backend()
-    return [
-        *map(package, PACKAGES),
-        cache(),
-        Check(
-            "rendering",
-            f"MUJOCO_GL={backend}" if backend else "no video",
-            "" if backend else GET_RENDERING,
-        ),
-    ]
+    if backend is None:
+        return Check("rendering", "no video", GET_RENDERING)
+    return Check("rendering", f"MUJOCO_GL={backend}")
 
 
 def package(name: str) -> Check:
     """Check the installed version of a package against the range that asm-gym asks for."""
-    extra = BROUGHT_BY.get(module := name.replace("-", "_"), "")
+    module = name.replace("-", "_")
+    extra = BROUGHT_BY.get(module, "")
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        return Check(
-            name, "not installed", remedy(module) if extra else REINSTALL, needed=not extra
-        )
-    asked = [r for r in map(Requirement, metadata.requires("asm-gym") or []) if r.name == name]
-    wanted = next(
-        (r.specifier for r in asked if not r.marker or r.marker.evaluate({"extra": extra})),
-        SpecifierSet(),
-    )
-    if name in TESTED and not TESTED[name].contains(version, prereleases=True):
+        if extra:
+            return Check(name, "not installed", remedy(module))
+        return Check(name, "not installed", REINSTALL, needed=True)
+
+    def fits(versions: SpecifierSet) -> bool:
+        return versions.contains(version, prereleases=True)
+
+    if name in TESTED and not fits(TESTED[name]):
         return Check(name, f"{version}, but needs {TESTED[name]}", fitting(name), needed=True)
-    if (
-        name == "pyarrow"
-        and Version(version).major >= 26
-        and Version(metadata.version("numpy")).major < 2
-    ):
-        # pip does not know
+    if name == "pyarrow" and needs_numpy_2(version):
         return Check(name, f"{version}, but needs NumPy 2", "pip install 'pyarrow<26'")
-    if wanted.contains(version, prereleases=True):
-        return Check(name, version)
-    return Check(
-        name, f"{version}, but needs {wanted}", f"pip install '{name}{wanted}'", needed=True
-    )
+    wanted = asked_for(name, extra)
+    if not fits(wanted):
+        install = f"pip install '{name}{wanted}'"
+        return Check(name, f"{version}, but needs {wanted}", install, needed=True)
+    return Check(name, version)
+
+
+def asked_for(name: str, extra: str) -> SpecifierSet:
+    """Return the versions of a package that asm-gym with an extra asks for; any where it asks for none."""
+    for requirement in map(Requirement, metadata.requires("asm-gym") or []):
+        marker = requirement.marker
+        if requirement.name == name and (marker is None or marker.evaluate({"extra": extra})):
+            return requirement.specifier
+    return SpecifierSet()
+
+
+def needs_numpy_2(pyarrow: str) -> bool:
+    """Return whether this version of pyarrow needs another NumPy than is installed, which pip does not know."""
+    return Version(pyarrow).major >= 26 and Version(metadata.version("numpy")).major < 2
 
 
 def cache() -> Check:
@@ -112,29 +129,23 @@ def cache() -> Check:
 
 def report(args: Args, console: Console) -> int:
     """Print the table and its verdict; return the exit code."""
-    table, checks = Table("check", "state", "found"), run_checks()
+    checks = run_checks()
+    table = Table("check", "state", "found")
     for check in checks:
-        state = (
-            "[green]ok"
-            if not check.remedy
-            else "[red]needed"
-            if check.needed
-            else "[yellow]optional"
-        )
-        table.add_row(check.name, state, escape(check.found))
-    missing = [check for check in checks if check.remedy]
+        table.add_row(check.name, check.state, escape(check.found))
     console.print(table)
+    missing = [check for check in checks if check.remedy]
     for check in missing:  # whole lines, to be copied
-        console.print(
-            f"{check.name}: {check.remedy}", markup=False, highlight=False, soft_wrap=True
-        )
+        line = f"{check.name}: {check.remedy}"
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     if any(check.needed for check in missing):
         console.print("[red]asm-gym cannot run here yet:[/] follow the lines above, from the top.")
         return BAD_NEWS
-    names = escape(", ".join(check.name for check in missing))
-    console.print(
-        f"asm-gym runs here, without {names}." if missing else "[green]Everything is here."
-    )
+    if missing:
+        names = ", ".join(check.name for check in missing)
+        console.print(f"asm-gym runs here, without {escape(names)}.")
+    else:
+        console.print("[green]Everything is here.")
     return DONE
 
 

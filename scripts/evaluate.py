@@ -8,10 +8,10 @@ from __future__ import annotations
 import json
 import math
 import platform
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 from rich.console import Console
@@ -25,11 +25,11 @@ from asm_gym.faults import anywhere
 from asm_gym.faults.suite import SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.monitor_registry import check_monitor_name
-from asm_gym.rollouts.collect import record_missing
-from asm_gym.rollouts.corpus import SKILLS, VERSION, skill_files
+from asm_gym.rollouts.detection_corpus import SKILLS, VERSION, skill_files
 from asm_gym.rollouts.parallel import parallel_map
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
+from asm_gym.rollouts.run_trials import record_missing
 from asm_gym.rollouts.trial import RolloutConfig, Trial, evaluation_trials
 from asm_gym.scripts.command import Options, one_line, option, origin, run
 from asm_gym.stream_source import StreamSource
@@ -39,8 +39,12 @@ from asm_gym.validation import check_choice, check_number
 ROLES = ("fit", "calibration", "nominal", "faulty")
 
 _QUICK = (
-    *("neural_asm", "association_linear+evidence", "kalman+evidence"),
-    *("logpzo", "external_torque_limit", "force_limit"),
+    "neural_asm",
+    "association_linear+evidence",
+    "kalman+evidence",
+    "logpzo",
+    "external_torque_limit",
+    "force_limit",
 )
 """Monitors that are fitted in seconds."""
 
@@ -88,15 +92,16 @@ class Args(Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.elsewhere and len(self.tasks) > 1:
-            raise ValueError(
-                f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}"
-            )
-        if self.steps is not None and not self.elsewhere:
-            raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
-        for name in self.faults if self.elsewhere else ():
-            check_choice("kind of fault", name, anywhere.KINDS)
-        if not self.elsewhere:
+        if self.elsewhere:
+            if len(self.tasks) > 1:
+                raise ValueError(
+                    f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}"
+                )
+            for name in self.faults:
+                check_choice("kind of fault", name, anywhere.KINDS)
+        else:
+            if self.steps is not None:
+                raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")
             kinds_of(self.faults)
         if self.faulty_episodes > self.nominal_episodes:
             raise ValueError(
@@ -122,53 +127,59 @@ class Args(Options):
     @property
     def elsewhere(self) -> bool:
         """Whether the environment is not one of robosuite's tasks."""
-        return not all(
-            name.removeprefix("asm_gym/").removesuffix("-v0") in TASKS for name in self.tasks
-        )
+        names = {name.removeprefix("asm_gym/").removesuffix("-v0") for name in self.tasks}
+        return not names <= set(TASKS)
 
     @property
     def config(self) -> RolloutConfig:
         """How episodes are made."""
         if not self.elsewhere:
             return RolloutConfig(self.policy, self.robot)
-        return RolloutConfig(
-            self.policy, env_kwargs=(("max_episode_steps", self.steps),) if self.steps else ()
-        )
+        if self.steps:
+            return RolloutConfig(self.policy, env_kwargs=(("max_episode_steps", self.steps),))
+        return RolloutConfig(self.policy)
 
 
 def without_unfit_monitors(args: Args, console: Console) -> Args:
     """Leave out the monitors that cannot watch the environment, and say which. Raises ValueError for all of them."""
     if not args.elsewhere:
         return args
-    env = gym.make(env_id(args.tasks[0]), **dict(args.config.settings))
-    spec, refused = StreamSource(env).spec, {}
-    env.close()
+    with closing(gym.make(env_id(args.tasks[0]), **dict(args.config.settings))) as env:
+        spec = StreamSource(env).spec
+    fit = []
+    reasons = []
     for name in args.monitors:
         try:
             make_monitor(name, spec)
+            fit.append(name)
         except ValueError as error:
-            refused[name] = one_line(error)
-            console.print(f"{name} is left out: {refused[name]}", highlight=False)
-    if len(refused) == len(args.monitors):
-        raise ValueError(f"no monitor can watch this: {next(iter(refused.values()))}")
-    return replace(args, monitors=tuple(m for m in args.monitors if m not in refused))
+            reasons.append(one_line(error))
+            console.print(f"{name} is left out: {reasons[-1]}", highlight=False)
+    if not fit:
+        raise ValueError(f"no monitor can watch this: {reasons[0]}")
+    return replace(args, monitors=tuple(fit))
 
 
 def trials_of(args: Args, task: str) -> list[Trial]:
     """Return every trial of a task."""
     return evaluation_trials(
-        env_id(task), task, args.config, args.episodes, args.faults, args.severities, args.seed
+        env_id(task),
+        task,
+        args.config,
+        args.episodes,
+        faults=args.faults,
+        severities=args.severities,
+        seed=args.seed,
     )
 
 
 def evaluate(args: Args, console: Console) -> None:
     """Record, fit, judge and publish; print the tables in brief."""
     args = without_unfit_monitors(args, console)
-    workers, seconds = args.workers, dict[str, float]()
+    seconds: dict[str, float] = {}  # of each stage
     timed = partial(stage, console=console, seconds=seconds)
-    claim: dict[str, Any] = {
-        name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")
-    }
+    claim = {name: getattr(args, name) for name in ("robot", "policy", "seed", "steps")}
+    trials = []
     if args.corpus is not None:
         files = skill_files(args.corpus, args.fit_episodes, args.tasks)
         claim["corpus"] = VERSION
@@ -176,21 +187,23 @@ def evaluate(args: Args, console: Console) -> None:
         trials = [trial for task in args.tasks for trial in trials_of(args, task)]
         files = [args.out / trial.label.path for trial in trials]
     with claimed(args.out, "recordings.json", claim):
-        if args.corpus is None:
+        if trials:
             with timed("recording") as progress:
-                record_missing(trials, args.config, args.out, workers, progress)
+                record_missing(trials, args.config, args.out, args.workers, progress)
         with timed("fitting and judging") as progress:
-            each = partial(parallel_map, workers=workers, progress=progress)
-            how = args.false_alarm_rate, WINDOW_S, args.seed
-            result = benchmark(args.out, files, args.monitors, *how, each)
+            result = benchmark(
+                args.out,
+                files,
+                args.monitors,
+                rate=args.false_alarm_rate,
+                window_s=WINDOW_S,
+                seed=args.seed,
+                each=partial(parallel_map, workers=args.workers, progress=progress),
+            )
         with timed("drawing"):
             details = origin() | json.loads(json.dumps(asdict(args), default=str))
-            details |= {
-                "python": platform.python_version(),
-                "machine": platform.machine(),
-                "seconds": seconds,
-            }
-            publish(args.out, result, details)
+            machine = {"python": platform.python_version(), "machine": platform.machine()}
+            publish(args.out, result, details | machine | {"seconds": seconds})
     tables = [brief_monitors_table(result), kept_table(result)]
     if args.elsewhere:
         tables.append(kinds_table(result))

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -41,14 +42,13 @@ from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
 SILENCE_S = 2.0  # a live source without a row for this long has ended [s]
-# longest pieces of a live recording [s], and how many more there are than the promise needs
-PIECE_S, SPARE = (
-    5.0,
-    4,
-)
+PIECE_S = 5.0  # longest pieces of a live recording [s]
+SPARE = 4  # pieces of a live recording beyond what the promise needs
 ANY_EPISODE = 0.5  # a rate that one episode can promise: a promise by the hour needs hours
 CALIBRATION_SHARE = 0.5  # share of the episodes that set the threshold, and are not learned from
-QUICK_EPISODES, QUICK_EPOCHS = 20, 5  # most episodes and passes with ``--quick``
+QUICK_EPISODES = 20  # most episodes with ``--quick``
+QUICK_EPOCHS = 5  # most passes with ``--quick``
+MOST_COLUMNS = 4  # incomplete columns that an error names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,23 +97,31 @@ class Args(LogOptions):
     @property
     def promise(self) -> AlarmRate:
         """The promise of the threshold."""
-        hourly = self.false_alarms_per_hour
-        return AlarmRate.of(self.false_alarm_rate if hourly is None else None, hourly)
+        if self.false_alarms_per_hour is None:
+            return AlarmRate.of(self.false_alarm_rate, None)
+        return AlarmRate.of(None, self.false_alarms_per_hour)
 
     @property
     def needed(self) -> int:
         """Calibration episodes that the promise takes; 0 for one by the hour."""
-        return conformal_episodes(self.false_alarm_rate) if self.promise.per == EPISODE else 0
+        if self.promise.per != EPISODE:
+            return 0
+        return conformal_episodes(self.false_alarm_rate)
 
 
 def record_live(args: Args, say: Callable[[str], None]) -> Args:
     """Record a live source; return how to learn from that, cut into as many pieces as the promise needs."""
-    to = args.out.with_suffix(".jsonl")
-    seconds, ended = record(lines_from(str(args.data), sys.stdin, SILENCE_S), to, args.minutes)
-    say(f"{ended}, kept in {to}")
-    count = args.needed / CALIBRATION_SHARE + SPARE if args.needed else 1
-    split = args.split or min(PIECE_S, seconds / count)
-    return replace(args, data=to, split=max(split, SHORTEST_S))
+    file = args.out.with_suffix(".jsonl")
+    lines = lines_from(str(args.data), sys.stdin, SILENCE_S)
+    seconds, ended = record(lines, file, args.minutes)
+    say(f"{ended}, kept in {file}")
+    split = args.split
+    if split is None:
+        pieces_needed = 1.0
+        if args.needed:
+            pieces_needed = args.needed / CALIBRATION_SHARE + SPARE
+        split = min(PIECE_S, seconds / pieces_needed)
+    return replace(args, data=file, split=max(split, SHORTEST_S))
 
 
 def divide(
@@ -129,12 +137,15 @@ def divide(
                 f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
             )
     else:
-        needed = conformal_episodes(args.false_alarm_rate if by_episode else ANY_EPISODE)
+        episodes = flat(logs)
+        needed = args.needed or conformal_episodes(ANY_EPISODE)
         fitting, calibration = selection.split_at_random(
-            [p for log in logs for p in log], needed, CALIBRATION_SHARE, args.seed
+            episodes, needed, CALIBRATION_SHARE, args.seed
         )
     args.promise.check_hours(hours_of(calibration))
-    return fitting[: QUICK_EPISODES if args.quick else None], calibration
+    if args.quick:
+        fitting = fitting[:QUICK_EPISODES]
+    return fitting, calibration
 
 
 def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[str]]:
@@ -146,44 +157,59 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
     dt = episodes[0].spec.dt
     seconds = bridge_of(args.bridge, dt)
     bridged = [replace(e, stream=filled(e.stream, dt, seconds)) for e in episodes]
-    cut = [selection.complete_parts(e) for e in bridged]
-    if args.split is None and sum(map(len, cut)) < args.needed / CALIBRATION_SHARE:
-        shorter = [selection.complete_parts(e) for e in episodes]
-        if sum(map(len, shorter)) > sum(map(len, cut)):
-            bridged, cut = episodes, shorter
-    parts = [part for of_one in cut for part in of_one]
-    if not parts:
-        missing = np.mean([np.isnan(e.stream).mean(axis=0) for e in episodes], axis=0)  # (D,)
-        worst = [
-            f"{episodes[0].spec.labels[k]} in {missing[k]:.0%}"
-            for k in np.argsort(-missing)[:4]
-            if missing[k]
-        ]
+    parts = [selection.complete_parts(e) for e in bridged]  # of each episode
+    if args.split is None and len(flat(parts)) < args.needed / CALIBRATION_SHARE:
+        without_bridge = [selection.complete_parts(e) for e in episodes]
+        if len(flat(without_bridge)) > len(flat(parts)):
+            bridged = episodes
+            parts = without_bridge
+    if not flat(parts):
         raise ValueError(
-            f"no stretch of {SHORTEST_S:g} s is complete: rows that lack a number are {', '.join(worst)} of all; "
-            "--ignore leaves such columns out, --bridge SECONDS fills longer gaps"
+            f"no stretch of {SHORTEST_S:g} s is complete: rows that lack a number are "
+            f"{incomplete_columns(episodes)} of all; --ignore leaves such columns out, "
+            "--bridge SECONDS fills longer gaps"
         )
-    rows = sum(
-        int((np.isnan(a.stream) != np.isnan(b.stream)).any(axis=1).sum())
-        for a, b in zip(episodes, bridged, strict=True)
-    )
-    said = (
-        [f"Filled {rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."]
-        if rows
-        else []
-    )
-    holed = [
-        of_one
-        for of_one, whole in zip(cut, bridged, strict=True)
-        if not np.isfinite(whole.stream).all()
-    ]
-    if holed:
-        hint = "" if args.bridge else " --bridge 0.05 fills gaps up to 0.05 s."
-        made = sum(map(len, holed))
-        said.append(
-            f"Rows were lost: {len(holed)} of {len(cut)} episodes were cut there, into {made} parts.{hint}"
+
+    return flat(parts), notes_on_gaps(args, episodes, bridged, parts)
+
+
+def notes_on_gaps(
+    args: Args, episodes: list[Episode], bridged: list[Episode], parts: list[list[Episode]]
+) -> list[str]:
+    """Return how many rows were filled in ``episodes``, and where the ``bridged`` ones were cut into ``parts``."""
+    seconds = bridge_of(args.bridge, episodes[0].spec.dt)
+    notes = []
+    filled_rows = 0
+    for episode, other in zip(episodes, bridged, strict=True):
+        is_filled = np.isnan(episode.stream) & ~np.isnan(other.stream)
+        filled_rows += int(is_filled.any(axis=1).sum())
+    if filled_rows:
+        notes.append(
+            f"Filled {filled_rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."
         )
-    return parts, said
+    cut = [own for own, e in zip(parts, bridged, strict=True) if not np.isfinite(e.stream).all()]
+    if cut:
+        note = (
+            f"Rows were lost: {len(cut)} of {len(parts)} episodes were cut there, "
+            f"into {len(flat(cut))} parts."
+        )
+        if not args.bridge:
+            note += " --bridge 0.05 fills gaps up to 0.05 s."
+        notes.append(note)
+    return notes
+
+
+def flat(groups: list[list[Episode]]) -> list[Episode]:
+    """Return the episodes of all groups."""
+    return list(chain.from_iterable(groups))
+
+
+def incomplete_columns(episodes: list[Episode]) -> str:
+    """Return the columns that lack the most numbers, and in how many rows."""
+    missing = np.mean([np.isnan(e.stream).mean(axis=0) for e in episodes], axis=0)  # (D,)
+    labels = episodes[0].spec.labels
+    worst = [k for k in np.argsort(-missing)[:MOST_COLUMNS] if missing[k]]
+    return ", ".join(f"{labels[k]} in {missing[k]:.0%}" for k in worst)
 
 
 def settings(args: Args) -> dict[str, Any]:
@@ -199,30 +225,33 @@ def settings(args: Args) -> dict[str, Any]:
 
 def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
     """Yield notes on which columns of a log are commands."""
-    names = ", ".join(c.name for c in spec.channels if c.group == MOTOR)
-    if spec.source == "table" and not names:
+    if spec.source != "table":
+        return
+    names = ", ".join(channel.name for channel in spec.channels if channel.group == MOTOR)
+    if not names:
         yield "no command is recorded, so faults are found later; --action names the columns of commands"
-    elif spec.source == "table" and not args.action:
+    elif not args.action:
         yield f"read as commands, by name: {names}; the output of a controller would hide pushes"
 
 
 def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
     """Yield notes on the gain from the body model, and the column of each joint."""
-    values = monitor.values_ if isinstance(monitor, NeuralASM) else None
-    model = monitor.model if values is None else values.monitor.model
-    if args.urdf is None or not isinstance(model, ValueAssociation):
+    if args.urdf is None:
+        return
+    model = monitor.model
+    if isinstance(monitor, NeuralASM) and monitor.values_ is not None:
+        model = monitor.values_.monitor.model
+    if not isinstance(model, ValueAssociation):
         return
     left = f"with it the squared error of held-out torques is {model.left_by_body:.2f} of that without it"
     if model.links is None:
         yield f"{args.urdf} is not used: {left}; check its masses, and that it names joints as the log does"
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
-    how = (
-        "by name"
-        if model.links.by_name
-        else "by the best fit to the torques, as no column names a joint"
-    )
-    yield f"{args.urdf} is used: {left}; angles are assigned {how}: {joints}"
+    assigned = "by the best fit to the torques, as no column names a joint"
+    if model.links.by_name:
+        assigned = "by name"
+    yield f"{args.urdf} is used: {left}; angles are assigned {assigned}: {joints}"
 
 
 def hours_of(episodes: list[Episode]) -> float:
@@ -230,81 +259,83 @@ def hours_of(episodes: list[Episode]) -> float:
     return sum(len(e) * e.spec.dt for e in episodes) / 3600
 
 
+def read(args: Args, console: Console) -> tuple[list[Episode], str]:
+    """Return the normal episodes, and which others were left out; ValueError where there is none."""
+    logs = read_logs(args.data, args.hints(args.action), args.given_schema())
+    with stage("reading", console, {}) as progress:
+        episodes, counts = normal_episodes(logs, args.split is not None, progress)
+    left_out = ", ".join(f"{count} {why}" for why, count in counts.items())
+    if episodes:
+        return episodes, left_out
+    message = f"{args.data} holds no normal episode: {left_out or 'it is empty'}"
+    if args.split is None:
+        message += "; --split 5 learns from between the marked rows of a log"
+    if counts["with a fault"]:
+        message += "; --ignore a column that is wrongly taken for a label"
+    raise ValueError(message)
+
+
 def fit(args: Args, console: Console) -> int:
     """Read, learn, calibrate, save, and print a summary."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     live = live_source(str(args.data)) is not None
-    args = record_live(args, say) if live else args
+    if live:
+        args = record_live(args, say)
     start = time.perf_counter()
     writable(args.out)
-    with stage("reading", console, {}) as progress, noted() as notes:
-        found, reasons = normal_episodes(
-            read_logs(args.data, args.hints(args.action), args.given_schema()),
-            args.split is not None,
-            progress,
-        )
-    left_out = ", ".join(f"{count} {why}" for why, count in reasons.items())
-    if not found:
-        hint = (
-            "; --split 5 learns from between the marked rows of a log" if args.split is None else ""
-        )
-        hint += (
-            "; --ignore a column that is wrongly taken for a label"
-            if reasons["with a fault"]
-            else ""
-        )
-        raise ValueError(f"{args.data} holds no normal episode: {left_out or 'it is empty'}{hint}")
-    parts, cuts = parts_between_gaps(args, found)
-    fitting, calibration = divide(
-        args, [[p] if args.split is None else pieces(p, args.split) for p in parts], live
-    )
+
+    with noted() as notes:
+        episodes, left_out = read(args, console)
+    parts, of_gaps = parts_between_gaps(args, episodes)
+    logs = [[part] for part in parts]
+    if args.split is not None:
+        logs = [pieces(part, args.split) for part in parts]
+    fitting, calibration = divide(args, logs, live)
+
     spec = fitting[0].spec
     with stage("learning", console, {}) as progress:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
-    for line in [
-        *notes,
-        *notes_on_columns(args, spec),
-        *notes_on_body(args, monitor),
-        *mute_channels(fitting),
-    ]:
-        say(f"Note: {line}.")
-    rows, hours, used = sum(map(len, fitting)), monitor.blocks_.total, len(monitor.maxima_)
+
+    of_columns = notes_on_columns(args, spec)
+    of_body = notes_on_body(args, monitor)
+    for note in chain(notes, of_columns, of_body, mute_channels(fitting)):
+        say(f"Note: {note}.")
+    rows = sum(map(len, fitting))
     say(
         f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second."
     )
-    for line in [f"Left out: {left_out}."] * bool(left_out) + cuts:
+    if left_out:
+        say(f"Left out: {left_out}.")
+    for line in chain(of_gaps, summary_of_threshold(args, monitor, len(calibration))):
         say(line)
-    promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
-    if args.promise.per == EPISODE:
-        promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
-    modelled = (
-        ", by a model of the tail of their maxima, as they are few"
-        if monitor.promise.modelled
-        else ""
-    )
-    ceilings = (
-        f"; {len(calibration) - used} more say how far each sense goes"
-        if used < len(calibration)
-        else ""
-    )
-    say(
-        f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}{modelled}{ceilings}."
-    )
-    expected, most = monitor.promise.hourly(hours)
-    more = (
-        ""
-        if expected <= 1.0
-        else f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
-    )
-    say(
-        f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, at most "
-        f"{most:.3g} with 95 % confidence; other motion raises more.{more}"
-    )
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Next: asm-gym watch LOG --monitor {args.out}")
     return ended(notes)
+
+
+def summary_of_threshold(args: Args, monitor: Any, calibration: int) -> Iterator[str]:
+    """Yield the threshold and its promise, and the false alarms to expect, after so many episodes of calibration."""
+    hours = monitor.blocks_.total
+    used = len(monitor.maxima_)
+    promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
+    if args.promise.per == EPISODE:
+        promise = f"an alarm in at most {args.false_alarm_rate:.1%} of normal ones"
+    if monitor.promise.modelled:
+        promise += ", by a model of the tail of their maxima, as they are few"
+    if used < calibration:
+        promise += f"; {calibration - used} more say how far each sense goes"
+    yield f"Threshold {monitor.threshold:.4g}, from {used} other episodes: {promise}."
+
+    expected, most = monitor.promise.hourly(hours)
+    line = (
+        f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, at most "
+        f"{most:.3g} with 95 % confidence; other motion raises more."
+    )
+    if expected > 1.0:
+        line += f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."
+    yield line
 
 
 main = partial(run, "fit", Args, fit)

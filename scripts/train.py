@@ -21,11 +21,11 @@ from asm_gym.data.episode import load_episode
 from asm_gym.data.minari_datasets import read_dataset
 from asm_gym.files import write_text
 from asm_gym.policies import rollout
-from asm_gym.rollouts.collect import check, collect_to
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed
+from asm_gym.rollouts.run_trials import check, collect_to
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.training import train
+from asm_gym.rollouts.training import TrainingSettings, train
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import ROBOTS, TASKS, env_id
@@ -61,39 +61,42 @@ class Args(Options):
 
 def train_agent(args: Args, console: Console) -> None:
     """Train, judge the best agent, and write it to ``out/agent.npz``."""
-    task, config = env_id(args.task), RolloutConfig(robot=args.robot)
-    names = ("steps", "cloning_updates", "evaluate_every", "evaluation_episodes", "seed")
+    task = env_id(args.task)
+    config = RolloutConfig(robot=args.robot)
     make = partial(gym.make, task, **dict(config.settings))
     make().close()  # bad options are refused before the folder is made
     if args.dataset is None:
         check(task, config)
-    episodes = None if args.dataset is None else read_dataset(args.dataset, env_id=task)
+        episodes = []
+    else:
+        episodes = read_dataset(args.dataset, env_id=task)
     torch.set_num_threads(1)  # more of them slow networks this small down
     start = time.perf_counter()
-    claim = {
-        name: getattr(args, name) for name in ("task", "robot", "demonstrations", "dataset", "seed")
-    }
-    with claimed(args.out, "train.json", claim):
-        if episodes is None:
-            folder, seeds = (
-                args.out / "demonstrations" / "episodes",
-                episode_seeds(args.seed, args.demonstrations),
-            )
-            with stage("recording demonstrations", console, {}) as tick:
-                files = collect_to(folder, task, config, seeds, args.workers, tick)
+    names = ("task", "robot", "demonstrations", "dataset", "seed")
+    with claimed(args.out, "train.json", {name: getattr(args, name) for name in names}):
+        if args.dataset is None:
+            folder = args.out / "demonstrations" / "episodes"
+            seeds = episode_seeds(args.seed, args.demonstrations)
+            with stage("recording demonstrations", console, {}) as progress:
+                files = collect_to(folder, task, config, seeds, args.workers, progress)
             episodes = [load_episode(file) for file in files]
-        solved = [e for e in episodes if e.success]
+        solved = [episode for episode in episodes if episode.success]
         if not solved:
             raise ValueError(f"none of {len(episodes)} demonstrations succeeded")
-        with stage("cloning and learning", console, {}) as tick:
-            agent = train(
-                make, args.out, solved, tick, **{name: getattr(args, name) for name in names}
-            )
+
+        settings = TrainingSettings(
+            steps=args.steps,
+            cloning_updates=args.cloning_updates,
+            evaluate_every=args.evaluate_every,
+            evaluation_episodes=args.evaluation_episodes,
+            seed=args.seed,
+        )
+        with stage("cloning and learning", console, {}) as progress:
+            agent = train(make, args.out, solved, settings, progress)
         with stage("judging", console, {}), closing(make()) as env:
+            policy = agent.fit_to(env, "the agent")
             seeds = episode_seeds(args.seed, args.final_episodes, stage=3)
-            success = float(
-                np.mean([rollout(env, agent.fit_to(env, "the agent"), seed) for seed in seeds])
-            )
+            success = float(np.mean([rollout(env, policy, seed) for seed in seeds]))
         minutes = round((time.perf_counter() - start) / 60, 1)
         result = {"success": success, "episodes": args.final_episodes, "minutes": minutes}
         agent.save(args.out / "agent.npz", **result)

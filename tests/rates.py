@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from asm_gym.policies import make_policy, rollout
-from asm_gym.rollouts.collect import environment
+from asm_gym.rollouts.run_trials import environment
 
 CHANCE = 1e-3
 """With which a test of a rate that holds fails."""

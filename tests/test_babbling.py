@@ -15,26 +15,31 @@ from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
 from asm_gym.policies.scripted.base import ObservationReader
-from asm_gym.rollouts.pretraining.babbling import (
-    ALONE,
+from asm_gym.rollouts.pretraining.body_evaluation import (
+    EvaluationCase,
+    Scores,
+    evaluate_case,
+    summary,
+    usual_force,
+)
+from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy, held_out
+from asm_gym.rollouts.pretraining.training_motions import (
     AROUND,
-    DRIVEN,
+    DISTURBED,
+    EXPERT,
     HELD,
-    LED,
     NOISE,
+    NOISE_ALONE,
     PACE,
     PRESS,
-    PRESSING,
     REACHING,
     TURNED,
-    Babbler,
-    Lesson,
-    Reaching,
+    MotionPolicy,
+    ReachingPolicy,
+    TrainingMotion,
     curriculum,
-    record_lesson,
+    record_motion,
 )
-from asm_gym.rollouts.pretraining.exam import Exam, Marks, examine, summary, usual_force
-from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy, held_out
 from asm_gym.rollouts.run_folder import make_missing
 from asm_gym.rollouts.trial import RolloutConfig
 from asm_gym.scripts.babble import Args, main
@@ -57,10 +62,12 @@ def test_a_task_has_the_experts_own_course_disturbed_courses_noise_alone_and_pre
         [n for n in lessons if n.task == "Door" and bool(n.press) is press]
         for press in (False, True)
     )
-    alone = {"": ALONE, "reaching": REACHING}
-    kinds = [alone.get(n.guide, LED if n.noise == 0 else DRIVEN) for n in own]
-    assert kinds[2::3] == [LED] * 13  # the threshold is set on those
-    assert [kinds.count(kind) for kind in (LED, DRIVEN, REACHING if reaching else ALONE)] == [
+    alone = {"": NOISE_ALONE, "reaching": REACHING}
+    kinds = [alone.get(n.guide, EXPERT if n.noise == 0 else DISTURBED) for n in own]
+    assert kinds[2::3] == [EXPERT] * 13  # the threshold is set on those
+    assert [
+        kinds.count(kind) for kind in (EXPERT, DISTURBED, REACHING if reaching else NOISE_ALONE)
+    ] == [
         23,
         12,
         5,
@@ -82,7 +89,7 @@ def test_a_task_has_the_experts_own_course_disturbed_courses_noise_alone_and_pre
 @pytest.mark.parametrize("robot", ["Panda", "IIWA"])
 def test_a_hand_that_reaches_comes_near_one_place_after_another_and_turns(robot):
     env = gym.make("asm_gym/Lift-v0", robot=robot)
-    reach, read, state = Reaching(env, seed=5), ObservationReader(env), None
+    reach, read, state = ReachingPolicy(env, seed=5), ObservationReader(env), None
     observation, _ = env.reset(seed=5)
     aims, progress = [], []
     for _ in range(95):
@@ -110,7 +117,9 @@ def test_a_hand_that_reaches_comes_near_one_place_after_another_and_turns(robot)
 @pytest.mark.parametrize("smoothness", [0.0, 0.9])
 def test_noise_is_as_strong_and_as_smooth_as_the_lesson_says(smoothness):
     env = FakeEnv()
-    babbler = Babbler(env, Lesson("Lift", 0, seed=1, guide="", noise=0.1, smoothness=smoothness))
+    babbler = MotionPolicy(
+        env, TrainingMotion("Lift", 0, seed=1, guide="", noise=0.1, smoothness=smoothness)
+    )
     actions = np.array([babbler.predict(None)[0] for _ in range(20_000)])
     assert actions.std() == pytest.approx(0.1, rel=0.05)
     assert np.corrcoef(actions[1:, 0], actions[:-1, 0])[0, 1] == pytest.approx(smoothness, abs=0.02)
@@ -129,13 +138,15 @@ class Holding:
 def test_what_is_held_is_pressed_down_or_aside_for_a_while_and_the_grip_is_kept():
     env = FakeEnv()
     env.action_space, env.gripper_actions = gym.spaces.Box(-1.0, 1.0, (4,), np.float32), (3,)
-    babbler = Babbler(env, Lesson("Lift", 0, seed=2, guide="", noise=1e-6, press=PRESS))
+    babbler = MotionPolicy(
+        env, TrainingMotion("Lift", 0, seed=2, guide="", noise=1e-6, press=PRESS.probability)
+    )
     babbler._guide = Holding()
     actions = np.array([babbler.predict(None)[0] for _ in range(3000)])
     pressed = np.abs(actions[:, :3]).max(axis=1) > 0.05
     assert not pressed[: 10 + HELD].any()  # nothing was held for long
     assert 0.3 < pressed.mean() < 0.7
-    assert PRESSING[1] >= np.abs(actions[pressed, :3]).max() > 0.4
+    assert PRESS.strength[1] >= np.abs(actions[pressed, :3]).max() > 0.4
     starts = actions[1:][pressed[1:] & ~pressed[:-1]]
     down = (starts[:, 2] < 0) & (starts[:, :2] == 0).all(axis=1)
     assert 0.35 < down.mean() < 0.65
@@ -148,7 +159,7 @@ def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(
     lesson = next(
         n for n in curriculum(["Lift"], 40, seed=0) if n.noise and n.guide and n.weight != 1
     )
-    make = partial(record_lesson, config=RolloutConfig())
+    make = partial(record_motion, config=RolloutConfig())
     first = load_episode(make(lesson, folder=tmp_path / "a"))
     make(lesson._replace(weight=1.4, seed=lesson.seed + 1), folder=tmp_path / "b")
     again = load_episode(make(lesson, folder=tmp_path / "c"))
@@ -164,7 +175,7 @@ def test_a_recorded_lesson_is_the_same_again_and_leaves_the_simulator_as_it_was(
 def test_the_limit_of_a_hands_speed_changes_now_and_then_and_slows_it_down():
     env, found = gym.make("asm_gym/Lift-v0"), {}
     for limit in (0.0, 0.05):
-        lesson = Lesson("Lift", 0, seed=3, speed=1.5, limit=limit)
+        lesson = TrainingMotion("Lift", 0, seed=3, speed=1.5, limit=limit)
         found[limit] = [
             (info.get("braked", 0.0), env.unwrapped.contact_limits)
             for info in steps_of(env, lesson)
@@ -179,7 +190,7 @@ def test_the_limit_of_a_hands_speed_changes_now_and_then_and_slows_it_down():
 
 def steps_of(env, lesson):
     """Yield what is said of each step."""
-    policy, (observation, _) = Babbler(env, lesson), env.reset(seed=lesson.seed)
+    policy, (observation, _) = MotionPolicy(env, lesson), env.reset(seed=lesson.seed)
     for _ in range(90):
         observation, *_, info = env.step(policy.predict(observation)[0])
         yield info
@@ -195,7 +206,7 @@ def lesson_of(forces, torques, noise=0.0, number=0, task="Lift", rows=1):
     stream = np.zeros((len(torques), 3), np.float32)
     stream[:, 0] = np.negative(torques)
     assert len(stream) == rows * len(forces)
-    lesson = Lesson(task, number, seed=number, noise=noise)
+    lesson = TrainingMotion(task, number, seed=number, noise=noise)
     about = {"skill": task, "lesson": lesson._asdict()}
     return Episode(
         stream,
@@ -268,7 +279,7 @@ def test_of_a_policys_own_episodes_crashes_are_left_out_and_what_is_kept_is_whol
 
 def test_a_task_needs_a_solved_lesson_without_noise_and_something_must_be_left():
     crashed = replace(lesson_of([1] * 30, [1] * 30, task="Door"), success=False)
-    with pytest.raises(ValueError, match="no undisturbed lesson of Door was solved"):
+    with pytest.raises(ValueError, match="no undisturbed motion of Door was solved"):
         healthy([lesson_of([1] * 30, [1] * 30), crashed])
     with pytest.raises(ValueError, match="leave too little"):
         healthy([lesson_of([1] * 30, [1] * 30)])
@@ -301,13 +312,13 @@ def test_hours_are_the_same_in_each_task_and_episodes_fewer_where_they_are_longe
 
 
 def test_agents_are_examined_where_they_were_trained_and_arms_where_their_experts_succeed():
-    panda = {(e.task, e.policy): e.known for e in Args().exams}
+    panda = {(e.task, e.policy): e.known for e in Args().cases}
     assert panda["Lift", "lift_sac"] is panda["PickPlaceMilk", "scripted"] is False
     assert panda["PickPlaceCan", "scripted"] is True
-    assert {e.policy for e in Args(robot="Sawyer").exams} == {"scripted"}
+    assert {e.policy for e in Args(robot="Sawyer").cases} == {"scripted"}
     iiwa = Args(robot="IIWA")
     assert iiwa.shown == ("Lift", "Stack", "PickPlaceCan", "PickPlaceBread", "PickPlaceCereal")
-    assert [e.task for e in iiwa.exams if not e.known] == ["PickPlaceMilk"]
+    assert [e.task for e in iiwa.cases if not e.known] == ["PickPlaceMilk"]
 
 
 @pytest.mark.slow  # 48 episodes of two tasks, and a fit
@@ -326,10 +337,10 @@ def test_the_command_makes_a_memory_of_a_body_and_goes_on_where_it_was(tmp_path)
 
 
 def test_an_exam_pairs_every_fault_with_a_healthy_twin():
-    labels = Exam("Lift", "scripted", known=False).trials(3, ["push", "slip"], seed=5)
+    labels = EvaluationCase("Lift", "scripted", known=False).trials(3, ["push", "slip"], seed=5)
     nominal = [n for n in labels if n.role == "nominal"]
     assert [n.seed for n in nominal] == [
-        n.seed for n in Exam("Lift", "lift_sac", known=True).trials(3, [], 5)
+        n.seed for n in EvaluationCase("Lift", "lift_sac", known=True).trials(3, [], 5)
     ]
     faulty = [n for n in labels if n.role == "faulty"]
     assert [n.kind for n in faulty] == ["push", "push", "slip", "slip"]
@@ -354,7 +365,7 @@ def test_alarms_are_counted_by_event_and_faults_at_any_threshold():
     found = [hourly_alarms(solved, *event) for event in ((), ("knock",), ("stop",))]
     assert [rate.k for rate in found] == [1, 2, 3]  # what is a fault is no knock beside it
     assert found[0].hours == pytest.approx(1.0)
-    marks = Marks("Lift", solved, [], DetectionMetrics("Lift", [trace(3.5, onset=1)], solved, 1.0))
+    marks = Scores("Lift", solved, [], DetectionMetrics("Lift", [trace(3.5, onset=1)], solved, 1.0))
     assert summary([marks]).endswith("in 1.00 healthy hours, 0 of 1 faults found.")
     assert summary([marks.at(3.2)]).endswith("1 of 1 faults found.")
     # surprises less often than it may
@@ -376,7 +387,7 @@ def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usua
     memory = SimpleNamespace(
         threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes]
     )
-    marks = examine(memory, "Lift", agents_own, 1.0, usual=10.0)
+    marks = evaluate_case(memory, "Lift", agents_own, 1.0, usual=10.0)
     assert [[t.seed for t in own] for own in (marks.solved, marks.failed)] == [[0, 1, 2], [3]]
 
 

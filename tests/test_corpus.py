@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from asm_gym.rollouts import corpus as module
-from asm_gym.rollouts.corpus import (
+from asm_gym.rollouts import detection_corpus as module
+from asm_gym.rollouts.detection_corpus import (
     CLAIM,
     ROUNDS,
     VERSION,
@@ -43,7 +43,7 @@ def recorded(tmp_path, monkeypatch):
         made.append(trial)
         return replace(sine_episodes(1, trial.seed % 1000)[0], label=trial.label, success=True)
 
-    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record_stream", record)
+    monkeypatch.setattr(sys.modules["asm_gym.rollouts.run_trials"], "record_stream", record)
     for number in range(2):
         record_round(tmp_path, number)
     return tmp_path, made
@@ -121,7 +121,7 @@ def pushed(tmp_path, monkeypatch):
             episode, stream=stream, faults=np.arange(60) >= onset, label=trial.label, success=True
         )
 
-    monkeypatch.setattr(sys.modules["asm_gym.rollouts.collect"], "record_stream", record)
+    monkeypatch.setattr(sys.modules["asm_gym.rollouts.run_trials"], "record_stream", record)
     monkeypatch.setattr(module, "trials", lambda *_: wanted)
     record_round(tmp_path / "corpus", 0, 1, SOURCES[:1])
     return tmp_path / "corpus"

@@ -14,7 +14,7 @@ import pytest
 from asm_gym.detection.conformal import Blocks
 from asm_gym.evaluation.metrics import DetectionMetrics
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.rollouts.pretraining.exam import Marks, promises_table
+from asm_gym.rollouts.pretraining.body_evaluation import Scores, promises_table
 from asm_gym.scripts.cli import main as cli
 from asm_gym.scripts.reproduce import STUDIES, hours, kit, memorise_and_recall
 
@@ -100,7 +100,9 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
     severities = [(2.5, "strong"), (9.0, "medium"), (2.0, "mild")]
     faults = [ten_minutes(n, peak, 200, severity) for n, (peak, severity) in enumerate(severities)]
     marks = [
-        Marks("lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0))
+        Scores(
+            "lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0)
+        )
     ]
     table = promises_table(marks, {1.0: 4.5, 5.0: 1.5}, 1.0)
     assert "1.00 healthy hours" in table.caption
@@ -127,7 +129,7 @@ def test_promises_over_halves_come_true_where_all_hours_are_alike():
     solved = [replace(ten_minutes(n, 0.0), surprise=rng.exponential(size=600)) for n in range(240)]
     faults = [ten_minutes(0, 99.0, 200, "strong"), ten_minutes(1, 0.5, 200, "strong")]
     table = hours.splits_table(
-        [Marks("scripted", solved, [], DetectionMetrics("", faults, solved, 1.0))]
+        [Scores("scripted", solved, [], DetectionMetrics("", faults, solved, 1.0))]
     )
     assert "40.0 healthy hours" in table.caption
     came = [float(cell.split()[0]) for cell in table.rows[0]]

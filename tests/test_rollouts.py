@@ -16,8 +16,8 @@ from asm_gym import collect
 from asm_gym.data.episode import Episode, EpisodeLabel
 from asm_gym.evaluation.scoring import NOMINAL_ROLES, Recordings
 from asm_gym.rollouts import progress
-from asm_gym.rollouts.collect import environment
 from asm_gym.rollouts.run_folder import claimed, make_missing
+from asm_gym.rollouts.run_trials import environment
 from asm_gym.scripts.cli import main
 from tests.fakes import FakeEnv
 from tests.streams import sine_episodes

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from asm_gym import collect
 from asm_gym.faults import FrozenEncoder, Push
-from asm_gym.rollouts.collect import watch
+from asm_gym.rollouts.run_trials import watch
 from asm_gym.rollouts.seeds import episode_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial
 from asm_gym.scripts import command, demo

@@ -12,7 +12,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from asm_gym.data.episode import Episode
 from asm_gym.data.minari_datasets import write_dataset
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.rollouts.training import Standardised, clone, export, fill_buffer, make_learner, train
+from asm_gym.rollouts.training import (
+    Standardised,
+    TrainingSettings,
+    clone,
+    export,
+    fill_buffer,
+    make_learner,
+    train,
+)
 from asm_gym.scripts.cli import main
 from asm_gym.spec import StreamSpec
 from asm_gym.wrappers import NeuralASMSafety
@@ -82,14 +90,11 @@ def test_the_buffer_holds_the_action_that_was_executed():
 
 
 def test_an_agent_is_cloned_improved_and_judged(tmp_path):
-    counts = {
-        "steps": 30,
-        "cloning_updates": 10,
-        "evaluate_every": 15,
-        "evaluation_episodes": 1,
-        "seed": 3,
-    }
-    how, make = counts | {"progress": lambda done, total: None}, partial(gym.make, "Pendulum-v1")
+    settings = TrainingSettings(
+        steps=30, cloning_updates=10, evaluate_every=15, evaluation_episodes=1, seed=3
+    )
+    how = {"settings": settings, "progress": lambda done, total: None}
+    make = partial(gym.make, "Pendulum-v1")
     agent = train(make, tmp_path, linear_expert(), **how)
     assert np.load(tmp_path / "log" / "evaluations.npz")["timesteps"].tolist() == [15, 30]
     assert (agent.observation_size, agent.action_size) == (3, 1)

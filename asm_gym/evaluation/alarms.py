@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,9 @@ from asm_gym.data.logs import Log
 from asm_gym.data.timing import TOGETHER_S, blamed, bridged, reason
 from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.evaluation.scored_episode import ScoredEpisode
-from asm_gym.spec import StreamSpec
+
+HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "clock [s]", "date")
+FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
 
 
 class Alarm(NamedTuple):
@@ -29,28 +30,19 @@ class Alarm(NamedTuple):
     stamp: float | None = None  # of its first row, by the robot's own clock [s]
 
     def cells(self) -> tuple[str, ...]:
-        """Format for a table."""
-        return (
-            self.log,
-            f"{self.start:.3f}",
-            f"{self.end:.3f}",
-            self.channel,
-            self.why,
-            f"{self.excess:.2f}",
-            "" if self.stamp is None else f"{self.stamp:.3f}",
-            "" if self.stamp is None else date_of(self.stamp),
-        )
-
-
-FORMULA = "=+-@\t\r"  # what a cell that a spreadsheet takes for a formula begins with
+        """Format for a table, under ``HEADINGS``."""
+        clock = ("", "")
+        if self.stamp is not None:
+            clock = (f"{self.stamp:.3f}", date_of(self.stamp))
+        times = (f"{self.start:.3f}", f"{self.end:.3f}")
+        return (self.log, *times, self.channel, self.why, f"{self.excess:.2f}", *clock)
 
 
 def plain_cell(text: str) -> str:
     """Return a cell of CSV that no spreadsheet takes for a formula: a name that looks like one is quoted."""
-    return f"'{text}" if text[:1] in FORMULA and text else text
-
-
-HEADINGS = ("log", "from [s]", "to [s]", "channel", "why", "thresholds", "clock [s]", "date")
+    if text.startswith(tuple(FORMULA)):
+        return f"'{text}"
+    return text
 
 
 def alarms_of(trace: ScoredEpisode, origin: float | None = None) -> list[Alarm]:
@@ -62,33 +54,30 @@ def alarms_of(trace: ScoredEpisode, origin: float | None = None) -> list[Alarm]:
     """
     assert trace.attribution is not None
     assert trace.stream is not None
-    found: list[Alarm] = []
-    newest: dict[str, int] = {}  # place of the newest alarm in ``found``, by its reason
+    alarms: list[Alarm] = []
+    newest: dict[str, int] = {}  # index of the newest alarm, by its reason
     for first, stop in spans(trace.alarm):
         row = trace.stream[first]
         why = reason(row)
         start = (first + 1) * trace.dt
+        end = stop * trace.dt
         excess = float(trace.surprise[first:stop].max() / trace.threshold)
-        before = found[newest[why]] if why in newest else None
-        if before is not None and start - before.end <= TOGETHER_S:
-            found[newest[why]] = before._replace(
-                end=stop * trace.dt, excess=max(excess, before.excess)
-            )
+
+        index = newest.get(why)
+        if index is not None and start - alarms[index].end <= TOGETHER_S:
+            excess = max(excess, alarms[index].excess)
+            alarms[index] = alarms[index]._replace(end=end, excess=excess)
             continue
-        newest[why] = len(found)
+
+        newest[why] = len(alarms)
+        alarm = Alarm(log=trace.kind, start=start, end=end, channel="", why=why, excess=excess)
         column = blamed(row, trace.attribution[first])
-        found.append(
-            Alarm(
-                log=trace.kind,
-                start=start,
-                end=stop * trace.dt,
-                channel="" if column is None else trace.channels[column],
-                why=why,
-                excess=excess,
-                stamp=None if origin is None else origin + first * trace.dt,
-            )
-        )
-    return found
+        if column is not None:
+            alarm = alarm._replace(channel=trace.channels[column])
+        if origin is not None:
+            alarm = alarm._replace(stamp=origin + first * trace.dt)
+        alarms.append(alarm)
+    return alarms
 
 
 def sensed_peak(trace: ScoredEpisode) -> float:
@@ -98,23 +87,27 @@ def sensed_peak(trace: ScoredEpisode) -> float:
 
 def traces_of(logs: Sequence[Log], monitor: Any, bridge: float = 0.0) -> list[ScoredEpisode]:
     """Score logs; rows that lack a number for at most ``bridge`` seconds are not judged."""
-    spec: StreamSpec = monitor.spec
+    dt = monitor.spec.dt
+    surprises = monitor.score_episodes([log.episode for log in logs])
     traces = []
-    for (name, episode), surprise in zip(
-        logs, monitor.score_episodes([log.episode for log in logs]), strict=True
-    ):
-        fault = (
-            episode.faults
-            if len(episode.faults) == len(episode)
-            else np.zeros(len(episode), np.bool_)
-        )
-        judged = surprise.silenced(bridged(episode.stream, spec.dt, bridge))
-        trace = ScoredEpisode(
-            name, 0, spec.dt, monitor.threshold, judged.value, excused=judged.excused_by_event
-        )
-        shares, labels = judged.attribution, spec.labels
+    for (name, episode), surprise in zip(logs, surprises, strict=True):
+        fault = episode.faults
+        if len(fault) != len(episode):
+            fault = np.zeros(len(episode), np.bool_)
+        judged = surprise.silenced(bridged(episode.stream, dt, bridge))
         traces.append(
-            replace(trace, attribution=shares, channels=labels, fault=fault, stream=episode.stream)
+            ScoredEpisode(
+                kind=name,
+                seed=0,
+                dt=dt,
+                threshold=monitor.threshold,
+                surprise=judged.value,
+                excused=judged.excused_by_event,
+                attribution=judged.attribution,
+                channels=monitor.spec.labels,
+                fault=fault,
+                stream=episode.stream,
+            )
         )
     return traces
 

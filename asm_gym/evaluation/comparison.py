@@ -13,6 +13,7 @@ N(±S/2, S):
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -60,7 +61,8 @@ def noise_floor(noise: Array, streams: list[Array]) -> NDArray[np.float64]:
 def separation(faulty: Array, twin: Array, noise: Array, onset: int) -> NDArray[np.float64]:
     """Return (T - onset,) S up to each step of an episode (T, D) and its twin in noise (D,); ValueError: no twins."""
     length = min(len(faulty), len(twin))
-    if not np.array_equal(faulty[: min(onset, length)], twin[: min(onset, length)]):
+    before = min(onset, length)
+    if not np.array_equal(faulty[:before], twin[:before]):
         raise ValueError(
             f"the episodes differ before the onset at step {onset}: they are not twins"
         )
@@ -83,7 +85,9 @@ def power_bound(separation: Array | float, rate: float) -> NDArray[np.float64]:
 def earliest(separation: Array) -> int | None:
     """Return the first step since the onset at which the power at ``REPORTED_RATE`` reaches ``SURE``; None if never."""
     enough = np.flatnonzero(power_bound(separation, REPORTED_RATE) >= SURE)
-    return int(enough[0]) if enough.size else None
+    if not enough.size:
+        return None
+    return int(enough[0])
 
 
 def mean_power(faults: Sequence[Detectability], rate: float) -> float:
@@ -96,24 +100,36 @@ def detectability_of(
 ) -> list[Detectability]:
     """Return what an ideal observer could detect of the faulty episodes, whose nominal twins it knows."""
     twins = {(e.labelled.task, e.labelled.seed): e.stream for e in nominal}
-    noises: dict[str, Any] = {}
-    found = []
+    streams: defaultdict[str, list[Array]] = defaultdict(list)  # by task
+    for episode in nominal:
+        streams[episode.labelled.task].append(episode.stream)
+    noises: dict[str, Array] = {}  # by task
+
+    detectability = []
     for episode in faulty:
-        label, dt = episode.labelled, episode.spec.dt
+        label = episode.labelled
+        dt = episode.spec.dt
         if label.task not in noises:
-            own = [e.stream for e in nominal if e.labelled.task == label.task]
-            noises[label.task] = noise_floor(episode.spec.noise, own)
-        summed = separation(
-            episode.stream,
-            twins[label.task, label.seed],
-            noises[label.task],
-            onset_row(episode) or 0,
+            noises[label.task] = noise_floor(episode.spec.noise, streams[label.task])
+        twin = twins[label.task, label.seed]
+        onset = onset_row(episode) or 0
+        window = separation(episode.stream, twin, noises[label.task], onset)
+        window = window[: window_steps(window_s, dt)]
+        delay = None
+        sure = earliest(window)
+        if sure is not None:
+            delay = (sure + 1) * dt
+        detectability.append(
+            Detectability(
+                task=label.task,
+                kind=label.kind,
+                severity=label.severity,
+                seed=label.seed,
+                separation=float(window.max(initial=0.0)),
+                delay=delay,
+            )
         )
-        window = summed[: window_steps(window_s, dt)]
-        sure, most = earliest(window), float(window[-1]) if len(window) else 0.0
-        delay = None if sure is None else (sure + 1) * dt
-        found.append(Detectability(label.task, label.kind, label.severity, label.seed, most, delay))
-    return found
+    return detectability
 
 
 def visible_kinds(detectability: Sequence[Detectability]) -> dict[tuple[str, str], bool]:
@@ -135,17 +151,14 @@ class Bound(NamedTuple):
     def of(cls, faults: Sequence[Detectability], rate: float) -> Bound:
         """Return the bound on these faults, at ``RATES`` and at a false-alarm ``rate``."""
         n = len(faults)
-        return cls(
-            auroc=float(np.mean(auroc_bound(np.array([d.separation for d in faults]))))
-            if n
-            else math.nan,
-            found={
-                AlarmRate(r, EPISODE): Share(round(n * mean_power(faults, r)), n)
-                for r in {*RATES, rate}
-                if n
-            },
-            delays=Delays.of([math.inf if d.delay is None else 1e3 * d.delay for d in faults]),
-        )
+        if not n:
+            return cls(auroc=math.nan, found={}, delays=Delays())
+        delays = [math.inf if fault.delay is None else 1e3 * fault.delay for fault in faults]
+        found = {}
+        for each in {*RATES, rate}:
+            found[AlarmRate(each, EPISODE)] = Share(round(n * mean_power(faults, each)), n)
+        auroc = auroc_bound(np.array([fault.separation for fault in faults])).mean()
+        return cls(auroc=float(auroc), found=found, delays=Delays.of(delays))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +170,7 @@ class BenchmarkResult:
     rate: float  # false-alarm rate at which monitors are judged
     window_s: float  # an alarm within this time of the onset is a detection [s]
     # numbers of nominal episodes in which the policy failed, and crashed
-    left_out: tuple[int, int] = (
-        0,
-        0,
-    )
+    left_out: tuple[int, int] = (0, 0)
 
     @property
     def promise(self) -> AlarmRate:
@@ -172,6 +182,11 @@ class BenchmarkResult:
         """Whether the ideal observer could detect each kind and severity."""
         return visible_kinds(self.detectability)
 
+    @property
+    def visible_kinds(self) -> list[Kind]:
+        """The kinds and severities that the ideal observer could detect."""
+        return [kind for kind, is_visible in self.visible.items() if is_visible]
+
     def bound(self, kinds: Collection[Kind]) -> Bound:
         """Return what the ideal observer detects of these kinds."""
         return Bound.of([d for d in self.detectability if (d.kind, d.severity) in kinds], self.rate)
@@ -179,5 +194,4 @@ class BenchmarkResult:
     @cached_property
     def on_visible(self) -> list[DetectionMetrics]:
         """Each monitor on the visible kinds of fault."""
-        kinds = [kind for kind, seen in self.visible.items() if seen]
-        return [m.only(kinds) for m in self.monitors.values()]
+        return [m.only(self.visible_kinds) for m in self.monitors.values()]

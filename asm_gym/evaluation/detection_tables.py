@@ -22,26 +22,30 @@ from asm_gym.evaluation.tables import Table, count, percent, tabulate
 from asm_gym.monitors.calibration import AlarmRate
 
 SPLITS = 20  # of nominal episodes into halves
-UNLIKELY = (
-    0.025  # a calibration counts as broken where so many false alarms are less likely than this
-)
+UNLIKELY = 0.025  # a calibration counts as broken where so many false alarms are less likely
+BRIEF = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right channel")
+"""Columns that a terminal shows, beside the share found at the run's own rate."""
+
+
+# ------------------------------------------------------------------ one monitor by condition
 
 
 def milliseconds(delay: float, otherwise: str = "missed") -> str:
     """Format a delay [ms]; ``otherwise`` where it is infinite."""
-    return f"{delay:.0f}" if math.isfinite(delay) else otherwise
+    if not math.isfinite(delay):
+        return otherwise
+    return f"{delay:.0f}"
 
 
 def _delays(m: DetectionMetrics) -> str:
-    return (
-        ", ".join(milliseconds(delay, f">{1e3 * m.window_s:.0f}") for delay in m.delays)
-        if m.faulty
-        else ""
-    )
+    if not m.faulty:
+        return ""
+    late = f">{1e3 * m.window_s:.0f}"
+    return ", ".join(milliseconds(delay, late) for delay in m.delays)
 
 
 def _before_and_after(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetrics], str]:
-    return lambda m: " → ".join(measure(outcome) for outcome in m.outcomes)
+    return lambda m: " → ".join(map(measure, m.outcomes))
 
 
 CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
@@ -60,18 +64,22 @@ CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
 
 def headline(rows: Sequence[DetectionMetrics]) -> str:
     """Return one sentence: detected of all faults, false alarms of all nominal episodes."""
-    found = Share(sum(m.detected.k for m in rows), sum(m.detected.n for m in rows))
-    false = metrics.false_alarms([t for m in rows if m.name == NOMINAL for t in m.watched])
-    return f"{count(found)} faults detected; {count(false)} nominal episodes with a false alarm."
+    detected = Share.total([m.detected for m in rows])
+    nominal = [trace for m in rows if m.name == NOMINAL for trace in m.watched]
+    return (
+        f"{count(detected)} faults detected; {count(metrics.false_alarms(nominal))} nominal "
+        "episodes with a false alarm."
+    )
+
+
+# ------------------------------------------------------------------ monitors side by side
 
 
 def monitor_columns(promises: Sequence[AlarmRate]) -> dict[str, Callable[[DetectionMetrics], str]]:
     """Return the columns of monitors side by side."""
     return {
         "Monitor": lambda m: m.name,
-        "AUROC, same steps": lambda m: "{:.3f} ({:.3f}–{:.3f})".format(
-            *interval(m.auroc, m.draws.auroc)
-        ),
+        "AUROC, same steps": _auroc,
         **{f"Found at {_rate(promise)}": partial(_found, promise=promise) for promise in promises},
         "Median delay [ms]": lambda m: milliseconds(m.delays.median_ms),
         "False alarms": _false_alarms,
@@ -82,16 +90,38 @@ def monitor_columns(promises: Sequence[AlarmRate]) -> dict[str, Callable[[Detect
 
 def _rate(promise: AlarmRate) -> str:
     """Format such as ``1 %`` or ``10/h``."""
-    return f"{promise.rate:g}/h" if promise.per == HOUR else f"{100 * promise.rate:g} %"
+    if promise.per == HOUR:
+        return f"{promise.rate:g}/h"
+    return f"{100 * promise.rate:g} %"
 
 
-BRIEF = ("Monitor", "AUROC, same steps", "Median delay [ms]", "Alarms/h", "Right channel")
-"""Columns that a terminal shows, beside the share found at the run's own rate."""
+def _auroc(m: DetectionMetrics) -> str:
+    auroc = interval(m.auroc, m.draws.auroc)
+    return f"{auroc.value:.3f} ({auroc.low:.3f}–{auroc.high:.3f})"
+
+
+def _found(m: DetectionMetrics, promise: AlarmRate) -> str:
+    share = m.found.get(promise)
+    if share is None:
+        if promise.per == HOUR:
+            return ""
+        return f"needs {conformal_episodes(promise.rate)}"
+    if promise not in m.draws.found:
+        return percent(share)
+    found = interval(share.value, m.draws.found[promise])
+    return f"{100 * found.value:.0f} % ({100 * found.low:.0f}–{100 * found.high:.0f})"
+
+
+def _false_alarms(m: DetectionMetrics) -> str:
+    share = metrics.false_alarms(m.nominal)
+    if not share.n:
+        return ""
+    low, high = share.interval
+    return f"{count(share)} ({100 * low:.0f}–{100 * high:.0f} %)"
 
 
 def monitors_table(result: BenchmarkResult) -> Table:
     """Return the monitors side by side, the ideal observer on top."""
-    hidden = [_in_words(kind) for kind, seen in result.visible.items() if not seen]
     failed, crashed = result.left_out
     caption = (
         f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds and severities of fault that an "
@@ -100,22 +130,26 @@ def monitors_table(result: BenchmarkResult) -> Table:
         f"calibration episodes. AUROC: against nominal episodes over the same steps. Needs: calibration episodes for "
         f"that rate, where there were fewer. Left out: nominal episodes in which the policy failed ({failed}) or "
         f"crashed ({crashed}), and faults in such scenes."
-        + (f" Kinds that cannot be detected: {', '.join(hidden)}." if hidden else "")
     )
-    promises = [AlarmRate(r, EPISODE) for r in sorted({*RATES, result.rate})] + [
-        AlarmRate(r, HOUR) for r in PER_HOUR
-    ]
+    hidden = [_in_words(kind) for kind, is_visible in result.visible.items() if not is_visible]
+    if hidden:
+        caption += f" Kinds that cannot be detected: {', '.join(hidden)}."
+
+    promises = [AlarmRate(rate, EPISODE) for rate in sorted({*RATES, result.rate})]
+    promises += [AlarmRate(rate, HOUR) for rate in PER_HOUR]
     monitors = tabulate(caption, monitor_columns(promises), result.on_visible)
-    ideal = result.bound([kind for kind, seen in result.visible.items() if seen])
+    ideal = result.bound(result.visible_kinds)
     found = [percent(ideal.found.get(promise)) for promise in promises]
-    first = (IDEAL, f"{ideal.auroc:.3f}", *found, milliseconds(ideal.delays.median_ms), "", "", "")
+    delay = milliseconds(ideal.delays.median_ms)
+    first = (IDEAL, f"{ideal.auroc:.3f}", *found, delay, "", "", "")
     return Table(caption, monitors.headings, [first, *monitors.rows])
 
 
 def brief_monitors_table(result: BenchmarkResult) -> Table:
     """Return the chief columns without their intervals, narrow enough for a terminal."""
     table = monitors_table(result)
-    headings = [h for h in table.headings if h in BRIEF or h == f"Found at {_rate(result.promise)}"]
+    shown = (*BRIEF, f"Found at {_rate(result.promise)}")
+    headings = [heading for heading in table.headings if heading in shown]
     columns = [table.headings.index(heading) for heading in headings]
     rows = [[str(row[n]).partition(" (")[0] for n in columns] for row in table.rows]
     return Table(f"found within {result.window_s:g} s of the onset", headings, rows)
@@ -124,13 +158,14 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
 def kinds_table(result: BenchmarkResult) -> Table:
     """Return AUROC and faults found of every kind."""
     rows = []
-    for kind, seen in result.visible.items():
-        own: list[Bound | DetectionMetrics] = [
-            result.bound([kind]),
-            *(m.only([kind]) for m in result.monitors.values()),
-        ]
-        found = (f"{m.auroc:.2f} / {percent(m.found.get(result.promise))}" for m in own)
-        rows.append((_in_words(kind) if seen else f"({_in_words(kind)})", *found))
+    for kind, is_visible in result.visible.items():
+        name = _in_words(kind)
+        if not is_visible:
+            name = f"({name})"
+        observers: list[Bound | DetectionMetrics] = [result.bound([kind])]
+        observers += [monitor.only([kind]) for monitor in result.monitors.values()]
+        cells = [f"{o.auroc:.2f} / {percent(o.found.get(result.promise))}" for o in observers]
+        rows.append((name, *cells))
     return Table(
         f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no observer could "
         "detect it.",
@@ -140,105 +175,88 @@ def kinds_table(result: BenchmarkResult) -> Table:
 
 
 def _in_words(kind: Kind) -> str:
-    return " ".join(part.replace("_", " ") for part in kind if part)
+    return " ".join(kind).strip().replace("_", " ")
 
 
 def lead_table(result: BenchmarkResult) -> Table:
     """Return how far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
     first, *others = result.on_visible
-    promises = [result.promise, *(p for p in first.calibration.thresholds if p.per == HOUR)]
-    rows = []
-    for other in others:
-        cells = [
-            _lead(interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc), 1, 3)
-        ]
-        for promise in promises:
-            if promise not in first.draws.found.keys() & other.draws.found.keys():
-                cells.append("")
-                continue
-            difference = first.found[promise].value - other.found[promise].value
-            draws = first.draws.found[promise] - other.draws.found[promise]
-            cells.append(_lead(interval(difference, draws), 100, 1))
-        rows.append((other.name, *cells))
-    return Table(
+    caption = (
         f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference, which decide "
-        "between ahead, behind and within chance.",
-        ("Monitor", "AUROC", *(f"Found at {_rate(promise)} [points]" for promise in promises)),
-        rows,
+        "between ahead, behind and within chance."
     )
+    by_hour = [promise for promise in first.calibration.thresholds if promise.per == HOUR]
+    columns: dict[str, Callable[[DetectionMetrics], str]] = {
+        "Monitor": lambda m: m.name,
+        "AUROC": partial(_auroc_lead, first),
+    }
+    for promise in (result.promise, *by_hour):
+        columns[f"Found at {_rate(promise)} [points]"] = partial(_found_lead, promise, first)
+    return tabulate(caption, columns, others)
+
+
+def _auroc_lead(first: DetectionMetrics, other: DetectionMetrics) -> str:
+    lead = interval(first.auroc - other.auroc, first.draws.auroc - other.draws.auroc)
+    return _lead(lead, scale=1, digits=3)
+
+
+def _found_lead(promise: AlarmRate, first: DetectionMetrics, other: DetectionMetrics) -> str:
+    if promise not in first.draws.found or promise not in other.draws.found:
+        return ""
+    difference = first.found[promise].value - other.found[promise].value
+    draws = first.draws.found[promise] - other.draws.found[promise]
+    return _lead(interval(difference, draws), scale=100, digits=1)
 
 
 def _lead(difference: Estimate, scale: float, digits: int) -> str:
-    value, low, high = (f"{scale * x:+.{digits}f}" for x in difference)
-    verdict = (
-        "ahead" if difference.low > 0 else "behind" if difference.high < 0 else "within chance"
-    )
+    verdict = "within chance"
+    if difference.low > 0:
+        verdict = "ahead"
+    elif difference.high < 0:
+        verdict = "behind"
+    value, low, high = (f"{scale * number:+.{digits}f}" for number in difference)
     return f"{value} ({low} to {high}), {verdict}"
+
+
+# ------------------------------------------------------------------ promises and what they came to
 
 
 def kept_table(result: BenchmarkResult) -> Table:
     """Return the false alarms in nominal test episodes, beside the promise of each threshold."""
-    every = list(result.monitors.values())
-    promises = sorted(
-        {promise for m in every for promise in m.calibration.thresholds},
-        key=lambda p: (p.per == HOUR, -p.rate if p.per == HOUR else p.rate),
-    )
-    rows = [(m.name, *(_kept(m, promise) for promise in promises)) for m in every]
-    hours = sum(len(t) * t.dt for t in every[0].nominal) / 3600
-    unsafe = Share.of([t.outcome.unsafe for t in every[0].nominal if t.outcome.success])
-    return Table(
-        f"False alarms in {len(every[0].nominal)} nominal test episodes of {hours:.2f} hours, by the promise of the "
+    monitors = list(result.monitors.values())
+    every = {promise for m in monitors for promise in m.calibration.thresholds}
+    by_episode = sorted(promise for promise in every if promise.per == EPISODE)
+    by_hour = sorted((promise for promise in every if promise.per == HOUR), reverse=True)
+
+    nominal = monitors[0].nominal
+    hours = sum(len(trace) * trace.dt for trace in nominal) / 3600
+    unsafe = Share.of([trace.outcome.unsafe for trace in nominal if trace.outcome.success])
+    caption = (
+        f"False alarms in {len(nominal)} nominal test episodes of {hours:.2f} hours, by the promise of the "
         "threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in 40 (beta-binomial); by the hour, "
-        f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N.",
-        ("Monitor", *(f"promised {_rate(promise)}" for promise in promises)),
-        rows,
+        f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N."
     )
+    return _by_promise(caption, [*by_episode, *by_hour], _kept, monitors)
 
 
-def splits_table(result: BenchmarkResult) -> Table:
-    """Return what each promise comes to over random halves of the nominal episodes: set on one, kept on the other."""
-    promises = list(result.on_visible[0].calibration.thresholds)
-    rows = []
-    for m in result.on_visible:
-        of = Blocks.of([t.surprise for t in m.nominal], m.nominal[0].dt)
-        known = m.calibration.blocks or Blocks(*np.zeros((2, 0)))
-        by_hour = Blocks(*(np.concatenate(both) for both in zip(known[:2], of[:2], strict=True)))
-        maxima = np.concatenate([m.calibration.maxima, [t.surprise.max() for t in m.nominal]])
-        units = {EPISODE: Blocks(maxima, np.ones(len(maxima))), HOUR: by_hour}
-        rows.append((m.name, *(over_splits(m, units[p.per], p) for p in promises)))
-    return Table(
-        f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where {SPLITS} random halves "
-        "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD.",
-        ("Monitor", *(f"promised {_rate(promise)}" for promise in promises)),
-        rows,
-    )
+def _by_promise(
+    caption: str,
+    promises: Sequence[AlarmRate],
+    cell: Callable[[AlarmRate, DetectionMetrics], str],
+    monitors: Sequence[DetectionMetrics],
+) -> Table:
+    """Return a row for each monitor, with a cell for each promise."""
+    columns: dict[str, Callable[[DetectionMetrics], str]] = {"Monitor": lambda m: m.name}
+    for promise in promises:
+        columns[f"promised {_rate(promise)}"] = partial(cell, promise)
+    return tabulate(caption, columns, monitors)
 
 
-def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
-    """Return the false alarms that came, and faults found, where random halves of ``units`` set the threshold."""
-    rng, windows, came, found = np.random.default_rng(0), Windows(m.faulty, m.window_s), [], []
-    for _ in range(SPLITS):
-        half = np.zeros(len(units.maxima), bool)
-        half[rng.permutation(len(half))[: len(half) // 2]] = True
-        own = Blocks(units.maxima[half], units.hours[half])
-        try:
-            threshold = promise.threshold(own.maxima, own)
-        except ValueError:  # too few
-            return ""
-        came.append((units.maxima[~half] > threshold).sum() / units.hours[~half].sum())
-        found.append(windows.detected(threshold).mean())
-    unit, scale = ("/h", 1.0) if promise.per == HOUR else (" %", 100.0)
-    return (
-        f"{scale * np.mean(came):.2f} ± {scale * np.std(came):.2f}{unit}, "
-        f"{100 * np.mean(found):.1f} ± {100 * np.std(found):.1f} % found"
-    )
-
-
-def _kept(m: DetectionMetrics, promise: AlarmRate) -> str:
+def _kept(promise: AlarmRate, m: DetectionMetrics) -> str:
     threshold = m.calibration.thresholds.get(promise)
     if threshold is None:
         return ""
-    judged = [t.at(threshold) for t in m.nominal]
+    judged = [trace.at(threshold) for trace in m.nominal]
     if promise.per == HOUR:
         return kept_rate(metrics.hourly_alarms(judged), promise.rate)
     return _kept_share(metrics.false_alarms(judged), m.calibration, threshold)
@@ -246,7 +264,10 @@ def _kept(m: DetectionMetrics, promise: AlarmRate) -> str:
 
 def kept_rate(rate: Rate, promised: float) -> str:
     """Format the alarms per hour, and say whether the promise was broken."""
-    return rate.text + (", broken" if rate.interval[0] > promised else "")
+    low, _ = rate.interval
+    if low > promised:
+        return f"{rate.text}, broken"
+    return rate.text
 
 
 def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str:
@@ -256,26 +277,60 @@ def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str
     from Beta(beyond + 1, n - beyond), so their count is beta-binomial.
     """
     low, high = share.interval
-    beyond, n = int((calibration.maxima > threshold).sum()), len(calibration.maxima)
-    broken = bool(
-        share.n
-        and beyond < n
-        and stats.betabinom.sf(share.k - 1, share.n, beyond + 1, n - beyond) < UNLIKELY
+    text = f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+    n = len(calibration.maxima)
+    beyond = int((calibration.maxima > threshold).sum())
+    if not share.n or beyond >= n:
+        return text
+    if stats.betabinom.sf(share.k - 1, share.n, beyond + 1, n - beyond) < UNLIKELY:
+        return f"{text}, broken"
+    return text
+
+
+def splits_table(result: BenchmarkResult) -> Table:
+    """Return what each promise comes to over random halves of the nominal episodes: set on one, kept on the other."""
+    caption = (
+        f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where {SPLITS} random halves "
+        "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD."
     )
-    return f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})" + ", broken" * broken
+    promises = list(result.on_visible[0].calibration.thresholds)
+    return _by_promise(caption, promises, _over_own_splits, result.on_visible)
 
 
-def _false_alarms(m: DetectionMetrics) -> str:
-    share = metrics.false_alarms(m.nominal)
-    low, high = share.interval
-    return f"{count(share)} ({100 * low:.0f}–{100 * high:.0f} %)" if share.n else ""
+def _over_own_splits(promise: AlarmRate, m: DetectionMetrics) -> str:
+    """Return ``over_splits`` of the nominal episodes for calibration and test."""
+    surprises = [trace.surprise for trace in m.nominal]
+    if promise.per == EPISODE:
+        peaks = [surprise.max() for surprise in surprises]
+        maxima = np.concatenate([m.calibration.maxima, peaks])
+        return over_splits(m, Blocks(maxima, np.ones(len(maxima))), promise)
+    blocks = Blocks.of(surprises, m.nominal[0].dt)
+    known = m.calibration.blocks
+    if known is not None:
+        maxima = np.concatenate([known.maxima, blocks.maxima])
+        blocks = Blocks(maxima, np.concatenate([known.hours, blocks.hours]))
+    return over_splits(m, blocks, promise)
 
 
-def _found(m: DetectionMetrics, promise: AlarmRate) -> str:
-    share = m.found.get(promise)
-    if share is None:
-        return "" if promise.per == HOUR else f"needs {conformal_episodes(promise.rate)}"
-    if promise not in m.draws.found:
-        return percent(share)
-    found = interval(share.value, m.draws.found[promise])
-    return f"{100 * found.value:.0f} % ({100 * found.low:.0f}–{100 * found.high:.0f})"
+def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
+    """Return the false alarms that came, and faults found, where random halves of ``units`` set the threshold."""
+    rng = np.random.default_rng(0)
+    windows = Windows(m.faulty, m.window_s)
+    size = len(units.maxima)
+    alarms = []  # per unit, of each split
+    found = []  # share of the faults, of each split
+    for _ in range(SPLITS):
+        half = np.zeros(size, bool)
+        half[rng.permutation(size)[: size // 2]] = True
+        own = Blocks(units.maxima[half], units.hours[half])
+        try:
+            threshold = promise.threshold(own.maxima, own)
+        except ValueError:  # too few
+            return ""
+        alarms.append((units.maxima[~half] > threshold).sum() / units.hours[~half].sum())
+        found.append(windows.detected(threshold).mean())
+
+    detected = f"{100 * np.mean(found):.1f} ± {100 * np.std(found):.1f} % found"
+    if promise.per == HOUR:
+        return f"{np.mean(alarms):.2f} ± {np.std(alarms):.2f}/h, {detected}"
+    return f"{100 * np.mean(alarms):.2f} ± {100 * np.std(alarms):.2f} %, {detected}"

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from asm_gym.detection import alarms_in
 from asm_gym.evaluation.resampling import Calibration, Draws, Windows, Wins, resample
-from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpisode, window_steps
+from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE, ScoredEpisode
 from asm_gym.evaluation.statistics import Floats, Rate, Share
 from asm_gym.monitors.calibration import AlarmRate
 
@@ -38,9 +38,12 @@ class Delays(NamedTuple):
     @classmethod
     def of(cls, delays_ms: Sequence[float] | Floats) -> Delays:
         """Summarise one delay per fault [ms], ``inf`` for a miss."""
-        late = sorted(map(float, delays_ms))
-        # Observed values, not interpolated ones: between a number and a miss there is nothing.
-        return cls(*(late[math.ceil(q * len(late)) - 1] for q in (0.5, 0.95))) if late else cls()
+        if not len(delays_ms):
+            return cls()
+        # observed values: between a number and a miss there is nothing to interpolate
+        late = np.sort(delays_ms)
+        median, p95 = (float(late[math.ceil(q * len(late)) - 1]) for q in (0.5, 0.95))
+        return cls(median, p95)
 
 
 def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.float64]:
@@ -48,14 +51,8 @@ def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.fl
 
     A time runs from the beginning of the row of the onset to the end of the row of the alarm: at least one period.
     """
-    found = [
-        (t.detected_after, window_steps(window_s, t.dt), t.delay)
-        for t in traces
-        if t.onset is not None
-    ]
-    return np.sort(
-        [math.inf if k is None or d is None or k >= window else 1e3 * d for k, window, d in found]
-    )
+    faulty = [t for t in traces if t.onset is not None]
+    return np.sort([1e3 * t.delay_within(window_s) for t in faulty])
 
 
 def false_alarms(traces: Sequence[ScoredEpisode]) -> Share:
@@ -68,33 +65,32 @@ def hourly_alarms(traces: Sequence[ScoredEpisode], event: str = "") -> Rate:
 
     With an ``event``, ``"knock"`` or ``"stop"``, count the surprise that it excused instead.
     """
-    count, hours = 0, 0.0
-    for t in traces:
-        until = len(t) if t.onset is None else t.onset
-        value = (
-            np.where(t.alarm, 0.0, t.excused.get(event, np.zeros(len(t)))) if event else t.surprise
-        )
-        count += alarms_in(value[:until], t.threshold, t.dt)
-        hours += until * t.dt / 3600
+    count = 0
+    hours = 0.0
+    for trace in traces:
+        surprise = trace.surprise
+        if event:
+            excused = trace.excused.get(event, np.zeros(len(trace)))
+            surprise = np.where(trace.alarm, 0.0, excused)
+        rows = trace.healthy_rows
+        count += alarms_in(surprise[:rows], trace.threshold, trace.dt)
+        hours += rows * trace.dt / 3600
     return Rate(count, hours)
 
 
 def attribution_accuracy(faulty: Sequence[ScoredEpisode]) -> Share:
     """Count the detected faults whose most surprising channel belongs to the fault."""
-    return Share.of(
-        [
-            t.top_channel in t.affected_channels
-            for t in faulty
-            if t.top_channel and t.affected_channels
-        ]
-    )
+    known = [t for t in faulty if t.top_channel and t.affected_channels]
+    return Share.of([t.top_channel in t.affected_channels for t in known])
 
 
 def typical(traces: Sequence[ScoredEpisode]) -> ScoredEpisode:
     """Return the episode whose greatest surprise since the onset is the median one."""
-    return sorted(traces, key=lambda t: float(t.surprise[t.onset or 0 :].max(initial=0.0)))[
-        len(traces) // 2
-    ]
+
+    def greatest_surprise(trace: ScoredEpisode) -> float:
+        return float(trace.surprise[trace.onset or 0 :].max(initial=0.0))
+
+    return sorted(traces, key=greatest_surprise)[len(traces) // 2]
 
 
 class Outcomes(NamedTuple):
@@ -109,14 +105,17 @@ class Outcomes(NamedTuple):
     @classmethod
     def of(cls, acting: str, traces: Sequence[ScoredEpisode]) -> Outcomes:
         """Summarise the episodes with this response."""
-        ends = [t.outcome for t in traces if t.acting == acting]
-        force, solved = (
-            float(np.median([o.contact_force for o in ends])),
-            [o for o in ends if o.success],
-        )
-        time = float(np.median([o.time for o in solved])) if solved else math.nan
+        outcomes = [t.outcome for t in traces if t.acting == acting]
+        solved = [outcome for outcome in outcomes if outcome.success]
+        time = math.nan
+        if solved:
+            time = float(np.median([outcome.time for outcome in solved]))
         return cls(
-            acting, Share(len(solved), len(ends)), force, Share.of([o.unsafe for o in solved]), time
+            acting=acting,
+            success=Share(len(solved), len(outcomes)),
+            peak_force=float(np.median([outcome.contact_force for outcome in outcomes])),
+            unsafe=Share.of([outcome.unsafe for outcome in solved]),
+            time=time,
         )
 
 
@@ -158,10 +157,8 @@ class DetectionMetrics:
     def found(self) -> dict[AlarmRate, Share]:
         """All faults detected within the window, by the promised rate of false alarms."""
         windows = Windows(self.faulty, self.window_s)
-        return {
-            promise: Share.of(windows.detected(q))
-            for promise, q in self.calibration.thresholds.items()
-        }
+        thresholds = self.calibration.thresholds
+        return {rate: Share.of(windows.detected(q)) for rate, q in thresholds.items()}
 
     @cached_property
     def delays(self) -> Delays:
@@ -176,17 +173,14 @@ class DetectionMetrics:
     @cached_property
     def outcomes(self) -> list[Outcomes]:
         """One for each response, the policy alone first."""
-        actings = sorted(
-            dict.fromkeys(t.acting for t in self.traces), key=lambda a: a != POLICY_ALONE
-        )
-        return [Outcomes.of(a, self.traces) for a in actings]
+        responses = sorted({t.acting: None for t in self.traces}, key=lambda r: r != POLICY_ALONE)
+        return [Outcomes.of(response, self.traces) for response in responses]
 
 
 def by_condition(traces: Sequence[ScoredEpisode], window_s: float) -> list[DetectionMetrics]:
     """Return one for each condition, the nominal one first, then in order of appearance."""
     nominal = [t for t in traces if t.kind == NOMINAL and t.acting == POLICY_ALONE]
-    conditions = sorted(dict.fromkeys(t.condition for t in traces), key=lambda c: c != NOMINAL)
-    return [
-        DetectionMetrics(c, [t for t in traces if t.condition == c], nominal, window_s)
-        for c in conditions
-    ]
+    by_name: dict[str, list[ScoredEpisode]] = {NOMINAL: []}
+    for trace in traces:
+        by_name.setdefault(trace.condition, []).append(trace)
+    return [DetectionMetrics(name, own, nominal, window_s) for name, own in by_name.items() if own]

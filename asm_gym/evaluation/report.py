@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -23,10 +24,12 @@ from asm_gym.evaluation.detection_tables import (
     monitors_table,
     splits_table,
 )
-from asm_gym.evaluation.scored_episode import window_steps
 from asm_gym.evaluation.tables import Table, markdown
 from asm_gym.extras import require
 from asm_gym.files import write_text, written_whole
+
+COPIED = ("task", "monitor", "kind", "severity", "seed", "onset")
+"""Columns of ``results.parquet`` that are fields of a scored episode."""
 
 _PAGE = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
 
@@ -55,7 +58,8 @@ def write_report(
         parts.append(f'<section><h2>Figures</h2>\n<div class="figures">{shown}</div></section>')
     if details:
         items = "\n".join(
-            f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in details.items()
+            f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>"
+            for name, value in details.items()
         )
         parts.append(f"<section><h2>How this was made</h2>\n<dl>{items}</dl></section>")
     write_text(path, _PAGE.substitute(title=escape(title), body="\n".join(parts)))
@@ -63,11 +67,10 @@ def write_report(
 
 
 def _table(table: Table) -> str:
-    name, *headings = table.headings
-    cells = [list(map(str, row)) for row in table.rows]
-    frame = pd.DataFrame(
-        [c[1:] for c in cells], pd.Index([c[0] for c in cells]), headings
-    ).rename_axis(columns=name)
+    frame = pd.DataFrame(table.rows, columns=table.headings, dtype=str)
+    frame = (
+        frame.set_index(table.headings[0]).rename_axis(None).rename_axis(columns=table.headings[0])
+    )
     with pd.option_context("display.max_colwidth", None):
         start, rest = frame.to_html(border=0).split("\n", 1)
     return f'<div class="scroll">{start}<caption>{escape(table.caption)}</caption>\n{rest}</div>'
@@ -75,14 +78,12 @@ def _table(table: Table) -> str:
 
 def _figure(caption: str, figure: Figure) -> str:
     buffer = io.StringIO()
-    with mpl.rc_context(
-        {"svg.hashsalt": caption}
-    ):  # ids are the same each time, and differ between figures
-        figure.savefig(
-            buffer, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        )
-    svg = buffer.getvalue()[buffer.getvalue().index("<svg") :]
-    svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)  # HTML needs none
+    without_date = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    # ids are the same each time, and differ between figures
+    with mpl.rc_context({"svg.hashsalt": caption}):
+        figure.savefig(buffer, format="svg", metadata=without_date)
+    text = buffer.getvalue()
+    svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", text[text.index("<svg") :])  # HTML needs none
     svg = svg.replace("<svg ", f'<svg role="img" aria-label="{escape(caption)}" ', 1)
     return f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
 
@@ -105,27 +106,31 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
 
 def _rows(result: BenchmarkResult) -> Iterator[dict[str, Any]]:
     """Yield what each monitor made of each episode."""
-    possible = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
+    detectability = {(d.task, d.kind, d.severity, d.seed): d for d in result.detectability}
     for monitor in result.monitors.values():
         for trace in (*monitor.nominal, *monitor.traces):
-            ideal = possible.get((trace.task, trace.kind, trace.severity, trace.seed))
-            after, window = trace.detected_after, window_steps(result.window_s, trace.dt)
-            yield {
-                **{
-                    name: getattr(trace, name)
-                    for name in ("task", "monitor", "kind", "severity", "seed", "onset")
-                },
+            row = {name: getattr(trace, name) for name in COPIED}
+            row |= {
                 "steps": len(trace),
                 "dt": trace.dt,
                 "threshold": trace.threshold,
                 "alarm": bool(trace.alarms),
-                "detected": None if trace.onset is None else after is not None and after < window,
+                "detected": None,
                 "delay_s": trace.delay,
                 "peak_in_window": float(
                     trace.surprise[trace.window(result.window_s)].max(initial=0.0)
                 ),
-                "blamed": trace.top_channel if after is not None else None,
-                "ideal_separation": ideal.separation if ideal else None,
-                "ideal_delay_s": ideal.delay if ideal else None,
+                "blamed": None,
+                "ideal_separation": None,
+                "ideal_delay_s": None,
                 "surprise": np.asarray(trace.surprise, np.float32),
             }
+            if trace.onset is not None:
+                row["detected"] = math.isfinite(trace.delay_within(result.window_s))
+            if trace.detected_after is not None:
+                row["blamed"] = trace.top_channel
+            ideal = detectability.get((trace.task, trace.kind, trace.severity, trace.seed))
+            if ideal is not None:
+                row["ideal_separation"] = ideal.separation
+                row["ideal_delay_s"] = ideal.delay
+            yield row

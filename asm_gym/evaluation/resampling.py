@@ -30,20 +30,17 @@ class Calibration:
     """The thresholds of a monitor, and the scores that they were set on."""
 
     thresholds: Mapping[AlarmRate, float] = field(default_factory=dict)
-    # (n,) the greatest surprise of each episode
-    maxima: Floats = field(default_factory=lambda: np.zeros(0))
+    maxima: Floats = field(default_factory=lambda: np.zeros(0))  # (n,) of each episode
     blocks: Blocks | None = None  # the maxima by the hour; None if not calibrated by the hour
 
     def resampled(self, rng: np.random.Generator) -> dict[AlarmRate, float]:
         """Return the thresholds from resampled episodes and blocks; the hours stay as they were."""
-        n, blocks = len(self.maxima), self.blocks
-        if not n:
+        if not len(self.maxima):
             return {}
-        maxima = self.maxima[rng.integers(n, size=n)]
+        maxima = rng.choice(self.maxima, len(self.maxima))
+        blocks = self.blocks
         if blocks is not None and any(promise.per == HOUR for promise in self.thresholds):
-            blocks = blocks._replace(
-                maxima=blocks.maxima[rng.integers(len(blocks.maxima), size=len(blocks.maxima))]
-            )
+            blocks = blocks._replace(maxima=rng.choice(blocks.maxima, len(blocks.maxima)))
         return {promise: promise.threshold(maxima, blocks) for promise in self.thresholds}
 
 
@@ -69,39 +66,40 @@ class Wins:
     def __init__(
         self, faulty: Sequence[ScoredEpisode], nominal: Sequence[ScoredEpisode], window_s: float
     ) -> None:
-        shape, kinds = (len(faulty), len(nominal)), dict[tuple[str, str], int]()
-        # (F, N) 1 where a fault surprised more, ½ in ties
-        self.won, self.comparable = (
-            np.zeros(shape),
-            np.zeros(shape),
-        )
-        self.kind = np.array(
-            [kinds.setdefault((t.kind, t.severity), len(kinds)) for t in faulty], int
-        )
-        for n, trace in enumerate(faulty):
+        shape = (len(faulty), len(nominal))
+        self.won = np.zeros(shape)  # (F, N) 1 where a fault surprised more, ½ in ties
+        self.comparable = np.zeros(shape)  # (F, N) 1 where both have a row in the window
+        names = [(t.kind, t.severity) for t in faulty]
+        kinds = list(dict.fromkeys(names))
+        self.kind = np.array([kinds.index(name) for name in names], int)  # (F,)
+
+        for row, trace in enumerate(faulty):
             steps = trace.window(window_s)
             if trace.onset is None or steps.stop <= steps.start:
                 continue
             peak = trace.surprise[steps].max()
-            for k, other in enumerate(nominal):
-                if other.task == trace.task and len(other) > steps.start:
-                    theirs = other.surprise[steps].max()
-                    self.won[n, k], self.comparable[n, k] = (
-                        0.5 * ((peak > theirs) + float(peak >= theirs)),
-                        1.0,
-                    )
+            for column, other in enumerate(nominal):
+                if other.task != trace.task or len(other) <= steps.start:
+                    continue
+                theirs = other.surprise[steps].max()
+                self.won[row, column] = 0.5 * (float(peak > theirs) + float(peak >= theirs))
+                self.comparable[row, column] = 1.0
 
-    def auroc(self, own: Floats | None = None, theirs: Floats | None = None) -> float:
-        """Return the mean over kinds, faults (F,) and nominal episodes (N,) counted so many times; NaN without any."""
-        own, theirs = (
-            np.ones(n) if w is None else w
-            for n, w in zip(self.won.shape, (own, theirs), strict=True)
-        )
+    def auroc(self) -> float:
+        """Return the mean over kinds of fault; NaN where nothing can be compared."""
+        faulty, nominal = self.won.shape
+        return self.weighted_auroc(np.ones(faulty), np.ones(nominal))
+
+    def weighted_auroc(self, own: Floats, theirs: Floats) -> float:
+        """Return the same, with faults (F,) and nominal episodes (N,) counted so many times."""
         others = self.comparable @ theirs  # (F,)
         counted = np.where(others > 0, own, 0.0)
         each = (self.won @ theirs) / np.maximum(others, 1.0)
-        total, drawn = (np.bincount(self.kind, w) for w in (counted * each, counted))
-        return float((total[drawn > 0] / drawn[drawn > 0]).mean()) if drawn.any() else math.nan
+        total = np.bincount(self.kind, counted * each)
+        drawn = np.bincount(self.kind, counted)
+        if not drawn.any():
+            return math.nan
+        return float((total[drawn > 0] / drawn[drawn > 0]).mean())
 
 
 class Windows:
@@ -132,24 +130,25 @@ def resample(
 ) -> Draws:
     """Resample the results of one monitor; twins share task and seed, and monitors of the same ``seed`` are paired."""
     rng = np.random.default_rng(seed)
-    names = sorted({(t.task, t.seed) for t in (*nominal, *faulty)})
-    place = {name: i for i, name in enumerate(names)}
-    tasks = np.array([task for task, _ in names])
-    scenes_of = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
-    own, theirs = (
-        np.array([place[t.task, t.seed] for t in traces], int) for traces in (faulty, nominal)
-    )
-    wins, windows = Wins(faulty, nominal, window_s), Windows(faulty, window_s)
+    scenes = sorted({(t.task, t.seed) for t in (*nominal, *faulty)})
+    index = {scene: n for n, scene in enumerate(scenes)}
+    scene_of_fault = np.array([index[t.task, t.seed] for t in faulty], int)  # (F,)
+    scene_of_nominal = np.array([index[t.task, t.seed] for t in nominal], int)  # (N,)
+    tasks = np.array([task for task, _ in scenes])
+    scenes_of_tasks = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
+
+    wins = Wins(faulty, nominal, window_s)
+    windows = Windows(faulty, window_s)
     auroc = np.full(draws, math.nan)
     found: dict[AlarmRate, Floats] = {}
-    for k in range(draws):
-        weights = np.zeros(len(names))  # how often each scene was drawn
-        for scenes in scenes_of:
-            np.add.at(weights, rng.choice(scenes, len(scenes)), 1.0)
-        times = weights[own]  # (F,)
-        auroc[k] = wins.auroc(times, weights[theirs])
+    for draw in range(draws):
+        weights = np.zeros(len(scenes))  # how often each scene was drawn
+        for own in scenes_of_tasks:
+            np.add.at(weights, rng.choice(own, len(own)), 1.0)
+        times = weights[scene_of_fault]  # (F,)
+        auroc[draw] = wins.weighted_auroc(times, weights[scene_of_nominal])
         for promise, threshold in calibration.resampled(rng).items():
             shares = found.setdefault(promise, np.full(draws, math.nan))
             if times.any():
-                shares[k] = windows.detected(threshold) @ times / times.sum()
-    return Draws(auroc, found)
+                shares[draw] = windows.detected(threshold) @ times / times.sum()
+    return Draws(auroc=auroc, found=found)

@@ -54,15 +54,13 @@ class ScoredEpisode:
     monitor: str = ""
     acting: str = POLICY_ALONE  # else the response to an alarm, such as ``"hold"``
     affected_channels: frozenset[str] = frozenset()  # those in which the fault shows first
-    top_channel: str = (
-        ""  # with the greatest share of surprise at ``first_alarm``; empty without an alarm
-    )
+    # with the greatest share of surprise at ``first_alarm``; empty without an alarm
+    top_channel: str = ""
     outcome: InterventionOutcome = InterventionOutcome()  # noqa: RUF009  (immutable)
     # (T,) surprise that a knock, or a stop, excused
     excused: Mapping[str, Floats] = field(default_factory=dict)
-    attribution: Floats | None = (
-        None  # (T, D) shares of the channels in the surprise, for figures alone
-    )
+    # (T, D) shares of the channels in the surprise, for figures alone
+    attribution: Floats | None = None
     channels: tuple[str, ...] = ()  # D names
     fault: NDArray[np.bool_] | None = None  # (T,) the ground truth, for figures alone
     stream: Floats | None = None  # (T, D) sensed values, where they are drawn
@@ -88,11 +86,9 @@ class ScoredEpisode:
     @property
     def missing(self) -> NDArray[np.bool_]:
         """(T,) the rows that lack a number; none where the stream was not kept."""
-        return (
-            np.zeros(len(self), np.bool_)
-            if self.stream is None
-            else np.asarray(np.isnan(self.stream).any(axis=1))
-        )
+        if self.stream is None:
+            return np.zeros(len(self), np.bool_)
+        return np.asarray(np.isnan(self.stream).any(axis=1))
 
     @cached_property
     def alarm(self) -> NDArray[np.bool_]:
@@ -105,11 +101,16 @@ class ScoredEpisode:
         return tuple(start for start, _ in spans(self.alarm))
 
     @property
+    def healthy_rows(self) -> int:
+        """The number of rows before the onset; of all without a fault."""
+        if self.onset is None:
+            return len(self)
+        return self.onset
+
+    @property
     def false_alarms(self) -> tuple[int, ...]:
         """The alarms raised before the onset; all of them where there was no fault."""
-        return (
-            self.alarms if self.onset is None else tuple(t for t in self.alarms if t < self.onset)
-        )
+        return tuple(row for row in self.alarms if row < self.healthy_rows)
 
     @property
     def first_alarm(self) -> int | None:
@@ -117,21 +118,29 @@ class ScoredEpisode:
 
         An alarm that was up before the onset and stays up is a false alarm, no detection.
         """
-        return next((t for t in self.alarms if t >= (self.onset or 0)), None)
+        since = self.onset or 0
+        return next((row for row in self.alarms if row >= since), None)
 
     @property
     def detected_after(self) -> int | None:
         """Rows from the onset to the first alarm raised at or after it; None without one."""
-        return (
-            None
-            if self.onset is None or self.first_alarm is None
-            else self.first_alarm - self.onset
-        )
+        if self.onset is None or self.first_alarm is None:
+            return None
+        return self.first_alarm - self.onset
 
     @property
     def delay(self) -> float | None:
         """Time from the beginning of the fault to the alarm [s], at least one ``dt``; None if missed."""
-        return None if self.detected_after is None else (self.detected_after + 1) * self.dt
+        if self.detected_after is None:
+            return None
+        return (self.detected_after + 1) * self.dt
+
+    def delay_within(self, window_s: float) -> float:
+        """Return the delay of an alarm within ``window_s`` of the onset [s]; ``inf`` if missed."""
+        after = self.detected_after
+        if self.delay is None or after is None or after >= window_steps(window_s, self.dt):
+            return math.inf
+        return self.delay
 
     def window(self, window_s: float) -> slice:
         """Return the rows within ``window_s`` of the onset, in which a detection counts; all without a fault."""
@@ -145,10 +154,12 @@ class ScoredEpisode:
 
     def attributed(self, attribution: Floats, channels: Sequence[str]) -> ScoredEpisode:
         """Return the episode with its ``top_channel``, from the shares (T, D) of D ``channels``; none in a tie."""
-        step = self.first_alarm
-        if step is None or (attribution[step] == attribution[step].max()).sum() > 1:
+        if self.first_alarm is None:
             return self
-        return replace(self, top_channel=channels[int(np.argmax(attribution[step]))])
+        shares = attribution[self.first_alarm]  # (D,)
+        if (shares == shares.max()).sum() > 1:
+            return self
+        return replace(self, top_channel=channels[int(np.argmax(shares))])
 
 
 def window_steps(window_s: float, dt: float) -> int:
@@ -161,5 +172,7 @@ def window_steps(window_s: float, dt: float) -> int:
 def onset_row(episode: Episode) -> int | None:
     """Return the row at which the fault begins; the label counts control steps, of several rows each."""
     label = episode.labelled
-    rows = len(episode) // (len(episode.contact_force) or len(episode))
-    return label.onset * rows if label.role == "faulty" and label.onset is not None else None
+    if label.role != "faulty" or label.onset is None:
+        return None
+    steps = len(episode.contact_force) or len(episode)
+    return label.onset * (len(episode) // steps)

@@ -47,10 +47,7 @@ class Recordings(NamedTuple):
     @classmethod
     def of(cls, recordings: Sequence[Episode]) -> Recordings:
         """Sort by role. Raises ValueError where there is nothing normal to learn from or to test on."""
-        healthy = [r for r in recordings if r.labelled.role in NOMINAL_ROLES and r.success]
-        reference = [r.labelled.role != "nominal" for r in healthy]
-        found = crashes(healthy, [r.labelled.task for r in healthy], reference)
-        crashed = {(healthy[n].labelled.task, healthy[n].labelled.seed) for n in found}
+        crashed = scenes_with_crash(recordings)
         roles: dict[str, list[Episode]] = {}
         failed = 0
         for recording in recordings:
@@ -61,14 +58,22 @@ class Recordings(NamedTuple):
             elif (label.task, label.seed) not in crashed:
                 roles.setdefault(label.role, []).append(recording)
         for role in NOMINAL_ROLES:
-            if not roles.get(role):
+            if role not in roles:
                 raise ValueError(
                     f"none of the {role} episodes succeeded without a crash: "
                     "there is nothing normal to learn or to test on"
                 )
-        return cls(
-            roles, (failed, len(crashed)), [r for r in recordings if r.labelled.role == "nominal"]
-        )
+        twins = [r for r in recordings if r.labelled.role == "nominal"]
+        return cls(roles=roles, left_out=(failed, len(crashed)), twins=twins)
+
+
+def scenes_with_crash(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
+    """Return task and seed of the solved nominal episodes in which the robot crashes."""
+    solved = [r for r in recordings if r.labelled.role in NOMINAL_ROLES and r.success]
+    labels = [r.labelled for r in solved]
+    is_reference = [label.role != "nominal" for label in labels]
+    crashed = crashes(solved, [label.task for label in labels], is_reference)
+    return {(labels[n].task, labels[n].seed) for n in crashed}
 
 
 @lru_cache(maxsize=1)
@@ -91,26 +96,30 @@ def benchmark(
     ``folder`` keeps the fitted monitors; ``each`` maps a function over items, as ``parallel_map`` does.
     """
     paths = tuple(file.resolve() for file in files)
+    folder = folder.resolve()
     models: dict[str, list[str]] = {}  # one that is judged in two ways is fitted once
     for name in monitors:
         models.setdefault(name.removesuffix(EVIDENCE), []).append(name)
-    folder = folder.resolve()
 
-    def score(names: Sequence[str]) -> dict[str, DetectionMetrics]:
+    def score(names: Sequence[str]) -> list[DetectionMetrics]:
         roles = read(paths).roles
-        return {
-            name: judged(name, fitted(folder, name, roles["fit"], seed), roles, rate, window_s)
-            for name in names
-        }
+        results = []
+        for name in names:
+            monitor = fitted(folder, name, roles["fit"], seed)
+            results.append(judged(name, monitor, roles, rate, window_s))
+        return results
 
-    found = {
-        name: result
-        for results in each(score, list(models.values()))
-        for name, result in results.items()
-    }
-    by_role, left_out, twins = read(paths)
-    seen = detectability_of(twins, by_role.get("faulty", []), window_s)
-    return BenchmarkResult({name: found[name] for name in monitors}, seen, rate, window_s, left_out)
+    by_name = {m.name: m for results in each(score, list(models.values())) for m in results}
+    recordings = read(paths)
+    return BenchmarkResult(
+        monitors={name: by_name[name] for name in monitors},
+        detectability=detectability_of(
+            recordings.twins, recordings.roles.get("faulty", []), window_s
+        ),
+        rate=rate,
+        window_s=window_s,
+        left_out=recordings.left_out,
+    )
 
 
 def judged(
@@ -122,51 +131,49 @@ def judged(
 ) -> DetectionMetrics:
     """Calibrate a fitted monitor, and score all other episodes."""
     monitor.calibrate(by_role["calibration"], rate)
-    fresh = 0 if monitor.maxima_ is None else len(monitor.maxima_)
-    rates = sorted({rate, *(r for r in RATES if fresh >= conformal_episodes(r))})
-    hours = 0.0 if monitor.blocks_ is None else monitor.blocks_.total
-    promises = [AlarmRate(r, EPISODE) for r in rates] + [
-        AlarmRate(r, HOUR) for r in PER_HOUR if r * hours >= 1.0
-    ]
-    calibration = Calibration(
-        {promise: monitor.threshold_at(**promise.named) for promise in promises},
-        np.zeros(0) if monitor.maxima_ is None else monitor.maxima_,
-        monitor.blocks_,
+    maxima = monitor.maxima_
+    blocks = monitor.blocks_
+    assert maxima is not None
+    assert blocks is not None
+
+    possible = [r for r in RATES if len(maxima) >= conformal_episodes(r)]
+    promises = [AlarmRate(r, EPISODE) for r in sorted({rate, *possible})]
+    promises += [AlarmRate(r, HOUR) for r in PER_HOUR if r * blocks.total >= 1.0]
+    thresholds = {promise: monitor.threshold_at(**promise.named) for promise in promises}
+    threshold = thresholds[AlarmRate(rate, EPISODE)]
+    return DetectionMetrics(
+        name=name,
+        traces=traces_of(name, monitor, by_role.get("faulty", []), threshold),
+        nominal=traces_of(name, monitor, by_role["nominal"], threshold),
+        window_s=window_s,
+        calibration=Calibration(thresholds, maxima, blocks),
     )
-    threshold = calibration.thresholds[AlarmRate(rate, EPISODE)]
-    nominal, faulty = (
-        traces_of(name, monitor, by_role.get(role, []), threshold) for role in ("nominal", "faulty")
-    )
-    return DetectionMetrics(name, faulty, nominal, window_s, calibration)
 
 
 @cache
 def code_digest() -> str:
     """Return a digest of the code that decides what a monitor learns."""
-    package, made = Path(__file__).parents[1], hashlib.sha256()
-    for place in (package / name for name in CODE):
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            made.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
-    return made.hexdigest()[:8]
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for name in CODE:
+        path = package / name
+        for file in sorted(path.rglob("*.py")) or [path]:
+            digest.update(file.relative_to(package).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()[:8]
 
 
 def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
     """Return the monitor fitted on these episodes; kept in the folder by episodes, settings and code."""
     model = name.removesuffix(EVIDENCE)
-    made = make_monitor(name, recordings[0].spec, seed=seed)
-    learned = (
-        model,
-        __version__,
-        made.get_params(),
-        sorted(str(r.labelled.path) for r in recordings),
-    )
+    monitor = make_monitor(name, recordings[0].spec, seed=seed)
+    files = sorted(str(r.labelled.path) for r in recordings)
+    learned = (model, __version__, monitor.get_params(), files)
     digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
     path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"
     with suppress(FileNotFoundError, ValueError):  # a damaged one is fitted anew
         return monitor_class(name).load(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    monitor = made.fit(recordings)
-    monitor.save(path)
+    monitor.fit(recordings).save(path)
     return monitor
 
 
@@ -174,11 +181,12 @@ def traces_of(
     name: str, monitor: CalibratedMonitor, episodes: Sequence[Episode], threshold: float
 ) -> list[ScoredEpisode]:
     """Score recordings, judged at this threshold."""
-    made = []
+    traces = []
     for first in range(0, len(episodes), AT_ONCE):
         some = episodes[first : first + AT_ONCE]
         for episode, surprise in zip(some, monitor.score_episodes(some), strict=True):
             label = episode.labelled
+            force = float(np.max(episode.contact_force, initial=0.0))
             trace = ScoredEpisode(
                 kind=label.kind or NOMINAL,
                 seed=label.seed,
@@ -190,10 +198,8 @@ def traces_of(
                 task=label.task,
                 monitor=name,
                 affected_channels=label.affected_channels,
-                outcome=InterventionOutcome(
-                    episode.success, contact_force=float(np.max(episode.contact_force, initial=0.0))
-                ),
+                outcome=InterventionOutcome(episode.success, contact_force=force),
                 excused=surprise.excused_by_event,
             )
-            made.append(trace.attributed(surprise.attribution, episode.spec.labels))
-    return made
+            traces.append(trace.attributed(surprise.attribution, episode.spec.labels))
+    return traces

@@ -22,7 +22,9 @@ class Share(NamedTuple):
     @property
     def value(self) -> float:
         """The proportion; NaN for none of none."""
-        return self.k / self.n if self.n else math.nan
+        if not self.n:
+            return math.nan
+        return self.k / self.n
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -35,7 +37,12 @@ class Share(NamedTuple):
     @classmethod
     def of(cls, outcomes: Sequence[bool] | NDArray[np.bool_]) -> Share:
         """Count the true outcomes."""
-        return cls(sum(map(bool, outcomes)), len(outcomes))
+        return cls(int(np.count_nonzero(outcomes)), len(outcomes))
+
+    @classmethod
+    def total(cls, shares: Sequence[Share]) -> Share:
+        """Add the counts of several shares."""
+        return cls(sum(share.k for share in shares), sum(share.n for share in shares))
 
 
 class Rate(NamedTuple):
@@ -47,25 +54,27 @@ class Rate(NamedTuple):
     @property
     def value(self) -> float:
         """Events per hour; NaN without any time."""
-        return self.k / self.hours if self.hours else math.nan
+        if not self.hours:
+            return math.nan
+        return self.k / self.hours
 
     @property
     def interval(self) -> tuple[float, float]:
         """95 % exact Poisson interval [1/h] (Garwood 1936); events that come in clusters count once."""
-        low = stats.gamma.ppf(0.025, self.k) if self.k else 0.0
-        high = stats.gamma.isf(0.025, self.k + 1)
-        return (
-            (float(low / self.hours), float(high / self.hours)) if self.hours else (0.0, math.inf)
-        )
+        if not self.hours:
+            return 0.0, math.inf
+        low = 0.0
+        if self.k:
+            low = float(stats.gamma.ppf(0.025, self.k) / self.hours)
+        return low, float(stats.gamma.isf(0.025, self.k + 1) / self.hours)
 
     @property
     def text(self) -> str:
         """``value (low to high)``; empty without any time."""
-        return (
-            f"{self.value:.1f} ({self.interval[0]:.1f} to {self.interval[1]:.1f})"
-            if self.hours
-            else ""
-        )
+        if not self.hours:
+            return ""
+        low, high = self.interval
+        return f"{self.value:.1f} ({low:.1f} to {high:.1f})"
 
 
 class Estimate(NamedTuple):
@@ -85,17 +94,19 @@ class Spread(NamedTuple):
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
         """Summarise one value per seed; the deviation of a single one is NaN."""
-        return cls(
-            float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
-        )
+        deviation = math.nan
+        if len(values) > 1:
+            deviation = float(np.std(values, ddof=1))
+        return cls(float(np.mean(values)), deviation)
 
-    def text(self, scale: float = 1.0, digits: int = 3) -> str:
-        """``mean ± sd``, each times ``scale``; the mean alone without a deviation."""
-        deviation = "" if math.isnan(self.sd) else f" ± {scale * self.sd:.{digits}f}"
-        return f"{scale * self.mean:.{digits}f}{deviation}"
+    def text(self, digits: int = 3) -> str:
+        """``mean ± sd``; the mean alone without a deviation."""
+        if math.isnan(self.sd):
+            return f"{self.mean:.{digits}f}"
+        return f"{self.mean:.{digits}f} ± {self.sd:.{digits}f}"
 
 
 def auroc(positive: Floats, negative: Floats) -> float:
     """Return the probability that a positive (n,) scores higher than a negative (m,), ties counted half."""
-    found = stats.mannwhitneyu(positive, negative, method="asymptotic", nan_policy="raise")
-    return float(found.statistic / (len(positive) * len(negative)))
+    test = stats.mannwhitneyu(positive, negative, method="asymptotic", nan_policy="raise")
+    return float(test.statistic / (len(positive) * len(negative)))

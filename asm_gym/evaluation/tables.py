@@ -31,12 +31,13 @@ class Table:
 
     def __rich__(self) -> RichTable:
         """Return the table for a terminal; rich calls this."""
-        made = RichTable(title=escape(self.caption))
-        for n, heading in enumerate(self.headings):
-            made.add_column(escape(heading), justify="right" if n else "left", overflow="fold")
+        shown = RichTable(title=escape(self.caption))
+        for heading in self.headings:
+            shown.add_column(escape(heading), justify="right", overflow="fold")
+        shown.columns[0].justify = "left"
         for row in self.rows:
-            made.add_row(*(escape(str(cell)) for cell in row))
-        return made
+            shown.add_row(*(escape(str(cell)) for cell in row))
+        return shown
 
 
 def tabulate(
@@ -49,17 +50,20 @@ def tabulate(
 
 def markdown(table: Table) -> str:
     """Return the caption, and a table of pipes and dashes."""
-    lines = [table.headings, ["---"] * len(table.headings), *table.rows]
-    return "\n".join(
-        [table.caption, "", *("| " + " | ".join(map(str, cells)) + " |" for cells in lines)]
-    )
+    rows = (table.headings, ["---"] * len(table.headings), *table.rows)
+    lines = ["| " + " | ".join(map(str, cells)) + " |" for cells in rows]
+    return "\n".join([table.caption, "", *lines])
 
 
 def count(share: Share | None) -> str:
-    """Format as ``k of n``."""
-    return "" if share is None else f"{share.k} of {share.n}"
+    """Format as ``k of n``; empty without a share."""
+    if share is None:
+        return ""
+    return f"{share.k} of {share.n}"
 
 
 def percent(share: Share | None) -> str:
-    """Format as a percentage; none of none as nothing."""
-    return f"{100 * share.value:.0f} %" if share is not None and share.n else ""
+    """Format as a percentage; empty without a share, or for none of none."""
+    if share is None or not share.n:
+        return ""
+    return f"{100 * share.value:.0f} %"

@@ -57,27 +57,28 @@ def parallel_map(
     """
     check_number("workers", workers, low=1, high=MOST_WORKERS, whole=True)
     report = progress or (lambda done, total: None)
-    found: dict[int, Result] = {}
+    total = len(items)
+    results: dict[int, Result] = {}
     if workers == 1:
         for index, item in enumerate(items):
-            found[index] = task(item)
-            report(len(found), len(items))
+            results[index] = task(item)
+            report(len(results), total)
     elif items:
         pickled = _pickled(task)
-        with _loky(min(workers, len(items))) as executor:
-            index_of = {
-                executor.submit(_call, pickled, item): index for index, item in enumerate(items)
-            }
-            for future in as_completed(index_of):
-                found[index_of[future]] = future.result()
-                report(len(found), len(items))
-    return [found[index] for index in range(len(items))]
+        with _loky(min(workers, total)) as executor:
+            futures = {executor.submit(_call, pickled, item): n for n, item in enumerate(items)}
+            for future in as_completed(futures):
+                results[futures[future]] = future.result()
+                report(len(results), total)
+    return [results[index] for index in range(total)]
 
 
 def _pickled(task: Callable[[Any], Any]) -> bytes:
     try:
         rows = added()
-        return cloudpickle.dumps(partial(knowing, rows, task) if rows else task)
+        if rows:
+            task = partial(knowing, rows, task)
+        return cloudpickle.dumps(task)
     except Exception as error:  # whatever a foreign __reduce__ raises
         raise TypeError(
             f"the work cannot be sent to another process ({type(error).__name__}: {error}): make what it needs in the "
@@ -92,16 +93,14 @@ def _call(task: bytes, item: Any) -> Any:
 
 @contextmanager
 def _loky(workers: int) -> Iterator[Any]:
-    get_reusable_executor = require(
-        "loky", what="running episodes in several processes"
-    ).get_reusable_executor
-    how = {
-        "timeout": IDLE_S,
-        "initializer": _end_with_parent,
-        "initargs": (os.getpid(),),
-        "env": ONE_THREAD,
-    }
-    executor = get_reusable_executor(workers, **how)
+    loky = require("loky", what="running episodes in several processes")
+    executor = loky.get_reusable_executor(
+        workers,
+        timeout=IDLE_S,
+        initializer=_end_with_parent,
+        initargs=(os.getpid(),),
+        env=ONE_THREAD,
+    )
     try:
         yield executor
     except BrokenProcessPool as error:

@@ -55,14 +55,15 @@ def claimed(folder: Path, name: str, settings: dict[str, Any]) -> Iterator[None]
         path = folder / name
         if path.is_file():
             theirs = json.loads(path.read_text(encoding="utf-8"))
-            other = [
-                f"{n}: {theirs.get(n)!r} there, {ours[n]!r} here"
-                for n in ours
-                if theirs.get(n) != ours[n]
+            differences = [
+                f"{name}: {theirs.get(name)!r} there, {own!r} here"
+                for name, own in ours.items()
+                if theirs.get(name) != own
             ]
-            if other:
+            if differences:
                 raise ValueError(
-                    f"{folder} holds recordings of other settings ({'; '.join(other)}): name another --out"
+                    f"{folder} holds recordings of other settings ({'; '.join(differences)}): "
+                    "name another --out"
                 )
         with written_whole(path) as file:
             file.write((json.dumps(ours, indent=2) + "\n").encode())
@@ -84,9 +85,10 @@ def make_missing(
 
     ``make`` writes the file of an item, complete or not at all, at its ``place``. Files that exist count as done.
     """
-    places = [place(item) for item in items]
-    missing = [item for item, path in zip(items, places, strict=True) if not path.is_file()]
-    done, tell = len(items) - len(missing), progress or (lambda done, total: None)
-    tell(done, len(items))
-    parallel_map(make, missing, workers, lambda k, _: tell(done + k, len(items)))
-    return places
+    missing = [item for item in items if not place(item).is_file()]
+    total = len(items)
+    existing = total - len(missing)
+    report = progress or (lambda done, total: None)
+    report(existing, total)
+    parallel_map(make, missing, workers, lambda made, _: report(existing + made, total))
+    return [place(item) for item in items]

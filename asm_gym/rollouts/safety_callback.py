@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from asm_gym.data.episode import spans
+
+
+class GuardedStep(NamedTuple):
+    """What the guard did in one step."""
+
+    surprise: float  # in thresholds
+    alarm: bool
+    cost: float
+    overridden: bool
+    slowed: float  # share of the action that the speed limit removed
 
 
 class SafetyCallback(BaseCallback):
@@ -21,25 +33,30 @@ class SafetyCallback(BaseCallback):
         self.ended: list[dict[str, float]] = []  # the numbers of all episodes that have ended
 
     def _on_training_start(self) -> None:
-        self._steps: list[list[tuple[float, ...]]] = [[] for _ in range(self.training_env.num_envs)]
+        self._steps: list[list[GuardedStep]] = [[] for _ in range(self.training_env.num_envs)]
 
     def _on_step(self) -> bool:
-        for steps, info, done in zip(
-            self._steps, self.locals["infos"], self.locals["dones"], strict=True
-        ):
+        infos = self.locals["infos"]
+        for steps, info, done in zip(self._steps, infos, self.locals["dones"], strict=True):
             if "asm" not in info:
                 raise KeyError('info has no "asm": wrap the environment in NeuralASMSafety')
-            surprise = float(info["asm_surprise"]) / float(info["asm"]["threshold"])
-            flat = bool(info["asm_alarm"]), float(info["cost"]), bool(info["asm_intervened"])
-            steps.append((surprise, *flat, float(info["asm"]["slowed"])))
+            steps.append(
+                GuardedStep(
+                    surprise=float(info["asm_surprise"]) / float(info["asm"]["threshold"]),
+                    alarm=bool(info["asm_alarm"]),
+                    cost=float(info["cost"]),
+                    overridden=bool(info["asm_intervened"]),
+                    slowed=float(info["asm"]["slowed"]),
+                )
+            )
             if done:
-                worst, alarm, cost, overridden, slowed = zip(*steps, strict=True)
-                counts = {
-                    "alarms": len(spans(np.array(alarm))),
-                    "cost": sum(cost),
-                    "overridden": sum(overridden),
-                }
-                self._log(surprise=max(worst), slowed=float(np.mean(slowed)), **counts)
+                self._log(
+                    surprise=max(step.surprise for step in steps),
+                    slowed=float(np.mean([step.slowed for step in steps])),
+                    alarms=len(spans(np.array([step.alarm for step in steps]))),
+                    cost=sum(step.cost for step in steps),
+                    overridden=sum(step.overridden for step in steps),
+                )
                 steps.clear()
         return True
 

@@ -24,16 +24,12 @@ def role_seeds(seed: int, task: str, role: str, episodes: int) -> list[int]:
 def draw_onset(seed: int, horizon: int) -> int:
     """Return when a fault begins in the episode of ``seed`` [steps]: after step 10, in the first half."""
     latest = max(11, check_number("horizon", horizon, low=0, high=1e9, whole=True) // 2)
-    return int(
-        np.random.default_rng([check_number("seed", seed, low=0, whole=True), 1]).integers(
-            10, latest
-        )
-    )
+    rng = np.random.default_rng([check_number("seed", seed, low=0, whole=True), 1])
+    return int(rng.integers(10, latest))
 
 
 def _draw(seed: int, which: int, episodes: int) -> list[int]:
     check_number("episodes", episodes, low=0, high=MOST_EPISODES, whole=True)
     entropy = [check_number("seed", seed, low=0, whole=True), which]
-    return [
-        int(s) for s in np.random.SeedSequence(entropy).generate_state(episodes, np.uint32) // 2
-    ]
+    drawn = np.random.SeedSequence(entropy).generate_state(episodes, np.uint32)
+    return (drawn // 2).tolist()

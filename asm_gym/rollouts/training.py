@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -31,14 +32,28 @@ from asm_gym.rollouts.parallel import Progress
 ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
 ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
 CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
-BATCH, LOG_STD = 256, -3.5  # of cloning, and the actor's log standard deviation before tanh
-# learning rates of cloning, before and while the agent learns from its steps
-CLONING_RATE, ANCHOR_RATE = (
-    1e-3,
-    3e-4,
-)
+BATCH = 256  # steps of an update of cloning
+LOG_STD = -3.5  # the actor's log standard deviation before tanh, after cloning
+CLONING_RATE = 1e-3  # learning rate of cloning
+ANCHOR_RATE = 3e-4  # the same while the agent learns from its steps
 
 Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How an agent is trained."""
+
+    steps: int
+    """Control steps of SAC; 0 for a clone."""
+    cloning_updates: int
+    """Updates of the actor in cloning."""
+    evaluate_every: int
+    """Control steps between evaluations."""
+    evaluation_episodes: int
+    """Episodes of each evaluation."""
+    seed: int
+    """Seed of all random draws."""
 
 
 class Standardised(gym.ObservationWrapper[Floats, Any, Any]):
@@ -60,15 +75,14 @@ class NormalisedCritic(SACPolicy):
     def make_critic(self, features_extractor: Any = None) -> Any:
         """Return the critics."""
         critic: Any = super().make_critic(features_extractor)
-        for n, q in enumerate(critic.q_networks):
-            parts = [
-                (p, torch.nn.LayerNorm(p.out_features))
-                if getattr(p, "out_features", 1) > 1
-                else (p,)
-                for p in q
-            ]
-            critic.q_networks[n] = torch.nn.Sequential(*(layer for some in parts for layer in some))
-            critic.add_module(f"qf{n}", critic.q_networks[n])
+        for n, network in enumerate(critic.q_networks):
+            layers = torch.nn.Sequential()
+            for layer in network:
+                layers.append(layer)
+                if getattr(layer, "out_features", 1) > 1:
+                    layers.append(torch.nn.LayerNorm(layer.out_features))
+            critic.q_networks[n] = layers
+            critic.add_module(f"qf{n}", layers)
         return critic
 
 
@@ -83,15 +97,12 @@ class GuardedSAC(SAC):
     def _store_transition(
         self, buffer: Any, action: Any, seen: Any, reward: Any, dones: Any, infos: Any
     ) -> None:
-        executed = [info.get("asm", {}).get("executed_action") for info in infos]
-        scale = self.policy.scale_action
-        kept = np.array(
-            [
-                own if other is None else scale(other)
-                for own, other in zip(action, executed, strict=True)
-            ]
-        )
-        super()._store_transition(buffer, kept, seen, reward, dones, infos)
+        executed = np.array(action)
+        for n, info in enumerate(infos):
+            override = info.get("asm", {}).get("executed_action")
+            if override is not None:
+                executed[n] = self.policy.scale_action(override)
+        super()._store_transition(buffer, executed, seen, reward, dones, infos)
 
 
 def make_learner(env: gym.Env[Any, Any], seed: int) -> GuardedSAC:
@@ -114,13 +125,8 @@ def train(
     make: Callable[[], gym.Env[Any, Any]],
     out: Path,
     demonstrations: Sequence[Episode],
+    settings: TrainingSettings,
     progress: Progress,
-    *,
-    steps: int,
-    cloning_updates: int,
-    evaluate_every: int,
-    evaluation_episodes: int,
-    seed: int,
 ) -> NetworkPolicy:
     """Return the best agent of the evaluations; without any of them, the last one. ``make`` makes the environment.
 
@@ -131,39 +137,40 @@ def train(
     with closing(make()) as env, closing(make()) as other:  # the learner's own must not be reset
         check_sizes(env, demonstrations)
         observations = np.concatenate([e.observations for e in demonstrations])
+        mean = observations.mean(axis=0)
         spread = observations.std(axis=0)
-        standard = (
-            observations.mean(axis=0),
-            np.where(spread > 1e-3, spread, 1.0).astype(np.float32),
-        )
-        view = Standardised(env, *standard)
-        learner = make_learner(Monitor(view), seed)
-        learner.set_logger(
-            configure(str(out / "log"), ["csv", *["tensorboard"] * bool(find_spec("tensorboard"))])
-        )
+        scale = np.where(spread > 1e-3, spread, 1.0).astype(np.float32)
+        view = Standardised(env, mean, scale)
+
+        formats = ["csv"]
+        if find_spec("tensorboard"):
+            formats.append("tensorboard")
+        learner = make_learner(Monitor(view), settings.seed)
+        learner.set_logger(configure(str(out / "log"), formats))
         fill_buffer(learner, demonstrations, view)
-        anchor = clone(learner, cloning_updates, seed, progress)
-        if steps:
+        anchor = clone(learner, settings.cloning_updates, settings.seed, progress)
+        if settings.steps:
             learner.actor.requires_grad_(False)
-            learner.train(min(CRITIC_UPDATES, cloning_updates), BATCH)
+            learner.train(min(CRITIC_UPDATES, settings.cloning_updates), BATCH)
             learner.actor.requires_grad_(True)
-            judge = EvalCallback(
-                Monitor(Standardised(other, *standard)),
-                n_eval_episodes=evaluation_episodes,
-                eval_freq=evaluate_every,
+            evaluations = EvalCallback(
+                Monitor(Standardised(other, mean, scale)),
+                n_eval_episodes=settings.evaluation_episodes,
+                eval_freq=settings.evaluate_every,
                 log_path=str(out / "log"),
                 best_model_save_path=str(out),
                 verbose=0,
             )
-            judge.eval_env.seed(seed + 1)
+            evaluations.eval_env.seed(settings.seed + 1)
 
-            def follow(own: dict[str, Any], _: Any) -> bool:
+            def after_step(variables: dict[str, Any], _: Any) -> bool:
                 anchor()
-                progress(min(own["self"].num_timesteps, steps), steps)
+                done = variables["self"].num_timesteps
+                progress(min(done, settings.steps), settings.steps)
                 return True
 
-            learner.learn(steps, [judge, ConvertCallback(follow)])
-        if steps >= evaluate_every:
+            learner.learn(settings.steps, [evaluations, ConvertCallback(after_step)])
+        if settings.steps >= settings.evaluate_every:
             learner.set_parameters(str(out / "best_model.zip"))
         return export(learner, view)
 
@@ -188,28 +195,27 @@ def fill_buffer(learner: SAC, episodes: Sequence[Episode], view: Standardised) -
     assert learner.replay_buffer is not None
     space: Any = learner.action_space
     for episode in episodes:
-        seen = view.observation(episode.observations)
+        observations = view.observation(episode.observations)
         actions = learner.policy.scale_action(np.clip(episode.actions, space.low, space.high))
+        is_last = np.arange(len(episode.rewards)) == len(episode.rewards) - 1
         for t, reward in enumerate(episode.rewards):
-            last = t == len(episode.rewards) - 1
-            info: dict[str, Any] = {
-                "TimeLimit.truncated": last and not episode.info.get("terminated", False)
-            }
-            row = (
-                seen[t][None],
-                seen[t + 1][None],
-                actions[t][None],
-                np.array([reward]),
-                np.array([last]),
+            truncated = bool(is_last[t]) and not episode.info.get("terminated", False)
+            learner.replay_buffer.add(
+                observations[[t]],
+                observations[[t + 1]],
+                actions[[t]],
+                reward=np.array([reward]),
+                done=is_last[[t]],
+                infos=[{"TimeLimit.truncated": truncated}],
             )
-            learner.replay_buffer.add(*row, [info])
 
 
 def clone(
     learner: SAC, updates: int, seed: int = 0, progress: Progress = lambda *_: None
 ) -> Callable[[], None]:
-    """Fit a learner's actor to the actions in its replay buffer; return what makes one update more."""
-    buffer, actor = learner.replay_buffer, learner.actor
+    """Fit a learner's actor to the actions in its replay buffer; return a function that makes one update more."""
+    buffer = learner.replay_buffer
+    actor = learner.actor
     assert buffer is not None
     observations = torch.as_tensor(buffer.observations[: buffer.size(), 0].copy())
     actions = torch.as_tensor(buffer.actions[: buffer.size(), 0].copy())
@@ -217,9 +223,8 @@ def clone(
     with torch.no_grad():
         head.weight.zero_()
         head.bias.fill_(LOG_STD)
-    optimiser = torch.optim.Adam(
-        [p for name, p in actor.named_parameters() if "log_std" not in name], lr=CLONING_RATE
-    )
+    weights = [w for name, w in actor.named_parameters() if "log_std" not in name]
+    optimiser = torch.optim.Adam(weights, lr=CLONING_RATE)
     decay = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
     batches = torch.Generator().manual_seed(seed)
 
@@ -240,14 +245,10 @@ def clone(
 
 def export(learner: SAC, view: Standardised) -> NetworkPolicy:
     """Return the learner's policy for unstandardised observations, without its noise, to act in the environment."""
-    parts = [
-        part
-        for part in (*learner.actor.latent_pi, learner.actor.mu)
-        if isinstance(part, torch.nn.Linear)
-    ]
-    layers = [
-        (part.weight.detach().cpu().numpy().copy(), part.bias.detach().cpu().numpy().copy())
-        for part in parts
-    ]
-    how: dict[str, Any] = {"mean": view.mean, "scale": view.scale, "trained_in": describe(view.env)}
-    return NetworkPolicy(layers, **how).fit_to(view.env, "the agent")
+    layers = []
+    for part in (*learner.actor.latent_pi, learner.actor.mu):
+        if isinstance(part, torch.nn.Linear):
+            weights, bias = (p.detach().cpu().numpy().copy() for p in (part.weight, part.bias))
+            layers.append((weights, bias))
+    policy = NetworkPolicy(layers, mean=view.mean, scale=view.scale, trained_in=describe(view.env))
+    return policy.fit_to(view.env, "the agent")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,9 @@ class RolloutConfig:
     @property
     def settings(self) -> Settings:
         """Arguments of ``gym.make``."""
-        named = ("robot", self.robot), ("stream_freq", self.stream_freq)
-        return (*((name, value) for name, value in named if value is not None), *self.env_kwargs)
+        named: dict[str, Any] = {"robot": self.robot, "stream_freq": self.stream_freq}
+        given = tuple((name, value) for name, value in named.items() if value is not None)
+        return given + self.env_kwargs
 
 
 @dataclass(frozen=True)
@@ -52,45 +54,59 @@ class Trial:
     seed: int  # of the environment and of the policy: trials that share it are twins
     kind: str = NOMINAL  # else ``"passing_push"``, a fault of the suite of this ``severity``; with ``faults``, a name
     severity: str = ""
-    onset: int | None = (
-        None  # [steps]; by default drawn from the seed, in the first half of the episode
-    )
+    # [steps]; by default drawn from the seed, in the first half of the episode
+    onset: int | None = None
     faults: tuple[Fault, ...] | None = None
     acting: str = POLICY_ALONE  # or a value of ``on_alarm``
-    after_s: float | None = (
-        None  # the episode ends so long after the onset [s]; by default it runs to its end
-    )
+    # the episode ends so long after the onset [s]; by default it runs to its end
+    after_s: float | None = None
     role: str = "nominal"  # or ``"fit"``, ``"calibration"``, ``"faulty"``, ``"babble"``
 
     @property
     def task(self) -> str:
-        """The name in the id: ``"Lift"`` of ``asm_gym/Lift-v0``."""
-        return self.env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0]
+        """The task of the environment."""
+        return task_in(self.env_id)
 
     @property
     def label(self) -> EpisodeLabel:
         """The label of its recording."""
-        kind = self.kind if self.role == "faulty" else ""
-        return EpisodeLabel(self.task, self.role, kind, self.severity, self.seed, self.onset)
+        kind = ""
+        if self.role == "faulty":
+            kind = self.kind
+        return EpisodeLabel(
+            task=self.task,
+            role=self.role,
+            kind=kind,
+            severity=self.severity,
+            seed=self.seed,
+            onset=self.onset,
+        )
 
     @property
     def on_alarm(self) -> str:
         """The response of the safety wrapper."""
-        return "monitor" if self.acting == POLICY_ALONE else self.acting
+        if self.acting == POLICY_ALONE:
+            return "monitor"
+        return self.acting
 
     def begins(self, env: gym.Env[Any, Any]) -> int:
         """Return the onset in ``env`` [steps]."""
-        if self.onset is not None or self.faults:
-            return self.onset if self.onset is not None else min(f.onset for f in self.faults or ())
+        if self.onset is not None:
+            return self.onset
+        if self.faults:
+            return min(fault.onset for fault in self.faults)
         return draw_onset(self.seed, horizon_of(env))
 
     def steps_in(self, env: gym.Env[Any, Any]) -> int | None:
         """Return the last step that is run; None for the end of the episode."""
-        return (
-            None
-            if self.after_s is None
-            else self.begins(env) + round(self.after_s / control_period(env))
-        )
+        if self.after_s is None:
+            return None
+        return self.begins(env) + round(self.after_s / control_period(env))
+
+
+def task_in(env_id: str) -> str:
+    """Return the name in an id: ``"Lift"`` of ``asm_gym/Lift-v0``."""
+    return env_id.rsplit("/", 1)[-1].rsplit("-v", 1)[0]
 
 
 def nominal_trials(env_id: str, role: str, seeds: list[int]) -> list[Trial]:
@@ -106,8 +122,10 @@ def faulty_trial(env_id: str, kind: str, severity: str, seed: int, horizon: int)
 
 def horizon_of(env: gym.Env[Any, Any]) -> int:
     """Return the control steps of an episode; 0 where unknown."""
-    limit = env.spec.max_episode_steps if env.spec else None
-    return int(getattr(env.unwrapped, "horizon", limit) or 0)
+    steps = None
+    if env.spec:
+        steps = env.spec.max_episode_steps
+    return int(getattr(env.unwrapped, "horizon", steps) or 0)
 
 
 def kinds_in(env: gym.Env[Any, Any], faults: Sequence[str]) -> list[str]:
@@ -131,14 +149,12 @@ def evaluation_trials(
     """Return nominal episodes of a task by role, and faulty twins of some; raise ValueError for an unfit policy."""
     with closing(gym.make(env_id, **dict(config.settings))) as env:
         make_policy(str(config.policy), env, seed=0)
-        kinds, horizon = kinds_in(env, faults), horizon_of(env)
+        kinds = kinds_in(env, faults)
+        horizon = horizon_of(env)
     roles = ("fit", "calibration", "nominal")
     seeds = {role: role_seeds(seed, name, role, episodes[role]) for role in roles}
+    trials = [trial for role in roles for trial in nominal_trials(env_id, role, seeds[role])]
     twins = seeds["nominal"][: episodes["faulty"]]
-    trials = [t for role in roles for t in nominal_trials(env_id, role, seeds[role])]
-    return trials + [
-        faulty_trial(env_id, k, severity, s, horizon)
-        for k in kinds
-        for severity in severities
-        for s in twins
-    ]
+    for kind, severity, twin in product(kinds, severities, twins):
+        trials.append(faulty_trial(env_id, kind, severity, twin, horizon))
+    return trials

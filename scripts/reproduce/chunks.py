@@ -17,7 +17,7 @@ from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.evaluation.tables import Table
 from asm_gym.guard.preview import preview_chunk
 from asm_gym.policies import rollout
-from asm_gym.rollouts.collect import collect, environment, staged
+from asm_gym.rollouts.run_trials import collect, environment, staged
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import harm, kit
 from asm_gym.tasks import env_id

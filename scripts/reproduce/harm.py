@@ -27,7 +27,7 @@ from asm_gym.guard.contact_state import LEANS_S
 from asm_gym.monitors import NeuralASM
 from asm_gym.policies import Policy, rollout
 from asm_gym.policies.hostile import HOSTILE
-from asm_gym.rollouts.collect import environment, policy_for, staged
+from asm_gym.rollouts.run_trials import environment, policy_for, staged
 from asm_gym.rollouts.trial import PASSING, RolloutConfig, Trial
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit

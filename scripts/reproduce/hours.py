@@ -27,15 +27,15 @@ from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.tables import Table, percent
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibration import AlarmRate
-from asm_gym.rollouts.corpus import Corpus
-from asm_gym.rollouts.pretraining.exam import (
+from asm_gym.rollouts.detection_corpus import Corpus
+from asm_gym.rollouts.pretraining.body_evaluation import (
     PROMISES,
-    Exam,
-    Marks,
-    card,
-    examine,
+    EvaluationCase,
+    Scores,
+    all_episodes,
+    evaluate_case,
     promises_table,
-    together,
+    scores_table,
     usual_force,
 )
 from asm_gym.scripts.command import option
@@ -63,8 +63,8 @@ def run(config: Config) -> Findings:
     memory, corpus = find(config.memory), Corpus.open(config.corpus)
     thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES}
     exams = corpus.files[["policy", "task"]].drop_duplicates().to_numpy().tolist()
-    marks: list[Marks] = []
-    known: list[Marks] = []
+    marks: list[Scores] = []
+    known: list[Scores] = []
     with kit.stage("examining") as tell:
         for n, (policy, task) in enumerate(exams):
             tell(n, len(exams))
@@ -72,9 +72,11 @@ def run(config: Config) -> Findings:
             usual = usual_force(
                 list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100])
             )
-            exam = Exam(task, policy, known=policy == EXPERT and task in memory.about["tasks"])
+            exam = EvaluationCase(
+                task, policy, known=policy == EXPERT and task in memory.about["tasks"]
+            )
             (known if exam.known else marks).append(
-                examine(memory, exam.name, own, WINDOW_S, usual)
+                evaluate_case(memory, exam.name, own, WINDOW_S, usual)
             )
     came = {(r, m.name): hourly_alarms(m.at(thresholds[r]).solved) for r in PROMISES for m in marks}
     records = [
@@ -85,7 +87,7 @@ def run(config: Config) -> Findings:
         records,
         [
             promises_table(marks, thresholds, WINDOW_S),
-            card(marks, memory, WINDOW_S),
+            scores_table(marks, memory, WINDOW_S),
             rules_table(marks, memory, thresholds),
             splits_table(marks + known),
         ],
@@ -122,7 +124,7 @@ class EDetector:
 
 
 def rules_table(
-    marks: Sequence[Marks], memory: NeuralASM, thresholds: Mapping[float, float]
+    marks: Sequence[Scores], memory: NeuralASM, thresholds: Mapping[float, float]
 ) -> Table:
     """Return a row for each promise and rule of alarm."""
     blocks, rows = memory.blocks_, []
@@ -137,7 +139,7 @@ def rules_table(
         for name, judged in rules.items():
             came = [hourly_alarms(m.solved) for m in judged]
             above = sum(c.interval[0] > rate for c in came)
-            healthy, faulty = together(judged)
+            healthy, faulty = all_episodes(judged)
             found = percent(DetectionMetrics("", faulty, [], WINDOW_S).detected)
             cells = (
                 hourly_alarms(healthy).text,
@@ -157,9 +159,9 @@ def rules_table(
     )
 
 
-def splits_table(marks: Sequence[Marks]) -> Table:
+def splits_table(marks: Sequence[Scores]) -> Table:
     """Return what each promise comes to over random halves of all healthy hours, known tasks included."""
-    solved, faulty = together(marks)
+    solved, faulty = all_episodes(marks)
     units = Blocks.of([t.surprise for t in solved], solved[0].dt)
     found = DetectionMetrics("", faulty, [], WINDOW_S)
     caption = (

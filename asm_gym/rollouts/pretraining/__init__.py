@@ -1,1 +1,1 @@
-"""Motor babbling, the memory that learns from its healthy episodes, and the memory's examination."""
+"""Motor babbling, the memory that learns from its healthy episodes, and the evaluation of that memory."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -40,6 +40,8 @@ from asm_gym.validation import check_number, typed
 from asm_gym.wrappers import NeuralASMSafety, StreamRecorder
 from asm_gym.wrappers.faults import FaultInjection
 
+Item = TypeVar("Item")
+
 _LATEST: dict[str, tuple[str, Any]] = {}
 """What this process made last, by name: the text of what it was made of, and the result."""
 
@@ -50,7 +52,7 @@ def _latest(name: str, key: object, make: Callable[[], Any]) -> Any:
         text = repr(key)  # the caller's own lists, dicts and arrays may change
     if name not in _LATEST or _LATEST[name][0] != text:
         _LATEST.pop(name, None)  # two environments at a time would take twice the memory
-        _LATEST[name] = text, make()
+        _LATEST[name] = (text, make())
     return _LATEST[name][1]
 
 
@@ -64,27 +66,27 @@ def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tu
 
     Outside of robosuite, magnitudes are relative to how far senses move in three nominal episodes as of ``config``.
     """
-    if trial.faults is not None or trial.kind == NOMINAL:
-        return trial.faults or ()
-    inner: Any = env.unwrapped
+    if trial.faults is not None:
+        return trial.faults
+    if trial.kind == NOMINAL:
+        return ()
+    arm: Any = env.unwrapped
     onset = trial.begins(env)
-    if not isinstance(inner, RobosuiteEnv):
+    if not isinstance(arm, RobosuiteEnv):
         sigma = _latest("sigmas", (trial.env_id, config), lambda: _sigmas(trial.env_id, config))
-        return faults_anywhere(
-            trial.kind, FaultyInterface(env), sigma, trial.severity, onset, trial.seed
-        )
-    if trial.kind == PASSING:
-        drawn, steps = draw(inner, onset, trial.seed), max(1, round(0.3 / control_period(env)))
-        return (
-            Push(
-                body=drawn.link,
-                newtons=20.0,
-                direction=drawn.direction,
-                duration=steps,
-                onset=onset,
-            ),
-        )
-    return (suite_fault(trial.kind, inner, trial.severity, onset, trial.seed),)
+        interface = FaultyInterface(env)
+        return faults_anywhere(trial.kind, interface, sigma, trial.severity, onset, trial.seed)
+    if trial.kind != PASSING:
+        return (suite_fault(trial.kind, arm, trial.severity, onset, trial.seed),)
+    drawn = draw(arm, onset, trial.seed)
+    push = Push(
+        body=drawn.link,
+        newtons=20.0,
+        direction=drawn.direction,
+        duration=max(1, round(0.3 / control_period(env))),
+        onset=onset,
+    )
+    return (push,)
 
 
 def _sigmas(env_id: str, config: RolloutConfig) -> NDArray[np.float64]:
@@ -127,9 +129,9 @@ def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Polic
     """Return the policy for one episode; one with ``set_random_seed``, as stable-baselines3's have, is seeded anew."""
     if isinstance(source, str | Path):
         return make_policy(str(source), env, seed=seed)
-    policy: Any = (
-        source if isinstance(source, Policy) and not isinstance(source, type) else source(env)
-    )
+    policy: Any = source
+    if isinstance(source, type) or not isinstance(source, Policy):
+        policy = source(env)
     if hasattr(policy, "set_random_seed"):
         policy.set_random_seed(seed)
     return policy
@@ -138,17 +140,15 @@ def policy_for(source: PolicySource, env: gym.Env[Any, Any], seed: int) -> Polic
 def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
     """Return the stream, contact forces and label of a trial: what monitors need, without what agents learn from."""
     forces: list[float] = []
+
+    def note_force(info: dict[str, Any]) -> None:
+        forces.append(info.get("contact_force", math.nan))
+
     with staged(trial, config) as env:
         recorder = StreamRecorder(env)
-        play(
-            trial, config, recorder, lambda info: forces.append(info.get("contact_force", math.nan))
-        )
-    base = environment(trial.env_id, config.settings)
-    inner: Any = (
-        base.unwrapped if isinstance(base.unwrapped, RobosuiteEnv) else FaultyInterface(base)
-    )
-    faults = faults_in(trial, base, config) if trial.role == "faulty" else ()
-    affected: frozenset[str] = frozenset().union(*(fault.labels(inner) for fault in faults))
+        play(trial, config, recorder, note_force)
+    if np.isnan(forces).all():
+        forces.clear()
     recorded = recorder.finish()
     return Episode(
         stream=recorded.stream,
@@ -156,10 +156,22 @@ def record_stream(trial: Trial, config: RolloutConfig) -> Episode:
         success=recorded.success,
         seed=trial.seed,
         faults=recorded.faults,
-        contact_force=np.asarray([] if np.isnan(forces).all() else forces, np.float32),
-        label=replace(trial.label, affected_channels=affected),
+        contact_force=np.asarray(forces, np.float32),
+        label=replace(trial.label, affected_channels=_affected_channels(trial, config)),
         info={"skill": trial.task, CONTROLLER: recorded.info[CONTROLLER]},
     )
+
+
+def _affected_channels(trial: Trial, config: RolloutConfig) -> frozenset[str]:
+    """Return the channels in which the faults of a trial show first."""
+    if trial.role != "faulty":
+        return frozenset()
+    env = environment(trial.env_id, config.settings)
+    interface: Any = env.unwrapped
+    if not isinstance(interface, RobosuiteEnv):
+        interface = FaultyInterface(env)
+    labels = [fault.labels(interface) for fault in faults_in(trial, env, config)]
+    return frozenset().union(*labels)
 
 
 def record_missing(
@@ -171,11 +183,28 @@ def record_missing(
 ) -> list[Path]:
     """Record the trials that are not in ``folder`` yet; return the files of all."""
     folder = folder.resolve()
+    return _record_missing(
+        trials,
+        lambda trial: record_stream(trial, config),
+        lambda trial: folder / trial.label.path,
+        workers,
+        progress,
+    )
 
-    def make(trial: Trial) -> Path:
-        return save_episode(folder / trial.label.path, record_stream(trial, config))
 
-    return make_missing(make, trials, lambda trial: folder / trial.label.path, workers, progress)
+def _record_missing(
+    items: Sequence[Item],
+    record: Callable[[Item], Episode],
+    file_of: Callable[[Item], Path],
+    workers: int,
+    progress: Progress | None,
+) -> list[Path]:
+    """Record the items without a file; return the files of all."""
+
+    def make(item: Item) -> Path:
+        return save_episode(file_of(item), record(item))
+
+    return make_missing(make, items, file_of, workers, progress)
 
 
 @typed
@@ -243,12 +272,15 @@ def collect_to(
     progress: Progress | None = None,
 ) -> list[Path]:
     """Record the episodes that are not in ``folder`` yet; return the files of all."""
-    folder, spec = folder.resolve(), env_spec(env_id)
-
-    def make(seed: int) -> Path:
-        return save_episode(folder / f"{seed}.npz", record_episode(seed, spec, config))
-
-    return make_missing(make, seeds, lambda seed: folder / f"{seed}.npz", workers, progress)
+    folder = folder.resolve()
+    spec = env_spec(env_id)
+    return _record_missing(
+        seeds,
+        lambda seed: record_episode(seed, spec, config),
+        lambda seed: folder / f"{seed}.npz",
+        workers,
+        progress,
+    )
 
 
 def check(env_id: str, config: RolloutConfig) -> None:
@@ -275,8 +307,13 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     asm = [info["asm"] for info in infos]
     rows = len(asm[0]["surprises"])  # of each control step
     fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
-    # the step's greatest
-    attribution = np.repeat([list(a["attribution"].values()) for a in asm], rows, axis=0)
+    onset = None
+    if fault.any():
+        onset = int(np.argmax(fault))
+    time = math.nan
+    solved = [step for step, info in enumerate(infos) if info["success"]]
+    if solved:
+        time = (solved[0] + 1) * rows * monitor.spec.dt
     trace = ScoredEpisode(
         kind=trial.kind,
         severity=trial.severity,
@@ -285,24 +322,22 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
         seed=trial.seed,
         dt=monitor.spec.dt,
         threshold=monitor.threshold,
-        surprise=np.concatenate([a["surprises"] for a in asm]),
-        onset=int(np.argmax(fault)) if fault.any() else None,
+        surprise=np.concatenate([step["surprises"] for step in asm]),
+        onset=onset,
         outcome=InterventionOutcome(
-            success,
+            success=success,
             contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
             overridden=any(info["overridden"] for info in infos),
-            time=next((n + 1 for n, i in enumerate(infos) if i["success"]), np.nan)
-            * rows
-            * monitor.spec.dt,
+            time=time,
         ),
         fault=fault,
     )
+    # of the row of each control step that surprised most
+    attribution = np.repeat([list(step["attribution"].values()) for step in asm], rows, axis=0)
     return trace.attributed(attribution, monitor.spec.labels)
 
 
 def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[ScoredEpisode]:
     """Run one trial with the policy alone, and with its response."""
-    return [
-        watch(replace(trial, acting=acting), config, memory)
-        for acting in (POLICY_ALONE, trial.acting)
-    ]
+    alone = replace(trial, acting=POLICY_ALONE)
+    return [watch(each, config, memory) for each in (alone, trial)]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +21,8 @@ import pandas as pd
 
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.faults.suite import KINDS, SEVERITIES, TEST, kinds_of, possible
-from asm_gym.rollouts.collect import environment, record_missing
 from asm_gym.rollouts.parallel import Progress
+from asm_gym.rollouts.run_trials import environment, record_missing
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
@@ -48,24 +48,28 @@ class Source(NamedTuple):
 
 
 PARTS: dict[str, tuple[Source, ...]] = {
-    "skills": tuple(Source(task, "scripted", 100, 100, 335, faults=True) for task in SKILLS),
+    "skills": tuple(
+        Source(task, fit=100, calibration=100, nominal=335, faults=True) for task in SKILLS
+    ),
     "hours": (
-        *(Source("Lift", "lift_sac", nominal=1190), Source("Stack", "stack_sac", nominal=790)),
-        *(Source("Door", "door_sac", nominal=790), Source("NutAssemblySquare", nominal=450)),
-        *(
-            Source(f"PickPlace{o}", f"{o.lower()}_clone", nominal=300)
-            for o in ("Can", "Milk", "Bread")
-        ),
+        Source("Lift", "lift_sac", nominal=1190),
+        Source("Stack", "stack_sac", nominal=790),
+        Source("Door", "door_sac", nominal=790),
+        Source("NutAssemblySquare", nominal=450),
+        Source("PickPlaceCan", "can_clone", nominal=300),
+        Source("PickPlaceMilk", "milk_clone", nominal=300),
+        Source("PickPlaceBread", "bread_clone", nominal=300),
         Source("PickPlaceCereal", "cereal_clone", nominal=400),
         Source("NutAssemblySquare", "square_clone", nominal=400),
-        *(Source(f"PickPlace{o}", nominal=400) for o in ("Bread", "Cereal")),
+        Source("PickPlaceBread", nominal=400),
+        Source("PickPlaceCereal", nominal=400),
     ),
 }
 """Six skills of experts, to learn, to calibrate and to test on; and healthy motion of agents and in other tasks."""
 ROUNDS = 5
-QUICK = {
-    "skills": (Source("Lift", "scripted", 2, 2, 2, faults=True),),
-    "hours": (Source("Lift", "lift_sac", 0, 0, 2),),
+QUICK: dict[str, tuple[Source, ...]] = {
+    "skills": (Source("Lift", fit=2, calibration=2, nominal=2, faults=True),),
+    "hours": (Source("Lift", "lift_sac", nominal=2),),
 }
 
 
@@ -79,7 +83,8 @@ class Corpus:
     @classmethod
     def open(cls, folder: str | Path) -> Corpus:
         """Find the files. Raises FileNotFoundError where no corpus is there, ValueError where it is another version."""
-        claim = Path(folder) / CLAIM
+        folder = Path(folder)
+        claim = folder / CLAIM
         if not claim.is_file():
             raise FileNotFoundError(2, "no corpus is there; asm-gym corpus records one", str(claim))
         version = json.loads(claim.read_text(encoding="utf-8")).get("corpus")
@@ -87,11 +92,17 @@ class Corpus:
             raise ValueError(
                 f"{claim} is of version {version!r} of the corpus, and this asm-gym reads {VERSION}"
             )
-        found = [f.relative_to(folder) for f in sorted(Path(folder).glob("*/episodes/*/*/*.npz"))]
-        rows = [(f.parts[0], *f.parts[2:4], *(f.stem.split("-")[:-1] or ("", ""))) for f in found]
-        return cls(
-            Path(folder), pd.DataFrame(rows, [f.as_posix() for f in found], COLUMNS, dtype=object)
-        )
+        paths = [path.relative_to(folder) for path in folder.glob("*/episodes/*/*/*.npz")]
+        rows = {path.as_posix(): cls._row(path) for path in sorted(paths)}
+        files = pd.DataFrame.from_dict(rows, orient="index", columns=COLUMNS, dtype=object)
+        return cls(folder, files)
+
+    @staticmethod
+    def _row(path: Path) -> tuple[str, ...]:
+        """Return ``COLUMNS`` of POLICY/episodes/TASK/ROLE/[KIND-SEVERITY-]SEED.npz."""
+        policy, _, task, role, _ = path.parts
+        fault = path.stem.split("-")[:-1]
+        return policy, task, role, *(fault or ("", ""))
 
     def episodes(
         self, *roles: str, policies: Sequence[str] = (), tasks: Sequence[str] = ()
@@ -99,7 +110,8 @@ class Corpus:
         """Load episodes by role, policy and task; all where none is named."""
         chosen = self.files
         for name, values in (("role", roles), ("policy", policies), ("task", tasks)):
-            chosen = chosen[chosen[name].isin(values)] if values else chosen
+            if values:
+                chosen = chosen[chosen[name].isin(values)]
         return [load_episode(self.folder / path) for path in chosen.index]
 
 
@@ -111,9 +123,8 @@ def skill_files(folder: Path, fit: int | None = None, tasks: Sequence[str] = SKI
     order = {name: n for n, name in enumerate(("", *KINDS, *SEVERITIES))}
     chosen = files[(files.policy == "scripted") & files.task.isin(tasks)]
     if fit is not None:
-        chosen = chosen[
-            (chosen.role != "fit") | (chosen.groupby(["task", "role"]).cumcount() < fit)
-        ]
+        number = chosen.groupby(["task", "role"]).cumcount()
+        chosen = chosen[(chosen.role != "fit") | (number < fit)]
     chosen = chosen.sort_values(
         ["kind", "severity"], key=lambda names: names.map(order), kind="stable"
     )
@@ -122,22 +133,22 @@ def skill_files(folder: Path, fit: int | None = None, tasks: Sequence[str] = SKI
 
 def trials(source: Source, number: int, rounds: int = ROUNDS) -> list[Trial]:
     """Return the trials of a source in a round; the first has all episodes to learn from and to calibrate on."""
-    env_id, where = task_spec(source.task).id, f"{source.policy}/{source.task}"
-    found = []
-    for role, count in (("fit", source.fit), ("calibration", source.calibration)):
-        found += nominal_trials(env_id, role, role_seeds(SEED, where, role, 0 if number else count))
-    seeds = role_seeds(SEED, where, "nominal", source.nominal)[number::rounds]
-    found += nominal_trials(env_id, "nominal", seeds)
+    env_id = task_spec(source.task).id
+    name = f"{source.policy}/{source.task}"
+    planned = []
+    if number == 0:
+        for role, count in (("fit", source.fit), ("calibration", source.calibration)):
+            planned += nominal_trials(env_id, role, role_seeds(SEED, name, role, count))
+    seeds = role_seeds(SEED, name, "nominal", source.nominal)[number::rounds]
+    planned += nominal_trials(env_id, "nominal", seeds)
     if source.faults:
         env: Any = environment(env_id).unwrapped
-        faults = product((kind for kind in kinds_of((TEST,)) if possible(kind, env)), SEVERITIES)
+        kinds = [kind for kind in kinds_of((TEST,)) if possible(kind, env)]
         horizon = task_spec(source.task).horizon
-        # A scene each, as far as there are as many.
-        found += [
-            faulty_trial(env_id, *fault, seeds[k % len(seeds)], horizon)
-            for k, fault in enumerate(faults)
-        ]
-    return found
+        # a scene each, as far as there are as many
+        for (kind, severity), seed in zip(product(kinds, SEVERITIES), cycle(seeds), strict=False):
+            planned.append(faulty_trial(env_id, kind, severity, seed, horizon))
+    return planned
 
 
 def record_corpus(
@@ -150,7 +161,6 @@ def record_corpus(
 ) -> None:
     """Record what is missing of a round, source by source."""
     for source in sources:
-        wanted = trials(source, number, rounds)
-        record_missing(
-            wanted, RolloutConfig(source.policy), folder / source.policy, workers, progress
-        )
+        planned = trials(source, number, rounds)
+        config = RolloutConfig(source.policy)
+        record_missing(planned, config, folder / source.policy, workers, progress)
