@@ -10,7 +10,7 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.reproduce import closed_loop, memorise_and_recall, six_skills, workspace
+from asm_gym.scripts.reproduce import closed_loop, memorise_and_recall, skill_measures, workspace
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
@@ -202,6 +202,6 @@ def test_every_task_is_seen_by_the_same_senses(lift):
 
 
 def test_a_name_counts_from_when_it_is_right_for_good():
-    assert six_skills.rows_until(np.array([False, True, False, True, True])) == 4
-    assert six_skills.rows_until(np.ones(5, np.bool_)) == 1
-    assert six_skills.rows_until(np.zeros(5, np.bool_)) == 6
+    assert skill_measures.rows_until(np.array([False, True, False, True, True])) == 4
+    assert skill_measures.rows_until(np.ones(5, np.bool_)) == 1
+    assert skill_measures.rows_until(np.zeros(5, np.bool_)) == 6

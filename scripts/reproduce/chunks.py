@@ -102,11 +102,12 @@ def run(config: Config) -> kit.Findings:
     rows = []
     for columns in (["kind"], ["task", "policy"]):
         for names, own in frame.groupby(columns, sort=False):
+            predicted = f"{own.predicted.sum()} of {own.blow.sum()}"
             rows.append(
                 {
                     "": ", ".join(names),
                     "episodes": len(own),
-                    f"impacts predicted {AHEAD_S:g} s ahead": f"{own.predicted.sum()} of {own.blow.sum()}",
+                    f"impacts predicted {AHEAD_S:g} s ahead": predicted,
                     "chunks refused in vain": own.in_vain.sum(),
                     "hours": f"{own.hours.sum():.2f}",
                 }

@@ -25,14 +25,7 @@ from asm_gym.memory.settling import SettlingNetwork
 from asm_gym.monitors.memory_policy import CommandReadout
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce.expression import Backpropagated
-from asm_gym.scripts.reproduce.workspace import (
-    EVENT,
-    GROUP_OF,
-    GROUPS,
-    JOINTS,
-    Floats,
-    Workspace,
-)
+from asm_gym.scripts.reproduce.workspace import EVENT, GROUP_OF, GROUPS, JOINTS, Floats, Workspace
 
 LONGEST = 250  # rows of a rollout
 YIELD = 12  # rows for which a pushed arm yields

@@ -163,8 +163,9 @@ def splits_table(marks: Sequence[Marks]) -> Table:
     units = Blocks.of([t.surprise for t in solved], solved[0].dt)
     metrics = DetectionMetrics("", faulty, [], WINDOW_S)
     caption = (
-        f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory has met too: one "
-        "half sets the threshold, in the other so many false alarms came, mean ± SD."
+        f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory "
+        "has met too: one half sets the threshold, in the other so many false alarms came, "
+        "mean ± SD."
     )
     row = {}
     for rate in PROMISES:

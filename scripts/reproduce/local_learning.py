@@ -326,7 +326,10 @@ def run(config: Config) -> Findings:
     work = partial(one_seed, config=config)
     records = kit.records_of("learning both ways", work, config.repetitions, config)
     frame = pd.DataFrame(records).replace({"target": TARGETS})
-    angle = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
+    angle = (
+        "Angle [°] between the local change and the exact one, before so many epochs; "
+        "mean ± SD over seeds"
+    )
     error = "Mean squared error of the next row [variance], before so many epochs"
     tables = [
         kit.grid(angle, frame, "degrees", "target", "epoch", digits=0),

@@ -373,8 +373,10 @@ def table(records: pd.DataFrame, arm: RealArm) -> Table:
     fewest = int((healthy.excess > 1).groupby(healthy.monitor).sum().min())
     seconds = healthy.seconds.sum() / len(monitors)
     caption = (
-        f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. * added to the recording, found within half a piece. "
-        f"At {fewest}: pushes and payloads found by the threshold that {fewest} healthy pieces pass."
+        f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. "
+        "* added to the recording, found within half a piece. "
+        f"At {fewest}: pushes and payloads found by the threshold "
+        f"that {fewest} healthy pieces pass."
     )
     return kit.table_of(caption, [monitor_row(name, own, fewest) for name, own in monitors])
 
