@@ -76,8 +76,9 @@ class Settling:
         self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
         ridge = Ridge(PRIOR).fit(states, np.log(squares + np.exp(self.least)))
         ratios = squares / np.exp(ridge.predict(states))
+        ridge.intercept_ += np.log(np.mean(ratios, axis=0))
         self.W = ridge.coef_
-        self.bias = ridge.intercept_ + np.log(np.mean(ratios, axis=0))
+        self.bias = ridge.intercept_
 
     def begin(self) -> None:
         """Forget the past."""
