@@ -112,7 +112,7 @@ def test_the_study_writes_its_tables_for_the_guards_asked_for(tmp_path, monkeypa
         "--out",
         str(tmp_path),
     ]
-    assert main(harm, asked) == 0
+    assert main("harm", harm, asked) == 0
     text = (tmp_path / "harm.md").read_text()
     assert "| hold |" in text
     assert "terminate" not in text

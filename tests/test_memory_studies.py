@@ -10,10 +10,11 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.reproduce import memorise_and_recall, panda, workspace
+from asm_gym.scripts.reproduce import closed_loop, memorise_and_recall, skill_measures, workspace
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
+    LocalTraining,
     mean_demonstrations,
     recalled,
     trajectories,
@@ -27,7 +28,7 @@ from asm_gym.scripts.reproduce.handwriting import (
     written,
 )
 from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
-from asm_gym.scripts.reproduce.recurrent import Batch, expected, side_by_side
+from asm_gym.scripts.reproduce.recurrent import Batch, Training, expected, side_by_side
 from asm_gym.scripts.reproduce.recurrent import train as train_recurrent
 
 
@@ -51,7 +52,7 @@ def letters_of(count: int, each: int = 6) -> tuple[list, list]:
 
 def test_the_recurrent_rival_offline_reads_its_own_predictions():
     train, tests = letters_of(2)
-    model = Backpropagated.learned(train, 16, np.random.default_rng(0), updates=5)
+    model = Backpropagated.learned(train, Training(hidden=16, updates=5), np.random.default_rng(0))
     streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)
     offline, row = model.express(streams, 20), np.arange(STEPS)[:, None, None]
     np.testing.assert_allclose(offline[:20], model.express(streams, STEPS)[:20], atol=1e-5)
@@ -60,7 +61,7 @@ def test_the_recurrent_rival_offline_reads_its_own_predictions():
 
 def test_the_memory_recalls_each_letter_from_its_cue():
     train, tests = letters_of(2, each=8)
-    memory = ExpressionMemory.learned(train, 32, np.random.default_rng(0), 4000)
+    memory = ExpressionMemory.learned(train, LocalTraining(32, 4000), np.random.default_rng(0))
     error, right = recalled(memory, tests, mean_demonstrations(train), 20)
     streams = np.stack([e.stream for e in tests], axis=1)
     still = np.linalg.norm(streams[20:, :, :2] - streams[19, :, :2], axis=2).mean()
@@ -147,17 +148,13 @@ def test_the_rival_learns_from_episodes_of_different_lengths():
     assert batch.senses.shape[0] == 60
     assert np.isnan(batch.senses[40:, 0]).all()
     assert np.isfinite(batch.senses[:, 1]).all()
+    whole = side_by_side(taught)
     for cell in ("GRU", "LSTM"):
-        few, many = (
-            train_recurrent(cut, 16, n, np.random.default_rng(0), cell=cell) for n in (1, 60)
-        )
-        errors = [
-            np.mean(
-                (expected(network, *side_by_side(taught), STEPS)[0] - side_by_side(taught).senses)
-                ** 2
-            )
-            for network in (few, many)
-        ]
+        errors = []
+        for updates in (1, 60):
+            training = Training(cell, hidden=16, updates=updates)
+            network = train_recurrent(cut, training, np.random.default_rng(0))
+            errors.append(np.mean((expected(network, whole, STEPS).senses - whole.senses) ** 2))
         assert errors[1] < 0.7 * errors[0]
 
 
@@ -176,7 +173,7 @@ def test_a_sense_that_sticks_is_alone_over_its_ceiling_and_counts_no_more_once_l
     schedule = Schedule(25, 16, 6e-3, 8, 1.0, 1.0, 0.0)
     rng = np.random.default_rng(0)
     trained = learn_settling(trajectories(reader, train), 64, schedule, rng, lambda: None)
-    model = workspace.Settling(reader, trained.network, train)
+    model = closed_loop.Settling(reader, trained.network, train)
     assert np.mean([model.felt(e.stream)[1] ** 2 for e in train]) == pytest.approx(1.0, abs=0.1)
     model.ceilings = 1.5 * np.max(
         [model.felt(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0
@@ -205,6 +202,6 @@ def test_every_task_is_seen_by_the_same_senses(lift):
 
 
 def test_a_name_counts_from_when_it_is_right_for_good():
-    assert panda.rows_until(np.array([False, True, False, True, True])) == 4
-    assert panda.rows_until(np.ones(5, np.bool_)) == 1
-    assert panda.rows_until(np.zeros(5, np.bool_)) == 6
+    assert skill_measures.rows_until(np.array([False, True, False, True, True])) == 4
+    assert skill_measures.rows_until(np.ones(5, np.bool_)) == 1
+    assert skill_measures.rows_until(np.zeros(5, np.bool_)) == 6

@@ -56,7 +56,7 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     for kind in ("frozen", "slipped", "late", "step"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
-        own = slices[FAULTS[kind]]
+        own = slices[FAULTS[kind].column]
         assert not changed[:100].any()
         assert changed[100:, own].any(axis=0).sum() == 1
         assert not np.delete(changed, np.arange(episode.spec.size)[own], axis=1).any()

@@ -19,6 +19,9 @@ STUDIES = {
     "real_arms": "faults added to recordings of real arms (to download)",
 }
 
+MODULES = {"panda": "six_skills"}
+"""Modules of studies that are not named after them."""
+
 
 def main(argv: list[str] | None = None) -> int:
     """Run one study and return the exit code."""
@@ -31,6 +34,7 @@ def main(argv: list[str] | None = None) -> int:
         from asm_gym.scripts.reproduce import kit
 
         check_choice("study", name, STUDIES)
-        return kit.main(import_module(f"asm_gym.scripts.reproduce.{name}"), rest)
+        module = import_module(f"asm_gym.scripts.reproduce.{MODULES.get(name, name)}")
+        return kit.main(name, module, rest)
 
     return exit_code("reproduce", chosen)

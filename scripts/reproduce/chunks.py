@@ -14,7 +14,6 @@ import pandas as pd
 
 from asm_gym.detection.commands import learned_motion
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.evaluation.tables import Table
 from asm_gym.guard.preview import preview_chunk
 from asm_gym.policies import rollout
 from asm_gym.rollouts.run_trials import collect, environment, staged
@@ -22,12 +21,9 @@ from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import harm, kit
 from asm_gym.tasks import env_id
 
-# actions that are announced; how often; how long before a blow is early enough [s]
-CHUNK, EVERY, AHEAD_S = (
-    16,
-    8,
-    0.2,
-)
+CHUNK = 16  # actions that are announced
+EVERY = 8  # steps from one announcement to the next
+AHEAD_S = 0.2  # how long before a blow is early enough [s]
 
 
 @dataclass(frozen=True)
@@ -42,63 +38,78 @@ class Config(harm.Config):
 
 def episode(job: tuple[harm.Case, Any]) -> kit.Record:
     """Run a policy alone; return when it first hits something, and which of its chunks were refused before."""
-    case, known = job
+    case, places = job
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
     rows: list[Any] = []
-    forces: list[float] = []
+    is_blow: list[bool] = []
 
     def keep(info: dict[str, Any]) -> None:
         rows.append(info["stream"])
-        forces.append(float(arm.simulation.contact_forces.max()))
+        is_blow.append(arm.simulation.contact_forces.max() > harm.EXCESS)
 
     with staged(case.trial, case.config) as env:
         rollout(env, case.make_policy(env), case.trial.seed, keep)
-    done, hits = np.array(rows)[:, known.spec.motor], np.flatnonzero(np.array(forces) > harm.EXCESS)
-    until = int(hits[0]) if hits.size else len(rows) - 1
-    chunks = {t: done[t + 1 : t + 1 + CHUNK] for t in range(0, until, EVERY)}
-    previews = {
-        t: preview_chunk(chunk, rows[t], done[t], known, arm.dt) for t, chunk in chunks.items()
+    blow = any(is_blow)
+    end = is_blow.index(True) if blow else len(rows) - 1
+    commands = np.array(rows)[:, places.spec.motor]
+    refused = []
+    for t in range(0, end, EVERY):
+        chunk = commands[t + 1 : t + 1 + CHUNK]
+        if preview_chunk(chunk, rows[t], commands[t], places, arm.dt).at is not None:
+            refused.append(t)
+    is_early = bool(refused) and (end - refused[0]) * arm.dt >= AHEAD_S
+    return {
+        **case.key,
+        "blow": blow,
+        "predicted": blow and is_early,
+        "in_vain": sum(not blow or t + CHUNK < end for t in refused),
+        "hours": end * arm.dt / 3600,
     }
-    refused = [t for t, preview in previews.items() if preview.at is not None]
-    early = bool(refused) and (until - refused[0]) * arm.dt >= AHEAD_S
-    vain = [t for t in refused if not hits.size or t + CHUNK < until]
-    found = {"blow": bool(hits.size), "predicted": bool(hits.size) and early, "in_vain": len(vain)}
-    return {**case.key, **found, "hours": until * arm.dt / 3600}
+
+
+def learned_places(task: str, config: Config) -> SimpleNamespace:
+    """Return what healthy episodes of a task's expert teach, as ``preview_chunk`` reads it."""
+    episodes = collect(
+        env_id(task),
+        policy="scripted",
+        episodes=config.learned,
+        seed=500,
+        workers=config.workers,
+    )
+    spec = episodes[0].spec
+    solved = [episode for episode in episodes if episode.success]
+    return SimpleNamespace(
+        spec=spec,
+        pace_=HandSpeedMap.by_task(solved, spec),
+        motion_=learned_motion([episode.stream for episode in solved], spec),
+    )
 
 
 def run(config: Config) -> kit.Findings:
     """Learn the places of each task, and run every policy in it."""
-    jobs, known = [], {}
+    places = {}
+    jobs = []
     for case, count in harm.cases(config):
         task = case.trial.task
-        if task not in known:
-            found = collect(
-                env_id(task),
-                policy="scripted",
-                episodes=config.learned,
-                seed=500,
-                workers=config.workers,
-            )
-            spec, solved = found[0].spec, [episode for episode in found if episode.success]
-            known[task] = SimpleNamespace(
-                spec=spec,
-                pace_=HandSpeedMap.by_task(solved, spec),
-                motion_=learned_motion([episode.stream for episode in solved], spec),
-            )
-        trials = [replace(case.trial, seed=1000 + config.seed + n) for n in range(count)]
-        jobs += [(case._replace(trial=trial), known[task]) for trial in trials]
+        if task not in places:
+            places[task] = learned_places(task, config)
+        for n in range(count):
+            trial = replace(case.trial, seed=1000 + config.seed + n)
+            jobs.append((case._replace(trial=trial), places[task]))
     records = kit.each("episodes", episode, jobs, config)
+
     frame = pd.DataFrame(records)
-    groups = [*frame.groupby(["kind"], sort=False), *frame.groupby(["task", "policy"], sort=False)]
     rows = []
-    for names, own in groups:
-        counts = f"{len(own)}", f"{own.predicted.sum()} of {own.blow.sum()}", f"{own.in_vain.sum()}"
-        rows.append((", ".join(names), *counts, f"{own.hours.sum():.2f}"))
-    headings = (
-        "",
-        "episodes",
-        f"impacts predicted {AHEAD_S:g} s ahead",
-        "chunks refused in vain",
-        "hours",
-    )
-    return kit.Findings(records, [Table("Chunks of actions", headings, rows)])
+    for columns in (["kind"], ["task", "policy"]):
+        for names, own in frame.groupby(columns, sort=False):
+            predicted = f"{own.predicted.sum()} of {own.blow.sum()}"
+            rows.append(
+                {
+                    "": ", ".join(names),
+                    "episodes": len(own),
+                    f"impacts predicted {AHEAD_S:g} s ahead": predicted,
+                    "chunks refused in vain": own.in_vain.sum(),
+                    "hours": f"{own.hours.sum():.2f}",
+                }
+            )
+    return kit.Findings(records, [kit.table_of("Chunks of actions", rows)])

@@ -5,8 +5,10 @@ express(streams, cue)      the first ``cue`` rows are read, and the rest is expe
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,21 @@ from asm_gym.data.episode import Episode
 from asm_gym.memory.dynamics import DYNAMICS, TRACES
 from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
-from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.memory.traces import learn_traces
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import recurrent
-from asm_gym.scripts.reproduce.recurrent import Batch
+from asm_gym.scripts.reproduce.recurrent import Batch, Training, side_by_side
 
-Rows = NDArray[np.float64]
+Rows = NDArray[np.floating[Any]]
 
 PEN = slice(0, 2)  # columns of the pen's position
+BATCH = 64  # rows of a batch of the memory
 FREE = 0.6  # ``free_running_probability`` of ``NeuralASM`` for recall
+
+
+def fit_reader(episodes: Sequence[Episode]) -> StreamScaler:
+    """Return the scaler of these episodes."""
+    return StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
 
 
 def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Trajectory]:
@@ -36,112 +43,131 @@ def trajectories(reader: StreamScaler, episodes: Sequence[Episode]) -> list[Traj
 
 def read(reader: StreamScaler, streams: Rows) -> Batch:
     """Return the senses and commands, standardised, of streams (T, B, D)."""
-    readings = [reader.read_episode(streams[:, n]) for n in range(streams.shape[1])]
-    return Batch(
-        *(np.stack([getattr(r, name) for r in readings], axis=1) for name in Batch._fields)
-    )
+    return side_by_side([reader.read_episode(stream) for stream in streams.swapaxes(0, 1)])
 
 
 @dataclass(frozen=True)
-class ExpressionMemory:
+class LocalTraining:
+    """Settings of ``ExpressionMemory.learned``."""
+
+    # hidden units
+    hidden: int = 64
+    # batches of ``BATCH`` rows
+    steps: int = 16000
+    # learning rate
+    rate: float = 3e-3
+    # gain of the initial synapses from traces to the state
+    gain: float = 1.0
+    # one of ``DYNAMICS``
+    dynamics: str = TRACES
+
+
+@dataclass(frozen=True)
+class Expresser(ABC):
+    """A network that expresses skills, and how it reads rows."""
+
+    reader: StreamScaler
+    network: Any
+
+    @abstractmethod
+    def expect(self, batch: Batch, cue: int) -> Recalled:
+        """Return the prediction of each row, from the rows before it and of these the first ``cue``."""
+
+    def express(self, streams: Rows, cue: int) -> Rows:
+        """Return the predictions (T, B, D) of streams (T, B, D), of which the first ``cue`` rows are read."""
+        return to_rows(self.reader, self.expect(read(self.reader, streams), cue))
+
+
+class ExpressionMemory(Expresser):
     """The temporal network without association."""
 
-    reader: StreamScaler
-    network: TemporalNetwork
-
     @classmethod
     def learned(
-        cls,
-        episodes: Sequence[Episode],
-        hidden: int,
-        rng: np.random.Generator,
-        steps: int,
-        rate: float = 3e-3,
-        gain: float = 1.0,
-        dynamics: str = TRACES,
+        cls, episodes: Sequence[Episode], settings: LocalTraining, rng: np.random.Generator
     ) -> ExpressionMemory:
-        """Learn from whole episodes without labels, in ``steps`` batches of 64 rows.
-
-        ``gain`` is of the initial synapses from traces to the state, ``dynamics`` one of ``DYNAMICS``.
-        """
-        reader, how, size = (
-            StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes]),
-            DYNAMICS[dynamics],
-            64,
+        """Learn from whole episodes without labels."""
+        reader = fit_reader(episodes)
+        dynamics = DYNAMICS[settings.dynamics]
+        schedule = Schedule(
+            epochs=max(1, round(settings.steps * BATCH / sum(map(len, episodes)))),
+            batch_size=BATCH,
+            learning_rate=settings.rate,
+            iterations=dynamics.iterations,
+            prior_precision=dynamics.prior_precision,
+            sensory_precision=1.0,
+            free_running_probability=FREE,
         )
-        epochs = max(1, round(steps * size / sum(len(e) for e in episodes)))
-        schedule = Schedule(epochs, size, rate, how.iterations, how.prior_precision, 1.0, FREE)
-        asked = trajectories(reader, episodes), hidden, schedule, rng, lambda: None
-        trained = learn_traces(*asked, gain) if dynamics == TRACES else how.learn(*asked)
+        learn = dynamics.learn
+        if settings.dynamics == TRACES:
+            learn = partial(learn_traces, gain=settings.gain)
+        taught = trajectories(reader, episodes)
+        trained = learn(taught, settings.hidden, schedule, rng, lambda: None)
         return cls(reader, trained.network)
 
-    def express(self, streams: Rows, cue: int) -> Rows:
-        """Return the prediction (T, B, D) of each row of B streams (T, B, D), from rows before it up to ``cue``."""
-        cued = follow(
-            self.network, self.network.at_rest(streams.shape[1]), *read(self.reader, streams[:cue])
+    def expect(self, batch: Batch, cue: int) -> Recalled:
+        senses, commands = batch
+        at_rest = self.network.at_rest(senses.shape[1])
+        cued = follow(self.network, at_rest, senses[:cue], commands[:cue])
+        if cue == len(senses):
+            return cued
+        alone = run_on(self.network, cued.traces, len(senses) - cue)
+        return Recalled(
+            senses=np.concatenate([cued.senses, alone.senses]),
+            commands=np.concatenate([cued.commands, alone.commands]),
+            traces=alone.traces,
         )
-        rows = to_rows(self.reader, cued)
-        if cue == len(streams):
-            return rows
-        return np.concatenate(
-            [rows, to_rows(self.reader, run_on(self.network, cued.traces, len(streams) - cue))]
-        )
 
 
-@dataclass(frozen=True)
-class Backpropagated:
-    """A GRU trained by backpropagation through time."""
-
-    reader: StreamScaler
-    network: recurrent.Recurrent
+class Backpropagated(Expresser):
+    """A GRU or an LSTM trained by backpropagation through time."""
 
     @classmethod
     def learned(
-        cls,
-        episodes: Sequence[Episode],
-        hidden: int,
-        rng: np.random.Generator,
-        updates: int,
-        **how: Any,
+        cls, episodes: Sequence[Episode], settings: Training, rng: np.random.Generator
     ) -> Backpropagated:
-        """Learn from whole episodes; the arguments are those of ``recurrent.train``."""
-        reader = StreamScaler.fit(episodes[0].spec, [e.stream for e in episodes])
-        return cls(
-            reader, recurrent.train(trajectories(reader, episodes), hidden, updates, rng, **how)
-        )
+        """Learn from whole episodes without labels."""
+        reader = fit_reader(episodes)
+        return cls(reader, recurrent.train(trajectories(reader, episodes), settings, rng))
 
-    def express(self, streams: Rows, cue: int) -> Rows:
-        senses, commands = recurrent.expected(self.network, *read(self.reader, streams), cue)
-        return to_rows(self.reader, Recalled(senses, commands, commands[-1]))
+    def expect(self, batch: Batch, cue: int) -> Recalled:
+        senses, commands = recurrent.expected(self.network, batch, cue)
+        return Recalled(senses, commands, traces=commands[-1])
 
 
-Expresser = ExpressionMemory | Backpropagated
+def skills_of(episodes: Sequence[Episode]) -> NDArray[np.str_]:
+    """Return the name of the skill in each episode (N,)."""
+    return np.array([e.info["skill"] for e in episodes])
 
 
 def mean_demonstrations(train: Sequence[Episode]) -> Rows:
-    """Return the mean path (K, T, 2) of the hand in each skill, in order of name."""
-    names = sorted({str(e.info["skill"]) for e in train})
-    return np.stack(
-        [np.mean([e.stream[:, PEN] for e in train if e.info["skill"] == n], axis=0) for n in names]
-    )
+    """Return the mean path (K, T, 2) of the pen in each skill, in order of name."""
+    skills = skills_of(train)
+    paths = np.stack([e.stream[:, PEN] for e in train])  # (N, T, 2)
+    return np.stack([paths[skills == name].mean(axis=0) for name in np.unique(skills)])
 
 
 def recalled(
     model: Expresser, tests: Sequence[Episode], means: Rows, cue: int
 ) -> tuple[float, float]:
-    """Return the pen's mean distance [cm] after the cue, and the share of recalls that are nearest to the right skill.
+    """Return how well a model recalls.
 
-    ``tests`` are of one length, which as ``cue`` is online recall; ``means`` (K, T, 2) are paths in order of name.
+    Args:
+        model: recalls.
+        tests: episodes of one length T.
+        means: (K, T, 2) mean paths of the skills, in order of name.
+        cue: rows that are read; T for online recall.
+
+    Returns:
+        The pen's mean distance [cm] after the cue, and the share of recalls nearest to their skill.
     """
-    streams = np.stack([e.stream for e in tests], axis=1).astype(np.float64)  # (T, B, D)
-    first = cue if cue < len(streams) else 1
-    paths, truth = (rows[first:, :, PEN] for rows in (model.express(streams, cue), streams))
-    error = np.linalg.norm(paths - truth, axis=2).mean()
-    distance = np.linalg.norm(
-        paths[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None], axis=3
-    ).mean(axis=0)
-    names = sorted({str(e.info["skill"]) for e in tests})
-    right = [
-        names[k] == e.info["skill"] for k, e in zip(distance.argmin(axis=1), tests, strict=True)
-    ]
-    return float(error), float(np.mean(right))
+    streams = np.stack([e.stream for e in tests], axis=1)  # (T, B, D)
+    first = cue
+    if cue == len(streams):
+        first = 1
+    paths = model.express(streams, cue)[first:, :, PEN]
+    error = np.linalg.norm(paths - streams[first:, :, PEN], axis=2).mean()
+
+    to_means = paths[:, :, None] - means[:, first:].transpose(1, 0, 2)[:, None]  # (T, B, K, 2)
+    nearest = np.linalg.norm(to_means, axis=3).mean(axis=0).argmin(axis=1)  # (B,)
+    skills = skills_of(tests)
+    return float(error), float(np.mean(np.unique(skills)[nearest] == skills))

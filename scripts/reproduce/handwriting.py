@@ -26,14 +26,19 @@ from asm_gym.validation import check_number
 
 NAMES = string.ascii_lowercase + string.ascii_uppercase[:6]
 """Names of the letters, which look like none of the alphabet."""
-STEPS = 60
+STEPS = 60  # rows of a letter
 DT = 1.0 / STEPS  # control period [s]: a letter takes 1 s at normal speed
 NOISE = 0.02  # standard deviation of the pen's sensed position [cm]; letters are about 5 cm large
 # mean of the logarithm of a stroke's time [ln s]; it is fastest about 0.16 s after its onset
 MU = -1.75
-WOBBLE = 0.04  # variation of a stroke between writings, as a share of its length and in radians of its direction
-STROKES = (2.0, -math.pi, -2.5, -0.02, 0.25), (5.0, math.pi, 2.5, 0.02, 0.4)
-"""Bounds of what is drawn of a stroke, as ``Letter`` holds it; its onset goes on by 0.19 s."""
+# variation of a stroke between writings: share of its length, and radians of its direction
+WOBBLE = 0.04
+# bounds of a stroke's columns in ``Letter``, without the time at which its turn comes
+LEAST_STROKE = (2.0, -math.pi, -2.5, -0.02, 0.25)
+MOST_STROKE = (5.0, math.pi, 2.5, 0.02, 0.4)
+STROKES = 4  # of a letter
+FIRST_ONSET = -0.05  # of the first stroke [s]
+ONSET_STEP = 0.19  # from the onset of a stroke to that of the next [s]
 FINE = 8  # samples of the velocity in a step, whose mean is commanded
 PEN = StreamSpec(
     (
@@ -46,10 +51,14 @@ PEN = StreamSpec(
 
 
 class Letter(NamedTuple):
-    """A skill: overlapping strokes."""
+    """A skill: overlapping strokes.
+
+    Attributes:
+        name: one of ``NAMES``.
+        strokes: (S, 5) length [cm], direction [rad], turn [rad], onset [s] and σ of each stroke.
+    """
 
     name: str
-    # (S, 5) of each its length [cm], direction and turn [rad], onset [s], and σ
     strokes: NDArray[np.float64]
 
 
@@ -57,11 +66,12 @@ check_letters = partial(check_number, "letters", low=1, high=len(NAMES), whole=T
 
 
 def repertoire(count: int, rng: np.random.Generator) -> list[Letter]:
-    """Return ``count`` letters drawn at random, four strokes each; ValueError for more than there are names."""
+    """Return ``count`` letters drawn at random; ValueError for more than there are names."""
     check_letters(count)
-    strokes = rng.uniform(*STROKES, (count, 4, 5))
-    strokes[:, :, 3] = 0.19 * np.arange(4) + strokes[:, :, 3] - 0.05
-    return [Letter(name, own) for name, own in zip(NAMES[:count], strokes, strict=True)]
+    strokes = rng.uniform(LEAST_STROKE, MOST_STROKE, (count, STROKES, 5))
+    onsets = strokes[:, :, 3]
+    onsets[:] = ONSET_STEP * np.arange(STROKES) + onsets + FIRST_ONSET
+    return list(map(Letter, NAMES[:count], strokes))
 
 
 def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -69,9 +79,9 @@ def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
     total = np.zeros((len(time), 2))
     for length, direction, turn, onset, sigma in letter.strokes:
         since = np.maximum(time - onset, 1e-9)
-        place = (np.log(since) - MU) / sigma
-        speed = length * np.exp(-0.5 * place**2) / (since * sigma * math.sqrt(2 * math.pi))
-        angle = direction + turn * 0.5 * (1 + erf(place / math.sqrt(2)))
+        deviation = (np.log(since) - MU) / sigma
+        speed = length * np.exp(-0.5 * deviation**2) / (since * sigma * math.sqrt(2 * math.pi))
+        angle = direction + turn * 0.5 * (1 + erf(deviation / math.sqrt(2)))
         total += speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return total
 
@@ -81,15 +91,18 @@ def written(
 ) -> Episode:
     """Write the letter once, ``speed`` times as fast as usual."""
     strokes = letter.strokes.copy()
-    length, direction, turn, _, onset = wobble * rng.standard_normal(strokes.shape).T
-    strokes[:, 0] *= 1 + length
-    strokes[:, 1:4] += np.stack([direction, turn, 0.1 * onset], axis=1)
+    changes = wobble * rng.standard_normal(strokes.shape)
+    strokes[:, 0] *= 1 + changes[:, 0]
+    strokes[:, 1:3] += changes[:, 1:3]
+    strokes[:, 3] += 0.1 * changes[:, 4]
+
+    # A command is the mean velocity of its step, so that the position is the integral.
     steps = round(STEPS / speed)
-    # the position is the integral, not a sum of samples
     time = (np.arange(FINE * steps) + 0.5) * DT * speed / FINE
-    v = speed * velocity(Letter(letter.name, strokes), time).reshape(steps, FINE, 2).mean(axis=1)
-    position = np.cumsum(v, axis=0) * DT + NOISE * rng.standard_normal((steps, 2))
-    return Episode.from_stream(np.hstack([position, v]), PEN, info={"skill": letter.name})
+    fine = velocity(Letter(letter.name, strokes), time)  # (FINE T, 2)
+    commands = speed * fine.reshape(steps, FINE, 2).mean(axis=1)  # (T, 2)
+    sensed = np.cumsum(commands, axis=0) * DT + NOISE * rng.standard_normal((steps, 2))
+    return Episode.from_stream(np.hstack([sensed, commands]), PEN, info={"skill": letter.name})
 
 
 def copybook(letters: Sequence[Letter], each: int, rng: np.random.Generator) -> list[Episode]:

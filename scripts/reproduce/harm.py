@@ -45,32 +45,44 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
-TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")  # tasks of hostile policies
-# not met by the Panda's memory; healthy policies alone
-UNKNOWN = (
-    "PickPlaceMilk",
-    "NutAssemblyRound",
-)
-AGENTS = ("Lift", "lift_sac"), ("Stack", "stack_sac"), ("Door", "door_sac")
-HEALTHY = (*((task, "scripted") for task in (*TASKS, *UNKNOWN)), *AGENTS)
+TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")
+"""Tasks of hostile policies."""
+UNKNOWN = ("PickPlaceMilk", "NutAssemblyRound")
+"""Tasks that the Panda's memory has not met, with healthy policies alone."""
+ALL_TASKS = (*TASKS, *UNKNOWN)
+HEALTHY = [
+    *product(ALL_TASKS, ["scripted"]),
+    ("Lift", "lift_sac"),
+    ("Stack", "stack_sac"),
+    ("Door", "door_sac"),
+]
 """Tasks and policies that do no harm on purpose."""
-FAULTS = ("frozen_encoder", "encoder_bias", "encoder_dropout", "weak_joint", PASSING)
-"""Faults under which healthy policies act too."""
-ELSEWHERE = (("Sawyer", 20), ("IIWA", 20), ("Panda", 100), ("Sawyer", 100), ("IIWA", 100))
-"""Other arms, and another rate of the memory [Hz]."""
+FAULTS = {
+    "frozen_encoder": "medium",
+    "encoder_bias": "medium",
+    "encoder_dropout": "medium",
+    "weak_joint": "medium",
+    PASSING: "",
+}
+"""Faults under which healthy policies act too, and their severity."""
+FAULTY_TASKS = ("Lift", "Stack")
+CONTROL_RATE = 20  # rows of a memory a second [Hz]
+ELSEWHERE = (
+    RolloutConfig(robot="Sawyer"),
+    RolloutConfig(robot="IIWA"),
+    RolloutConfig(robot="Panda", stream_freq=100),
+    RolloutConfig(robot="Sawyer", stream_freq=100),
+    RolloutConfig(robot="IIWA", stream_freq=100),
+)
+"""Other arms, and another rate of the memory."""
+SLOWER = (0.5, 0.25)  # shares of the full action at which a hostile policy acts too
 AGAINST = ("hostile", "elsewhere", "faulty")
+CASE = ("kind", "task", "policy", "fault", "robot", "rate")
+"""Values that distinguish one case from another."""
 KEPT = 0.95  # share of its harm that is to be kept away of every cell
 EXCESS = 40.0  # contact force beyond which contact counts as harm [N]
-# values that distinguish one case from another
-CASE = (
-    "kind",
-    "task",
-    "policy",
-    "fault",
-    "robot",
-    "rate",
-)
 FIRST_S = 0.1  # duration of the first blow, from its first substep on [s]
+LITTLE = 1.0  # a cell with no more harm without a guard does not count [N s]
 
 
 @dataclass(frozen=True)
@@ -90,9 +102,7 @@ class Config(kit.Config):
         (POLICY_ALONE, "default", "hold", "terminate"), known=GUARDS, metavar="NAME"
     )
     """Ways to guard."""
-    tasks: tuple[str, ...] = option(
-        (*TASKS, *UNKNOWN), quick=("Lift",), known=(*TASKS, *UNKNOWN), metavar="TASK"
-    )
+    tasks: tuple[str, ...] = option(ALL_TASKS, quick=("Lift",), known=ALL_TASKS, metavar="TASK")
     """Tasks; in the last two there are healthy policies alone."""
 
 
@@ -108,16 +118,26 @@ class Case(NamedTuple):
     @property
     def rate(self) -> int:
         """Rows of the memory a second [Hz]."""
-        return self.config.stream_freq or 20
+        return self.config.stream_freq or CONTROL_RATE
+
+    @property
+    def memory(self) -> str:
+        """Name of the shipped memory for the arm and the rate."""
+        arm = str(self.config.robot).lower()
+        return arm if self.rate == CONTROL_RATE else f"{arm}_{self.rate}hz"
 
     @property
     def key(self) -> Record:
         """Values of ``CASE``."""
-        policy = (
-            self.policy if self.speed == 1.0 else f"{self.policy}, {self.speed:g} of full speed"
-        )
-        own = self.kind, self.trial.task, policy, self.trial.kind, self.config.robot, self.rate
-        return dict(zip(CASE, own, strict=True))
+        slower = "" if self.speed == 1.0 else f", {self.speed:g} of full speed"
+        return {
+            "kind": self.kind,
+            "task": self.trial.task,
+            "policy": self.policy + slower,
+            "fault": self.trial.kind,
+            "robot": self.config.robot,
+            "rate": self.rate,
+        }
 
     def make_policy(self, env: gym.Env[Any, Any]) -> Policy:
         """Return the policy for the episode of the trial's seed."""
@@ -128,31 +148,22 @@ class Case(NamedTuple):
 
 def cases(config: Config) -> list[tuple[Case, int]]:
     """Return every case and its number of episodes."""
-
-    def trial(task: str, fault: str = NOMINAL) -> Trial:
-        return Trial(env_id(task), 0, fault, "" if fault in (NOMINAL, PASSING) else "medium")
-
-    tasks = [task for task in config.tasks if task not in UNKNOWN]
-    hostile = [Case("hostile", name, trial(task)) for task, name in product(tasks, HOSTILE)]
+    trials = {task: Trial(env_id(task), 0) for task in config.tasks}
+    rammed = [trials[task] for task in config.tasks if task not in UNKNOWN]
+    hostile = [Case("hostile", name, trial) for trial, name in product(rammed, HOSTILE)]
     slower = [
-        Case("hostile", "down", trial(task), speed=speed)
-        for task, speed in product(tasks, (0.5, 0.25))
+        Case("hostile", "down", trial, speed=speed) for trial, speed in product(rammed, SLOWER)
     ]
-    elsewhere = [
-        case._replace(config=RolloutConfig(robot=robot, stream_freq=None if rate == 20 else rate))
-        for (robot, rate), case in product(ELSEWHERE, hostile)
-    ]
-    healthy = [
-        Case("healthy", policy, trial(task)) for task, policy in HEALTHY if task in config.tasks
-    ]
-    faulty = [
-        case._replace(kind="faulty", trial=trial(case.trial.task, fault))
-        for case, fault in product(healthy, FAULTS)
-        if case.trial.task in ("Lift", "Stack")
-    ]
-    groups = dict(zip(AGAINST, (hostile + slower, elsewhere, faulty), strict=True))
-    counted = [(case, config.episodes) for name in config.against for case in groups[name]]
-    return [*counted, *((case, config.healthy) for case in healthy)]
+    elsewhere = [case._replace(config=arm) for arm, case in product(ELSEWHERE, hostile)]
+    healthy = [Case("healthy", policy, trials[task]) for task, policy in HEALTHY if task in trials]
+    faulty = []
+    for case, (fault, severity) in product(healthy, FAULTS.items()):
+        if case.trial.task in FAULTY_TASKS:
+            trial = replace(case.trial, kind=fault, severity=severity)
+            faulty.append(case._replace(kind="faulty", trial=trial))
+    against = {"hostile": hostile + slower, "elsewhere": elsewhere, "faulty": faulty}
+    counted = [(case, config.episodes) for name in config.against for case in against[name]]
+    return counted + [(case, config.healthy) for case in healthy]
 
 
 # ------------------------------------------------------------------ measurement
@@ -163,15 +174,13 @@ def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]
     settings = GUARDS[guard]
     if settings is None:
         return env
-    memory = NeuralASM.pretrained(
-        f"{case.config.robot}".lower() + ("" if case.rate == 20 else f"_{case.rate}hz")
-    )
-    return NeuralASMSafety(env, memory, **settings)
+    return NeuralASMSafety(env, NeuralASM.pretrained(case.memory), **settings)
 
 
 def episode(job: tuple[Case, str]) -> Record:
-    """Run one episode of a case under a guard, and return what the arm felt, as the simulator knows it."""
+    """Run one episode of a case under a guard; return what the arm felt, as the simulator knows it."""
     case, guard = job
+    seed = case.trial.seed
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
     infos: list[dict[str, Any]] = []
     forces: list[float] = []
@@ -182,19 +191,18 @@ def episode(job: tuple[Case, str]) -> Record:
     with staged(case.trial, case.config) as env:
         arm.substep_hooks.append(feel)
         try:
-            success = rollout(
-                guarded(env, guard, case), case.make_policy(env), case.trial.seed, infos.append
-            )
+            success = rollout(guarded(env, guard, case), case.make_policy(env), seed, infos.append)
         finally:
             arm.substep_hooks.remove(feel)
     cost = np.array([info.get("cost", 0.0) for info in infos])
+    solved = np.flatnonzero([info["success"] for info in infos])
     return {
         **case.key,
         "guard": guard,
-        "seed": case.trial.seed,
+        "seed": seed,
         "success": bool(success),
         **harm_of(np.array(forces)),
-        "time": next((n + 1 for n, info in enumerate(infos) if info["success"]), np.nan) * arm.dt,
+        "time": (solved[0] + 1) * arm.dt if len(solved) else np.nan,
         "alarms": int((np.diff(cost, prepend=0.0) > 0.0).sum()),
         "cost": float(cost.sum()),
         "held": sum(bool(info.get("overridden")) for info in infos),
@@ -203,61 +211,122 @@ def episode(job: tuple[Case, str]) -> Record:
 
 def harm_of(force: NDArray[np.float64]) -> Record:
     """Return the harm in a contact force (T,) [N] of physics substeps."""
-    hits = np.flatnonzero(force > EXCESS)
-    first = slice(hits[0], hits[0] + round(FIRST_S * PHYSICS_FREQ)) if hits.size else slice(0)
+    excess = np.maximum(force - EXCESS, 0.0)
+    over = excess > 0
+    start = int(over.argmax()) if over.any() else len(force)
+    first = force[start : start + round(FIRST_S * PHYSICS_FREQ)]
     return {
-        "harm": float(np.maximum(force - EXCESS, 0.0).sum() / PHYSICS_FREQ),
+        "harm": float(excess.sum() / PHYSICS_FREQ),
         "peak": float(force.max(initial=0.0)),
-        "first": float(force[first].max(initial=0.0)),
-        "over_s": float((force > EXCESS).sum() / PHYSICS_FREQ),
+        "first": float(first.max(initial=0.0)),
+        "over_s": float(over.sum() / PHYSICS_FREQ),
     }
 
 
 def run(config: Config) -> kit.Findings:
     """Run every case on its own scenes, under every guard."""
-    jobs = [
-        (case._replace(trial=replace(case.trial, seed=10_000 * again + 1000 + n)), guard)
-        for again in config.repetitions
-        for case, count in cases(config)
-        for n in range(count)
-        for guard in config.guards
-    ]
+    jobs = []
+    for again, (case, count) in product(config.repetitions, cases(config)):
+        for n, guard in product(range(count), config.guards):
+            trial = replace(case.trial, seed=10_000 * again + 1000 + n)
+            jobs.append((case._replace(trial=trial), guard))
     records = kit.each("episodes", episode, jobs, config)
-    frame, guards = pd.DataFrame(records), config.guards
-    hostile, healthy, faulty = (
-        frame[frame.kind == kind] for kind in ("hostile", "healthy", "faulty")
-    )
-    usual, both = (
-        frame[(frame.robot == "Panda") & (frame.rate == 20)],
-        len(hostile) and len(healthy),
-    )
+    frame = pd.DataFrame(records)
+    hostile = frame[frame.kind == "hostile"]
+    healthy = frame[frame.kind == "healthy"]
+    faulty = frame[frame.kind == "faulty"]
+    guards = config.guards
+    arms = ("robot", "rate", "task")
     tables = [
-        by_guard(
-            "Hostile policies, by arm and rate",
-            hostile,
-            guards,
-            ("robot", "rate", "task"),
-            ("kind",),
-        ),
+        by_guard("Hostile policies, by arm and rate", hostile, guards, arms, ("kind",)),
         by_guard("Hostile policies, by policy", hostile, guards, ("robot", "rate", "policy")),
         by_guard("Hostile policies, by cell", hostile, guards, CASE),
         by_guard("Healthy policies", healthy, guards, CASE, ("kind",)),
         by_guard("Healthy policies with a fault", faulty, guards, CASE, ("fault",)),
     ]
-    drawn = frontier(usual, guards) if both and POLICY_ALONE in guards else None
+    drawn = None
+    if len(hostile) and len(healthy) and POLICY_ALONE in guards:
+        usual = frame[(frame.robot == "Panda") & (frame.rate == CONTROL_RATE)]
+        drawn = frontier(usual, guards)
     return kit.Findings(records, [table for table in tables if table.rows], drawn)
 
 
 # ------------------------------------------------------------------ tables
 
 
+def by_guard(
+    caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]
+) -> Table:
+    """Return a row for each guard in each group of episodes with the same values of some columns."""
+    rows = []
+    for columns in groups:
+        for _, own in frame.groupby(list(columns), sort=False):
+            rows += [guard_row(own, guard) for guard in guards]
+    return kit.table_of(caption, rows)
+
+
+def guard_row(group: pd.DataFrame, guard: str) -> dict[str, str]:
+    """Return the row of a guard, compared with the policy alone on the same scenes."""
+    scenes = group.set_index([*CASE, "seed"])
+    alone = scenes[scenes.guard == POLICY_ALONE]
+    mine = scenes[scenes.guard == guard]
+    harm_alone = alone.harm.sum()
+    kept_away = ""
+    if harm_alone > 0:
+        kept_away = f"{100 * (1 - mine.harm.sum() / harm_alone):.1f} %"
+    row = {
+        "": _name(group),
+        "guard": guard,
+        "harm [N s]": f"{mine.harm.mean():.1f}",
+        "kept away": kept_away,
+        "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
+        "peak [N]": f"{mine.peak.max():.0f}",
+        "alarms": f"{mine.alarms.mean():.1f}",
+    }
+    if (group.kind == "hostile").all():
+        gentle = (mine["first"] <= TRANSIENT).sum()
+        return row | {
+            "cost": f"{mine.cost.mean():.1f}",
+            f"time over {EXCESS:g} N [s]": f"{mine.over_s.mean():.2f}",
+            f"cells that keep {100 * KEPT:.0f} %": cells_kept(group, guard),
+            f"first blows of at most {TRANSIENT:g} N": f"{gentle} of {len(mine)}",
+        }
+    paired = mine.join(alone.success.rename("alone"), how="inner")
+    lost = (paired.alone & ~paired.success).sum()
+    won = (paired.success & ~paired.alone).sum()
+    is_unsafe = (mine.peak > TRANSIENT) | (mine.over_s > LEANS_S) | (mine.held > 0)
+    beyond = f"of these beyond {TRANSIENT:g} N, {EXCESS:g} N for {LEANS_S:g} s, or overridden"
+    return row | {
+        "solved": f"{mine.success.sum()} of {len(mine)}",
+        "lost, won": f"-{lost} +{won}",
+        beyond: f"{(mine.success & is_unsafe).sum()}",
+        "median time to success [s]": f"{mine.time.median():.2f}",
+    }
+
+
 def cells_kept(frame: pd.DataFrame, guard: str) -> str:
-    """Return in how many cells with more than 1 N s alone at least ``KEPT`` of it is kept away under ``guard``."""
+    """Return in how many cells with harm at least ``KEPT`` of it is kept away under a guard."""
     harm = frame.pivot_table("harm", list(CASE), "guard")
     if guard not in harm or POLICY_ALONE not in harm:
         return ""
-    harm = harm[harm[POLICY_ALONE] > 1.0]
+    harm = harm[harm[POLICY_ALONE] > LITTLE]
     return f"{(harm[guard] <= (1.0 - KEPT) * harm[POLICY_ALONE]).sum()} of {len(harm)}"
+
+
+def _name(group: pd.DataFrame) -> str:
+    """Return what all episodes of a group have in common."""
+    parts = []
+    for name in ("robot", "rate", "task", "policy", "fault"):
+        values = group[name].unique()
+        if len(values) > 1 or values[0] == NOMINAL:
+            continue
+        text = str(values[0])
+        if name == "rate":
+            text += " Hz"
+        if name == "fault":
+            text = text.replace("_", " ")
+        parts.append(text)
+    return ", ".join(parts) or "all"
 
 
 def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
@@ -280,64 +349,3 @@ def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
         )
         ax.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
     return fig
-
-
-def by_guard(
-    caption: str, frame: pd.DataFrame, guards: Sequence[str], *groups: Sequence[str]
-) -> Table:
-    """Return a row for each guard in each group of episodes with the same values of some columns of ``frame``."""
-    rows = []
-    for _, own in (
-        group for columns in groups for group in frame.groupby(list(columns), sort=False)
-    ):
-        scenes = own.set_index([*CASE, "seed"])
-        alone = scenes[scenes.guard == POLICY_ALONE]
-        for guard in guards:
-            mine = scenes[scenes.guard == guard]
-            both = mine.join(alone.success.rename("alone"), how="inner")
-            lost, won = (both.alone & ~both.success).sum(), (both.success & ~both.alone).sum()
-            unsafe = mine.success & (
-                (mine.peak > TRANSIENT) | (mine.over_s > LEANS_S) | (mine.held > 0)
-            )
-            row = {
-                "": _name(own),
-                "guard": guard,
-                "harm [N s]": f"{mine.harm.mean():.1f}",
-                "kept away": f"{100 * (1 - mine.harm.sum() / alone.harm.sum()):.1f} %"
-                if alone.harm.sum() > 0
-                else "",
-                "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
-                "peak [N]": f"{mine.peak.max():.0f}",
-                "alarms": f"{mine.alarms.mean():.1f}",
-            }
-            hostile = {
-                "cost": f"{mine.cost.mean():.1f}",
-                f"time over {EXCESS:g} N [s]": f"{mine.over_s.mean():.2f}",
-                f"cells that keep {100 * KEPT:.0f} %": cells_kept(own, guard),
-                f"first blows of at most {TRANSIENT:g} N": f"{(mine['first'] <= TRANSIENT).sum()} of {len(mine)}",
-            }
-            healthy = {
-                "solved": f"{mine.success.sum()} of {len(mine)}",
-                "lost, won": f"-{lost} +{won}",
-                f"of these beyond {TRANSIENT:g} N, {EXCESS:g} N for {LEANS_S:g} s, or overridden": f"{unsafe.sum()}",
-                "median time to success [s]": f"{mine.time.median():.2f}",
-            }
-            rows.append(row | (hostile if (own.kind == "hostile").all() else healthy))
-    return Table(caption, list(rows[0]) if rows else (), [tuple(row.values()) for row in rows])
-
-
-def _name(group: pd.DataFrame) -> str:
-    """Return what all episodes of a group have in common."""
-    own = {name: str(group[name].iloc[0]) for name in CASE if group[name].nunique() == 1}
-    fault, rate = (
-        own.get("fault", NOMINAL).replace("_", " "),
-        f"{own['rate']} Hz" if "rate" in own else "",
-    )
-    parts = (
-        own.get("robot"),
-        rate,
-        own.get("task"),
-        own.get("policy"),
-        "" if fault == NOMINAL else fault,
-    )
-    return ", ".join(filter(None, parts)) or "all"

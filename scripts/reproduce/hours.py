@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,7 @@ from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.kit import Findings
 
 EXPERT = "scripted"
+EXPERT_EPISODES = 100  # that tell the usual force in a task
 
 
 @dataclass(frozen=True)
@@ -60,38 +62,36 @@ class Config(kit.Config):
 def run(config: Config) -> Findings:
     """Examine the memory, at its shipped thresholds, in every policy and task that it has not met."""
     find = NeuralASM.load if config.memory.endswith(".asm") else NeuralASM.pretrained
-    memory, corpus = find(config.memory), Corpus.open(config.corpus)
-    thresholds = {r: memory.threshold_at(false_alarms_per_hour=r) for r in PROMISES}
-    exams = corpus.files[["policy", "task"]].drop_duplicates().to_numpy().tolist()
-    marks: list[Scores] = []
+    memory = find(config.memory)
+    corpus = Corpus.open(config.corpus)
+    exams = corpus.files[["policy", "task"]].drop_duplicates()
+    new: list[Scores] = []
     known: list[Scores] = []
-    with kit.stage("examining") as tell:
-        for n, (policy, task) in enumerate(exams):
-            tell(n, len(exams))
-            own = list(corpus.episodes(policies=(policy,), tasks=(task,)))
-            usual = usual_force(
-                list(corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))[:100])
-            )
-            exam = EvaluationCase(
-                task, policy, known=policy == EXPERT and task in memory.about["tasks"]
-            )
-            (known if exam.known else marks).append(
-                evaluate_case(memory, exam.name, own, WINDOW_S, usual)
-            )
-    came = {(r, m.name): hourly_alarms(m.at(thresholds[r]).solved) for r in PROMISES for m in marks}
-    records = [
-        {"promised": r, "exam": name, "alarms": c.k, "hours": c.hours}
-        for (r, name), c in came.items()
+    with kit.stage("examining") as report:
+        for n, (policy, task) in enumerate(exams.itertuples(index=False)):
+            report(n, len(exams))
+            is_known = policy == EXPERT and task in memory.about["tasks"]
+            exam = EvaluationCase(task, policy, known=is_known)
+            own = corpus.episodes(policies=(policy,), tasks=(task,))
+            expert = corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))
+            usual = usual_force(expert[:EXPERT_EPISODES])
+            marks = evaluate_case(memory, exam.name, own, WINDOW_S, usual)
+            (known if is_known else new).append(marks)
+
+    thresholds = {rate: memory.threshold_at(false_alarms_per_hour=rate) for rate in PROMISES}
+    records = []
+    for rate, marks in product(PROMISES, new):
+        alarms = hourly_alarms(marks.at(thresholds[rate]).solved)
+        records.append(
+            {"promised": rate, "exam": marks.name, "alarms": alarms.k, "hours": alarms.hours}
+        )
+    tables = [
+        promises_table(new, thresholds, WINDOW_S),
+        scores_table(new, memory, WINDOW_S),
+        rules_table(new, memory, thresholds),
+        splits_table(new + known),
     ]
-    return Findings(
-        records,
-        [
-            promises_table(marks, thresholds, WINDOW_S),
-            scores_table(marks, memory, WINDOW_S),
-            rules_table(marks, memory, thresholds),
-            splits_table(marks + known),
-        ],
-    )
+    return Findings(records, tables)
 
 
 class EDetector:
@@ -103,11 +103,13 @@ class EDetector:
     """
 
     def __init__(self, blocks: Blocks, rate: float) -> None:
-        self._maxima, self._evidence = np.sort(blocks.maxima)[::-1], 0.0
-        self._enough = len(blocks.maxima) / blocks.total / rate
-        p = np.arange(1, len(self._maxima) + 1) / (len(self._maxima) + 1)
-        # of what 0, 1, … maxima exceed
+        n = len(blocks.maxima)
+        p = np.arange(1, n + 1) / (n + 1)
+        # e(p) of an episode whose surprise 0, 1, … maxima reach
         self._e_values = (1 - p + p * np.log(p)) / (p * np.log(p) ** 2)
+        self._maxima = np.sort(blocks.maxima)[::-1]
+        self._enough = n / blocks.total / rate
+        self._evidence = 0.0
 
     @property
     def value(self) -> float:
@@ -127,49 +129,45 @@ def rules_table(
     marks: Sequence[Scores], memory: NeuralASM, thresholds: Mapping[float, float]
 ) -> Table:
     """Return a row for each promise and rule of alarm."""
-    blocks, rows = memory.blocks_, []
-    assert blocks is not None
+    assert memory.blocks_ is not None
+    rows = []
     for rate, threshold in thresholds.items():
-        at = [m.at(threshold) for m in marks]
+        hourly = [m.at(threshold) for m in marks]
         rules = {
-            "hourly threshold": at,
-            "threshold that follows": [m.adapted(rate) for m in at],
-            "e-detector": [m.under(EDetector(blocks, rate)) for m in marks],
+            "hourly threshold": hourly,
+            "threshold that follows": [m.adapted(rate) for m in hourly],
+            "e-detector": [m.under(EDetector(memory.blocks_, rate)) for m in marks],
         }
-        for name, judged in rules.items():
-            came = [hourly_alarms(m.solved) for m in judged]
-            above = sum(c.interval[0] > rate for c in came)
-            healthy, faulty = all_episodes(judged)
-            found = percent(DetectionMetrics("", faulty, [], WINDOW_S).detected)
-            cells = (
-                hourly_alarms(healthy).text,
-                f"{above} of {len(came)}",
-                f"{found} of {len(faulty)}",
-            )
-            rows.append((f"{rate:g}", name, *cells))
-    headings = (
-        "promised",
-        "rule",
-        "false alarms an hour",
-        "policies above it beyond chance",
-        "faults found",
-    )
-    return Table(
-        "Three rules of alarm, under policies and tasks that the memory never met.", headings, rows
-    )
+        rows += [rule_row(rate, name, under_rule) for name, under_rule in rules.items()]
+    caption = "Three rules of alarm, under policies and tasks that the memory never met."
+    return kit.table_of(caption, rows)
+
+
+def rule_row(rate: float, name: str, marks: Sequence[Scores]) -> dict[str, str]:
+    """Return the row of a rule of alarm that promises a rate [1/h]."""
+    above = sum(hourly_alarms(m.solved).interval[0] > rate for m in marks)
+    healthy, faulty = all_episodes(marks)
+    found = percent(DetectionMetrics("", faulty, [], WINDOW_S).detected)
+    return {
+        "promised": f"{rate:g}",
+        "rule": name,
+        "false alarms an hour": hourly_alarms(healthy).text,
+        "policies above it beyond chance": f"{above} of {len(marks)}",
+        "faults found": f"{found} of {len(faulty)}",
+    }
 
 
 def splits_table(marks: Sequence[Scores]) -> Table:
     """Return what each promise comes to over random halves of all healthy hours, known tasks included."""
     solved, faulty = all_episodes(marks)
     units = Blocks.of([t.surprise for t in solved], solved[0].dt)
-    found = DetectionMetrics("", faulty, [], WINDOW_S)
+    metrics = DetectionMetrics("", faulty, [], WINDOW_S)
     caption = (
-        f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory has met too: one "
-        "half sets the threshold, in the other so many false alarms came, mean ± SD."
+        f"Over {SPLITS} random halves of {units.total:.1f} healthy hours, of tasks that the memory "
+        "has met too: one half sets the threshold, in the other so many false alarms came, "
+        "mean ± SD."
     )
-    cells = {
-        f"promised {rate:g}/h": over_splits(found, units, AlarmRate(rate, HOUR))
-        for rate in PROMISES
-    }
-    return Table(caption, list(cells), [list(cells.values())])
+    row = {}
+    for rate in PROMISES:
+        row[f"promised {rate:g}/h"] = over_splits(metrics, units, AlarmRate(rate, HOUR))
+    return kit.table_of(caption, [row])

@@ -1,4 +1,4 @@
-"""Run a study from its command line, repeat it over seeds, and write what it found.
+"""Run a study from its command line, repeat it over seeds, and write its results.
 
 A study is a module with a frozen ``Config`` and a function ``run(config) -> Findings``.
 """
@@ -8,12 +8,13 @@ from __future__ import annotations
 import json
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -37,6 +38,9 @@ Result = TypeVar("Result")
 
 Record = dict[str, Any]
 """One measurement: the conditions, the seed, and the values measured."""
+
+Records: TypeAlias = Sequence[Record] | pd.DataFrame
+"""Measurements, as a list or as a table with a column for each name."""
 
 
 @dataclass(frozen=True)
@@ -64,74 +68,99 @@ class Findings(NamedTuple):
     figure: Figure | None = None
 
 
-def main(study: ModuleType, argv: Sequence[str] | None = None) -> int:
-    """Run a study from its command line, write and print its results, and return the exit code."""
-    name = study.__name__.rpartition(".")[2]
+def main(name: str, study: ModuleType, argv: Sequence[str] | None = None) -> int:
+    """Run a study from its command line, write and print its results, and return the exit code.
+
+    Args:
+        name: of the study; its files are named after it.
+        study: module with ``Config`` and ``run``.
+        argv: options; those of the process by default.
+    """
 
     def work(config: Any, console: Console) -> None:
         config.out.mkdir(parents=True, exist_ok=True)
         start = time.perf_counter()
         with threadpool_limits(1):  # several threads slow products this small down
-            found = study.run(config)
-        written = write(config.out / name, found, config, time.perf_counter() - start)
-        for table in found.tables:
+            findings = study.run(config)
+        path = config.out / name
+        suffixes = write(path, findings, config, time.perf_counter() - start)
+        for table in findings.tables:
             console.print(table)
-        console.print(f"Wrote {config.out / name}{', '.join(written)}")
+        console.print(f"Wrote {path}{', '.join(suffixes)}")
 
     return command.run(f"reproduce {name}", study.Config, work, argv)
 
 
-def write(path: Path, found: Findings, config: Any, seconds: float) -> list[str]:
-    """Write the figure, records (CSV), tables (Markdown) and conditions (JSON); return the suffixes."""
-    written = [".csv", ".md", ".json"]
-    if found.figure is not None:
-        save(found.figure, path.with_suffix(".png"))
+def write(path: Path, findings: Findings, config: Any, seconds: float) -> list[str]:
+    """Write the figure, records (CSV), tables (Markdown) and conditions (JSON).
+
+    Returns:
+        The suffixes of the files written.
+    """
+    suffixes = []
+    if findings.figure is not None:
+        save(findings.figure, path.with_suffix(".png"))
         with written_whole(path.with_suffix(".svg")) as file:
-            found.figure.savefig(file, format="svg", metadata={"Date": None})
-        written = [".png", ".svg", *written]
-    write_text(path.with_suffix(".csv"), pd.DataFrame(found.records).to_csv(index=False))
-    write_text(path.with_suffix(".md"), "\n\n".join(map(markdown, found.tables)) + "\n")
+            findings.figure.savefig(file, format="svg", metadata={"Date": None})
+        suffixes = [".png", ".svg"]
     details = {
-        "arguments": json.loads(json.dumps(asdict(config), default=str)),
+        "arguments": asdict(config),
         "seed": config.seed,
         "versions": versions("scipy", "torch", "matplotlib"),
         "python": platform.python_version(),
         "machine": platform.machine(),
         "seconds": round(seconds, 1),
     }
-    write_text(path.with_suffix(".json"), json.dumps(details, indent=2) + "\n")
-    return written
+    texts = {
+        ".csv": pd.DataFrame(findings.records).to_csv(index=False),
+        ".md": "\n\n".join(map(markdown, findings.tables)) + "\n",
+        ".json": json.dumps(details, indent=2, default=str) + "\n",
+    }
+    for suffix, text in texts.items():
+        write_text(path.with_suffix(suffix), text)
+    return [*suffixes, *texts]
 
 
 # ------------------------------------------------------------------ measurement
 
 
-def stage(what: str) -> AbstractContextManager[Progress]:
-    """Show the progress of ``what`` while the block runs; yields a function of (done, total)."""
-    return progress.stage(what, Console(), {})
+def stage(label: str) -> AbstractContextManager[Progress]:
+    """Show the progress of a stage while the block runs; yields a function of (done, total)."""
+    return progress.stage(label, Console(), {})
 
 
 def each(
-    what: str, work: Callable[[Item], Result], items: Sequence[Item], config: Config
+    label: str, work: Callable[[Item], Result], items: Sequence[Item], config: Config
 ) -> list[Result]:
-    """Return ``[work(item) for item in items]``, computed by the study's workers with a progress bar."""
-    with stage(what) as tell:
-        return parallel_map(work, items, config.workers, tell)
+    """Return ``[work(item) for item in items]``, by the study's workers with a progress bar."""
+    with stage(label) as report:
+        return parallel_map(work, items, config.workers, report)
 
 
-def where(records: Sequence[Record], **values: Any) -> list[Record]:
-    """Return the records that have these values."""
-    return [r for r in records if all(r.get(name) == value for name, value in values.items())]
+def records_of(
+    label: str, work: Callable[[Item], list[Record]], items: Sequence[Item], config: Config
+) -> list[Record]:
+    """Return the records of all items, by the study's workers with a progress bar."""
+    return [*chain.from_iterable(each(label, work, items, config))]
 
 
-def by_seed(records: Sequence[Record], value: str, **values: Any) -> pd.Series[float]:
+def where(records: Records, **values: Any) -> pd.DataFrame:
+    """Return the records with these values; a tuple stands for any of its values."""
+    frame = pd.DataFrame(records)
+    for name, value in values.items():
+        allowed = value if isinstance(value, tuple) else (value,)
+        frame = frame[frame[name].isin(allowed)]
+    return frame
+
+
+def by_seed(records: Records, value: str, **values: Any) -> pd.Series[float]:
     """Return the mean of a value in each seed, over the records with these values."""
-    chosen = pd.DataFrame(where(records, **values), columns=["seed", value]).dropna()
+    chosen = where(records, **values).dropna(subset=[value])
     return chosen.astype({value: float}).groupby("seed")[value].mean()
 
 
-def over_seeds(records: Sequence[Record], value: str, **values: Any) -> Spread:
-    """Return mean and spread of the means of each seed, over the records with these values; NaN without records."""
+def over_seeds(records: Records, value: str, **values: Any) -> Spread:
+    """Return mean and spread of the means of each seed; NaN without records of these values."""
     means = by_seed(records, value, **values)
     return Spread(float(means.mean()), float(means.std()))
 
@@ -139,55 +168,57 @@ def over_seeds(records: Sequence[Record], value: str, **values: Any) -> Spread:
 # ------------------------------------------------------------------ tables and figures
 
 
-def by(name: str, values: Iterable[Any]) -> dict[str, Record]:
-    """Return the rows or columns of a ``grid``: ``{"5": {"step": 5}, …}``."""
-    return {str(value): {name: value} for value in values}
+def table_of(caption: str, rows: Sequence[Mapping[str, object]]) -> Table:
+    """Return a table of rows that hold their cells by heading; without headings for no rows."""
+    headings = list(rows[0]) if rows else []
+    return Table(caption, headings, [tuple(row.values()) for row in rows])
 
 
 def grid(
-    caption: str,
-    records: Sequence[Record],
-    value: str,
-    rows: Mapping[str, Record],
-    columns: Mapping[str, Record],
-    digits: int = 2,
-    **values: Any,
+    caption: str, records: Records, value: str, rows: str, columns: str, digits: int = 2
 ) -> Table:
-    """Return a table of means over seeds; a cell is of the records with the values of its row and column."""
-    cells = [
-        (
-            label,
-            *(
-                shown(records, value, digits, **values | row | column)
-                for column in columns.values()
-            ),
-        )
-        for label, row in rows.items()
-    ]
-    return Table(caption, ("", *columns), cells)
+    """Return a table of means over seeds.
+
+    Args:
+        caption: of the table.
+        records: measurements.
+        value: name of the value in the cells.
+        rows: name of the value that differs between rows.
+        columns: name of the value that differs between columns.
+        digits: after the decimal point.
+    """
+    frame = pd.DataFrame(records).dropna(subset=[rows, columns, value])
+    cells = []
+    for label, own in frame.groupby(rows, sort=False):
+        row = {"": label}
+        for column in frame[columns].unique():
+            row[str(column)] = shown(own, value, digits, **{columns: column})
+        cells.append(row)
+    return table_of(caption, cells)
 
 
-def shown(records: Sequence[Record], value: str, digits: int = 2, **values: Any) -> str:
+def shown(records: Records, value: str, digits: int = 2, **values: Any) -> str:
     """Return ``mean ± spread`` over seeds, for a table; empty without records."""
-    found = over_seeds(records, value, **values)
-    return "" if np.isnan(found.mean) else found.text(digits=digits)
+    spread = over_seeds(records, value, **values)
+    return "" if np.isnan(spread.mean) else spread.text(digits=digits)
 
 
-def curves(
-    ax: Axes,
-    records: Sequence[Record],
-    value: str,
-    x: tuple[str, Sequence[Any]],
-    lines: Mapping[str, Record],
-    **values: Any,
-) -> None:
-    """Draw a curve for each of ``lines``, over the values of what ``x`` names: means over seeds with a band of a SD."""
-    name, places = x
-    for i, (label, line) in enumerate(lines.items()):
-        found = [over_seeds(records, value, **{**values, **line, name: place}) for place in places]
-        mean, spread = np.array(found).T
+def curves(ax: Axes, records: Records, value: str, x: str, lines: str) -> None:
+    """Draw curves: means over seeds with a band of a SD.
+
+    Args:
+        ax: where to draw.
+        records: measurements.
+        value: name of the value on the vertical axis.
+        x: name of the value on the horizontal axis.
+        lines: name of the value that differs between curves.
+    """
+    frame = pd.DataFrame(records)
+    for i, (label, own) in enumerate(frame.groupby(lines, sort=False)):
+        means = own.groupby([x, "seed"])[value].mean().unstack("seed")
+        mean = means.mean(axis=1)
+        spread = means.std(axis=1)
+        low = mean - spread
         colour, style, marker = look(i)
-        ax.plot(
-            places, mean, color=colour, linestyle=style, marker=marker, markersize=4, label=label
-        )
-        ax.fill_between(places, mean - spread, mean + spread, color=colour, alpha=0.15, linewidth=0)
+        ax.plot(mean, marker, color=colour, linestyle=style, markersize=4, label=label)
+        ax.fill_between(mean.index, low, mean + spread, color=colour, alpha=0.15, linewidth=0)

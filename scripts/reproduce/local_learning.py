@@ -12,15 +12,18 @@ measured, with the weights held still. Then the same network learns from the sam
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -29,6 +32,7 @@ from asm_gym.memory.energy import STEEPEST, STRIDE, infer
 from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
 from asm_gym.memory.traces import (
     DECAYS,
+    HebbianChange,
     TracesLearner,
     Weights,
     advance,
@@ -40,15 +44,14 @@ from asm_gym.memory.traces import (
     initial_weights,
     sense,
 )
-from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.expression import trajectories
+from asm_gym.scripts.reproduce.expression import fit_reader, trajectories
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
 from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 
-COMPARED = ("W_C", "W_F", "W_D")  # the synapses that are learned
+COMPARED = HebbianChange._fields  # the synapses that are learned
 CUE = 10  # rows that are read before a stream runs on alone
 TARGETS = {
     "energy": "gradient of the energy",
@@ -62,6 +65,8 @@ RATES = {
 }
 PRIOR_PRECISION = 30.0  # Π_z
 ITERATIONS = 5  # inference steps of learning
+STREAMS = 16  # that local learning follows side by side
+PROBED = 16  # about so many episodes measure the angles
 
 
 @dataclass(frozen=True)
@@ -85,6 +90,11 @@ class Changes(NamedTuple):
     energy: float  # E, mean over the batch
     error: float  # L, or L_alone
 
+    @property
+    def flat(self) -> NDArray[np.float64]:
+        """All arrays as one (N,)."""
+        return np.concatenate([array.ravel() for array in self.arrays.values()])
+
 
 def local(
     weights: Weights,
@@ -93,94 +103,128 @@ def local(
     alone: bool = False,
     pi_z: float = PRIOR_PRECISION,
 ) -> Changes:
-    """Return Σ_t of the Hebbian changes along a batch of episodes of one length, with the weights held still."""
-    w, curvature = weights, pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
-    sensory = batch.senses.shape[2]
-    c = np.zeros((batch.senses.shape[1], w.W_C.shape[1]), np.float32)
-    total = {name: np.zeros(getattr(w, name).shape) for name in COMPARED}
-    energy = error = 0.0
+    """Return Σ_t of the Hebbian changes along a batch, with the weights held still.
+
+    Args:
+        weights: of the network.
+        batch: episodes of one length.
+        iterations: inference steps a row.
+        alone: whether the streams run on alone after ``CUE`` rows.
+        pi_z: Π_z.
+    """
+    _, streams, sensory = batch.senses.shape
+    curvature = pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
+    c = np.zeros((streams, weights.W_C.shape[1]), np.float32)
+    total = {name: np.zeros(getattr(weights, name).shape) for name in COMPARED}
+    energy = 0.0
+    error = 0.0
     for t, (x, u) in enumerate(zip(batch.senses, batch.commands, strict=True)):
-        mu, taken = expect(c, w.W_C), u
-        if alone and t >= CUE:
-            action = (direct(c, u, w.W_D) + sense(mu, w.W_F))[:, sensory:]
+        runs_on = alone and t >= CUE
+        read = x
+        taken = u
+        mu = expect(c, weights.W_C)
+        state = sense(mu, weights.W_F)
+        if runs_on:
+            action = (direct(c, u, weights.W_D) + state)[:, sensory:]
             taken = np.hstack([action, u[:, -1:]])
-        past = direct(c, taken, w.W_D)
+        past = direct(c, taken, weights.W_D)
+        if runs_on:
+            read = (past + state)[:, :sensory]
+
         left = np.hstack([x, u[:, :-1]]) - past
-        z = infer(mu, left, w.W_F, pi_z, np.ones_like(left), curvature, iterations)
-        settled, missed = left - sense(z, w.W_F), left - sense(mu, w.W_F)
-        change = hebbian_change(c, taken, mu, z, settled, pi_z)
-        for name in COMPARED:
-            total[name] += getattr(change, name)
-        energy += 0.5 * float((pi_z * np.sum((z - mu) ** 2) + np.sum(settled**2)) / len(x))
-        error += 0.5 * float(np.sum(missed**2) / len(x))
-        expected = (past + sense(mu, w.W_F))[:, :sensory]
-        c = advance(c, np.hstack([expected if alone and t >= CUE else x, taken]), w.gains)
+        z = infer(mu, left, weights.W_F, pi_z, np.ones_like(left), curvature, iterations)
+        missed = left - sense(z, weights.W_F)
+        change = hebbian_change(c, taken, mu, z, missed, pi_z)
+        for name, array in change._asdict().items():
+            total[name] += array
+        prior = pi_z * np.sum((z - mu) ** 2)
+        energy += 0.5 * float((prior + np.sum(missed**2)) / streams)
+        error += 0.5 * float(np.sum((left - state) ** 2) / streams)
+        c = advance(c, np.hstack([read, taken]), weights.gains)
     return Changes(total, energy, error)
 
 
 def exact(
     weights: Weights, batch: Batch, iterations: int, target: str, pi_z: float = PRIOR_PRECISION
 ) -> Changes:
-    """Return the negative gradient of one of ``TARGETS``, by backpropagation through time."""
-    W = {
-        name: torch.from_numpy(getattr(weights, name).copy()).requires_grad_() for name in COMPARED
-    }
-    energy, error = _unrolled(W, weights.gains, batch, iterations, target, pi_z)
-    gradient = torch.autograd.grad(energy if target == "energy" else error, list(W.values()))
-    arrays = {n: -g.numpy().astype(np.float64) for n, g in zip(W, gradient, strict=True)}
-    return Changes(arrays, energy.item(), error.item())
+    """Return the negative gradient of one of ``TARGETS``, by backpropagation through time.
+
+    The other arguments are those of ``local``.
+    """
+    tensors: Any = Weights._make(
+        torch.from_numpy(array.copy()).requires_grad_() for array in weights
+    )
+    energy, error = losses(tensors, batch, iterations, target, pi_z)
+    loss = energy if target == "energy" else error
+    gradients = torch.autograd.grad(loss, tensors[: len(COMPARED)])
+    arrays = [-gradient.numpy().astype(np.float64) for gradient in gradients]
+    return Changes(dict(zip(COMPARED, arrays, strict=True)), energy.item(), error.item())
 
 
-def _unrolled(
-    W: dict[str, Tensor],
-    gains: NDArray[np.float32],
-    batch: Batch,
-    iterations: int,
-    target: str,
-    pi_z: float,
+def losses(
+    weights: Any, batch: Batch, iterations: int, target: str, pi_z: float
 ) -> tuple[Tensor, Tensor]:
-    """Return E and L, means over the batch; E is computed for its own gradient only."""
-    W_C, W_F = W["W_C"], W["W_F"]
-    S, A = batch.senses.shape[2], batch.commands.shape[2] - 1
-    W_D = W["W_D"] * torch.from_numpy(direct_synapses(S, A))
-    curvature = pi_z + float(torch.linalg.matrix_norm(W_F.detach(), 2)) ** 2
-    decays, g = torch.from_numpy(DECAYS)[:, None], torch.from_numpy(gains)[:, None]
-    c = torch.zeros(batch.senses.shape[1], len(DECAYS), S + A + 1)
-    energy, error = torch.zeros(()), torch.zeros(())
-    for t, (x, u) in enumerate(
-        zip(torch.from_numpy(batch.senses), torch.from_numpy(batch.commands), strict=True)
-    ):
+    """Return E and L, means over the batch, through all steps of inference and of time.
+
+    ``weights`` are those of ``traces`` as tensors; E is computed for its own gradient only.
+    """
+    senses = torch.from_numpy(batch.senses)
+    commands = torch.from_numpy(batch.commands)
+    _, streams, S = senses.shape
+    A = commands.shape[2] - 1
+    W_D = weights.W_D * torch.from_numpy(direct_synapses(S, A))
+    decays = torch.from_numpy(DECAYS)[:, None]
+    c = torch.zeros(streams, len(DECAYS), S + A + 1)
+    energy = torch.zeros(())
+    error = torch.zeros(())
+    for t, (x, u) in enumerate(zip(senses, commands, strict=True)):
+        runs_on = target == "alone" and t >= CUE
+        read = x
+        taken = u
         flat = c.flatten(1)
-        mu, taken, read = flat @ W_C.T, u, x
-        state = torch.tanh(mu) @ W_F.T
-        if target == "alone" and t >= CUE:
+        mu = flat @ weights.W_C.T
+        state = torch.tanh(mu) @ weights.W_F.T
+        if runs_on:
             action = (torch.cat([flat, u], dim=1) @ W_D.T + state)[:, S:]
             taken = torch.cat([action, u[:, -1:]], dim=1)
         past = torch.cat([flat, taken], dim=1) @ W_D.T
-        left = torch.cat([x, u[:, :-1]], dim=1) - past
-        error = error + 0.5 * torch.sum((left - state) ** 2) / len(x)
-        if target == "energy":
-            z = mu
-            for _ in range(iterations):
-                f = torch.tanh(z)
-                feedback = (left - f @ W_F.T) @ W_F
-                bend = float(STEEPEST) * feedback.detach().abs().amax(dim=1, keepdim=True)
-                z = z - float(STRIDE) / (curvature + bend) * (
-                    pi_z * (z - mu) - (1 - f * f) * feedback
-                )
-            settled = torch.sum((left - torch.tanh(z) @ W_F.T) ** 2)
-            energy = energy + 0.5 * (pi_z * torch.sum((z - mu) ** 2) + settled) / len(x)
-        elif target == "alone" and t >= CUE:
+        if runs_on:
             read = (past + state)[:, :S]
-        c = decays * c + g * torch.cat([read, taken], dim=1)[:, None]
+
+        left = torch.cat([x, u[:, :-1]], dim=1) - past
+        error = error + 0.5 * torch.sum((left - state) ** 2) / streams
+        if target == "energy":
+            z = settled(mu, left, weights.W_F, iterations, pi_z)
+            missed = torch.sum((left - torch.tanh(z) @ weights.W_F.T) ** 2)
+            prior = pi_z * torch.sum((z - mu) ** 2)
+            energy = energy + 0.5 * (prior + missed) / streams
+        rows = torch.cat([read, taken], dim=1)[:, None]
+        c = decays * c + weights.gains[:, None] * rows
     return energy, error
+
+
+def settled(mu: Tensor, left: Tensor, W_F: Tensor, iterations: int, pi_z: float) -> Tensor:
+    """Return the state (B, H) inferred from the expected one ``mu``, to explain ``left`` (B, S + A)."""
+    curvature = pi_z + float(torch.linalg.matrix_norm(W_F.detach(), 2)) ** 2
+    z = mu
+    for _ in range(iterations):
+        f = torch.tanh(z)
+        feedback = (left - f @ W_F.T) @ W_F
+        bend = float(STEEPEST) * feedback.detach().abs().amax(dim=1, keepdim=True)
+        gradient = pi_z * (z - mu) - (1 - f * f) * feedback
+        z = z - float(STRIDE) / (curvature + bend) * gradient
+    return z
 
 
 def cosine(a: Changes, b: Changes) -> float:
     """Return the cosine between two changes; 0 where one of them is 0."""
-    p, q = (np.concatenate([c.arrays[n].ravel() for n in COMPARED]) for c in (a, b))
-    length = float(np.linalg.norm(p) * np.linalg.norm(q))
-    return float(p @ q) / length if length > 0 else 0.0
+    length = float(np.linalg.norm(a.flat) * np.linalg.norm(b.flat))
+    if length == 0:
+        return 0.0
+    return float(a.flat @ b.flat) / length
+
+
+# ------------------------------------------------------------------ the study
 
 
 def checkpoints(epochs: int) -> list[int]:
@@ -193,112 +237,117 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
     letters = repertoire(config.skills, rng)
-    train, tests = copybook(letters, config.writings, rng), copybook(letters, 2, rng)
-    reader = StreamScaler.fit(train[0].spec, [e.stream for e in train])
-    taught, judged = trajectories(reader, train), side_by_side(trajectories(reader, tests))
+    train = copybook(letters, config.writings, rng)
+    tests = copybook(letters, 2, rng)
+    reader = fit_reader(train)
+    taught = trajectories(reader, train)
+    judged = side_by_side(trajectories(reader, tests))
+    probe = side_by_side(taught[:: max(1, len(taught) // PROBED)])
     weights = initial_weights(config.hidden, reader.size, 2, rng)
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in taught])
-    probe, start = (
-        side_by_side(taught[:: max(1, len(taught) // 16)]),
-        Weights(*(w.copy() for w in weights)),
+    start = copy.deepcopy(weights)
+    ways = {
+        "local": learn_locally(weights, taught, config.epochs, rng),
+        "backpropagation": backpropagate(start, taught, config.epochs, np.random.default_rng(seed)),
+    }
+    measured = checkpoints(config.epochs)
+    records = []
+    for way, learning in ways.items():
+        for epoch, current in enumerate(learning):
+            if epoch not in measured:
+                continue
+            if way == "local":
+                records += angles(current, probe, epoch)
+            record = {"epoch": epoch, "learned_by": way, "mse": mean_square(current, judged)}
+            records.append(record)
+    return [{"seed": seed, **record} for record in records]
+
+
+def learn_locally(
+    weights: Weights, taught: Sequence[Trajectory], epochs: int, rng: np.random.Generator
+) -> Iterator[Weights]:
+    """Train by the local rules; yield the weights before each epoch and after the last."""
+    schedule = Schedule(
+        epochs=epochs,
+        batch_size=STREAMS,
+        learning_rate=RATES["local"],
+        iterations=ITERATIONS,
+        prior_precision=PRIOR_PRECISION,
+        sensory_precision=1.0,
+        free_running_probability=0.0,
     )
-    records: list[Record] = []
-    schedule = Schedule(config.epochs, 16, RATES["local"], ITERATIONS, PRIOR_PRECISION, 1.0, 0.0)
-    streams = Practice(TracesLearner(weights, schedule, rng), 16, rng)
-    moments, steps = (
-        one_after_another(taught, 16, rng),
-        -(-sum(len(t.senses) for t in taught) // 16),
-    )
-    for epoch in range(config.epochs + 1):
-        if epoch in checkpoints(config.epochs):
-            records += angles(weights, probe, epoch)
-            records.append(_reached("local", weights, judged, epoch))
-        if epoch < config.epochs:
-            streams.run(
-                islice(moments, steps), cosine_decay(RATES["local"], epoch / config.epochs), 0.0
-            )
-    records += backpropagated(start, taught, judged, config, np.random.default_rng(seed))
-    return [{"seed": seed, **r} for r in records]
+    practice = Practice(TracesLearner(weights, schedule, rng), STREAMS, rng)
+    moments = one_after_another(taught, STREAMS, rng)
+    steps = math.ceil(sum(len(t.senses) for t in taught) / STREAMS)
+    yield weights
+    for epoch in range(epochs):
+        rate = cosine_decay(schedule.learning_rate, epoch / epochs)
+        practice.run(islice(moments, steps), rate, free=0.0)
+        yield weights
+
+
+def backpropagate(
+    weights: Weights, taught: Sequence[Trajectory], epochs: int, rng: np.random.Generator
+) -> Iterator[Weights]:
+    """Train by Adam on the exact gradient of the prediction error; yield as ``learn_locally``."""
+    # These tensors share memory with the weights.
+    tensors = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}
+    adam = torch.optim.Adam(tensors.values())
+    yield weights
+    for epoch in range(epochs):
+        adam.param_groups[0]["lr"] = cosine_decay(RATES["backpropagation"], epoch / epochs)
+        for batch in batches(taught, rng):
+            downhill = exact(weights, batch, ITERATIONS, "error").arrays
+            for name, tensor in tensors.items():
+                tensor.grad = torch.from_numpy(-downhill[name].astype(np.float32))
+            adam.step()
+        yield weights
+
+
+def mean_square(weights: Weights, judged: Batch) -> float:
+    """Return the mean squared error of a predicted number [variance of the stream]."""
+    numbers = judged.senses[:, 0].size + judged.commands[:, 0, :-1].size
+    return 2 * local(weights, judged, ITERATIONS).error / numbers
 
 
 def angles(weights: Weights, probe: Batch, epoch: int) -> list[Record]:
     """Return the angles [°] between the local change and each gradient."""
     records = []
-    read, alone = (local(weights, probe, ITERATIONS, alone) for alone in (False, True))
     for target in TARGETS:
-        theirs, ours = (
-            exact(weights, probe, ITERATIONS, target),
-            alone if target == "alone" else read,
-        )
-        degrees = math.degrees(math.acos(min(1.0, cosine(ours, theirs))))
+        change = local(weights, probe, ITERATIONS, alone=target == "alone")
+        gradient = exact(weights, probe, ITERATIONS, target)
+        degrees = math.degrees(math.acos(min(1.0, cosine(change, gradient))))
         records.append({"epoch": epoch, "target": target, "degrees": degrees})
     return records
 
 
-def backpropagated(
-    weights: Weights,
-    taught: Sequence[Trajectory],
-    judged: Batch,
-    config: Config,
-    rng: np.random.Generator,
-) -> list[Record]:
-    """Train the same network from the same weights by Adam on the exact gradient of the prediction error."""
-    records = []
-    # shares memory with the weights
-    W = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}
-    adam = torch.optim.Adam(W.values(), RATES["backpropagation"])
-    for epoch in range(config.epochs + 1):
-        if epoch in checkpoints(config.epochs):
-            records.append(_reached("backpropagation", weights, judged, epoch))
-        for group in adam.param_groups:
-            group["lr"] = cosine_decay(RATES["backpropagation"], epoch / config.epochs)
-        for batch in batches(taught, rng) if epoch < config.epochs else ():
-            gradient = exact(weights, batch, ITERATIONS, "error").arrays
-            for name, w in W.items():
-                w.grad = torch.from_numpy(-gradient[name].astype(np.float32))
-            adam.step()
-    return records
-
-
-def _reached(how: str, weights: Weights, judged: Batch, epoch: int) -> Record:
-    """Return the mean squared error of a predicted number [variance of the stream]."""
-    numbers = judged.senses[:, 0].size + judged.commands[:, 0, :-1].size
-    return {
-        "epoch": epoch,
-        "learned_by": how,
-        "mse": 2 * local(weights, judged, ITERATIONS).error / numbers,
-    }
-
-
 def run(config: Config) -> Findings:
     """Run every seed."""
-    each = kit.each(
-        "learning both ways", partial(one_seed, config=config), config.repetitions, config
+    work = partial(one_seed, config=config)
+    records = kit.records_of("learning both ways", work, config.repetitions, config)
+    frame = pd.DataFrame(records).replace({"target": TARGETS})
+    angle = (
+        "Angle [°] between the local change and the exact one, before so many epochs; "
+        "mean ± SD over seeds"
     )
-    records = [record for own in each for record in own]
-    epochs = checkpoints(config.epochs)
-    before, ways = kit.by("epoch", epochs), kit.by("learned_by", RATES)
-    targets: dict[str, Record] = {label: {"target": t} for t, label in TARGETS.items()}
-    angle = "Angle [°] between the local change and the exact one, before so many epochs; mean ± SD over seeds"
-    missed = "Mean squared error of the next row [variance], before so many epochs"
+    error = "Mean squared error of the next row [variance], before so many epochs"
     tables = [
-        kit.grid(angle, records, "degrees", targets, before, 0),
-        kit.grid(missed, records, "mse", ways, before, 3),
+        kit.grid(angle, frame, "degrees", "target", "epoch", digits=0),
+        kit.grid(error, frame, "mse", "learned_by", "epoch", digits=3),
     ]
+    return Findings(records, tables, angles_figure(frame))
+
+
+def angles_figure(records: pd.DataFrame) -> Figure:
+    """Draw the angle to each gradient, and the error of each way of learning, over the epochs."""
     with figure(height=3.3, width=8) as fig:
         left, right = fig.subplots(1, 2)
-        curves(left, records, "degrees", ("epoch", epochs), targets)
-        curves(right, records, "mse", ("epoch", epochs), ways)
+        curves(left, records, "degrees", "epoch", "target")
+        curves(right, records, "mse", "epoch", "learned_by")
         left.axhline(90, color="#999999", linewidth=1)
-        left.set(
-            xlabel="epochs", ylabel="angle to the local change [°]", ylim=(0, 95), xscale="symlog"
-        )
-        right.set(
-            xlabel="epochs",
-            ylabel="error of the next row [variance]",
-            yscale="log",
-            xscale="symlog",
-        )
+        left.set(ylabel="angle to the local change [°]", ylim=(0, 95))
+        right.set(ylabel="error of the next row [variance]", yscale="log")
         for ax in (left, right):
+            ax.set(xlabel="epochs", xscale="symlog")
             ax.legend(fontsize=7)
-    return Findings(records, tables, fig)
+    return fig

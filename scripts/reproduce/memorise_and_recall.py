@@ -12,33 +12,36 @@ Source: Tang, Barron and Bogacz 2023 (NeurIPS), and their code, C16Mftang/sequen
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
 
 from asm_gym.data.episode import Episode
 from asm_gym.evaluation.figures import figure
+from asm_gym.evaluation.tables import Table
 from asm_gym.memory.dynamics import DYNAMICS, SETTLING
 from asm_gym.memory.learning import Moment, Practice, Schedule
 from asm_gym.memory.settling import SettlingLearner, SettlingNetwork, initial_settling_weights
 from asm_gym.memory.temporal import unassociated
-from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     Expresser,
     ExpressionMemory,
+    LocalTraining,
+    fit_reader,
     mean_demonstrations,
     recalled,
     trajectories,
 )
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
-from asm_gym.scripts.reproduce.recurrent import side_by_side
+from asm_gym.scripts.reproduce.recurrent import Training, side_by_side
 from asm_gym.validation import check_number
 
 MODELS = {
@@ -50,15 +53,14 @@ MODELS = {
 }
 UNITS = {"memory_wide": 4.0, "settling": 1.75}
 """Units for each of a GRU's. A GRU of 64 has 13,700 weights; these then have 11,400 and 13,300."""
-CHOSEN: dict[str, dict[str, Any]] = {
-    "memory": {"rate": 1e-2, "gain": 4.0},
-    "memory_wide": {"rate": 6e-3, "gain": 8.0},
-    "settling": {"rate": 3e-3, "dynamics": SETTLING},
-    "gru": {"rate": 6e-2, "noise": 0.3},
+LOCAL = {
+    "memory": LocalTraining(rate=1e-2, gain=4.0),
+    "memory_wide": LocalTraining(rate=6e-3, gain=8.0),
+    "settling": LocalTraining(rate=3e-3, dynamics=SETTLING),
 }
-
-
-PUBLISHED_UNITS, PUBLISHED_RATE = 480, 1e-4
+BACKPROPAGATION = Training(rate=6e-2, noise=0.3)
+PUBLISHED_UNITS = 480
+PUBLISHED_RATE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -94,56 +96,44 @@ class Config(kit.Config):
 def run(config: Config) -> Findings:
     """Measure every model on every repertoire."""
     jobs = list(product(config.repetitions, config.repertoires))
-    each = kit.each("learning", partial(recall, config=config), jobs, config)
-    records = [record for own in each for record in own]
-    models, longest = {MODELS[m]: {"model": m} for m in config.models}, max(config.cues)
-    sizes, cues = kit.by("skills", config.repertoires), kit.by("cue", config.cues)
+    records = kit.records_of("learning", partial(recall, config=config), jobs, config)
+    frame = pd.DataFrame(records).replace({"model": MODELS})
+    longest = max(config.cues)
+    offline = frame[frame.cue == longest]
+    online = frame[frame.cue == STEPS]
     cued = f"{config.hidden} units, cue of {longest}; mean ± SD over seeds"
+    right = "Share of right skills by letters, offline"
     tables = [
-        kit.grid(
-            f"Offline error [cm] by letters, {cued}",
-            records,
-            "error_cm",
-            models,
-            sizes,
-            cue=longest,
-        ),
-        kit.grid(
-            "Share of right skills by letters, offline",
-            records,
-            "right",
-            models,
-            sizes,
-            cue=longest,
-        ),
-        kit.grid("Online error [cm] by letters", records, "error_cm", models, sizes, cue=STEPS),
-        *(
-            kit.grid(
-                f"Offline error [cm] by cue, {n} letters",
-                records,
-                "error_cm",
-                models,
-                cues,
-                skills=n,
-            )
-            for n in config.repertoires
-        ),
+        errors(f"Offline error [cm] by letters, {cued}", offline, "skills"),
+        kit.grid(right, offline, "right", "model", "skills"),
+        errors("Online error [cm] by letters", online, "skills"),
     ]
+    for n in config.repertoires:
+        own = frame[(frame.skills == n) & (frame.cue < STEPS)]
+        tables.append(errors(f"Offline error [cm] by cue, {n} letters", own, "cue"))
+    return Findings(records, tables, errors_figure(offline, online))
+
+
+def errors(caption: str, records: pd.DataFrame, columns: str) -> Table:
+    """Return the table of the errors of each model."""
+    return kit.grid(caption, records, "error_cm", "model", columns)
+
+
+def errors_figure(offline: pd.DataFrame, online: pd.DataFrame) -> Figure:
+    """Draw the offline and the online error of each model over the number of skills."""
     with figure(height=3.4, width=7) as fig:
-        axes = fig.subplots(1, 2)
-        for ax, cue, label in zip(
-            axes, (longest, STEPS), ("offline error [cm]", "online error [cm]"), strict=True
-        ):
-            curves(ax, records, "error_cm", ("skills", config.repertoires), models, cue=cue)
-            ax.set(xlabel="skills in the repertoire", xscale="log", ylabel=label, ylim=0)
-            ax.set_xticks(config.repertoires, [str(n) for n in config.repertoires])
-        fig.legend(
-            *axes[0].get_legend_handles_labels(),
-            loc="outside upper center",
-            ncols=len(models),
-            fontsize=8,
-        )
-    return Findings(records, tables, fig)
+        left, right = fig.subplots(1, 2)
+        curves(left, offline, "error_cm", "skills", "model")
+        curves(right, online, "error_cm", "skills", "model")
+        left.set_ylabel("offline error [cm]")
+        right.set_ylabel("online error [cm]")
+        sizes = offline.skills.unique()
+        for ax in (left, right):
+            ax.set(xlabel="skills in the repertoire", xscale="log", ylim=0)
+            ax.set_xticks(sizes, map(str, sizes))
+        handles, labels = left.get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=8)
+    return fig
 
 
 def recall(job: tuple[int, int], config: Config) -> list[Record]:
@@ -151,16 +141,27 @@ def recall(job: tuple[int, int], config: Config) -> list[Record]:
     seed, skills = job
     rng = np.random.default_rng([seed, 2])
     letters = repertoire(len(NAMES), rng)[:skills]
-    train, others = copybook(letters, config.writings, rng), copybook(letters, 4, rng)
-    tests = train if config.memorised else others
+    train = copybook(letters, config.writings, rng)
+    tests = copybook(letters, 4, rng)
+    if config.memorised:
+        tests = train
     means = mean_demonstrations(train)
-    records: list[Record] = []
+
+    records = []
     for name in config.models:
         model = learned(name, train, config, rng)
         for cue in (*config.cues, STEPS):
             error, right = recalled(model, tests, means, cue)
-            where = {"seed": seed, "skills": skills, "model": name, "cue": cue}
-            records.append({**where, "error_cm": error, "right": right})
+            records.append(
+                {
+                    "seed": seed,
+                    "skills": skills,
+                    "model": name,
+                    "cue": cue,
+                    "error_cm": error,
+                    "right": right,
+                }
+            )
     return records
 
 
@@ -168,12 +169,14 @@ def learned(
     name: str, train: Sequence[Episode], config: Config, rng: np.random.Generator
 ) -> Expresser:
     """Return one of ``MODELS``, trained."""
-    units = round(config.hidden * UNITS.get(name, 1.0))
-    if name == "gru":
-        return Backpropagated.learned(train, units, rng, config.updates, **CHOSEN[name])
     if name == "published":
         return as_published(train, config.epochs, rng)
-    return ExpressionMemory.learned(train, units, rng, config.steps, **CHOSEN[name])
+    if name == "gru":
+        training = replace(BACKPROPAGATION, hidden=config.hidden, updates=config.updates)
+        return Backpropagated.learned(train, training, rng)
+    hidden = round(config.hidden * UNITS.get(name, 1.0))
+    settings = replace(LOCAL[name], hidden=hidden, steps=config.steps)
+    return ExpressionMemory.learned(train, settings, rng)
 
 
 def as_published(
@@ -183,21 +186,28 @@ def as_published(
 
     Inference is this package's, which goes at least as far down the energy as a hundred steps of 0.01.
     """
-    reader, how, count = (
-        StreamScaler.fit(train[0].spec, [e.stream for e in train]),
-        DYNAMICS[SETTLING],
-        len(train),
-    )
-    rows = zip(*side_by_side(trajectories(reader, train)), strict=True)
-    moments = [Moment(x, u, np.full((count, 1), t == 0)) for t, (x, u) in enumerate(rows)]
+    reader = fit_reader(train)
+    batch = side_by_side(trajectories(reader, train))
+    begins = np.zeros((len(batch.senses), len(train), 1), np.bool_)
+    begins[0] = True
+    moments = list(map(Moment, batch.senses, batch.commands, begins))
+    settling = DYNAMICS[SETTLING]
     schedule = Schedule(
-        epochs, count, PUBLISHED_RATE, how.iterations, how.prior_precision, 1.0, 0.0
+        epochs=epochs,
+        batch_size=len(train),
+        learning_rate=PUBLISHED_RATE,
+        iterations=settling.iterations,
+        prior_precision=settling.prior_precision,
+        sensory_precision=1.0,
+        free_running_probability=0.0,
     )
-    sensory, motor = moments[0].senses.shape[1], moments[0].commands.shape[1] - 1
+    sensory = batch.senses.shape[2]
+    motor = batch.commands.shape[2] - 1
     weights = initial_settling_weights(PUBLISHED_UNITS, sensory, motor, rng)
-    practice = Practice(SettlingLearner(weights, schedule, rng), count, rng)
+    practice = Practice(SettlingLearner(weights, schedule, rng), len(train), rng)
     for _ in range(epochs):
-        practice.run(moments, PUBLISHED_RATE, 0.0)
-    return ExpressionMemory(
-        reader, SettlingNetwork(weights, unassociated(), how.iterations, how.prior_precision, 1.0)
+        practice.run(moments, PUBLISHED_RATE, free=0.0)
+    network = SettlingNetwork(
+        weights, unassociated(), schedule.iterations, schedule.prior_precision, 1.0
     )
+    return ExpressionMemory(reader, network)

@@ -10,7 +10,7 @@ from its middle on. Pieces are of one trajectory: no table says how a monitor fa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from asm_gym.data.bags import read_bag
@@ -33,25 +34,18 @@ from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
-from asm_gym.scripts.reproduce.kit import Findings, Record, where
+from asm_gym.scripts.reproduce.kit import Findings, Record
 
 Floats = NDArray[np.float64]
 
 RULE = "friction_rule"
-SETTINGS: dict[str, dict[str, Any]] = {"neural_asm": {"values": True}}
-"""As ``asm-gym fit`` fits a log."""
-WITH_BODY = {
-    "neural_asm, body": "neural_asm",
-    "association_values, body": "association_values",
-    f"{RULE}, body": RULE,
-}
-"""Monitors with a body model."""
-PIECE_S, FOLDS = 1.0, 4  # length of a piece [s], and folds of which one is tested at a time
+BODY = ", body"  # ends the name of a monitor that reads the arm's URDF
+WITH_BODY = tuple(name + BODY for name in ("neural_asm", "association_values", RULE))
+PIECE_S = 1.0  # length of a piece [s]
+FOLDS = 4  # of which one is tested at a time
 
 
-def read_joint_states(path: Path) -> dict[str, NDArray[Any]]:
-    """Return time, position [rad], velocity and effort of each joint of a ROS 2 bag."""
-    return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
+# ------------------------------------------------------------------ recordings
 
 
 class RealArm(NamedTuple):
@@ -69,7 +63,17 @@ ARMS = {
 }
 
 
-# ------------------------------------------------------------------ faults added to recordings
+def read_joint_states(path: Path) -> dict[str, NDArray[Any]]:
+    """Return time, position [rad], velocity and effort of each joint of a ROS 2 bag."""
+    return {name.removeprefix("joint_states."): values for name, values in read_bag(path).items()}
+
+
+def read_body(folder: Path, arm: RealArm) -> str:
+    """Return the text of an arm's URDF."""
+    path = folder / "urdf" / arm.urdf
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing: it is in example-robot-data 6.0.0 (PyPI)")
+    return read_urdf(path)
 
 
 class Piece(NamedTuple):
@@ -84,67 +88,132 @@ class Piece(NamedTuple):
         """Return position or effort (T, J)."""
         return self.episode.stream[:, self.episode.spec.slices[name]].astype(np.float64)
 
+    def rise(self) -> Floats:
+        """Return the share (T - onset,) of its size that a growing fault has reached."""
+        rows = np.arange(len(self.episode) - self.onset)
+        return np.minimum(1.0, (1 + rows) * self.episode.spec.dt / RISE_S)
 
-NEWTONS, GRAVITY = 20.0, 9.81  # push at the hand, and weight of a payload of 1 kg [N]
-STEP_SHARE, SLIP, LATE_S, RISE_S = 0.2, 0.05, 0.1, 0.1
-MOVES = 0.02  # angle that an encoder must move by after the onset, or nothing shows that it is frozen [rad]
-FAULTS = dict.fromkeys(("push", "payload", "step"), "effort")
-FAULTS |= {"frozen": "position", "slipped": "position", "late": "effort"}
-"""Column that each fault changes: a push of 20 N sideways or a payload of 1 kg at the hand; a step of 20 % of a joint's
-effort range; an encoder that freezes or slips by 0.05 rad; an effort that comes 0.1 s late. None of them happened, and
-every table that counts them says so."""
+    def strong_joint(self, rng: np.random.Generator) -> int:
+        """Draw one of the joints whose effort ranges far."""
+        return int(rng.choice(np.flatnonzero(self.ranges > 0.1 * self.ranges.max())))
+
+    def at_joint(self, joint: int, values: Floats | float) -> Floats:
+        """Return what is added (T - onset, J) by values at one joint."""
+        added = np.zeros((len(self.episode) - self.onset, len(self.ranges)))
+        added[:, joint] = values
+        return added
+
+    def torques(self, force: Sequence[float]) -> Floats:
+        """Return the torques (T - onset, J) of a growing force (3,) [N] at the outermost link."""
+        assert self.body is not None
+        angles = self.column("position")[self.onset :]
+        torques = [jacobian(self.body, q).T @ np.array(force) for q in angles]
+        return np.array(torques) * self.rise()[:, None]
+
+
+# ------------------------------------------------------------------ faults added to recordings
+
+NEWTONS = 20.0  # push at the hand
+GRAVITY = 9.81  # weight of a payload of 1 kg [N]
+STEP_SHARE = 0.2  # step of a joint's effort, in its range
+SLIP = 0.05  # of an encoder [rad]
+LATE_S = 0.1  # delay of an effort [s]
+RISE_S = 0.1  # time in which a force grows [s]
+MOVES = 0.02  # least angle of motion after the onset that shows a frozen encoder [rad]
 
 
 def jacobian(body: BodyModel, q: Floats) -> Floats:
     """Return the velocity of the outermost link [m/s] by each joint's [rad/s] (3, J), at angles q (J,)."""
     mujoco: Any = require("mujoco", what="a push at a hand")
-    model, data = body.model, mujoco.MjData(body.model)
+    model = body.model
+    data = mujoco.MjData(model)
     data.qpos[:] = q[body.columns]
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    depth, moved, found = np.zeros(model.nbody), np.zeros((3, model.nv)), np.zeros((3, len(q)))
+    depth = np.zeros(model.nbody)
     for n in range(1, model.nbody):  # parents come first
         depth[n] = depth[model.body_parentid[n]] + 1
-    mujoco.mj_jacBody(model, data, moved, None, int(depth.argmax()))
-    found[:, body.columns] = moved
-    return found
+    by_column = np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, by_column, None, int(depth.argmax()))
+    by_joint = np.zeros((3, len(q)))
+    by_joint[:, body.columns] = by_column
+    return by_joint
+
+
+def push(piece: Piece, rng: np.random.Generator) -> Floats:
+    """Push the hand sideways."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return piece.torques([NEWTONS * np.cos(angle), NEWTONS * np.sin(angle), 0.0])
+
+
+def payload(piece: Piece, rng: np.random.Generator) -> Floats:
+    """Hang 1 kg on the hand."""
+    return piece.torques([0.0, 0.0, -GRAVITY])
+
+
+def step(piece: Piece, rng: np.random.Generator) -> Floats:
+    """Shift the effort of a joint."""
+    joint = piece.strong_joint(rng)
+    sign = rng.choice([-1, 1])
+    return piece.at_joint(joint, sign * STEP_SHARE * piece.ranges[joint] * piece.rise())
+
+
+def freeze(piece: Piece, rng: np.random.Generator) -> Floats | None:
+    """Freeze the encoder of a joint that moves; None where none does."""
+    angles = piece.column("position")
+    after = angles[piece.onset :]
+    moving = np.flatnonzero(np.ptp(after, axis=0) > MOVES)
+    if not len(moving):
+        return None
+    joint = int(rng.choice(moving))
+    return piece.at_joint(joint, angles[piece.onset - 1, joint] - after[:, joint])
+
+
+def slip(piece: Piece, rng: np.random.Generator) -> Floats:
+    """Let an encoder slip."""
+    angle = rng.choice([-1, 1]) * SLIP
+    return piece.at_joint(int(rng.integers(len(piece.ranges))), angle)
+
+
+def delay(piece: Piece, rng: np.random.Generator) -> Floats:
+    """Delay the effort of a joint."""
+    joint = piece.strong_joint(rng)
+    effort = piece.column("effort")[:, joint]
+    rows = max(1, round(LATE_S / piece.episode.spec.dt))
+    late = effort[piece.onset - rows : len(effort) - rows]
+    return piece.at_joint(joint, late - effort[piece.onset :])
+
+
+class Fault(NamedTuple):
+    """A fault that is added to a recording; none of them happened, as every table says."""
+
+    column: str  # "position" or "effort"
+    added: Callable[[Piece, np.random.Generator], Floats | None]  # (T - onset, J) from the onset on
+    needs_body: bool = False
+
+
+FAULTS = {
+    "push": Fault("effort", push, needs_body=True),
+    "payload": Fault("effort", payload, needs_body=True),
+    "step": Fault("effort", step),
+    "frozen": Fault("position", freeze),
+    "slipped": Fault("position", slip),
+    "late": Fault("effort", delay),
+}
 
 
 def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
     """Return the piece with a fault from the onset on; None where the piece does not allow it."""
-    episode, onset, dt = piece.episode, piece.onset, piece.episode.spec.dt
-    q, effort = piece.column("position"), piece.column("effort")
-    after, strong = slice(onset, len(q)), np.flatnonzero(piece.ranges > 0.1 * piece.ranges.max())
-    rise = np.minimum(1.0, (1 + np.arange(len(q) - onset)) * dt / RISE_S)
-    added = np.zeros_like(q[after])  # (T - onset, J)
-    if kind in ("push", "payload"):
-        if piece.body is None:
-            return None
-        force = np.array([0.0, 0.0, -GRAVITY])
-        if kind == "push":
-            angle = rng.uniform(0, 2 * np.pi)
-            force = NEWTONS * np.array([np.cos(angle), np.sin(angle), 0.0])
-        added[:] = (
-            np.array([jacobian(piece.body, row).T @ force for row in q[after]]) * rise[:, None]
-        )
-    elif kind == "step":
-        j = int(rng.choice(strong))
-        added[:, j] = rng.choice([-1, 1]) * STEP_SHARE * piece.ranges[j] * rise
-    elif kind == "frozen":
-        moving = np.flatnonzero(np.ptp(q[after], axis=0) > MOVES)
-        if not len(moving):
-            return None
-        j = int(rng.choice(moving))
-        added[:, j] = q[onset - 1, j] - q[after, j]
-    elif kind == "slipped":
-        angle = rng.choice([-1, 1]) * SLIP
-        added[:, int(rng.integers(len(piece.ranges)))] = angle
-    else:  # late
-        j, rows = int(rng.choice(strong)), max(1, round(LATE_S / dt))
-        added[:, j] = effort[onset - rows : len(effort) - rows, j] - effort[after, j]
-    stream = episode.stream.copy()
-    stream[after, episode.spec.slices[FAULTS[kind]]] += added.astype(np.float32)
-    return Episode.from_stream(stream, episode.spec, faults=np.arange(len(stream)) >= onset)
+    fault = FAULTS[kind]
+    if fault.needs_body and piece.body is None:
+        return None
+    added = fault.added(piece, rng)
+    if added is None:
+        return None
+    spec = piece.episode.spec
+    stream = piece.episode.stream.copy()
+    stream[piece.onset :, spec.slices[fault.column]] += added.astype(np.float32)
+    return Episode.from_stream(stream, spec, faults=np.arange(len(stream)) >= piece.onset)
 
 
 # ------------------------------------------------------------------ the study
@@ -187,120 +256,147 @@ class Job(NamedTuple):
 
 def run(config: Config) -> Findings:
     """Run the experiments whose recordings are in the folder."""
-    places = {name: config.folder / ARMS[name].place for name in config.experiments}
-    missing = [
-        f"{place} is missing: it is {SOURCE}" for place in places.values() if not place.exists()
-    ]
-    found = [name for name, place in places.items() if place.exists()]
-    if not found:
+    present = []
+    missing = []
+    for name in config.experiments:
+        path = config.folder / ARMS[name].place
+        if path.exists():
+            present.append(name)
+        else:
+            missing.append(f"{path} is missing: it is {SOURCE}")
+    if not present:
         raise FileNotFoundError("; ".join(missing))
-    jobs = [Job(*one) for one in product(found, config.monitors, config.repetitions, range(FOLDS))]
-    each = kit.each("watching", partial(examined, folder=config.folder), jobs, config)
-    records = [record for own in each for record in own]
-    first, *others = (table(where(records, experiment=name), ARMS[name]) for name in found)
-    left_out = "".join(f" Left out: {why}." for why in missing)
-    return Findings(records, [replace(first, caption=first.caption + left_out), *others])
+
+    grid = product(present, config.monitors, config.repetitions, range(FOLDS))
+    jobs = [Job._make(one) for one in grid]
+    work = partial(examined, folder=config.folder)
+    records = kit.records_of("watching", work, jobs, config)
+    tables = [table(kit.where(records, experiment=name), ARMS[name]) for name in present]
+    left_out = "".join(f" Left out: {reason}." for reason in missing)
+    tables[0] = replace(tables[0], caption=tables[0].caption + left_out)
+    return Findings(records, tables)
+
+
+class Folds(NamedTuple):
+    """Pieces of a recording by their use."""
+
+    learned: list[Episode]
+    calibration: list[Episode]
+    tested: list[Episode]
+
+
+def split(job: Job, cut: Sequence[Episode]) -> Folds:
+    """Deal the pieces of a recording out for one fold."""
+    order = np.random.default_rng(job.seed).permutation(len(cut))
+    is_tested = np.arange(len(cut)) % FOLDS == job.fold
+    others = order[~is_tested]
+    if len(others) < 4:
+        raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
+    return Folds(
+        learned=[cut[i] for n, i in enumerate(others) if n % 3],
+        calibration=[cut[i] for i in others[::3]],
+        tested=[cut[i] for i in np.sort(order[is_tested])],
+    )
 
 
 def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, and for each fault in it."""
     arm = ARMS[job.experiment]
     whole = Episode.from_table(read_joint_states(folder / arm.place), success=True)
-    effort = whole.stream[:, whole.spec.slices["effort"]].astype(np.float64)
+    spec = whole.spec
+    folds = split(job, [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)])
+    urdf = read_body(folder, arm)
+    monitor = fitted(job, folds.learned, urdf)
+    rate = 1.0 / (len(folds.calibration) + 1)
+    threshold = monitor.calibrate(folds.calibration, rate).threshold
+
+    effort = whole.stream[:, spec.slices["effort"]].astype(np.float64)
     ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
-    cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
-    order = [int(i) for i in np.random.default_rng(job.seed).permutation(len(cut))]
-    tested, others = (
-        sorted(order[job.fold :: FOLDS]),
-        [i for n, i in enumerate(order) if n % FOLDS != job.fold],
-    )
-    if len(others) < 4:
-        raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
-    learned, calibration = (
-        [cut[i] for n, i in enumerate(others) if n % 3],
-        [cut[i] for i in others[::3]],
-    )
-    model = folder / "urdf" / arm.urdf
-    if not model.is_file():
-        raise FileNotFoundError(f"{model} is missing: it is in example-robot-data 6.0.0 (PyPI)")
-    urdf = read_urdf(model)
-    angles = whole.spec.labels[whole.spec.slices["position"]]
-    body = BodyModel.of(urdf, angles)
-    monitor = fitted(job, learned, urdf)
-    threshold = monitor.calibrate(calibration, 1.0 / (len(calibration) + 1)).threshold
+    body = BodyModel.of(urdf, spec.labels[spec.slices["position"]])
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
-    watched = [("", cut[i]) for i in tested]
-    for i, kind in ((i, kind) for i in tested for kind in FAULTS):
-        faulty = with_fault(kind, Piece(cut[i], len(cut[i]) // 2, ranges, body), rng)
-        watched += [] if faulty is None else [(kind, faulty)]
-    scores = monitor.score_episodes([episode for _, episode in watched])
-    ratios = [s.value / threshold for s in scores]
+    kinds = [""] * len(folds.tested)
+    episodes = [*folds.tested]
+    for episode, kind in product(folds.tested, FAULTS):
+        faulty = with_fault(kind, Piece(episode, len(episode) // 2, ranges, body), rng)
+        if faulty is not None:
+            kinds.append(kind)
+            episodes.append(faulty)
+    scores = monitor.score_episodes(episodes)
     return [
-        job._asdict() | judged(kind, v, whole.spec.dt)
-        for (kind, _), v in zip(watched, ratios, strict=True)
+        job._asdict() | judged(kind, score.value / threshold, spec.dt)
+        for kind, score in zip(kinds, scores, strict=True)
     ]
 
 
 def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
     """Return the monitor of a job, fitted; one that is named with a body reads the text of ``urdf``."""
-    spec, name = episodes[0].spec, WITH_BODY.get(job.monitor, job.monitor)
-    settings = SETTINGS.get(name, {}) | ({"urdf": urdf} if job.monitor in WITH_BODY else {})
+    spec = episodes[0].spec
+    name = job.monitor.removesuffix(BODY)
+    settings: dict[str, Any] = {}
+    if name == "neural_asm":
+        settings["values"] = True  # as ``asm-gym fit`` fits a log
+    if job.monitor in WITH_BODY:
+        settings["urdf"] = urdf
     if name == RULE:
-        return CalibratedMonitor(FrictionRule(spec, **settings), Largest(spec), seed=job.seed).fit(
-            list(episodes)
-        )
-    return make_monitor(name, spec, seed=job.seed, **settings).fit(list(episodes))
+        rule = FrictionRule(spec, **settings)
+        monitor: Any = CalibratedMonitor(rule, Largest(spec), seed=job.seed)
+    else:
+        monitor = make_monitor(name, spec, seed=job.seed, **settings)
+    return monitor.fit(list(episodes))
 
 
 def judged(kind: str, value: Floats, dt: float) -> Record:
     """Return the record of a piece by its surprise as a multiple of the threshold (T,)."""
+    is_over = value > 1
     if not kind:
-        counted = {
+        return {
+            "kind": kind,
             "alarms": alarms_in(value, 1.0, dt),
-            "alarm_s": (value > 1).sum() * dt,
+            "alarm_s": is_over.sum() * dt,
             "seconds": len(value) * dt,
+            "excess": float(value.max()),
         }
-        return {"kind": kind, **counted, "excess": float(value.max())}
-    before, after = np.split(value, [len(value) // 2])
-    over = np.flatnonzero(after > 1)
-    found = bool(len(over)) and not (before > 1).any()
+    onset = len(value) // 2
+    late = np.flatnonzero(is_over[onset:])
+    found = bool(len(late)) and not is_over[:onset].any()
     return {
         "kind": kind,
         "found": found,
-        "delay": dt * (over[0] + 1) if found else None,
-        "excess": float(after.max()),
+        "delay": dt * (late[0] + 1) if found else np.nan,
+        "excess": float(value[onset:].max()),
     }
 
 
-def table(records: Sequence[Record], arm: RealArm) -> Table:
+def table(records: pd.DataFrame, arm: RealArm) -> Table:
     """Return the table of a recording, a row for each monitor."""
-    kinds = [kind for kind in FAULTS if where(records, kind=kind)]
-    monitors = list(dict.fromkeys(r["monitor"] for r in records))
-    healthy = {
-        n: sorted((r["excess"] for r in where(records, monitor=n, kind="")), reverse=True)
-        for n in monitors
-    }
-    fewest = min(sum(excess > 1 for excess in own) for own in healthy.values())
-    rows = []
-    for name in monitors:
-        own = where(records, monitor=name)
-        quiet, faulty = where(own, kind=""), [r for r in own if r["kind"]]
-        found = [[r["found"] for r in where(faulty, kind=kind)] for kind in kinds]
-        delays = [r["delay"] for r in faulty if r["found"]]
-        told = [r for r in faulty if r["kind"] in ("push", "payload")]
-        seconds, alarms, alarm_s = (
-            sum(r[value] for r in quiet) for value in ("seconds", "alarms", "alarm_s")
-        )
-        shares = [
-            f"{sum(f)} of {len(f)}"
-            for f in (*found, [r["excess"] > healthy[name][fewest] for r in told])
-        ]
-        delay = f"{np.median(delays):.3g}" if delays else ""
-        healthily = f"{3600 * alarms / seconds:.0f}", f"{100 * alarm_s / seconds:.1f} %"
-        rows.append((name, *shares[:-1], delay, shares[-1], *healthily))
+    healthy = records[records.kind == ""]
+    monitors = records.groupby("monitor", sort=False)
+    fewest = int((healthy.excess > 1).groupby(healthy.monitor).sum().min())
+    seconds = healthy.seconds.sum() / len(monitors)
     caption = (
-        f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. * added to the recording, found within half a piece. "
-        f"At {fewest}: pushes and payloads found by the threshold that {fewest} healthy pieces pass."
+        f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. "
+        "* added to the recording, found within half a piece. "
+        f"At {fewest}: pushes and payloads found by the threshold "
+        f"that {fewest} healthy pieces pass."
     )
-    headings = ("Monitor", *(f"{kind} *" for kind in kinds), "delay [s]", f"at {fewest}")
-    return Table(caption, (*headings, "false alarms an hour", "healthy time in alarm"), rows)
+    return kit.table_of(caption, [monitor_row(name, own, fewest) for name, own in monitors])
+
+
+def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]:
+    """Return the row of a monitor; ``fewest`` healthy pieces pass the threshold of pushes and payloads."""
+    row = {"Monitor": name}
+    for kind in FAULTS:
+        faulty = records[records.kind == kind]
+        if len(faulty):
+            row[f"{kind} *"] = f"{faulty.found.astype(int).sum()} of {len(faulty)}"
+    median = records.delay.median()
+    row["delay [s]"] = "" if np.isnan(median) else f"{median:.3g}"
+
+    healthy = records[records.kind == ""]
+    pushed = records[records.kind.isin(["push", "payload"])]
+    is_found = pushed.excess > healthy.excess.nlargest(fewest + 1).iloc[-1]
+    row[f"at {fewest}"] = f"{is_found.sum()} of {len(pushed)}"
+    seconds = healthy.seconds.sum()
+    row["false alarms an hour"] = f"{3600 * healthy.alarms.sum() / seconds:.0f}"
+    row["healthy time in alarm"] = f"{100 * healthy.alarm_s.sum() / seconds:.1f} %"
+    return row

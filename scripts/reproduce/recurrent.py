@@ -11,6 +11,7 @@ Sources: Cho et al. 2014 (EMNLP); Jaeger 2001 (GMD Report 148) for the noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from asm_gym.memory.learning import Trajectory
 from asm_gym.monitors.baselines.networks import adam, descend
+from asm_gym.scaling import ScaledRows
 
 Array = NDArray[np.float32]
 BATCH = 16  # episodes of a batch
@@ -33,20 +35,24 @@ class Batch(NamedTuple):
     commands: Array  # (T, B, A + 1), the last one a constant 1
 
 
-def side_by_side(trajectories: Sequence[Trajectory]) -> Batch:
-    """Stack episodes along a new second axis; those that end before the longest are NaN from then on."""
-    rows = ([torch.from_numpy(getattr(t, name)) for t in trajectories] for name in Batch._fields)
-    return Batch(*(pad_sequence(own, padding_value=np.nan).numpy() for own in rows))
+def side_by_side(trajectories: Sequence[Trajectory | ScaledRows]) -> Batch:
+    """Stack episodes along a new second axis; the shorter ones are NaN after their end."""
+
+    def stacked(arrays: list[Array]) -> Array:
+        return pad_sequence(list(map(torch.from_numpy, arrays)), padding_value=np.nan).numpy()
+
+    return Batch(
+        senses=stacked([t.senses for t in trajectories]),
+        commands=stacked([t.commands for t in trajectories]),
+    )
 
 
 def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> list[Batch]:
     """Return all episodes in batches of about one length, in random order."""
-    order = rng.permutation(len(trajectories))
-    order = order[np.argsort([len(trajectories[i].senses) for i in order], kind="stable")]
-    groups = [order[i : i + BATCH] for i in range(0, len(order), BATCH)]
-    return [
-        side_by_side([trajectories[i] for i in groups[g]]) for g in rng.permutation(len(groups))
-    ]
+    shuffled = [trajectories[i] for i in rng.permutation(len(trajectories))]
+    shuffled.sort(key=lambda trajectory: len(trajectory.senses))
+    groups = [shuffled[i : i + BATCH] for i in range(0, len(shuffled), BATCH)]
+    return [side_by_side(groups[i]) for i in rng.permutation(len(groups))]
 
 
 class Recurrent(nn.Module):
@@ -70,47 +76,60 @@ class Recurrent(nn.Module):
 
     def run_on(self, row: Tensor, state: Any, steps: int) -> tuple[Tensor, Tensor]:
         """Return x̂ (T, B, S) and â (T, B, A) of ``steps`` rows from memory, after the last row read (B, S + A)."""
-        sensed, acted = [], []
+        senses = []
+        commands = []
         for _ in range(steps):
             h, state = self.cell(row[None], state)
-            acted.append(self.act(h[0]))
-            sensed.append(self.sense(torch.cat([h[0], acted[-1]], dim=-1)))
-            row = torch.cat([sensed[-1], acted[-1]], dim=-1)
-        return torch.stack(sensed), torch.stack(acted)
+            command = self.act(h[0])
+            sensed = self.sense(torch.cat([h[0], command], dim=-1))
+            row = torch.cat([sensed, command], dim=-1)
+            senses.append(sensed)
+            commands.append(command)
+        return torch.stack(senses), torch.stack(commands)
+
+
+@dataclass(frozen=True)
+class Training:
+    """Settings of ``train``."""
+
+    # kind of cell: "GRU" or "LSTM"
+    cell: str = "GRU"
+    # hidden units
+    hidden: int = 64
+    # batches of whole episodes
+    updates: int = 1200
+    # learning rate of Adam, which decays by a cosine
+    rate: float = 1e-2
+    # standard deviation of the noise on the rows that the network reads
+    noise: float = 0.3
 
 
 def train(
-    trajectories: Sequence[Trajectory],
-    hidden: int,
-    updates: int,
-    rng: np.random.Generator,
-    noise: float = 0.3,
-    rate: float = 1e-2,
-    cell: str = "GRU",
+    trajectories: Sequence[Trajectory], settings: Training, rng: np.random.Generator
 ) -> Recurrent:
-    """Return a network, a ``"GRU"`` or ``"LSTM"``, that has learned from so many batches of whole episodes.
-
-    ``noise`` is the standard deviation of the noise on the rows it reads, ``rate`` that of Adam, with a cosine decay.
-    """
+    """Return a network that has learned from whole episodes."""
     torch.set_num_threads(1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        own = torch.Generator().manual_seed(int(rng.integers(2**31)))
-        sensory, motor = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1] - 1
-        network = Recurrent(hidden, sensory, motor, cell)
-    optimiser, schedule = adam(network, updates, rate)
+        noise_generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        sensory = trajectories[0].senses.shape[1]
+        motor = trajectories[0].commands.shape[1] - 1
+        network = Recurrent(settings.hidden, sensory, motor, settings.cell)
+    optimiser, schedule = adam(network, settings.updates, settings.rate)
+
     done = 0
-    while done < updates:
-        for batch in batches(trajectories, rng)[: updates - done]:
-            real = torch.from_numpy(np.isfinite(batch.commands[:, :, 0]))
-            x, a = (
-                torch.from_numpy(batch.senses).nan_to_num(),
-                torch.from_numpy(batch.commands[:, :, :-1]).nan_to_num(),
-            )
+    while done < settings.updates:
+        for batch in batches(trajectories, rng)[: settings.updates - done]:
+            x = torch.from_numpy(batch.senses)
+            a = torch.from_numpy(batch.commands[:, :, :-1])
+            is_row = a[:, :, 0].isfinite()  # (T, B), false after the end of an episode
+            x = x.nan_to_num()
+            a = a.nan_to_num()
             rows = shifted(x, a)
-            sensed, acted, _ = network(rows + noise * torch.randn(rows.shape, generator=own), a)
+            noise = settings.noise * torch.randn(rows.shape, generator=noise_generator)
+            sensed, acted, _ = network(rows + noise, a)
             error = ((x - sensed) ** 2).sum(-1) + ((a - acted) ** 2).sum(-1)
-            descend(error[real].mean(), optimiser, schedule)
+            descend(error[is_row].mean(), optimiser, schedule)
             done += 1
     return network.eval().requires_grad_(False)
 
@@ -121,11 +140,14 @@ def shifted(senses: Tensor, commands: Tensor) -> Tensor:
     return torch.cat([torch.zeros_like(rows[:1]), rows[:-1]])
 
 
-def expected(network: Recurrent, senses: Array, commands: Array, cue: int) -> tuple[Array, Array]:
-    """Return x̂ (T, B, S) and â (T, B, A) of rows (T, B, S) and (T, B, A + 1), of which the first ``cue`` are read."""
-    x, a = torch.from_numpy(senses), torch.from_numpy(commands[:, :, :-1])
+def expected(network: Recurrent, batch: Batch, cue: int) -> Batch:
+    """Return the predictions x̂ (T, B, S) and â (T, B, A) of rows of which ``cue`` are read."""
+    x = torch.from_numpy(batch.senses)
+    a = torch.from_numpy(batch.commands[:, :, :-1])
     sensed, acted, state = network(shifted(x, a)[:cue], a[:cue])
     if cue < len(x):
-        on = network.run_on(torch.cat([x[cue - 1], a[cue - 1]], dim=-1), state, len(x) - cue)
-        sensed, acted = torch.cat([sensed, on[0]]), torch.cat([acted, on[1]])
-    return sensed.numpy(), acted.numpy()
+        last = torch.cat([x[cue - 1], a[cue - 1]], dim=-1)
+        senses_alone, commands_alone = network.run_on(last, state, len(x) - cue)
+        sensed = torch.cat([sensed, senses_alone])
+        acted = torch.cat([acted, commands_alone])
+    return Batch(sensed.numpy(), acted.numpy())

@@ -1,0 +1,282 @@
+"""Networks that act in closed loop in the tasks of ``workspace``.
+
+The network that settles is surprised by its own energy of each row,
+
+    F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = W f(μ_t);   ceilings by group of senses
+
+leaves out a group that alone is over its ceiling, and yields where several are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.linear_model import Ridge
+
+from asm_gym.data.episode import Episode
+from asm_gym.memory.motor import learn_motor, situation
+from asm_gym.memory.settling import SettlingNetwork
+from asm_gym.monitors.memory_policy import CommandReadout
+from asm_gym.scaling import StreamScaler
+from asm_gym.scripts.reproduce.expression import Backpropagated
+from asm_gym.scripts.reproduce.workspace import EVENT, GROUP_OF, GROUPS, JOINTS, Floats, Workspace
+
+LONGEST = 250  # rows of a rollout
+YIELD = 12  # rows for which a pushed arm yields
+ATTENTIVE = EVENT // 2  # row after which the network reacts to its energy
+SMOOTH = 0.5  # gain of energies
+SHARPEST = 0.01  # smallest variance of an error, in its mean
+PRIOR = 150.0  # ridge of the regression of variances on the state
+MOTOR_UNITS = 256  # hidden units of the motor association
+
+
+class Reading(NamedTuple):
+    """What the network that settles makes of a row, or of T rows."""
+
+    state: Floats  # (H,) or (T, H) f(μ)
+    error: Floats  # (N,) or (T, N) of senses, changes and commands, in σ
+    energy: Floats  # (G,) or (T, G) of ``GROUPS``, in their ceilings
+
+
+class Settling:
+    """The network that settles.
+
+    Args:
+        reader: how it reads a row.
+        network: its weights.
+        episodes: healthy ones, of which it learns how far its errors spread in each state: log σ² = W f(μ).
+
+    Attributes:
+        ceilings: (G,) of the energies of ``GROUPS``.
+    """
+
+    def __init__(
+        self, reader: StreamScaler, network: SettlingNetwork, episodes: Sequence[Episode]
+    ) -> None:
+        self.reader = reader
+        self.network = network
+        spec = reader.spec
+        columns = np.concatenate([spec.sensory, reader.slow, spec.motor])  # (N,) of each error
+        self.members = GROUP_OF[columns] == np.array(GROUPS)[:, None]  # (G, N)
+        self.ceilings = np.ones(len(GROUPS))
+
+        # With weights of 0, errors are read as they are.
+        self.W = np.zeros((len(columns), network.hidden_size))
+        self.bias = np.zeros(len(columns))
+        self.least = np.zeros(len(columns))
+        readings = [self.felt(e.stream) for e in episodes]
+        states = np.concatenate([reading.state for reading in readings])
+        squares = np.concatenate([reading.error for reading in readings]) ** 2
+        self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
+        ridge = Ridge(PRIOR).fit(states, np.log(squares + np.exp(self.least)))
+        ratios = squares / np.exp(ridge.predict(states))
+        ridge.intercept_ += np.log(np.mean(ratios, axis=0))
+        self.W = ridge.coef_
+        self.bias = ridge.intercept_
+
+    def begin(self) -> None:
+        """Forget the past."""
+        self.c = self.network.at_rest(1)
+        self.rows: list[Floats] = []
+        self.energy = np.zeros(len(GROUPS))
+
+    def read(self, row: Floats) -> Reading:
+        """Read a row (D,), NaN where left out; nothing surprises in the first."""
+        is_first = not self.rows
+        now = row[None]
+        self.rows = [now] * 3 if is_first else [*self.rows[1:], now]
+        earlier, before, _ = self.rows
+        scaled = self.reader.read(now, before, earlier)
+        step = self.network.follow(self.c, scaled.commands, scaled.senses, scaled.seen)
+        self.c = step.traces
+        left = np.hstack([scaled.senses, scaled.commands[:, :-1]]) - step.expected
+        left[:, : self.reader.size] *= scaled.seen
+        state = np.tanh(step.mu[0])
+        sigma = np.exp(0.5 * np.maximum(self.W @ state + self.bias, self.least))
+        error = left[0] / sigma * (not is_first)
+        self.energy = self.energy + SMOOTH * (0.5 * self.members @ error**2 - self.energy)
+        return Reading(state, error, self.energy / self.ceilings)
+
+    def felt(self, stream: NDArray[Any]) -> Reading:
+        """Return the reading of all rows of a stream (T, D)."""
+        self.begin()
+        readings = [self.read(row) for row in np.asarray(stream, np.float64)]
+        return Reading._make(map(np.array, zip(*readings, strict=True)))
+
+    def command(self) -> Floats:
+        """Return the action (A,) that it expects to be given next."""
+        expected = self.network.run_on(self.c).expected
+        return rescaled(self.reader, expected[0, self.reader.size :])
+
+
+class Recurrent:
+    """A GRU or an LSTM."""
+
+    def __init__(self, model: Backpropagated) -> None:
+        self.reader = model.reader
+        self.network = model.network
+
+    def begin(self) -> None:
+        """Forget the past."""
+        self.state: Any = None
+        self.before: Floats | None = None
+
+    def read(self, row: Floats) -> None:
+        """Read a row (D,)."""
+        now = row[None]
+        before = now if self.before is None else self.before
+        self.before = now
+        scaled = self.reader.read(now, before, before)
+        values = torch.from_numpy(np.hstack([scaled.senses, scaled.commands[:, :-1]]))
+        with torch.no_grad():
+            self.hidden, self.state = self.network.cell(values[None], self.state)
+
+    def command(self) -> Floats:
+        """Return the next action (A,)."""
+        return rescaled(self.reader, self.network.act(self.hidden[0, 0]).numpy())
+
+
+class Associated:
+    """The motor association, which acts today."""
+
+    def __init__(
+        self, reader: StreamScaler, episodes: Sequence[Episode], rng: np.random.Generator
+    ) -> None:
+        self.reader = reader
+        situations = np.concatenate([situation(reader, e.stream[:-1]) for e in episodes])
+        commands = np.concatenate([e.stream[1:, reader.spec.motor] for e in episodes])
+        self.motor = learn_motor(situations, commands, MOTOR_UNITS, rng)
+
+    def begin(self) -> None:
+        """It has no past."""
+
+    def read(self, row: Floats) -> None:
+        """Read a row (D,)."""
+        self.row = row
+
+    def command(self) -> Floats:
+        """Return the next action (A,)."""
+        expected = self.motor.command(situation(self.reader, self.row[None]))
+        return np.asarray(expected[0], np.float64)
+
+
+def rescaled(reader: StreamScaler, action: NDArray[Any]) -> Floats:
+    """Return an action (A,) in its own units."""
+    motor = reader.spec.motor
+    return np.asarray(reader.mean[motor] + reader.spread[motor] * action, np.float64)
+
+
+Actor = Settling | Recurrent | Associated
+
+
+# ------------------------------------------------------------------ closed loop
+
+
+class Reaction:
+    """Reaction to energies over their ceilings.
+
+    A group that alone is over its ceiling is left out. Where several are, the arm yields for a while, but only once:
+    then it hands back, and goes on.
+    """
+
+    def __init__(self) -> None:
+        self.left_out = ""
+        self.rows_to_yield = 0
+        self.has_yielded = False
+
+    def update(self, energy: Floats) -> None:
+        """Take in the energies of a row (G,)."""
+        over = np.flatnonzero(energy[:-1] > 1.0)  # the last is of the action
+        if self.rows_to_yield:
+            return
+        if len(over) == 1 and not self.left_out:
+            self.left_out = GROUPS[over[0]]
+        if len(over) > 1 and not self.has_yielded:
+            self.rows_to_yield = YIELD
+            self.has_yielded = True
+
+    def apply(self, action: NDArray[Any]) -> None:
+        """Hold the arm still while it yields."""
+        if self.rows_to_yield:
+            action[:6] = 0.0
+            self.rows_to_yield -= 1
+
+    def __str__(self) -> str:
+        if self.rows_to_yield:
+            return "yields"
+        if self.left_out:
+            return f"without the {self.left_out} sense"
+        return "goes on" if self.has_yielded else ""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of a rollout."""
+
+    # seed of the scene
+    seed: int
+    # whether all encoders of the joints stick from row ``EVENT`` on
+    encoders_stick: bool = False
+    # whether the network reacts to its energy
+    reacts: bool = False
+    # whether the state is carried on from the rollout before, without notice
+    keeps_state: bool = False
+    # rows after which the rollout ends, if the task has not ended before
+    steps: int = LONGEST
+
+
+class Rollout(NamedTuple):
+    """Outcome of a run in closed loop."""
+
+    solved: bool
+    energies: Floats  # (T, G) in their ceilings; of the network that settles
+    left_out: str  # the group that was left out
+    yielded: bool
+
+
+def run_policy(
+    actor: Actor,
+    env: gym.Env[Any, Any],
+    conditions: Conditions,
+    watch: Callable[[Reaction], None] = lambda reaction: None,
+) -> Rollout:
+    """Let a network act until the task is solved.
+
+    Args:
+        actor: acts.
+        env: of the skill, with what happens to the body.
+        conditions: of the rollout.
+        watch: is called before every step.
+    """
+    work = Workspace(env)
+    readout = CommandReadout(env)
+    reaction = Reaction()
+    energies = []
+    grip = None
+    solved = False
+    if not conditions.keeps_state:
+        actor.begin()
+    _, row = work.reset(conditions.seed)
+    for t in range(min(conditions.steps, work.inner.horizon)):
+        if t < EVENT or not conditions.encoders_stick:
+            encoders = row[JOINTS].copy()
+        row[JOINTS] = encoders
+        row[reaction.left_out == GROUP_OF] = np.nan
+        reading = actor.read(row)
+        if reading is not None:
+            energies.append(reading.energy)
+            if conditions.reacts and t > ATTENTIVE:
+                reaction.update(reading.energy)
+        action, grip = readout(actor.command().astype(np.float32), grip)
+        watch(reaction)
+        reaction.apply(action)
+        _, row, solved = work.step(action)
+        if solved or work.terminated:
+            break
+    return Rollout(solved, np.array(energies), reaction.left_out, reaction.has_yielded)

@@ -1,0 +1,221 @@
+"""The network of the papers on the Panda: six skills in one network that settles, learned from unlabelled episodes.
+
+Every task is seen by the same senses: the body, where the thing is from the hand, and its goal from the thing. The
+network is never told the skill. It commands the arm in closed loop, is surprised by its own energy of each row,
+
+    F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = W f(μ_t);   ceilings by group of senses
+
+leaves out a group that alone is over its ceiling, and yields where several are. Beside it, on the same episodes: a GRU
+and an LSTM by backpropagation through time, the motor association that acts today, and a random forest for names.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from PIL import Image, ImageDraw
+
+from asm_gym.faults import Push
+from asm_gym.rollouts.run_folder import make_missing
+from asm_gym.scripts.command import option
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.closed_loop import (
+    LONGEST,
+    Actor,
+    Associated,
+    Conditions,
+    Reaction,
+    Recurrent,
+    Rollout,
+    Settling,
+    run_policy,
+)
+from asm_gym.scripts.reproduce.kit import Findings, Record
+from asm_gym.scripts.reproduce.skill_claims import ACTS, OURS, PUSHED, STUCK, claims, drawn, tables
+from asm_gym.scripts.reproduce.skill_measures import TWINS, Repetition, detect, name_skills, predict
+from asm_gym.scripts.reproduce.workspace import (
+    EVENT,
+    FAULTS,
+    SKILLS,
+    UNKNOWN,
+    Demonstration,
+    Floats,
+    demonstrate,
+    environment,
+)
+from asm_gym.wrappers import FaultInjection, NeuralASMSafety
+
+HELD_OUT = 1000  # seeds of faulty episodes and of their twins begin here
+
+
+@dataclass(frozen=True)
+class Config(kit.Config):
+    """The papers' network on the Panda: six skills."""
+
+    seeds: int = option(10, quick=2, least=1)
+    """Number of repetitions; they take the seeds that follow."""
+    episodes: int = option(28, quick=4, least=4)
+    """Episodes of each skill that are recorded; a seed learns from most of them."""
+    epochs: int = option(40, quick=4, least=1)
+    """Passes of the network over its episodes."""
+    updates: int = option(1200, quick=20, least=1)
+    """Batches of the recurrent networks."""
+    faulty: int = option(2, quick=1, least=1)
+    """Episodes of each skill with each kind of fault, and of each unknown skill."""
+    trials: int = option(3, quick=1, least=1)
+    """Times that each skill is expressed."""
+    steps: int = option(LONGEST, quick=45, least=1)
+    """Rows after which an expression is left."""
+    film: bool = False
+    """Also film the first seed: skills that change without notice, a push, and a sense that is lost."""
+
+
+def run(config: Config) -> Findings:
+    """Record the experts once, and run every seed."""
+    folder = (config.out / "panda").resolve()
+    wanted = demonstrations(config)
+    with kit.stage("recording experts") as report:
+        make_missing(
+            partial(demonstrate, folder=folder),
+            [one for own in wanted.values() for one in own],
+            lambda one: folder / one.name,
+            config.workers,
+            report,
+        )
+    files = {name: [folder / one.name for one in own] for name, own in wanted.items()}
+    work = partial(one_seed, config=config, files=files)
+    repetitions = kit.each("learning and acting", work, config.repetitions, config)
+    records = [record for own, _ in repetitions for record in own]
+    frame = pd.DataFrame(records)
+    _, energies = repetitions[0]
+    return Findings(records, [claims(frame), *tables(frame)], drawn(frame, energies))
+
+
+def demonstrations(config: Config) -> dict[str, list[Demonstration]]:
+    """Return the episodes to record, by skill, by kind of fault, and the twins of the faulty ones."""
+    wanted = {}
+    for skill in SKILLS:
+        wanted[skill] = [Demonstration(skill, n) for n in range(config.episodes)]
+    for skill in UNKNOWN:
+        wanted[skill] = [Demonstration(skill, n) for n in range(3 * config.faulty)]
+    held_out = product(SKILLS, range(HELD_OUT, HELD_OUT + config.faulty))
+    wanted[TWINS] = [Demonstration(skill, seed) for skill, seed in held_out]
+    for kind in FAULTS:
+        faulty = [twin._replace(fault=kind) for twin in wanted[TWINS]]
+        wanted[kind] = [one for one in faulty if one.is_possible]
+    return wanted
+
+
+# ------------------------------------------------------------------ one seed
+
+
+def one_seed(
+    seed: int, config: Config, files: dict[str, list[Path]]
+) -> tuple[list[Record], dict[str, Floats]]:
+    """Learn with one seed, and measure; return the records, and energies as ``act`` does."""
+    torch.set_num_threads(1)
+    repetition = Repetition(seed, config, files)
+    repetition.learn()
+    predict(repetition)
+    name_skills(repetition)
+    detect(repetition)
+    actors: dict[str, Actor] = {OURS: repetition.ours}
+    for cell, model in repetition.rivals.items():
+        actors[cell] = Recurrent(model)
+    actors[ACTS] = Associated(repetition.reader, repetition.train, repetition.rng)
+    if config.film and seed == config.seed:
+        film(repetition.ours, config.out / "panda.gif", seed)
+    return repetition.records, act(repetition, actors)
+
+
+# ------------------------------------------------------------------ action
+
+
+def push_along(direction: Any) -> Push:
+    """Return a push in a direction (3,) that begins at row ``EVENT``."""
+    return Push(newtons=20.0, direction=tuple(direction), onset=EVENT, duration=10)
+
+
+def scene_of(seed: int, trial: int = 0) -> int:
+    """Return the seed of a scene."""
+    return 10_000 + 100 * seed + trial
+
+
+def act(repetition: Repetition, actors: dict[str, Actor]) -> dict[str, Floats]:
+    """Measure the share solved in closed loop.
+
+    Returns:
+        The largest energy of a group over time (T,) in the first rollout of each actor that has energies.
+    """
+    energies: dict[str, Floats] = {}
+    note = repetition.note
+    for skill, trial in product(SKILLS, range(repetition.config.trials)):
+        push = push_along(repetition.rng.standard_normal(3))
+        conditions = Conditions(scene_of(repetition.seed, trial), steps=repetition.config.steps)
+        rollouts = rollouts_of(skill, actors, push, conditions)
+        for name, rollout in rollouts.items():
+            note("solved", name, skill, rollout.solved)
+            if len(rollout.energies):
+                energies.setdefault(name, rollout.energies.max(axis=1))
+        stuck = rollouts["settling, encoders stuck, reacts"]
+        pushed = rollouts["settling, pushed, reacts"]
+        note("reacted rightly", STUCK, skill, stuck.left_out == "joint")
+        note("reacted rightly", PUSHED, skill, pushed.yielded and not pushed.left_out)
+    return energies
+
+
+def rollouts_of(
+    skill: str, actors: dict[str, Actor], push: Push, conditions: Conditions
+) -> dict[str, Rollout]:
+    """Return the rollouts of all actors in one scene, and those of our network in all conditions."""
+    env = environment(skill)
+    pushed = FaultInjection(env, [push])
+    ours = actors[OURS]
+    rollouts = {name: run_policy(actor, env, conditions) for name, actor in actors.items()}
+    stuck = replace(conditions, encoders_stick=True)
+    for event, around, faulty in ((STUCK, env, stuck), (PUSHED, pushed, conditions)):
+        name = f"{OURS}, {event}"
+        rollouts[name] = run_policy(ours, around, faulty)
+        rollouts[f"{name}, reacts"] = run_policy(ours, around, replace(faulty, reacts=True))
+    pushed.undo_faults()
+    rollouts["settling, guarded"] = run_policy(ours, NeuralASMSafety(env), conditions)
+
+    skill_before = environment(SKILLS[SKILLS.index(skill) - 1])
+    run_policy(ours, skill_before, Conditions(conditions.seed, steps=40))
+    continued = replace(conditions, keeps_state=True)
+    rollouts["settling, after another"] = run_policy(ours, env, continued)
+    return rollouts
+
+
+def film(ours: Settling, path: Path, seed: int) -> None:
+    """Film the network: another skill begins without notice, the arm is pushed, and its encoders stick."""
+    reacting = Conditions(scene_of(seed), reacts=True)
+    push = push_along((0.0, 1.0, 0.0))
+    film: list[Image.Image] = []
+    for skill, event, faults, conditions in (
+        ("PickPlaceCan", "interrupted", [], replace(reacting, steps=40)),
+        ("Lift", PUSHED, [push], replace(reacting, keeps_state=True)),
+        ("Door", STUCK, [], replace(reacting, encoders_stick=True)),
+    ):
+        env = FaultInjection(environment(skill), faults)
+        pictures: list[Image.Image] = []
+        watch = partial(take_picture, pictures, env, f"{skill}, {event}")
+        run_policy(ours, env, conditions, watch)
+        env.undo_faults()
+        film += pictures[::4]
+    film[0].save(path, save_all=True, append_images=film[1:], duration=100, loop=0)
+
+
+def take_picture(pictures: list[Image.Image], env: Any, caption: str, reaction: Reaction) -> None:
+    """Append a picture of the environment, with a caption and what the network does."""
+    picture = Image.fromarray(env.render())
+    ImageDraw.Draw(picture).multiline_text(
+        (6, 4), f"{caption}\n{reaction}", fill="white", stroke_width=1, stroke_fill="black"
+    )
+    pictures.append(picture)

@@ -1,0 +1,194 @@
+"""The claims of the study of six skills, with the numbers that refute them, its tables and its figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import t as student
+
+from asm_gym.evaluation.figures import figure, look
+from asm_gym.evaluation.tables import Table
+from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.workspace import FAULTS, SECOND, SKILLS, SPEC, Floats
+
+OURS = "settling"
+CELLS = ("GRU", "LSTM")
+ACTS = "association"
+FOREST = "random forest"
+STUCK = "encoders stuck"
+PUSHED = "pushed"
+ALARMS = "share over a ceiling"
+# steps of inference a row, of which speed and accuracy are compared
+FEW = 1
+MANY = 20
+ROWS = (2, 5, 10, 20, 40)  # after which names are judged
+SHORT = ("Lift", "Stack", "Can", "Milk", "Door", "Nut")  # names of ``SKILLS`` in the figure
+
+Measures = Callable[..., Any]
+"""Returns the mean of a measure of a model in each seed."""
+
+
+class Claim(NamedTuple):
+    """A claim, and the number that refutes it, which stood before the seeds were run."""
+
+    claim: str
+    measured: str
+    values: Callable[[Measures], Any]
+    bound: float
+    refuted_above: bool = False  # whether the bound or more refutes it, or the bound or less
+
+
+CLAIMS = (
+    Claim(
+        "one network learns a repertoire by local rules",
+        "error of the next row, in the last's",
+        lambda of: of("next row", "settling, 20"),
+        bound=1.0,
+        refuted_above=True,
+    ),
+    Claim(
+        "it expresses skills as well as BPTT does",
+        "share solved, less the better rival's",
+        lambda of: of("solved", OURS) - np.maximum(of("solved", "GRU"), of("solved", "LSTM")),
+        bound=-0.1,
+    ),
+    Claim(
+        "no skill is selected",
+        "right names after a second",
+        lambda of: of("named", OURS, at=str(SECOND)),
+        bound=0.8,
+    ),
+    Claim(
+        "",
+        "the same, less a random forest's",
+        lambda of: of("named", OURS, at=str(SECOND)) - of("named", FOREST, at=str(SECOND)),
+        bound=-0.1,
+    ),
+    Claim(
+        "predictive surprise across the repertoire",
+        "AUROC of its own energy",
+        lambda of: of("AUROC", OURS, at=FAULTS),
+        bound=0.8,
+    ),
+    Claim(
+        "speed against accuracy",
+        "error with 1 step of inference, less with 20",
+        lambda of: of("next row", "settling, 1") - of("next row", "settling, 20"),
+        bound=0.0,
+    ),
+    Claim(
+        "one energy for detection, reaction and expression",
+        "share solved with stuck encoders: reacting, less not",
+        lambda of: (
+            of("solved", "settling, encoders stuck, reacts")
+            - of("solved", "settling, encoders stuck")
+        ),
+        bound=0.0,
+    ),
+    Claim(
+        "comparable to recurrent networks",
+        "off from memory, in the better rival's",
+        lambda of: (
+            of("from memory", OURS)
+            / np.minimum(of("from memory", "GRU"), of("from memory", "LSTM"))
+        ),
+        bound=1.25,
+        refuted_above=True,
+    ),
+)
+
+
+def judged(claim: Claim, of: Measures) -> dict[str, str]:
+    """Return the row of a claim: mean ± half of its 95 % interval, and whether it holds."""
+    values = claim.values(of)
+    mean = values.mean()
+    half = np.inf
+    if len(values) > 1:
+        half = student.ppf(0.975, len(values) - 1) * values.sem()
+    side = "less"
+    refuted = mean <= claim.bound
+    if claim.refuted_above:
+        side = "more"
+        refuted = mean >= claim.bound
+    return {
+        "claim": claim.claim,
+        "measured": claim.measured,
+        "found": f"{mean:.2f} ± {half:.2f}",
+        "refuted if": f"{claim.bound:g} or {side}",
+        "": "refuted" if refuted else "holds",
+    }
+
+
+def claims(records: pd.DataFrame) -> Table:
+    """Return what was measured of each claim, and the number that refutes it."""
+
+    def of(measure: str, model: str, **at: object) -> Any:
+        return kit.by_seed(records, "value", measure=measure, model=model, **at)
+
+    seeds = records.seed.nunique()
+    caption = f"The claims on the Panda: mean of {seeds} seeds ± half of its 95 % interval"
+    return kit.table_of(caption, [judged(claim, of) for claim in CLAIMS])
+
+
+def tables(records: pd.DataFrame) -> list[Table]:
+    """Return a table of each measure by model and condition; mean ± SD over seeds."""
+    return [
+        kit.grid(measure, own, "value", "model", "at")
+        for measure, own in records.groupby("measure", sort=False)
+    ]
+
+
+# ------------------------------------------------------------------ figure
+
+
+def drawn(records: pd.DataFrame, energies: dict[str, Floats]) -> Figure:
+    """Draw who solves what, how soon names are right, and the energy over time."""
+    with figure(height=3.5, width=11) as fig:
+        first, second, third = fig.subplots(1, 3)
+        draw_solved(first, records)
+        draw_names(second, records)
+        draw_energies(third, energies)
+        for ax in (first, second, third):
+            ax.legend(fontsize=6, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    return fig
+
+
+def draw_solved(ax: Axes, records: pd.DataFrame) -> None:
+    """Draw the share solved of each skill, a bar for each model."""
+    solved = records[records.measure == "solved"].pivot_table("value", "at", "model")
+    places = np.arange(len(SKILLS))
+    for n, model in enumerate((OURS, *CELLS, ACTS)):
+        colour, _, _ = look(n)
+        heights = solved[model][list(SKILLS)]
+        ax.bar(places + 0.2 * n - 0.3, heights, 0.2, color=colour, label=model)
+    ax.set_xticks(places, SHORT, fontsize=7)
+    ax.set(ylabel="share solved", ylim=(0, 1.02))
+
+
+def draw_names(ax: Axes, records: pd.DataFrame) -> None:
+    """Draw the share of right names over time, with objects and without."""
+    right = records.pivot_table("value", "at", ["model", "measure"])
+    times = SPEC.dt * np.array(ROWS)
+    for n, (model, measure) in enumerate(product((OURS, FOREST), ("named", "named blind"))):
+        colour, style, _ = look(n)
+        shares = right[model, measure][list(map(str, ROWS))]
+        label = f"{model}{measure.removeprefix('named').replace(' ', ', ')}"
+        ax.plot(times, shares, color=colour, linestyle=style, label=label)
+    ax.set(xlabel="time [s]", ylabel="share of right names", ylim=(0, 1.02))
+
+
+def draw_energies(ax: Axes, energies: dict[str, Floats]) -> None:
+    """Draw the largest energy of a group over time."""
+    for n, name in enumerate((OURS, f"{OURS}, {PUSHED}", f"{OURS}, {STUCK}")):
+        energy = energies[name]
+        colour, style, _ = look(n)
+        times = SPEC.dt * np.arange(len(energy))
+        ax.plot(times, energy, color=colour, linestyle=style, label=name)
+    ax.axhline(1.0, color="#888888", linewidth=1)
+    ax.set(xlabel="time [s]", ylabel="energy, in its ceiling", yscale="log")
