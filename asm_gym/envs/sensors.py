@@ -160,7 +160,9 @@ _OBSERVED = (
     *("joint_position", "joint_velocity", "hand_position", "hand_orientation"),
     *("gripper_opening", "gripper_velocity"),
 )
-_BOUND = 100.0  # observations are clipped to this, which keeps the Box true; nothing a task does comes near it
+_BOUND = (
+    kernels.OBSERVED_BOUND
+)  # observations are clipped to this, which keeps the Box true; nothing a task does comes near it
 
 
 class Reading(NamedTuple):
@@ -232,9 +234,7 @@ class Senses:
             np.empty(len(self._carried), np.float32),
             np.empty(len(self._observed), np.float32),
         )
-        finite = kernels.finish(
-            row, self._steps, self._carried, stream, self._observed, _BOUND, seen
-        )
+        finite = kernels.finish(row, self._steps, self._carried, stream, self._observed, seen)
         return Reading(row, stream, seen, *(finite if sound is None else (sound, sound)))
 
     def space(self) -> spaces.Space[Any]:
