@@ -18,7 +18,7 @@ from asm_gym.envs.robots import mend_robots, robot_named, robots_for
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import (
     check_choice,
@@ -169,16 +169,13 @@ class RobosuiteEnv(SteppedEnv):
 
     def _build_spaces(self) -> None:
         channels = (*self.simulation.proprioception.channels, *self._objects.channels)
-        dt, source = self._row_substeps / PHYSICS_FREQ, "+".join(self.robots)
-        self._senses = Senses(
-            channels,
-            self._actions.size,
-            dt,
-            source,
-            self._groups,
-            self.sensor_noise,
-            flat=self._flat,
+        action = Channel("action", self._actions.size, group=MOTOR)
+        spec = StreamSpec(
+            channels=(*channels, action),
+            dt=self._row_substeps / PHYSICS_FREQ,
+            source="+".join(self.robots),
         )
+        self._senses = Senses(spec, self._groups, self.sensor_noise, self._flat)
         self.measured_spec = self._senses.measured_spec
         """Everything that is measured, whether or not the stream carries it."""
         self.felt_channels = tuple(
