@@ -220,7 +220,10 @@ def osc_torques(work: Work, n: int) -> None:
     Of ``work``: mass matrix M (n, n), bias h (n,), Jacobian J (6, n), the torque that keeps the posture, tau (n,), and
     the acceleration wanted of the hand, Kp e - Kd v, as the first row of F (2, 6).
     """
-    J, A, G, F = work.J, work.A, work.G, work.F
+    J = work.J
+    A = work.A
+    G = work.G
+    F = work.F
     for i in range(n):
         A[6, i] = work.tau[i]
         for r in range(6):
