@@ -255,15 +255,10 @@ class ObjectSensors:
 
     def __init__(self, env: Any, task: TaskSpec) -> None:
         observables = env._observables
-        of_objects = [name for name, o in observables.items() if o.modality == "object"]
-        # Never shown, but others compute from them.
-        hidden = [name for name in of_objects if name.startswith("world_pose_in")]
+        # Others compute from these: poses of hands, and of the world in a hand's frame.
+        hidden = [name for name in observables if name.startswith("world_pose_in")]
         hands = [f"robot{i}_eef_{what}" for i in range(len(env.robots)) for what in ("pos", "quat")]
-        self._observables: list[Any] = []
-        for name in of_objects:
-            is_shown = task.name in _CHOSEN or observables[name].is_active()
-            if is_shown and name not in hidden:
-                self._observables.append(observables[name])
+        self._observables = _poses_shown(observables, task)
 
         channels: list[Channel] = []
         self._rest: list[Floats] = []  # of objects out of play
@@ -295,6 +290,17 @@ class ObjectSensors:
             value = values.get(observable.name, rest)
             poses.append(np.asarray(value, np.float64).reshape(-1))
         return poses
+
+
+def _poses_shown(observables: dict[str, Any], task: TaskSpec) -> list[Any]:
+    """Return robosuite's observables of the task's objects."""
+    poses: list[Any] = []
+    for name, observable in observables.items():
+        if observable.modality != "object" or name.startswith("world_pose_in"):
+            continue
+        if task.name in _CHOSEN or observable.is_active():
+            poses.append(observable)
+    return poses
 
 
 def _is_relative(observable: Any) -> bool:

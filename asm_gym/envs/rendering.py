@@ -42,8 +42,15 @@ class OffscreenRenderer:
         if self._model is not model:
             self._open(model)
         self._gl.make_current()
-        every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, every, self._scene)
+        mujoco.mjv_updateScene(
+            m=model,
+            d=data,
+            opt=self._options,
+            pert=None,
+            cam=self._camera,
+            catmask=mujoco.mjtCatBit.mjCAT_ALL.value,
+            scn=self._scene,
+        )
         viewport = mujoco.MjrRect(0, 0, self.width, self.height)
         mujoco.mjr_render(viewport, self._scene, self._context)
         picture = np.empty((self.height, self.width, 3), np.uint8)
