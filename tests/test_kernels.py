@@ -50,7 +50,7 @@ def test_an_arms_mass_matrix_and_jacobian_and_its_hands_velocity_are_mujocos(som
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, linear, angular, arms.site[0])
     nominal, samples = somewhere.nominal.unedited, np.zeros((1, 1, kernels.SAMPLE))
-    called(control.read_arm)(somewhere.views, nominal, arms, work, 0)
+    called(control.read_arm)(somewhere.views, nominal, arms[0], work)
     kernels.sample(somewhere.views, nominal, arms, 0, samples)
     np.testing.assert_array_equal(work.M, whole[np.ix_(dofs, dofs)])
     np.testing.assert_array_equal([work.h, work.v], [data.qfrc_bias[dofs], data.qvel[dofs]])

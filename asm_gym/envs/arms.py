@@ -10,14 +10,17 @@ import numpy as np
 from asm_gym.detection.kinematics import Chain
 from asm_gym.envs.commands import scaling_of
 from asm_gym.envs.mujoco_views import (
+    ARM,
     HAND_POSE,
     JOINT_ANGLES,
     JOINT_POSITION,
     JOINTS,
+    MOST_BODIES,
     OSC_POSE,
-    Arms,
+    Arm,
     Floats,
     Ints,
+    records,
 )
 
 PHYSICS_FREQ = 500  # robosuite's physics rate [Hz]
@@ -58,110 +61,86 @@ def is_compilable(part: Part) -> bool:
     return len(robot.arms) == 1 and not robot.is_mobile
 
 
-def describe(parts: list[Part], model: mujoco.MjModel) -> Arms:
-    """Return one row for each arm; the settings of controllers that do not run compiled stay 0."""
-    arms = _unset(parts, model)
-    for a, part in enumerate(parts):
-        _fill_indices(arms, a, model, part)
+def describe(parts: list[Part], model: mujoco.MjModel) -> Any:
+    """Return one record for each arm; the settings of controllers that do not run compiled stay 0."""
+    arms = records(len(parts), ARM)
+    for arm, part in zip(arms, parts, strict=True):
+        _fill_places(arm, model, part)
         if is_compilable(part):
-            _fill_settings(arms, a, model, controller_of(part))
+            _fill_settings(arm, model, controller_of(part))
     return arms
 
 
-def describe_inputs(
-    arms: Arms, a: int, model: mujoco.MjModel, controller: Any, part: slice
-) -> None:
-    """Write what the inputs of arm ``a`` are, where they tell how fast its hand will go; ``part`` of an action."""
+def describe_inputs(arm: Arm, model: mujoco.MjModel, controller: Any, part: slice) -> None:
+    """Write what the inputs of an arm are, where they tell how fast its hand will go; ``part`` of an action."""
     size = part.stop - part.start
     if controller.name not in SLOWED or size > JOINTS:
         return
-    arms.first[a] = part.start
-    arms.inputs[a] = size
-    arms.scaling[a, :, :size] = scaling_of(controller, size)
+    arm.first = part.start
+    arm.inputs = size
+    arm.scaling[:, :size] = scaling_of(controller, size)
     if controller.input_type != "delta":
         return
 
     # A controller that is asked for a change again and again comes to the velocity Kp/Kd times the change.
     gains = controller.kp / controller.kd
-    arms.speeds[a, :size] = gains[:size] * unit_change(controller)
+    arm.speeds[:size] = gains[:size] * unit_change(controller)
     if controller.name == "JOINT_POSITION":
-        arms.changes[a] = JOINT_ANGLES
+        arm.changes = JOINT_ANGLES
     else:
-        arms.changes[a] = HAND_POSE
-        arms.base[a] = _base_site(model, controller)
+        arm.changes = HAND_POSE
+        arm.frame = _base_site(model, controller)
 
 
-def _unset(parts: list[Part], model: mujoco.MjModel) -> Arms:
-    """Return the rows of arms of which nothing but the bodies is filled in."""
-    count = len(parts)
-    moving: list[Ints] = []  # bodies of the robots, less what is fixed to the world
-    links: list[Ints] = []
-    trees: list[Ints] = []
-    for robot, arm in parts:
-        own = bodies(model, robot)
-        moving.append(own[model.body_weldid[own] != 0])
-        links.append(_links(model, model.body(robot.robot_model.eef_name[arm]).id))
-        trees.append(_carried_dofs(model, robot))
+def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
+    """Write where in MuJoCo's arrays an arm's joints, motors, bodies, site and sensors are."""
+    robot, name = part
+    joints = len(robot._ref_joint_pos_indexes)
+    arm.joints = joints
+    arm.qpos[:joints] = robot._ref_joint_pos_indexes
+    arm.dofs[:joints] = robot._ref_joint_vel_indexes
+    arm.motors[:joints] = robot._ref_actuators_indexes_dict[name]
+    arm.site = robot.eef_site_id[name]
+    arm.site_body = model.site_bodyid[arm.site]
+    arm.root = model.body_rootid[arm.site_body]
 
-    indices = (
-        "joints",
-        "site",
-        "site_body",
-        "root",
-        "base",
-        "wrench",
-        "kind",
-        "first",
-        "inputs",
-        "changes",
-    )
-    fields: dict[str, Any] = {name: np.zeros(count, np.int64) for name in indices}
-    fields |= {name: np.zeros((count, JOINTS), np.int64) for name in ("qpos", "dofs", "motors")}
-    fields |= {name: np.zeros((count, JOINTS)) for name in ("kp", "kd", "rest", "speeds")}
-    return Arms(
-        bodies=_padded(moving),
-        links=_padded(links),
-        tree=_padded(trees),
-        compensate=np.zeros(count, bool),
-        limits=np.tile([-np.inf, np.inf], (count, JOINTS, 1)),
-        scaling=np.zeros((count, 5, JOINTS)),
-        **fields,
-    )
+    # What is fixed to the world belongs to it.
+    own = bodies(model, robot)
+    hand = model.body(robot.robot_model.eef_name[name]).id
+    _fill(arm.bodies, own[model.body_weldid[own] != 0])
+    _fill(arm.links, _links(model, hand))
+    _fill(arm.tree, _carried_dofs(model, robot))
 
-
-def _fill_indices(arms: Arms, a: int, model: mujoco.MjModel, part: Part) -> None:
-    """Write where in MuJoCo's arrays the joints, motors, site and sensors of arm ``a`` are."""
-    robot, arm = part
-    joints = slice(len(robot._ref_joint_pos_indexes))
-    arms.joints[a] = joints.stop
-    arms.qpos[a, joints] = robot._ref_joint_pos_indexes
-    arms.dofs[a, joints] = robot._ref_joint_vel_indexes
-    arms.motors[a, joints] = robot._ref_actuators_indexes_dict[arm]
-    arms.site[a] = robot.eef_site_id[arm]
-    arms.site_body[a] = model.site_bodyid[arms.site[a]]
-    arms.root[a] = model.body_rootid[arms.site_body[a]]
-
-    sensors = robot.gripper[arm].important_sensors
-    arms.wrench[a] = model.sensor(sensors["force_ee"]).adr[0]
-    if model.sensor(sensors["torque_ee"]).adr[0] != arms.wrench[a] + 3:
+    sensors = robot.gripper[name].important_sensors
+    arm.wrench = model.sensor(sensors["force_ee"]).adr[0]
+    if model.sensor(sensors["torque_ee"]).adr[0] != arm.wrench + 3:
         raise RuntimeError("the wrist's force and torque sensors are expected side by side")
 
 
-def _fill_settings(arms: Arms, a: int, model: mujoco.MjModel, controller: Any) -> None:
+def _fill(row: Ints, values: Ints) -> None:
+    """Write values into a row, and -1 after them."""
+    if len(values) >= MOST_BODIES:
+        raise RuntimeError(f"a robot may have {MOST_BODIES - 1} bodies, this one has {len(values)}")
+    row[:] = -1
+    row[: len(values)] = values
+
+
+def _fill_settings(arm: Arm, model: mujoco.MjModel, controller: Any) -> None:
     """Write the settings of a controller that runs compiled."""
-    joints = slice(arms.joints[a])
-    gains = slice(len(controller.kp))
-    arms.kp[a, gains] = controller.kp
-    arms.kd[a, gains] = controller.kd
+    gains = len(controller.kp)
+    arm.kp[:gains] = controller.kp
+    arm.kd[:gains] = controller.kd
     if controller.name == "OSC_POSE":
-        arms.kind[a] = OSC_POSE
-        arms.rest[a, joints] = controller.initial_joint
-        arms.base[a] = _base_site(model, controller)
-    else:
-        arms.kind[a] = JOINT_POSITION
-        arms.compensate[a] = controller.use_torque_compensation
-        if controller.position_limits is not None:
-            arms.limits[a, joints] = np.transpose(controller.position_limits)
+        arm.kind = OSC_POSE
+        arm.rest[: arm.joints] = controller.initial_joint
+        arm.frame = _base_site(model, controller)
+        return
+
+    arm.kind = JOINT_POSITION
+    arm.compensate = controller.use_torque_compensation
+    arm.limits[:] = [-np.inf, np.inf]
+    if controller.position_limits is not None:
+        arm.limits[: arm.joints] = np.transpose(controller.position_limits)
 
 
 def _base_site(model: mujoco.MjModel, controller: Any) -> int:
@@ -174,7 +153,7 @@ def _base_site(model: mujoco.MjModel, controller: Any) -> int:
 def bodies(model: mujoco.MjModel, robot: Any) -> Ints:
     """Return the bodies of a robot."""
     root = model.body(robot.robot_model.root_body).id
-    return np.flatnonzero(model.body_rootid == root).astype(np.int64)
+    return np.flatnonzero(model.body_rootid == root)
 
 
 def _links(model: mujoco.MjModel, hand: int) -> Ints:
@@ -190,15 +169,7 @@ def _links(model: mujoco.MjModel, hand: int) -> Ints:
 def _carried_dofs(model: mujoco.MjModel, robot: Any) -> Ints:
     """Return the dofs of the robot and of everything fixed to it: MuJoCo numbers each tree of bodies that move."""
     first = robot._ref_joint_vel_indexes[0]
-    return np.flatnonzero(model.dof_treeid == model.dof_treeid[first]).astype(np.int64)
-
-
-def _padded(rows: list[Ints]) -> Ints:
-    """Return rows of different lengths in one array, each followed by -1 at least once."""
-    padded = np.full((len(rows), max(map(len, rows)) + 1), -1, np.int64)
-    for row, values in zip(padded, rows, strict=True):
-        row[: len(values)] = values
-    return padded
+    return np.flatnonzero(model.dof_treeid == model.dof_treeid[first])
 
 
 def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[Chain, ...]:
@@ -211,26 +182,29 @@ def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[C
     chains = []
     for i, (robot, arm) in enumerate(parts):
         joints = np.asarray(robot._ref_joint_indexes)
-        body = model.body(robot.robot_model.eef_name[arm]).id
-        if not _is_chain(model, joints, body):
+        hand = model.body(robot.robot_model.eef_name[arm]).id
+        if not _is_chain(model, joints, hand):
             continue
-        prefix = ""
-        if len(parts) > 1:
-            prefix = f"robot{i}_"
-        place = data.site_xpos[robot.eef_site_id[arm]]
-        turn = data.xmat[body].reshape(3, 3)
-        chains.append(
-            Chain(
-                prefix=prefix,
-                axes=data.xaxis[joints].copy(),
-                anchors=data.xanchor[joints].copy(),
-                hand=np.stack([place, turn[:, 0], turn[:, 1]]),
-                late_s=1.0
-                / PHYSICS_FREQ,  # the last substep has moved the joints, and not yet sites and bodies
-                noise=max(noise, 1.0),
-            )
+        fingers = data.site_xpos[robot.eef_site_id[arm]]
+        turn = data.xmat[hand].reshape(3, 3)
+        chain = Chain(
+            prefix=prefix_of(i, len(parts)),
+            axes=data.xaxis[joints].copy(),
+            anchors=data.xanchor[joints].copy(),
+            hand=np.stack([fingers, turn[:, 0], turn[:, 1]]),
+            # The last substep has moved the joints, and not yet sites and bodies.
+            late_s=1.0 / PHYSICS_FREQ,
+            noise=max(noise, 1.0),
         )
+        chains.append(chain)
     return tuple(chains)
+
+
+def prefix_of(number: int, robots: int) -> str:
+    """Return what begins the names of a robot's channels, where there are several."""
+    if robots > 1:
+        return f"robot{number}_"
+    return ""
 
 
 def _is_chain(model: mujoco.MjModel, joints: Ints, hand: int) -> bool:

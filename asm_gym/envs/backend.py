@@ -35,9 +35,8 @@ def import_robosuite() -> Any:
     logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
     with suppress(ImportError):
         import cv2  # noqa: F401
-    if (
-        no_viewer := "cv2" not in sys.modules
-    ):  # for want of libGL: only robosuite's own viewer would use it
+    no_viewer = "cv2" not in sys.modules
+    if no_viewer:  # for want of libGL: only robosuite's own viewer would use it
         sys.modules["cv2"] = ModuleType("cv2")
     try:
         robosuite = somewhere(_required)
@@ -50,11 +49,11 @@ def import_robosuite() -> Any:
 
 
 def _required() -> Any:
-    if (
-        "robosuite" not in sys.modules
-    ):  # parts that an import which failed has left are no attributes of a new one
-        for name in [name for name in sys.modules if name.startswith("robosuite.")]:
-            del sys.modules[name]
+    # Parts that an import which failed has left are no attributes of a new one.
+    if "robosuite" not in sys.modules:
+        for name in tuple(sys.modules):
+            if name.startswith("robosuite."):
+                del sys.modules[name]
     return require("robosuite", what="a robosuite environment")
 
 
@@ -64,9 +63,11 @@ def _fit_to_mujoco() -> None:
     from robosuite.utils.binding_utils import MjData
 
     def whole_mass_matrix(model: mujoco.MjModel, whole: Floats, triangle: Floats) -> None:
-        rows, columns = np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind
+        rows = np.repeat(np.arange(model.nv), model.M_rownnz)
+        columns = model.M_colind
         whole[:] = 0.0
-        whole[rows, columns] = whole[columns, rows] = triangle
+        whole[rows, columns] = triangle
+        whole[columns, rows] = triangle
 
     MjData.qM = property(lambda data: data._data.M)
     controller.mujoco = SimpleNamespace(mj_fullM=whole_mass_matrix)
@@ -83,11 +84,8 @@ def _compile_less() -> None:
 
 def row_substeps(rate: int, control_freq: int) -> int:
     """Return the physics substeps between two rows at ``rate`` [Hz]; raise ValueError, listing those that fit."""
-    possible = [
-        f
-        for f in range(control_freq, PHYSICS_FREQ + 1)
-        if not (PHYSICS_FREQ % f or f % control_freq)
-    ]
+    rates = range(control_freq, PHYSICS_FREQ + 1, control_freq)
+    possible = [f for f in rates if PHYSICS_FREQ % f == 0]
     if rate not in possible:
         raise ValueError(
             f"stream_freq must divide the physics rate of {PHYSICS_FREQ} Hz and be a multiple of the control rate of "
@@ -108,18 +106,19 @@ def make(
     check_choice("controller", check_text("controller", controller), CONTROLLERS)
     if controller == "IK_POSE":
         _check_inverse_kinematics(robots)
+    configurations = None  # robosuite's own: OSC_POSE
+    if controller != "OSC_POSE":
+        configurations = [_configuration(controller, robot) for robot in robots]
+    has_dense_reward = task.name != "TwoArmTransport"
     return robosuite.make(
         task.name,
         robots=list(robots),
-        controller_configs=None
-        if controller == "OSC_POSE"
-        else [_configuration(controller, r) for r in robots],
+        controller_configs=configurations,
         has_renderer=False,
         has_offscreen_renderer=False,
         use_camera_obs=False,
         control_freq=control_freq,
-        reward_shaping=reward_shaping
-        and task.name != "TwoArmTransport",  # which has no dense reward
+        reward_shaping=reward_shaping and has_dense_reward,
         ignore_done=True,
     )
 
@@ -164,63 +163,76 @@ def speed_up_contacts(env: Any) -> None:
     Robosuite puts the names of geoms together at every call, and looks up two for each contact and pair of groups;
     these compare ids in one pass.
     """
-    data, count = env.sim.data._data, env.sim.model.ngeom
-    ids = {name: env.sim.model.geom_name2id(name) for name in env.sim.model.geom_names}
+    contacts = Contacts(env)
+    env.check_contact = contacts.check_contact
+    env._check_grasp = contacts.check_grasp
+    env._gripper_to_target = contacts.gripper_to_target
 
-    @lru_cache
-    def members(group: Any) -> NDArray[np.bool_]:
-        names = getattr(group, "contact_geoms", group)  # of a model
-        names = (names,) if isinstance(names, str) else names
-        mask = np.zeros(count, bool)
-        mask[[ids[name] for name in names if name in ids]] = True
-        return mask
 
-    everything = np.ones(count, bool)
+class Contacts:
+    """Tells what touches in the loaded model, and how far a gripper is from its target, as robosuite does."""
 
-    def mask(geoms: Any) -> NDArray[np.bool_]:
-        return members(tuple(geoms) if isinstance(geoms, list) else geoms)
+    def __init__(self, env: Any) -> None:
+        self._data = env.sim.data._data
+        self._ids = {name: env.sim.model.geom_name2id(name) for name in env.sim.model.geom_names}
+        self._everything = np.ones(env.sim.model.ngeom, bool)
+        self._members = lru_cache(self._find_members)
+        self._pads = lru_cache(_find_pads)
+        self._grip_site = lru_cache(self._find_grip_site)
+        self._place = lru_cache(self._find_place)
 
-    def check_contact(geoms_1: Any, geoms_2: Any = None) -> bool:
+    def check_contact(self, geoms_1: Any, geoms_2: Any = None) -> bool:
         """Whether any geom of one group touches any of the other; of anything where there is no other."""
-        return touching(
-            data.contact.geom, mask(geoms_1), everything if geoms_2 is None else mask(geoms_2)
-        )
+        other = self._everything
+        if geoms_2 is not None:
+            other = self._mask(geoms_2)
+        return touching(self._data.contact.geom, self._mask(geoms_1), other)
 
-    @lru_cache
-    def pads(gripper: Any) -> tuple[tuple[str, ...], ...]:
-        return tuple(
-            tuple(gripper.important_geoms[f"{side}_fingerpad"]) for side in ("left", "right")
-        )
-
-    def check_grasp(gripper: Any, object_geoms: Any) -> bool:
+    def check_grasp(self, gripper: Any, object_geoms: Any) -> bool:
         """Whether the pads on both sides of a gripper, or of any of several, touch an object."""
         if isinstance(gripper, dict):
-            return any(check_grasp(each, object_geoms) for each in gripper.values())
-        return all(check_contact(pad, object_geoms) for pad in pads(gripper))
-
-    @lru_cache
-    def grip_site(gripper: Any) -> NDArray[np.float64]:
-        return np.asarray(data.site(gripper.important_sites["grip_site"]).xpos)
-
-    @lru_cache
-    def place(target: Any, kind: str) -> NDArray[np.float64]:
-        name = getattr(target, "root_body", None)  # of a model
-        return np.asarray(data.body(name).xpos if name else getattr(data, kind)(target).xpos)
+            return any(self.check_grasp(each, object_geoms) for each in gripper.values())
+        return all(self.check_contact(pad, object_geoms) for pad in self._pads(gripper))
 
     def gripper_to_target(
-        gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False
+        self, gripper: Any, target: Any, target_type: str = "body", return_distance: bool = False
     ) -> Any:
         """Way from a gripper, or from the nearest of several, to a target; or its length."""
-        grippers = gripper.values() if isinstance(gripper, dict) else (gripper,)
-        ways = [place(target, target_type) - grip_site(each) for each in grippers]
-        way = ways[0] if len(ways) == 1 else min(ways, key=np.linalg.norm)
-        return np.sqrt(way.dot(way)) if return_distance else way  # as NumPy's norm does it
+        place = self._place(target, target_type)
+        if isinstance(gripper, dict):
+            ways = [place - self._grip_site(each) for each in gripper.values()]
+            way = min(ways, key=np.linalg.norm)
+        else:
+            way = place - self._grip_site(gripper)
+        if return_distance:
+            return np.sqrt(way.dot(way))  # as NumPy's norm does it
+        return way
 
-    env.check_contact, env._check_grasp, env._gripper_to_target = (
-        check_contact,
-        check_grasp,
-        gripper_to_target,
-    )
+    def _mask(self, geoms: Any) -> NDArray[np.bool_]:
+        if isinstance(geoms, list):
+            geoms = tuple(geoms)
+        return self._members(geoms)
+
+    def _find_members(self, group: Any) -> NDArray[np.bool_]:
+        names = getattr(group, "contact_geoms", group)  # of a model
+        if isinstance(names, str):
+            names = (names,)
+        mask = np.zeros(len(self._everything), bool)
+        mask[[self._ids[name] for name in names if name in self._ids]] = True
+        return mask
+
+    def _find_grip_site(self, gripper: Any) -> Floats:
+        return np.asarray(self._data.site(gripper.important_sites["grip_site"]).xpos)
+
+    def _find_place(self, target: Any, kind: str) -> Floats:
+        if hasattr(target, "root_body"):  # a model
+            return np.asarray(self._data.body(target.root_body).xpos)
+        return np.asarray(getattr(self._data, kind)(target).xpos)
+
+
+def _find_pads(gripper: Any) -> tuple[tuple[str, ...], ...]:
+    geoms = gripper.important_geoms
+    return tuple(geoms["left_fingerpad"]), tuple(geoms["right_fingerpad"])
 
 
 class _Asked(dict[str, Any]):
@@ -243,37 +255,53 @@ class ObjectSensors:
 
     def __init__(self, env: Any, task: TaskSpec) -> None:
         observables = env._observables
-        of_objects = {n: o for n, o in observables.items() if o.modality == "object"}
+        # Others compute from these: poses of hands, and of the world in a hand's frame.
+        hidden = [name for name in observables if name.startswith("world_pose_in")]
         hands = [f"robot{i}_eef_{what}" for i in range(len(env.robots)) for what in ("pos", "quat")]
-        # Never shown, but others compute from them.
-        hidden = [n for n in of_objects if n.startswith("world_pose_in")]
-        chosen = task.name in _CHOSEN
-        inputs = [observables[n] for n in (*hands, *hidden) if n in observables]
-        self._observables = [
-            o for n, o in of_objects.items() if n not in hidden and (chosen or o.is_active())
-        ]
-        sizes = [int(np.prod(o._data_shape)) or 1 for o in self._observables]
-        self.channels = tuple(
-            Channel(o.name, size, "1", 0.0, "object")
-            for o, size in zip(self._observables, sizes, strict=True)
-        )
-        self._rest = [np.zeros(size) for size in sizes]
-        # Relative poses are computed from absolute ones, which robosuite lists after them.
-        self._in_order = sorted(self._observables, key=lambda o: "_to_" in o.name)
-        seen = _Asked()
-        for observable in (*inputs, *self._in_order):
-            seen[observable.name] = observable._sensor(seen)
-        self._inputs = [o for o in inputs if o.name in seen.names]
+        self._observables = _poses_shown(observables, task)
 
-    def read(self) -> list[NDArray[np.float64]]:
+        channels: list[Channel] = []
+        self._rest: list[Floats] = []  # of objects out of play
+        for observable in self._observables:
+            size = int(np.prod(observable._data_shape)) or 1
+            channels.append(Channel(observable.name, size, group="object"))
+            self._rest.append(np.zeros(size))
+        self.channels = tuple(channels)
+
+        # Relative poses are computed from absolute ones, which robosuite lists after them.
+        self._in_order = sorted(self._observables, key=_is_relative)
+        values = _Asked()
+        known = [observables[name] for name in (*hands, *hidden) if name in observables]
+        for observable in (*known, *self._in_order):
+            values[observable.name] = observable._sensor(values)
+        self._inputs = [observable for observable in known if observable.name in values.names]
+
+    def read(self) -> list[Floats]:
         """One array for each of ``channels``."""
-        seen: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for observable in self._inputs:
-            seen[observable.name] = observable._sensor(seen)
+            values[observable.name] = observable._sensor(values)
         for observable in self._in_order:
             if observable.is_active():
-                seen[observable.name] = observable._sensor(seen)
-        return [
-            np.asarray(seen[o.name], np.float64).reshape(-1) if o.name in seen else rest
-            for o, rest in zip(self._observables, self._rest, strict=True)
-        ]
+                values[observable.name] = observable._sensor(values)
+
+        poses: list[Floats] = []
+        for observable, rest in zip(self._observables, self._rest, strict=True):
+            value = values.get(observable.name, rest)
+            poses.append(np.asarray(value, np.float64).reshape(-1))
+        return poses
+
+
+def _poses_shown(observables: dict[str, Any], task: TaskSpec) -> list[Any]:
+    """Return robosuite's observables of the task's objects."""
+    poses: list[Any] = []
+    for name, observable in observables.items():
+        if observable.modality != "object" or name.startswith("world_pose_in"):
+            continue
+        if task.name in _CHOSEN or observable.is_active():
+            poses.append(observable)
+    return poses
+
+
+def _is_relative(observable: Any) -> bool:
+    return "_to_" in observable.name

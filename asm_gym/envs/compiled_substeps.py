@@ -19,19 +19,14 @@ from llvmlite import binding
 from numba import types
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled, inner
-from asm_gym.envs.control import HELD, control, read_arm, set_goal, slow_down
+from asm_gym.compilation import Bound, compiled, inner
+from asm_gym.envs.commands import within
+from asm_gym.envs.control import HELD, control, length, read_arm, set_goal, slow_down
 from asm_gym.envs.mujoco_views import (
-    ACTS,
-    ARMED,
-    BRAKED,
     FELT,
     JOINTS,
-    PASSED_IN,
-    STAYED,
-    SUBSTEPS,
+    Arm,
     Arms,
-    Bound,
     Floats,
     Goals,
     Ints,
@@ -41,14 +36,19 @@ from asm_gym.envs.mujoco_views import (
     Work,
 )
 
-# Parts of one arm's sample in a substep.
+# Parts of one arm's sample in a substep; those that have limits come first.
 EXTERNAL = slice(0, JOINTS)
-MOTOR = slice(JOINTS, 2 * JOINTS)
-WRENCH = slice(2 * JOINTS, 2 * JOINTS + 6)
-CONTACT = slice(2 * JOINTS + 6, 2 * JOINTS + 9)
-VELOCITY = slice(2 * JOINTS + 9, 2 * JOINTS + 15)
+WRENCH = slice(EXTERNAL.stop, EXTERNAL.stop + 6)
+MOTOR = slice(WRENCH.stop, WRENCH.stop + JOINTS)
+CONTACT = slice(MOTOR.stop, MOTOR.stop + 3)
+VELOCITY = slice(CONTACT.stop, CONTACT.stop + 6)
 SAMPLE = VELOCITY.stop
-_WRENCH, _CONTACT, _VELOCITY = WRENCH.start, CONTACT.start, VELOCITY.start
+_WRENCH = WRENCH.start
+_MOTOR = MOTOR.start
+_CONTACT = CONTACT.start
+_VELOCITY = VELOCITY.start
+
+OBSERVED_BOUND = 100.0  # of observations; nothing that a task does comes near it
 
 # MuJoCo's own functions, linked by name so that the compiled loop can be cached on disk.
 binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
@@ -67,6 +67,8 @@ _rne: Any = types.ExternalFunction(
 @partial(inner, inlined=True)
 def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
     """Evaluate the nominal model's dynamics at the live joint positions and velocities."""
+    if nominal.model == 0:
+        return
     for i in range(len(nominal.qpos)):
         nominal.qpos[i] = views.qpos[i]
     for i in range(len(nominal.qvel)):
@@ -81,73 +83,102 @@ def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
 @compiled
 def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
     """Write the sensor values of every arm after substep ``k`` into samples (A, K, SAMPLE)."""
-    for a in range(len(arms.joints)):
+    for a in range(len(arms)):
+        row = samples[a, k]
         for i in range(SAMPLE):
-            samples[a, k, i] = 0.0
-        for t in range(arms.tree.shape[1]):
-            i = arms.tree[a, t]
-            if i < 0:
-                break
-            first = views.M_rowadr[i]
-            for at in range(first + views.M_rownnz[i] - 1, first - 1, -1):
-                j = views.M_colind[at]
-                for r in range(arms.joints[a]):
-                    if arms.dofs[a, r] == i:
-                        samples[a, k, r] += nominal.mass[at] * views.qacc[j]
-                    elif arms.dofs[a, r] == j:
-                        samples[a, k, r] += nominal.mass[at] * views.qacc[i]
-        for i in range(arms.joints[a]):
-            dof = arms.dofs[a, i]
-            damped = (
-                views.qfrc_passive[dof]
-                + (views.dof_damping[dof] - nominal.damping[dof]) * views.qvel[dof]
-            )
-            samples[a, k, i] += nominal.bias[dof] - damped - views.qfrc_actuator[dof]
-            samples[a, k, JOINTS + i] = views.qfrc_actuator[dof]
+            row[i] = 0.0
+        read_torques(views, nominal, arms[a], row)
         for i in range(6):
-            samples[a, k, _WRENCH + i] = views.sensordata[arms.wrench[a] + i]
-        for t in range(arms.bodies.shape[1]):
-            body = arms.bodies[a, t]
-            if body < 0:
-                break
-            for i in range(3):
-                samples[a, k, _CONTACT + i] += (
-                    views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
-                )
-        site, body, root = arms.site[a], arms.site_body[a], arms.root[a]
+            row[_WRENCH + i] = views.sensordata[arms[a].wrench + i]
+        read_contact(views, arms[a], row)
+        read_hand_velocity(views, arms[a], row)
+
+
+@partial(inner, inlined=True)
+def read_torques(views: Views, nominal: NominalViews, arm: Arm, row: Floats) -> None:
+    """Add the external torques of an arm's joints to a row of 0, and write those of its motors."""
+    t = 0
+    while arm.tree[t] >= 0:
+        add_inertia(views, nominal, arm, arm.tree[t], row)
+        t += 1
+    for i in range(arm.joints):
+        dof = arm.dofs[i]
+        unknown_damping = views.dof_damping[dof] - nominal.damping[dof]
+        damped = views.qfrc_passive[dof] + unknown_damping * views.qvel[dof]
+        row[i] += nominal.bias[dof] - damped - views.qfrc_actuator[dof]
+        row[_MOTOR + i] = views.qfrc_actuator[dof]
+
+
+@partial(inner, inlined=True)
+def add_inertia(views: Views, nominal: NominalViews, arm: Arm, i: int, row: Floats) -> None:
+    """Add what row ``i`` of the mass matrix, and the column that mirrors it, give the torques M q̈."""
+    first = views.M_rowadr[i]
+    for at in range(first + views.M_rownnz[i] - 1, first - 1, -1):
+        j = views.M_colind[at]
+        for r in range(arm.joints):
+            if arm.dofs[r] == i:
+                row[r] += nominal.mass[at] * views.qacc[j]
+            elif arm.dofs[r] == j:
+                row[r] += nominal.mass[at] * views.qacc[i]
+
+
+@partial(inner, inlined=True)
+def read_contact(views: Views, arm: Arm, row: Floats) -> None:
+    """Add the contact force on an arm, less the loads that faults apply, to a row of 0."""
+    t = 0
+    while arm.bodies[t] >= 0:
+        body = arm.bodies[t]
         for i in range(3):
-            j, m = (i + 1) % 3, (i + 2) % 3
-            y = views.site_xpos[site, j] - views.subtree_com[root, j]
-            z = views.site_xpos[site, m] - views.subtree_com[root, m]
-            turning = views.cvel[body, j] * z - views.cvel[body, m] * y
-            samples[a, k, _VELOCITY + i] = views.cvel[body, 3 + i] + turning
-            samples[a, k, _VELOCITY + 3 + i] = views.cvel[body, i]
+            row[_CONTACT + i] += views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
+        t += 1
+
+
+@partial(inner, inlined=True)
+def read_hand_velocity(views: Views, arm: Arm, row: Floats) -> None:
+    """Write the hand's linear and angular velocity."""
+    twist = views.cvel[arm.site_body]  # at the robot's centre of mass: angular, then linear
+    hand = views.site_xpos[arm.site]
+    origin = views.subtree_com[arm.root]
+    for i in range(3):
+        j = (i + 1) % 3
+        m = (i + 2) % 3
+        y = hand[j] - origin[j]
+        z = hand[m] - origin[m]
+        turning = twist[j] * z - twist[m] * y
+        row[_VELOCITY + i] = twist[3 + i] + turning
+        row[_VELOCITY + 3 + i] = twist[i]
+
+
+@inner
+def largest_load(most: Floats, k: int, samples: Floats, largest: float) -> float:
+    """Return the largest share of a limit in substep ``k``, or ``largest`` before; infinite for NaN."""
+    for a in range(len(most)):
+        for i in range(FELT):
+            load = abs(samples[a, k, i]) / most[a, i]
+            if np.isnan(load):
+                return np.inf
+            largest = max(largest, load)
+    return largest
 
 
 @compiled
-def feel(joints: Ints, limits: SubstepLimits, held: Ints, k: int, samples: Floats) -> None:
-    """Compare the load of arms of so many ``joints`` (A,) in substep ``k`` with the limits; NaN passes a limit.
+def feel(goals: Goals, limits: SubstepLimits, k: int, samples: Floats) -> None:
+    """Compare the load of the arms in substep ``k`` with the limits.
 
-    Where a limit is the first to be passed in a control step, and asks for it, all arms are ``held`` (A,) from the next
-    substep on where they then are; those that are held already, where they were.
+    Where a limit is the first to be passed in a control step, and asks for it, all arms are held from the next substep
+    on where they then are; those that are held already, where they were.
     """
-    state = limits.state
-    for a in range(len(joints) if state[ARMED] else 0):
-        for i in range(FELT):
-            if i < JOINTS and i >= joints[a]:
-                continue
-            load = abs(samples[a, k, i if i < JOINTS else i - JOINTS + _WRENCH]) / limits.most[a, i]
-            if not load <= limits.load[0]:
-                limits.load[0] = load if load == load else np.inf
-            if state[PASSED_IN] < 0 and not load <= 1.0:
-                state[PASSED_IN] = state[SUBSTEPS]
-    state[SUBSTEPS] += 1
-    if state[ACTS] == 0 or state[PASSED_IN] < 0 or state[STAYED] != 0:
+    status = limits.status[0]
+    status.substeps += 1
+    if status.armed:
+        limits.load[0] = largest_load(limits.most, k, samples, limits.load[0])
+    if status.passed_after > 0 or limits.load[0] <= 1.0:
         return
-    state[STAYED] = 1
-    for a in range(len(held)):
-        if held[a] == 0:
-            held[a] = HELD
+    status.passed_after = status.substeps
+    if status.stops:
+        for a in range(len(goals)):
+            if goals[a].held == 0:
+                goals[a].held = HELD
 
 
 @compiled
@@ -155,24 +186,13 @@ def brake_beneath(
     views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, limits: SubstepLimits
 ) -> None:
     """Brake the arms that are held or too fast, where their controllers are not compiled."""
-    if nominal.model != 0:
-        _evaluate_nominal(views, nominal)
-    for a in range(len(arms.joints)):
-        if goals.held[a] != 0:
-            control(views, nominal, arms, goals, work, a)
+    _evaluate_nominal(views, nominal)
+    for a in range(len(arms)):
+        if goals[a].held:
+            control(views, nominal, arms[a], goals[a], work)
         else:
-            read_arm(views, nominal, arms, work, a)
-            limits.state[BRAKED] += slow_down(views, arms, limits, work, a)
-
-
-@compiled
-def bind(*parts: Any) -> Bound:
-    """Return what ``run`` works on.
-
-    Args:
-        parts: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``Work``, ``SubstepLimits``; samples (A, K, SAMPLE).
-    """
-    return Bound(parts)  # type: ignore[no-untyped-call]
+            read_arm(views, nominal, arms[a], work)
+            limits.status[0].braked += slow_down(views, arms[a], limits.speed[a], work)
 
 
 @partial(compiled, nogil=True)
@@ -180,27 +200,29 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
     """Run ``count`` physics substeps, controllers and sensors included.
 
     Args:
-        bound: of ``bind``; samples are written at ``first`` and after.
+        bound: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``Work``, ``SubstepLimits``; the action (A,) in
+            robosuite's units; samples (A, K, SAMPLE), written at ``first`` and after.
         fresh: the action moves the set-points in the first of these substeps.
         first: index of the first substep within the row.
 
     From the substep after a limit is passed, the arms stay where they are, where the limits ask for that.
     """
-    views, nominal, arms, goals, work, limits, samples = bound.parts
+    views, nominal, arms, goals, work, limits, action, samples = bound.parts
     for k in range(first, first + count):
         _step1(views.model, views.data)
-        if nominal.model != 0:
-            _evaluate_nominal(views, nominal)
-        for a in range(len(arms.joints)):
-            if fresh and k == first and goals.held[a] == 0:
-                set_goal(views, arms, goals, work, a)
-            control(views, nominal, arms, goals, work, a)
-            if goals.held[a] == 0:
-                limits.state[BRAKED] += slow_down(views, arms, limits, work, a)
+        _evaluate_nominal(views, nominal)
+        for a in range(len(arms)):
+            arm = arms[a]
+            goal = goals[a]
+            if fresh and k == first and goal.held == 0:
+                set_goal(views, arm, goal, action, work)
+            control(views, nominal, arm, goal, work)
+            if goal.held == 0:
+                limits.status[0].braked += slow_down(views, arm, limits.speed[a], work)
         _step2(views.model, views.data)
         # the place for all that is measured in every substep
         sample(views, nominal, arms, k, samples)
-        feel(arms.joints, limits, goals.held, k, samples)
+        feel(goals, limits, k, samples)
 
 
 @compiled
@@ -213,9 +235,11 @@ def sense(
         sources, where: arrays that the arms' sensors read; (P, 2) each number's source and its index there.
         beside: (M - P,) true values of the other numbers.
     """
-    for n in range(len(row)):
-        value = sources[where[n, 0]][where[n, 1]] if n < len(where) else beside[n - len(where)]
-        row[n] = value + noise[n] * row[n]
+    own = len(where)
+    for n in range(own):
+        row[n] = sources[where[n, 0]][where[n, 1]] + noise[n] * row[n]
+    for n in range(own, len(row)):
+        row[n] = beside[n - own] + noise[n] * row[n]
 
 
 @compiled
@@ -224,30 +248,34 @@ def finish(
     steps: Floats,
     carried: Ints,
     stream: NDArray[np.float32],
-    seen: Ints,
-    bound: float,
+    observed: Ints,
     observation: NDArray[np.float32],
 ) -> tuple[bool, bool]:
     """Round a row (M,) in place to resolutions ``steps`` (M,), 0 for none, and share its numbers out.
 
     Args:
-        carried, seen: which numbers go into the stream (D,), and which into the observation (S,).
-        bound: to which the observation is clipped; NaN becomes 0 there.
+        carried, observed: which numbers go into the stream (D,), and which into the observation (S,), where they are
+            clipped to ``OBSERVED_BOUND`` and NaN becomes 0.
 
     Returns:
         Whether row and stream are finite in single precision.
     """
-    row_finite = stream_finite = True
+    row_finite = True
     for n in range(len(row)):
         if steps[n] > 0.0:
             row[n] = np.rint(row[n] / steps[n]) * steps[n]
         row_finite = row_finite and np.isfinite(np.float32(row[n]))
+
+    stream_finite = True
     for n in range(len(carried)):
         stream[n] = np.float32(row[carried[n]])
         stream_finite = stream_finite and np.isfinite(stream[n])
-    for n in range(len(seen)):
-        value = row[seen[n]]
-        observation[n] = min(max(value, -bound), bound) if value == value else 0.0
+
+    for n in range(len(observed)):
+        value = within(row[observed[n]], -OBSERVED_BOUND, OBSERVED_BOUND)
+        if np.isnan(value):
+            value = 0.0
+        observation[n] = value
     return row_finite, stream_finite
 
 
@@ -261,7 +289,8 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
     largest = 0.0
     for a in range(len(samples)):
         for i in range(SAMPLE):
-            mean[a, i] = peak[a, i] = 0.0
+            mean[a, i] = 0.0
+            peak[a, i] = 0.0
             last[a, i] = samples[a, count - 1, i]
             for k in range(count):
                 value = samples[a, k, i]
@@ -270,12 +299,7 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
                 if not abs(value) <= abs(peak[a, i]) and peak[a, i] == peak[a, i]:
                     peak[a, i] = value
         for k in range(count):
-            x, y, z = (
-                samples[a, k, _CONTACT],
-                samples[a, k, _CONTACT + 1],
-                samples[a, k, _CONTACT + 2],
-            )
-            force = np.sqrt(x * x + y * y + z * z)
+            force = length(samples[a, k, _CONTACT:_VELOCITY])
             if not force <= largest and largest == largest:
                 largest = force
     return largest

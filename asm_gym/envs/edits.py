@@ -16,7 +16,9 @@ class _Entry:
     """An edited number, or row of numbers: its nominal value, and the changes of it in force."""
 
     def __init__(self, array: NDArray[Any], index: Any) -> None:
-        self.array, self.index, self.nominal = array, index, np.copy(array[index])
+        self.array = array
+        self.index = index
+        self.nominal = np.copy(array[index])
         self.changes: dict[object, Change] = {}
 
     def write(self) -> None:
@@ -38,21 +40,22 @@ class SimulatorEdits:
 
         Two parties must name one entry in the same way.
         """
-        keys = [(array.__array_interface__["data"][0], repr(index)) for index in indices]
         party = object()
-        for key, index in zip(keys, indices, strict=True):
-            self._entries.setdefault(key, _Entry(array, index)).changes[party] = lambda value: value
+        entries: dict[tuple[int, str], _Entry] = {}
+        for index in indices:
+            key = (array.__array_interface__["data"][0], repr(index))
+            entries[key] = self._entries.setdefault(key, _Entry(array, index))
+            entries[key].changes[party] = _unchanged
 
         def change(rule: Change) -> None:
-            for key in keys:
-                self._entries[key].changes[party] = rule
-                self._entries[key].write()
+            for entry in entries.values():
+                entry.changes[party] = rule
+                entry.write()
 
         try:
             yield change
         finally:
-            for key in keys:
-                entry = self._entries[key]
+            for key, entry in entries.items():
                 del entry.changes[party]
                 entry.write()
                 if not entry.changes:
@@ -60,3 +63,7 @@ class SimulatorEdits:
 
     def __len__(self) -> int:
         return len(self._entries)
+
+
+def _unchanged(value: Any) -> Any:
+    return value

@@ -6,17 +6,23 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numba import types
-from numba.experimental import structref
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 JOINTS = 7  # the most joints an arm may have; shorter arms leave the rest unused
+MOST_BODIES = 48  # the most bodies, or dofs, of a robot with its gripper
 # numbers that limits apply to: external torque of the joints, then force at the wrist
 FELT = JOINTS + 3
-OSC_POSE, JOINT_POSITION = 0, 1
-UNKNOWN_CHANGE, JOINT_ANGLES, HAND_POSE = range(3)  # what the inputs of an arm change
+
+# Controllers that run compiled.
+OSC_POSE = 0
+JOINT_POSITION = 1
+
+# What the inputs of an arm change.
+UNKNOWN_CHANGE = 0
+JOINT_ANGLES = 1
+HAND_POSE = 2
 
 
 class Views(NamedTuple):
@@ -50,8 +56,11 @@ class Views(NamedTuple):
     @classmethod
     def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Views:
         """Return the arrays of a loaded model."""
-        arrays = (getattr(data if hasattr(data, name) else model, name) for name in cls._fields[2:])
-        return cls(model._address, data._address, *arrays)
+        arrays = {}
+        for name in cls._fields[2:]:
+            owner = data if hasattr(data, name) else model
+            arrays[name] = getattr(owner, name)
+        return cls(model=model._address, data=data._address, **arrays)
 
 
 class NominalViews(NamedTuple):
@@ -67,51 +76,55 @@ class NominalViews(NamedTuple):
     damping: Floats
 
 
-class Arms(NamedTuple):
-    """Each arm's indices in the arrays, and its controller's settings; one row an arm."""
+ARM = np.dtype(
+    [
+        ("joints", np.int64),  # how many it has
+        ("qpos", np.int64, JOINTS),  # their places in MuJoCo's arrays
+        ("dofs", np.int64, JOINTS),
+        ("motors", np.int64, JOINTS),
+        ("site", np.int64),  # between the fingers
+        ("site_body", np.int64),  # that the site belongs to
+        ("root", np.int64),  # the robot's outermost body
+        ("frame", np.int64),  # the site that actions are relative to, -1 for the world
+        ("wrench", np.int64),  # where the wrist's force and torque begin in sensordata
+        ("bodies", np.int64, MOST_BODIES),  # whose contacts count; then -1
+        ("links", np.int64, MOST_BODIES),  # bodies from the hand to the base; then -1
+        ("tree", np.int64, MOST_BODIES),  # dofs of the arm and all that hangs on it; then -1
+        ("kind", np.int64),  # OSC_POSE or JOINT_POSITION
+        ("kp", np.float64, JOINTS),
+        ("kd", np.float64, JOINTS),
+        ("compensate", np.int64),  # 1 for joint control that knows the arm's dynamics
+        ("rest", np.float64, JOINTS),  # the posture that spare joints tend to [rad]
+        ("limits", np.float64, (JOINTS, 2)),  # of the joint set-point [rad]
+        ("first", np.int64),  # where the arm's part of the action begins
+        ("inputs", np.int64),  # how many numbers it has
+        ("scaling", np.float64, (5, JOINTS)),  # of them; see ``commands``
+        ("changes", np.int64),  # what they change: UNKNOWN_CHANGE, JOINT_ANGLES or HAND_POSE
+        ("speeds", np.float64, JOINTS),  # that a lasting input of 1 leads to [m/s], [rad/s]
+    ]
+)
+"""One arm: its places in the arrays, and its controller's settings."""
 
-    joints: Ints  # (A,) how many
-    qpos: Ints  # (A, JOINTS)
-    dofs: Ints  # (A, JOINTS)
-    motors: Ints  # (A, JOINTS)
-    site: Ints  # (A,) between the fingers
-    site_body: Ints  # (A,) that it belongs to
-    root: Ints  # (A,) the robot's outermost body
-    base: Ints  # (A,) the site that actions are relative to, -1 for the world
-    wrench: Ints  # (A,) where the wrist's force and torque begin in sensordata
-    bodies: Ints  # (A, B) bodies whose contacts count, padded with -1; what is fixed to the world belongs to it
-    links: Ints  # (A, L) bodies from the hand to the base, padded with -1
-    tree: Ints  # (A, T) dofs of the arm and all that hangs on it, padded with -1
-    kind: Ints  # (A,) OSC_POSE or JOINT_POSITION
-    kp: Floats  # (A, JOINTS)
-    kd: Floats  # (A, JOINTS)
-    compensate: NDArray[np.bool_]  # (A,) joint control that knows the arm's dynamics
-    rest: Floats  # (A, JOINTS) the posture that spare joints tend to [rad]
-    limits: Floats  # (A, JOINTS, 2) of the joint set-point [rad]
-    first: Ints  # (A,) where the arm's part of the action begins
-    inputs: Ints  # (A,) how many numbers it has
-    scaling: Floats  # (A, 5, JOINTS) of them; see ``commands``
-    changes: Ints  # (A,) what they change: UNKNOWN_CHANGE, JOINT_ANGLES or HAND_POSE
-    speeds: Floats  # (A, JOINTS) that a unit of them, asked for again and again, leads to [m/s], [rad/s]
+GOAL = np.dtype(
+    [
+        ("position", np.float64, 3),  # of the hand [m]
+        ("orientation", np.float64, (3, 3)),
+        ("joints", np.float64, JOINTS),  # [rad]
+        ("anchor", np.float64, JOINTS),  # where an arm that is held is to stay [rad]
+        ("held", np.int64),  # 0, ``control.HELD``, ``control.BRAKING`` or ``control.YIELDING``
+    ]
+)
+"""The set-point of one arm's controller, changed in place."""
+
+Arms = NDArray[np.void]  # (A,) of ARM
+Goals = NDArray[np.void]  # (A,) of GOAL
+Arm = Any  # one of them
+Goal = Any
 
 
-class Goals(NamedTuple):
-    """The controllers' set-points, changed in place."""
-
-    action: Floats  # that moves them, in robosuite's units
-    position: Floats  # (A, 3)
-    orientation: Floats  # (A, 3, 3)
-    joints: Floats  # (A, JOINTS)
-    anchor: Floats  # (A, JOINTS) where an arm that is held is to stay [rad]
-    held: (
-        Ints  # (A,) whether it is: 0, ``control.HELD``, ``control.BRAKING`` or ``control.YIELDING``
-    )
-
-    @classmethod
-    def of(cls, arms: int, inputs: int) -> Goals:
-        """Return set-points of 0, which no arm is held at."""
-        shapes = (inputs,), (arms, 3), (arms, 3, 3), (arms, JOINTS), (arms, JOINTS)
-        return cls._make([*map(np.zeros, shapes), np.zeros(arms, np.int64)])
+def records(count: int, kind: np.dtype[np.void]) -> Any:
+    """Return records (count,) of zeros, whose fields are attributes."""
+    return np.zeros(count, kind).view(np.recarray)
 
 
 class Work(NamedTuple):
@@ -124,6 +137,7 @@ class Work(NamedTuple):
     J: Floats  # (6, JOINTS) Jacobian of the hand: linear, then angular velocity
     F: Floats  # (2, 6)
     h: Floats  # (JOINTS,) bias
+    q: Floats  # (JOINTS,) angles
     v: Floats  # (JOINTS,) velocities
     p: Floats  # (JOINTS,)
     tau: Floats  # (JOINTS,) torques
@@ -131,38 +145,38 @@ class Work(NamedTuple):
     @classmethod
     def empty(cls) -> Work:
         """Return arrays to write into."""
-        shapes = *[(JOINTS, JOINTS)] * 4, (6, JOINTS), (2, 6), *[(JOINTS,)] * 4
-        return cls._make(map(np.zeros, shapes))
+        square = (JOINTS, JOINTS)
+        return cls(
+            M=np.zeros(square),
+            L=np.zeros(square),
+            A=np.zeros(square),
+            G=np.zeros(square),
+            J=np.zeros((6, JOINTS)),
+            F=np.zeros((2, 6)),
+            h=np.zeros(JOINTS),
+            q=np.zeros(JOINTS),
+            v=np.zeros(JOINTS),
+            p=np.zeros(JOINTS),
+            tau=np.zeros(JOINTS),
+        )
+
+
+STATUS = np.dtype(
+    [
+        ("armed", np.int64),  # 1: limits are compared
+        ("stops", np.int64),  # 1: the arms stay once a limit is passed
+        ("substeps", np.int64),  # since the control step began
+        ("passed_after", np.int64),  # so many of them a limit was passed first; 0: none was
+        ("braked", np.int64),  # substeps in which an arm was slowed down, added over the arms
+    ]
+)
+"""What became of the limits in a control step."""
 
 
 class SubstepLimits(NamedTuple):
     """Limits of the arms' load in every substep of a control step; changed in place."""
 
-    most: Floats  # (A, FELT) [N m], [N]
+    most: Floats  # (A, FELT) [N m], [N]; infinite for none
     load: Floats  # (1,) the largest share of a limit that was reached since the control step began
-    state: Ints  # (6,) see below
-    speed: Floats  # (A,) of the fastest point of an arm, from which on it is slowed down; infinite for none [m/s]
-
-
-ARMED, ACTS, SUBSTEPS, PASSED_IN, STAYED, BRAKED = range(6)
-"""Of ``SubstepLimits.state``: whether limits are compared; whether the arms stay once one is passed; substeps since the
-control step began; the first of them in which a limit was passed, -1 for none; whether the arms were stopped;
-in how many of them, counted for each arm, it was slowed down."""
-
-
-@structref.register
-class _BoundType(types.StructRef):
-    """The compiler's type of ``Bound``."""
-
-
-class Bound(structref.StructRefProxy):
-    """All that the compiled loop works on, in one object: ``parts`` is a tuple of it.
-
-    Numba takes an array apart at every call that it is given to, which for all of these together takes longer than some
-    substeps; it takes this apart once.
-    """
-
-    parts: tuple[Any, ...]
-
-
-structref.define_proxy(Bound, _BoundType, ["parts"])  # type: ignore[no-untyped-call]
+    status: Any  # (1,) of STATUS
+    speed: Floats  # (A,) of an arm's fastest point, beyond which it is slowed down [m/s]

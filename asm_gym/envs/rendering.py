@@ -26,7 +26,9 @@ class OffscreenRenderer:
     """
 
     def __init__(self, camera: str, width: int, height: int) -> None:
-        self.camera, self.width, self.height = camera, width, height
+        self.camera = camera
+        self.width = width
+        self.height = height
         self._model: mujoco.MjModel | None = None
         self._gl: Any = None
         self._camera = mujoco.MjvCamera()
@@ -40,8 +42,15 @@ class OffscreenRenderer:
         if self._model is not model:
             self._open(model)
         self._gl.make_current()
-        every = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, every, self._scene)
+        mujoco.mjv_updateScene(
+            m=model,
+            d=data,
+            opt=self._options,
+            pert=None,
+            cam=self._camera,
+            catmask=mujoco.mjtCatBit.mjCAT_ALL.value,
+            scn=self._scene,
+        )
         viewport = mujoco.MjrRect(0, 0, self.width, self.height)
         mujoco.mjr_render(viewport, self._scene, self._context)
         picture = np.empty((self.height, self.width, 3), np.uint8)
@@ -57,7 +66,8 @@ class OffscreenRenderer:
         atexit.register(_close_all)
         self._gl.make_current()
         model.vis.quality.offsamples = 0
-        model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
+        model.vis.global_.offwidth = self.width
+        model.vis.global_.offheight = self.height
         self._scene = mujoco.MjvScene(model, maxgeom=10_000)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
@@ -71,7 +81,8 @@ class OffscreenRenderer:
             if self._model is not None:
                 self._context.free()
             self._gl.free()
-        self._gl = self._model = None
+        self._gl = None
+        self._model = None
 
 
 def _close_all() -> None:

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.detection.contact_limits import ContactLimits
+from asm_gym.detection.contact_limits import LIMITED, ContactLimits
 from asm_gym.envs import backend, shapes
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.arms import PHYSICS_FREQ, chains_of
@@ -18,7 +18,7 @@ from asm_gym.envs.robots import mend_robots, robot_named, robots_for
 from asm_gym.envs.sensors import EXTRA_GROUPS, GROUPS, Senses
 from asm_gym.envs.simulation import Simulation
 from asm_gym.envs.stepping import SteppedEnv
-from asm_gym.spec import StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.tasks import task as task_spec
 from asm_gym.validation import (
     check_choice,
@@ -30,6 +30,30 @@ from asm_gym.validation import (
 )
 
 LARGEST_PICTURE = 4096  # height or width [pixels]
+
+
+def _check_groups(groups: Sequence[str]) -> None:
+    if isinstance(groups, str) or not isinstance(groups, Sequence):
+        raise ValueError(f"stream must be a sequence of names, got {short_repr(groups)}")
+    for group in groups:
+        check_text("stream group", group)
+        check_choice("stream group", group, (*GROUPS, *EXTRA_GROUPS))
+
+
+def _substeps_at(control_freq: int) -> int:
+    """Return the physics substeps of a control step; raise ValueError where that is no whole number."""
+    check_number("control_freq", control_freq, low=1, whole=True)
+    if PHYSICS_FREQ % control_freq:
+        raise ValueError(
+            f"control_freq must divide the physics rate of {PHYSICS_FREQ} Hz, got {control_freq}"
+        )
+    return PHYSICS_FREQ // control_freq
+
+
+def _check_picture(size: tuple[int, int]) -> None:
+    pixels = check_numbers("render_size", size, 2, low=1, high=LARGEST_PICTURE)
+    if (pixels % 1).any():
+        raise ValueError(f"render_size must be two whole numbers, got {short_repr(size)}")
 
 
 class RobosuiteEnv(SteppedEnv):
@@ -92,34 +116,16 @@ class RobosuiteEnv(SteppedEnv):
         self.robots = robots_for(self.task, robot)
         check_choice("render_mode", render_mode, (None, "rgb_array"))
         check_choice("observation", observation, ("flat", "dict"))
-        if isinstance(stream, str) or not isinstance(stream, Sequence):
-            raise ValueError(f"stream must be a sequence of names, got {short_repr(stream)}")
-        for group in stream:
-            check_choice(
-                "stream group", check_text("stream group", group), (*GROUPS, *EXTRA_GROUPS)
-            )
-        if (
-            check_number("control_freq", control_freq, low=1, whole=True)
-            and PHYSICS_FREQ % control_freq
-        ):
-            raise ValueError(
-                f"control_freq must divide the physics rate of {PHYSICS_FREQ} Hz, got {control_freq}"
-            )
-        super().__init__(PHYSICS_FREQ // control_freq)
-        if stream_freq is not None:
-            check_number("stream_freq", stream_freq, low=1, whole=True)
-        self._row_substeps = backend.row_substeps(
-            control_freq if stream_freq is None else stream_freq, control_freq
-        )
-        self.horizon = (
-            self.task.horizon
-            if horizon is None
-            else check_number("horizon", horizon, low=1, whole=True)
-        )
-        if (check_numbers("render_size", render_size, 2, low=1, high=LARGEST_PICTURE) % 1).any():
-            raise ValueError(
-                f"render_size must be two whole numbers, got {short_repr(render_size)}"
-            )
+        _check_groups(stream)
+        super().__init__(_substeps_at(control_freq))
+        if stream_freq is None:
+            stream_freq = control_freq
+        check_number("stream_freq", stream_freq, low=1, whole=True)
+        self._row_substeps = backend.row_substeps(stream_freq, control_freq)
+        if horizon is None:
+            horizon = self.task.horizon
+        self.horizon = check_number("horizon", horizon, low=1, whole=True)
+        _check_picture(render_size)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": control_freq}
         self.dt = 1.0 / control_freq
@@ -140,14 +146,12 @@ class RobosuiteEnv(SteppedEnv):
             check_flag("reward_shaping", reward_shaping),
         )
         """The simulator underneath."""
-        check_choice(
-            "camera", check_text("camera", camera), self.robosuite_env.sim.model.camera_names
-        )
+        cameras = self.robosuite_env.sim.model.camera_names
+        check_choice("camera", check_text("camera", camera), cameras)
         self._renderer = OffscreenRenderer(camera, render_size[1], render_size[0])
         self._bind()
-        self.hand_chains = chains_of(
-            self.simulation.parts, self.simulation.model, self.sensor_noise
-        )
+        parts = self.simulation.parts
+        self.hand_chains = chains_of(parts, self.simulation.model, self.sensor_noise)
         """Kinematic chains of the arms, as they were made."""
         self._actions = Actions(self.robosuite_env, self.task.name, self.controller)
         self._actions.begin_episode(self.simulation)
@@ -169,21 +173,16 @@ class RobosuiteEnv(SteppedEnv):
 
     def _build_spaces(self) -> None:
         channels = (*self.simulation.proprioception.channels, *self._objects.channels)
-        dt, source = self._row_substeps / PHYSICS_FREQ, "+".join(self.robots)
-        self._senses = Senses(
-            channels,
-            self._actions.size,
-            dt,
-            source,
-            self._groups,
-            self.sensor_noise,
-            flat=self._flat,
+        action = Channel("action", self._actions.size, group=MOTOR)
+        spec = StreamSpec(
+            channels=(*channels, action),
+            dt=self._row_substeps / PHYSICS_FREQ,
+            source="+".join(self.robots),
         )
+        self._senses = Senses(spec, self._groups, self.sensor_noise, self._flat)
         self.measured_spec = self._senses.measured_spec
         """Everything that is measured, whether or not the stream carries it."""
-        self.felt_channels = tuple(
-            c for c in channels if c.name.endswith(("external_torque", "wrist_force"))
-        )
+        self.felt_channels = tuple(c for c in channels if c.name.endswith(LIMITED))
         # the observation's parts in order, and how many numbers each has
         self.observation_layout = self._senses.sizes
         self.observation_space = self.laid_out_space = self._senses.space()
@@ -223,8 +222,9 @@ class RobosuiteEnv(SteppedEnv):
             backend.reseed(env, self.np_random)
             self._seeded = True
         backend.choose_object(env, self.task)
-        draws, nominal = seed is not None and self.task.draws_shapes, self.simulation.nominal
+        draws = seed is not None and self.task.draws_shapes
         # What others edit would be mixed up with what is drawn.
+        nominal = self.simulation.nominal
         edited = len(self.edits) > 0 or nominal.now() is not nominal.unedited
         env.hard_reset = draws and (edited or not shapes.draw(env))
         env.reset()
@@ -234,12 +234,14 @@ class RobosuiteEnv(SteppedEnv):
             self.simulation.begin_episode()
         self._actions.begin_episode(self.simulation)
         self._diverged = self._divergences()
-        self._steps_taken, self.holding = 0, False
+        self._steps_taken = 0
+        self.holding = False
         self.contact_limits = None
         self._limits_of_guards.clear()
         self._action = np.zeros(self._actions.size, np.float32)
         self._reading = self._read()
-        self._ended = self._solved = False
+        self._ended = False
+        self._solved = False
         return self._senses.observation(self._reading), self._info(bool(env._check_success()))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -257,15 +259,18 @@ class RobosuiteEnv(SteppedEnv):
         self._run(action)
         env.cur_time += env.control_timestep
         self._steps_taken += 1
-        reward, success = float(env._post_action(self._action)[0]), bool(env._check_success())
+        reward = float(env._post_action(self._action)[0])
+        success = bool(env._check_success())
         self._reading = self._read()
-        if unstable := self._divergences() != self._diverged or not (
-            self._finite and self._reading.row_finite
-        ):
+        is_finite = self._finite and self._reading.row_finite
+        unstable = not is_finite or self._divergences() != self._diverged
+        if unstable:
             # The simulation then holds MuJoCo's initial state as a rule, which no sensor of the robot could read.
-            self._reading.row[:] = self._reading.stream[:] = np.nan
+            self._reading.row[:] = np.nan
+            self._reading.stream[:] = np.nan
             self._reading.seen[:] = 0.0
-            reward, success = 0.0, False
+            reward = 0.0
+            success = False
         info = self._info(success, unstable)
         if self._row_substeps < self.substeps and "stream" in info:
             info["streams"] = np.stack([*self._rows, info["stream"]])
@@ -275,10 +280,15 @@ class RobosuiteEnv(SteppedEnv):
         return self._senses.observation(self._reading), reward, terminated, truncated, info
 
     def _info(self, success: bool, unstable: bool = False) -> dict[str, Any]:
-        stream = {"stream": self._reading.stream} if self._senses.stream_spec else {}
         self._solved |= success
-        done = {"success": success, "is_success": self._solved}
-        return {**stream, **done, **self._forces(unstable), "unstable": unstable}
+        info: dict[str, Any] = {}
+        if self._senses.stream_spec is not None:
+            info["stream"] = self._reading.stream
+        info["success"] = success
+        info["is_success"] = self._solved
+        info |= self._forces(unstable)
+        info["unstable"] = unstable
+        return info
 
     @property
     def stream_spec(self) -> StreamSpec:

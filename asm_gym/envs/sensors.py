@@ -8,6 +8,7 @@ at the end of the step.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
@@ -16,7 +17,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.envs import compiled_substeps as kernels
-from asm_gym.envs.mujoco_views import Views
+from asm_gym.envs.arms import Part, prefix_of
+from asm_gym.envs.mujoco_views import Floats, Ints, Views
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 if TYPE_CHECKING:
@@ -35,44 +37,45 @@ class _Sensor(NamedTuple):
     name: str
     group: str
     unit: str  # of fingers that slide; see ``_TURNING``
-    source: str  # a key of ``Proprioception._sources``
-    part: slice | str  # of a sample, or a key of ``_indices``
+    source: str  # an array of ``Proprioception.__init__``
+    part: slice | str  # of a sample, or a key of ``_places``
     noise: float = 0.0  # standard deviation [unit]
-    resolution: float = (
-        0.0  # step between readings [unit]; 0 for what is computed from several sensors
-    )
+    # step between readings [unit]; 0 for what is computed from several sensors
+    resolution: float = 0.0
 
 
+# 15 bits of a turn; the link-side encoders of DLR's light-weight arm, from which the iiwa descends [rad].
 _COUNT = np.deg2rad(0.01)
-"""[rad]: 15 bits of a turn; the link-side encoders of DLR's light-weight arm, from which the iiwa descends."""
 
-_FORCE, _TORQUE = (slice(kernels.WRENCH.start + i, kernels.WRENCH.start + i + 3) for i in (0, 3))
-_LINEAR, _ANGULAR = (
-    slice(kernels.VELOCITY.start + i, kernels.VELOCITY.start + i + 3) for i in (0, 3)
-)
+_FORCE = slice(kernels.WRENCH.start, kernels.WRENCH.start + 3)
+_TORQUE = slice(kernels.WRENCH.start + 3, kernels.WRENCH.stop)
+_LINEAR = slice(kernels.VELOCITY.start, kernels.VELOCITY.start + 3)
+_ANGULAR = slice(kernels.VELOCITY.start + 3, kernels.VELOCITY.stop)
 
 # About what a research arm's own sensors have. Resolutions: DLR, "Joint sensors of the light-weight robot" (0.01°);
 # Franka Emika, Panda data sheet (0.02 N m, 13 bits of ±87 N m); ATI Industrial Automation, Gamma SI-130-10 (±130 N in
 # steps of 1/20 N, ±10 N m in steps of 1/800 N m). A velocity is the difference of two counts, 50 ms apart. Mean and
 # peak come out of the sensor's own filter, in its steps. The rest is computed in floating point from several of these.
 _SENSORS = (
-    _Sensor("joint_position", "joint", "rad", "qpos", "joints", 2e-4, _COUNT),
-    _Sensor("joint_velocity", "joint", "rad/s", "qvel", "dofs", 3e-3, _COUNT / 0.05),
+    _Sensor("joint_position", "joint", "rad", "qpos", "joints", noise=2e-4, resolution=_COUNT),
+    _Sensor(
+        "joint_velocity", "joint", "rad/s", "qvel", "dofs", noise=3e-3, resolution=_COUNT / 0.05
+    ),
     _Sensor("commanded_torque", "torque", "N m", "ctrl", "motors"),
-    _Sensor("measured_torque", "torque", "N m", "mean", kernels.MOTOR, 0.1, 0.02),
-    _Sensor("external_torque", "torque", "N m", "mean", kernels.EXTERNAL, 0.15),
-    _Sensor("external_torque_peak", "torque", "N m", "peak", kernels.EXTERNAL, 0.3),
-    _Sensor("hand_position", "hand", "m", "site", "hand", 3e-4),
-    _Sensor("hand_orientation", "hand", "1", "body", "turn", 5e-4),
-    _Sensor("hand_velocity", "hand", "m/s", "last", _LINEAR, 3e-3),
-    _Sensor("hand_angular_velocity", "hand", "rad/s", "last", _ANGULAR, 1e-2),
-    _Sensor("wrist_force", "wrench", "N", "mean", _FORCE, 0.2, 1 / 20),
-    _Sensor("wrist_torque", "wrench", "N m", "mean", _TORQUE, 0.01, 1 / 800),
-    _Sensor("wrist_force_peak", "wrench", "N", "peak", _FORCE, 0.4, 1 / 20),
-    _Sensor("wrist_torque_peak", "wrench", "N m", "peak", _TORQUE, 0.02, 1 / 800),
-    _Sensor("gripper_opening", "gripper", "m", "qpos", "fingers", 2e-4),
-    _Sensor("gripper_velocity", "gripper", "m/s", "qvel", "finger_dofs", 2e-3),
-    _Sensor("gripper_force", "gripper", "N", "force", "finger_dofs", 0.2),
+    _Sensor("measured_torque", "torque", "N m", "mean", kernels.MOTOR, noise=0.1, resolution=0.02),
+    _Sensor("external_torque", "torque", "N m", "mean", kernels.EXTERNAL, noise=0.15),
+    _Sensor("external_torque_peak", "torque", "N m", "peak", kernels.EXTERNAL, noise=0.3),
+    _Sensor("hand_position", "hand", "m", "site", "hand", noise=3e-4),
+    _Sensor("hand_orientation", "hand", "1", "body", "turn", noise=5e-4),
+    _Sensor("hand_velocity", "hand", "m/s", "last", _LINEAR, noise=3e-3),
+    _Sensor("hand_angular_velocity", "hand", "rad/s", "last", _ANGULAR, noise=1e-2),
+    _Sensor("wrist_force", "wrench", "N", "mean", _FORCE, noise=0.2, resolution=1 / 20),
+    _Sensor("wrist_torque", "wrench", "N m", "mean", _TORQUE, noise=0.01, resolution=1 / 800),
+    _Sensor("wrist_force_peak", "wrench", "N", "peak", _FORCE, noise=0.4, resolution=1 / 20),
+    _Sensor("wrist_torque_peak", "wrench", "N m", "peak", _TORQUE, noise=0.02, resolution=1 / 800),
+    _Sensor("gripper_opening", "gripper", "m", "qpos", "fingers", noise=2e-4),
+    _Sensor("gripper_velocity", "gripper", "m/s", "qvel", "finger_dofs", noise=2e-3),
+    _Sensor("gripper_force", "gripper", "N", "force", "finger_dofs", noise=0.2),
     _Sensor("contact_force", "contact", "N", "mean", kernels.CONTACT),
     _Sensor("contact_force_peak", "contact", "N", "peak", kernels.CONTACT),
 )
@@ -82,9 +85,11 @@ _TURNING = {"m": "rad", "m/s": "rad/s", "N": "N m"}  # units of a gripper whose 
 class Proprioception:
     """Everything that the arms of one loaded model measure."""
 
-    def __init__(self, parts: list[tuple[Any, str]], views: Views, data: mujoco.MjData) -> None:
+    def __init__(self, parts: list[Part], views: Views, data: mujoco.MjData) -> None:
         shape = (len(parts), kernels.SAMPLE)
-        self.mean, self.peak, self.last = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+        self.mean = np.zeros(shape)
+        self.peak = np.zeros(shape)
+        self.last = np.zeros(shape)
         sources = {
             "mean": self.mean.ravel(),
             "peak": self.peak.ravel(),
@@ -97,76 +102,105 @@ class Proprioception:
             "body": data.xmat.ravel(),
         }
         self.sources = tuple(sources.values())  # arrays that the sensors read
-        channels, where, names = [], [], list(sources)
-        for i, (robot, arm) in enumerate(parts):
-            indices, slides, stops = _indices(robot, arm)
-            joints = len(indices["joints"])
+        names = list(sources)
+        channels: list[Channel] = []
+        where: list[tuple[int, int]] = []
+        for a, part in enumerate(parts):
+            places = _places(part)
             for sensor in _SENSORS:
-                if isinstance(sensor.part, str):
-                    at = indices[sensor.part]
-                else:
-                    at = np.arange(sensor.part.start, sensor.part.stop) + i * kernels.SAMPLE
-                    at = at[:joints] if sensor.group == "torque" else at
-                if not len(at):
-                    continue
-                unit = (
-                    _TURNING[sensor.unit]
-                    if sensor.group == "gripper" and not slides
-                    else sensor.unit
-                )
-                name = (f"robot{i}_" if len(parts) > 1 else "") + sensor.name
-                ends = stops if sensor.name == "joint_position" else ()
-                about = len(at), unit, sensor.noise, sensor.group
-                channels.append(Channel(name, *about, resolution=sensor.resolution, stops=ends))
-                where += [(names.index(sensor.source), int(k)) for k in at]
+                indices = _indices(sensor, a, places)
+                if len(indices) > 0:
+                    prefix = prefix_of(a, len(parts))
+                    channels.append(_channel(sensor, prefix, len(indices), part))
+                    where += [(names.index(sensor.source), int(i)) for i in indices]
         self.channels = tuple(channels)
         # (P, 2) of each number its source and its index there
         self.where = np.array(where, np.int64)
 
 
-def _indices(
-    robot: Any, arm: str
-) -> tuple[dict[str, NDArray[np.intp]], bool, tuple[tuple[float, float], ...]]:
-    """Return where an arm's sensors read, whether its fingers slide, and the joints' stops where any has some [rad]."""
+def _places(part: Part) -> dict[str, Any]:
+    """Return where in their sources an arm's sensors read, by ``_Sensor.part``."""
+    robot, arm = part
     model = robot.sim.model._model
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, robot.robot_model.eef_name[arm])
-    fingers = robot.gripper[arm].joints
-    finger_dofs = np.asarray(robot._ref_gripper_joint_vel_indexes[arm] if fingers else [], np.intp)
-    indices = {
+    places = {
         "joints": robot._ref_joint_pos_indexes,
         "dofs": robot._ref_joint_vel_indexes,
         "motors": robot._ref_actuators_indexes_dict[arm],
         "hand": 3 * robot.eef_site_id[arm] + np.arange(3),
         # The first two columns of the rotation: six numbers that turn smoothly, where a quaternion flips its sign.
-        "turn": 9 * body + np.array([0, 3, 6, 1, 4, 7]),
-        "fingers": robot._ref_gripper_joint_pos_indexes[arm] if fingers else [],
-        "finger_dofs": finger_dofs,
+        "turn": 9 * model.body(robot.robot_model.eef_name[arm]).id + np.array([0, 3, 6, 1, 4, 7]),
+        "fingers": (),
+        "finger_dofs": (),
     }
-    slides = all(
-        model.jnt_type[model.dof_jntid[d]] == mujoco.mjtJoint.mjJNT_SLIDE for d in finger_dofs
+    if robot.gripper[arm].joints:
+        places["fingers"] = robot._ref_gripper_joint_pos_indexes[arm]
+        places["finger_dofs"] = robot._ref_gripper_joint_vel_indexes[arm]
+    return places
+
+
+def _indices(sensor: _Sensor, a: int, places: dict[str, Any]) -> Any:
+    """Return the indices in its source that a sensor of arm ``a`` reads; none where the arm has no such part."""
+    if isinstance(sensor.part, str):
+        return places[sensor.part]
+    indices = np.arange(sensor.part.start, sensor.part.stop) + a * kernels.SAMPLE
+    if sensor.group == "torque":
+        return indices[: len(places["joints"])]
+    return indices
+
+
+def _channel(sensor: _Sensor, prefix: str, size: int, part: Part) -> Channel:
+    """Return the channel of a sensor."""
+    unit = sensor.unit
+    if sensor.group == "gripper" and not _fingers_slide(part):
+        unit = _TURNING[unit]
+    stops: tuple[tuple[float, float], ...] = ()
+    if sensor.name == "joint_position":
+        stops = _joint_stops(part)
+    return Channel(
+        name=prefix + sensor.name,
+        size=size,
+        unit=unit,
+        noise=sensor.noise,
+        group=sensor.group,
+        resolution=sensor.resolution,
+        stops=stops,
     )
+
+
+def _fingers_slide(part: Part) -> bool:
+    robot, arm = part
+    model = robot.sim.model._model
+    joints = model.dof_jntid[robot._ref_gripper_joint_vel_indexes[arm]]
+    return bool((model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE).all())
+
+
+def _joint_stops(part: Part) -> tuple[tuple[float, float], ...]:
+    """Return the least and the most of each joint [rad]; none where no joint has stops."""
+    robot, _ = part
+    model = robot.sim.model._model
     joints = robot._ref_joint_indexes
-    ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], (-np.inf, np.inf))
-    stops = (
-        tuple((float(low), float(high)) for low, high in ranges)
-        if model.jnt_limited[joints].any()
-        else ()
-    )
-    return {name: np.asarray(at, np.intp) for name, at in indices.items()}, slides, stops
+    limited = model.jnt_limited[joints].astype(bool)
+    if not limited.any():
+        return ()
+    ranges = np.where(limited[:, None], model.jnt_range[joints], (-np.inf, np.inf))
+    return tuple((float(low), float(high)) for low, high in ranges)
 
 
 # Channels of the robot that a policy observes: configuration and motion, no torques.
 _OBSERVED = (
-    *("joint_position", "joint_velocity", "hand_position", "hand_orientation"),
-    *("gripper_opening", "gripper_velocity"),
+    "joint_position",
+    "joint_velocity",
+    "hand_position",
+    "hand_orientation",
+    "gripper_opening",
+    "gripper_velocity",
 )
-_BOUND = 100.0  # observations are clipped to this, which keeps the Box true; nothing a task does comes near it
 
 
 class Reading(NamedTuple):
     """One row of measurements."""
 
-    row: NDArray[np.float64]  # (M,) everything
+    row: Floats  # (M,) everything
     stream: NDArray[np.float32]  # (D,) the part that the stream carries
     seen: NDArray[np.float32]  # (S,) the part that is observed; finite whatever the row holds
     row_finite: bool  # before faults
@@ -174,41 +208,46 @@ class Reading(NamedTuple):
 
 
 class Senses:
-    """Reads the sensors of one environment."""
+    """Reads the sensors of one environment.
+
+    Args:
+        spec: everything that is measured, whether or not the stream carries it.
+        groups: of the channels that the stream carries.
+        noise: scale of the sensors' noise; at 0 readings are exact, without resolution.
+        flat: observations are one array, not a dict of named ones.
+    """
 
     def __init__(
-        self,
-        channels: Sequence[Channel],  # of the arms and objects
-        actions: int,  # size of an action
-        dt: float,
-        source: str,
-        groups: Sequence[str],  # of the channels that the stream carries
-        noise: float,  # scale of the sensors' noise; at 0 readings are exact, without resolution
-        flat: bool,  # observations are one array, not a dict of named ones
+        self, spec: StreamSpec, groups: Sequence[str], noise: float, flat: bool = True
     ) -> None:
-        spec = self.measured_spec = StreamSpec(
-            (*channels, Channel("action", actions, "1", 0.0, MOTOR)), dt, source
-        )
-        """Everything that is measured, whether or not the stream carries it."""
+        self.measured_spec = spec
         chosen = tuple(c for c in spec.channels if c.group in groups)
-        self.stream_spec = StreamSpec(chosen, dt, source) if chosen else None
+        self.stream_spec: StreamSpec | None = None
+        if chosen:
+            self.stream_spec = replace(spec, channels=chosen)
         self._carried = _columns(spec, [c.name for c in chosen])
         self._noise = spec.noise * noise
-        self._steps = spec.resolution if noise else np.zeros(spec.size)
+        self._steps = spec.resolution
+        if noise == 0:
+            self._steps = np.zeros(spec.size)
         self._needs_objects = "object" in groups
+
         names = [c.name for c in spec.channels if c.name.endswith(_OBSERVED) or c.group == "object"]
         self._observed = _columns(spec, names)
         self._flat = flat
-        self.sizes = {name: spec.slices[name].stop - spec.slices[name].start for name in names}
+        self.sizes: dict[str, int] = {}
         """The observation's parts in order, and how many numbers each has."""
-        ends = np.cumsum([0, *self.sizes.values()]).tolist()
-        self._parts = dict(zip(names, map(slice, ends, ends[1:]), strict=False))
+        self._parts: dict[str, slice] = {}
+        start = 0
+        for name in names:
+            size = spec.slices[name].stop - spec.slices[name].start
+            self.sizes[name] = size
+            self._parts[name] = slice(start, start + size)
+            start += size
 
     def read(
         self,
-        sense: Callable[
-            [NDArray[np.float64], NDArray[np.float64], np.random.Generator], NDArray[np.float64]
-        ],
+        sense: Callable[[Floats, Floats, np.random.Generator], Floats],
         objects: ObjectSensors,
         action: NDArray[np.float32],
         faults: Sequence[Corruption],
@@ -221,21 +260,28 @@ class Senses:
         """
         if faults or self._needs_objects or not within_step:
             self._object_poses = objects.read()
-        row = sense(
-            np.concatenate([*self._object_poses, action], dtype=np.float64), self._noise, rng
+        beside = np.concatenate([*self._object_poses, action], dtype=np.float64)
+        row = sense(beside, self._noise, rng)
+        if faults:
+            was_finite = bool(np.isfinite(row).all())
+            for corrupt in faults:
+                corrupt(row)
+
+        stream = np.empty(len(self._carried), np.float32)
+        observed = np.empty(len(self._observed), np.float32)
+        row_finite, stream_finite = kernels.finish(
+            row, self._steps, self._carried, stream, self._observed, observed
         )
-        # a fault that reads NaN is no fault of the simulation
-        sound = bool(np.isfinite(row).all()) if faults else None
-        for corrupt in faults:
-            corrupt(row)
-        stream, seen = (
-            np.empty(len(self._carried), np.float32),
-            np.empty(len(self._observed), np.float32),
+        if faults:  # a fault that reads NaN is no fault of the simulation
+            row_finite = was_finite
+            stream_finite = was_finite
+        return Reading(
+            row=row,
+            stream=stream,
+            seen=observed,
+            row_finite=row_finite,
+            stream_finite=stream_finite,
         )
-        finite = kernels.finish(
-            row, self._steps, self._carried, stream, self._observed, _BOUND, seen
-        )
-        return Reading(row, stream, seen, *(finite if sound is None else (sound, sound)))
 
     def space(self) -> spaces.Space[Any]:
         """Return the space of observations."""
@@ -245,16 +291,17 @@ class Senses:
 
     def observation(self, reading: Reading) -> Any:
         """Return the observation of a reading."""
-        return (
-            reading.seen
-            if self._flat
-            else {name: reading.seen[part] for name, part in self._parts.items()}
-        )
+        if self._flat:
+            return reading.seen
+        return {name: reading.seen[part] for name, part in self._parts.items()}
 
 
 def _box(size: int) -> spaces.Space[Any]:
-    return spaces.Box(-_BOUND, _BOUND, (size,), np.float32)
+    # Clipped to these bounds, observations are within the Box.
+    return spaces.Box(-kernels.OBSERVED_BOUND, kernels.OBSERVED_BOUND, (size,), np.float32)
 
 
-def _columns(spec: StreamSpec, names: list[str]) -> NDArray[np.intp]:
-    return np.array([i for n in names for i in range(spec.size)[spec.slices[n]]], dtype=np.intp)
+def _columns(spec: StreamSpec, names: list[str]) -> Ints:
+    numbers = np.arange(spec.size)
+    columns = [numbers[:0], *(numbers[spec.slices[name]] for name in names)]
+    return np.concatenate(columns)

@@ -7,7 +7,6 @@ its own shapes is written into the model; what depends on other bodies too, MuJo
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
 from copy import deepcopy
 from typing import Any
 from xml.etree import ElementTree
@@ -37,14 +36,17 @@ def draw(env: Any) -> bool:
     # Sized as robosuite 1.5.2 does [m].
     cube = objects.BoxObject("cube", size_min=[0.020] * 3, size_max=[0.022] * 3, rng=env.rng)
     vars(env.cube).update(vars(cube))
-    model, data, alone = env.sim.model._model, env.sim.data._data, _compiled_alone(env, cube)
-    bodies = (m.body(cube.root_body).id for m in (model, alone))
-    for (name, live), (_, drawn) in zip(*map(_rows, (model, alone), bodies), strict=True):
-        if live.shape != drawn.shape:
+    model = env.sim.model._model
+    alone = _compiled_alone(env, cube)
+    drawn = _rows(alone, alone.body(cube.root_body).id)
+    for name, live in _rows(model, model.body(cube.root_body).id).items():
+        if live.shape != drawn[name].shape:
             raise RuntimeError(
-                f"{name} of the cube has {len(live)} rows, and {len(drawn)} when drawn anew"
+                f"{name} of the cube has {len(live)} rows, and {len(drawn[name])} when drawn anew"
             )
-        live[:] = drawn
+        live[:] = drawn[name]
+
+    data = env.sim.data._data
     mujoco.mj_resetData(model, data)
     mujoco.mj_setConst(model, data)
     return True
@@ -61,10 +63,16 @@ def _compiled_alone(env: Any, thing: Any) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
 
 
-def _rows(model: mujoco.MjModel, body: int) -> Iterator[tuple[str, NDArray[np.generic]]]:
-    """Views of what the compiler found of one body's own shapes."""
+def _rows(model: mujoco.MjModel, body: int) -> dict[str, NDArray[np.generic]]:
+    """Return views of what the compiler found of one body's own shapes, by name."""
+    rows: dict[str, NDArray[np.generic]] = {}
     for kind, names in _OWN.items():
-        first = body if kind == "body" else int(getattr(model, f"body_{kind}adr")[body])
-        count = 1 if kind == "body" else int(getattr(model, f"body_{kind}num")[body])
+        first = body
+        count = 1
+        if kind != "body":
+            first = int(getattr(model, f"body_{kind}adr")[body])
+            count = int(getattr(model, f"body_{kind}num")[body])
         for name in names:
-            yield f"{kind}_{name}", getattr(model, f"{kind}_{name}")[first : first + count]
+            array = f"{kind}_{name}"
+            rows[array] = getattr(model, array)[first : first + count]
+    return rows

@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import must_compile
+from asm_gym.compilation import Bound, bind, must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, controller_of, describe, describe_inputs, is_compilable
-from asm_gym.envs.commands import move_gripper, scaling_of
+from asm_gym.envs.commands import Gripper
 from asm_gym.envs.control import HELD
 from asm_gym.envs.mujoco_views import (
-    ACTS,
-    ARMED,
-    BRAKED,
     FELT,
+    GOAL,
     JOINTS,
-    PASSED_IN,
-    Bound,
+    STATUS,
     Floats,
-    Goals,
     NominalViews,
     SubstepLimits,
     Views,
     Work,
+    records,
 )
 from asm_gym.envs.nominal_dynamics import NominalDynamics
 from asm_gym.envs.sensors import Proprioception
@@ -59,7 +56,10 @@ class Simulation:
         self.speed_limits = np.full(n, np.inf)
         """(A,) speed of the fastest point of an arm, from which on it is slowed down [m/s]."""
         self._limits = SubstepLimits(
-            np.full((n, FELT), np.inf), np.zeros(1), np.zeros(6, np.int64), self.speed_limits
+            most=np.full((n, FELT), np.inf),
+            load=np.zeros(1),
+            status=records(1, STATUS),
+            speed=self.speed_limits,
         )
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.contact_force = 0.0
@@ -80,7 +80,7 @@ class Simulation:
         self.dofs = np.concatenate([robot._ref_joint_vel_indexes for robot, _ in self.parts])
         """Places of the arms' joints among the velocities."""
         self._work = Work.empty()
-        self._bound: tuple[NominalViews, Bound] | None = None
+        self._bound_nominal: NominalViews | None = None  # that ``_bound`` holds
         self._take_up_controllers()
         self._forget_limits()
 
@@ -97,64 +97,71 @@ class Simulation:
         # whether control runs compiled
         self.compiled = all(is_compilable(part) for part in self.parts)
         self.arms = describe(self.parts, self.model)
+        self._goals = records(len(self.parts), GOAL)
         self.controllers = [controller_of(part) for part in self.parts]
         """Robosuite's, of each arm."""
         self.moves: list[slice] = []
         """Each arm's part of the action, asked for once an episode: robosuite makes it anew at every look."""
-        self._grips: list[Callable[[Floats], None]] = []
+        self._grippers: list[Gripper] = []
         start = 0
         for a, (robot, arm) in enumerate(self.parts):
             low, high = robot._action_split_indexes[arm]
             move = slice(start + low, start + high)
             self.moves.append(move)
-            describe_inputs(self.arms, a, self.model, self.controllers[a], move)
-            grip = self._gripper(start, robot, arm)
-            if grip is not None:
-                self._grips.append(grip)
+            describe_inputs(self.arms[a], self.model, self.controllers[a], move)
+            low, high = robot._action_split_indexes.get(robot.get_gripper_name(arm), (0, 0))
+            if low < high:
+                part = slice(start + low, start + high)
+                self._grippers.append(Gripper(robot, arm, part, self.views))
             start += robot.action_dim
-        self._goals = Goals.of(len(self.parts), start)
+        self._action = np.zeros(start)  # in robosuite's units
 
     def _forget_limits(self) -> None:
         self.speed_limits[:] = np.inf
-        self._limits.state[:] = 0, 0, 0, -1, 0, 0
+        self._limits.status[:] = 0
         self._limits_set: ContactLimits | None = None
-        # Arm and index in the limits of each number that limits apply to, and its column in a sample.
-        used = np.ones((len(self.parts), FELT), bool)
-        for a, joints in enumerate(self.arms.joints):
-            used[a, joints:JOINTS] = False
-        self._limited = np.nonzero(used)
-        number = self._limited[1]
-        self._columns = np.where(number < JOINTS, number, number - JOINTS + kernels.WRENCH.start)
+        # Arm, and column of a sample, of each number that limits apply to.
+        columns = np.arange(FELT)
+        is_limited = (columns >= JOINTS) | (columns < self.arms.joints[:, None])
+        self._limited = np.nonzero(is_limited)
 
     def begin(self, limits: ContactLimits | None = None, limited: Sequence[Channel] = ()) -> None:
         """Begin a control step under ``limits`` of the ``limited`` channels."""
-        self._done = self._row_began = 0
-        self._limits.state[:] = 0, 0, 0, -1, 0, 0
-        self._pressed, self._limits.load[0] = self.load > 1.0, 0.0
-        if limits is not None:
-            if limits is not self._limits_set:
-                self._limits.most[self._limited], self._limits_set = limits.most(limited), limits
-            self._limits.state[ARMED], self._limits.state[ACTS] = 1, limits.stays
+        self._done = 0
+        self._row_began = 0
         self._force_before = 0.0
+        self._pressed = self.load > 1.0
+        self._limits.load[0] = 0.0
+        self._limits.status[:] = 0
+        if limits is None:
+            return
+        if limits is not self._limits_set:
+            self._limits.most[self._limited] = limits.most(limited)
+            self._limits_set = limits
+        self._limits.status.armed = True
+        self._limits.status.stops = limits.stays
 
-    def command(self, action: NDArray[np.float64], hold: bool = False) -> None:
+    def command(self, action: Floats, hold: bool = False) -> None:
         """Give the controllers a new set-point, which they take up in the next substep.
 
         Args:
+            action: (A,) in robosuite's units.
             hold: the arms are to stay, which no action says: one of no change follows a push, a torque of zero brakes
                 nothing. So they are braked beneath their controllers (``control.brake``).
         """
+        held = self._goals.held
         if hold:
-            self._goals.held[self._goals.held == 0] = HELD
+            held[held == 0] = HELD
         else:
-            self._goals.held[:] = 0
-        self._goals.action[:] = action
+            held[:] = 0
+        self._action[:] = action
         self._fresh = True
-        if self.compiled and not (
-            hold and self._pressed
-        ):  # fingers that close on a table would lift the hand
-            for grip in self._grips:
-                grip(action)
+
+        # Fingers that close on a table would lift the hand.
+        stays_open = hold and self._pressed
+        if self.compiled and not stays_open:
+            for gripper in self._grippers:
+                gripper.command(action)
 
     def advance(self, count: int) -> None:
         """Run ``count`` substeps of the control step that was begun."""
@@ -175,30 +182,34 @@ class Simulation:
         for k in range(first, first + count):
             nominal = self.nominal.now()
             self.env.sim.step1()
-            self.env._pre_action(self._goals.action.copy(), self._fresh)
+            self.env._pre_action(self._action.copy(), self._fresh)
             if self._goals.held.any() or self.speed_limits.min() < np.inf:
                 kernels.brake_beneath(
                     self.views, nominal, self.arms, self._goals, self._work, self._limits
                 )
             self.env.sim.step2()
             kernels.sample(self.views, nominal, self.arms, k, self._samples)
-            kernels.feel(self.arms.joints, self._limits, self._goals.held, k, self._samples)
+            kernels.feel(self._goals, self._limits, k, self._samples)
             self._fresh = False
 
     def _run(self, count: int) -> None:
         nominal = self.nominal.now()
-        if self._bound is None or self._bound[0] is not nominal:
-            state = (
-                self.views,
-                nominal,
-                self.arms,
-                self._goals,
-                self._work,
-                self._limits,
-                self._samples,
-            )
-            self._bound = nominal, kernels.bind(*state)
-        kernels.run(self._bound[1], self._fresh, self._done - self._row_began, count)
+        if nominal is not self._bound_nominal:
+            self._bind(nominal)
+        kernels.run(self._bound, self._fresh, self._done - self._row_began, count)
+
+    def _bind(self, nominal: NominalViews) -> None:
+        self._bound_nominal = nominal
+        self._bound: Bound = bind(
+            self.views,
+            nominal,
+            self.arms,
+            self._goals,
+            self._work,
+            self._limits,
+            self._action,
+            self._samples,
+        )
 
     def begin_row(self) -> None:
         """Begin another row of the stream; the contact force goes on to be that of the whole control step."""
@@ -208,8 +219,10 @@ class Simulation:
     @property
     def passed_limit(self) -> int | None:
         """The first substep of the control step in which a limit was passed; None for none."""
-        first = int(self._limits.state[PASSED_IN])
-        return None if first < 0 else first
+        passed_after = int(self._limits.status[0]["passed_after"])
+        if passed_after == 0:
+            return None
+        return passed_after - 1
 
     @property
     def load(self) -> float:
@@ -219,21 +232,22 @@ class Simulation:
     @property
     def braked(self) -> float:
         """The share of the control step's substeps in which an arm was slowed down beneath its controller."""
-        return float(self._limits.state[BRAKED]) / max(1, self._done * len(self.parts))
+        return float(self._limits.status[0]["braked"]) / max(1, self._done * len(self.parts))
 
     @property
-    def felt(self) -> NDArray[np.float64]:
+    def felt(self) -> Floats:
         """(K, N) noiseless loads in each substep since the row began: of each arm the external torque of its joints
         [N m], then the force at its wrist [N]."""
-        return self._samples[self._limited[0], : self._done - self._row_began, self._columns].T
+        arms, columns = self._limited
+        return self._samples[arms, : self._done - self._row_began, columns].T
 
     @property
     def felt_mean(self) -> Floats:
         """(N,) their means over the substeps that ``sense`` has summarised last."""
-        return self.proprioception.mean[self._limited[0], self._columns]
+        return self.proprioception.mean[self._limited]
 
     @property
-    def contact_forces(self) -> NDArray[np.float64]:
+    def contact_forces(self) -> Floats:
         """(K,) the largest net contact force on an arm in each substep since the row began [N]; no sensor tells it."""
         forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
         return np.linalg.norm(forces, axis=2).max(axis=0)
@@ -249,65 +263,30 @@ class Simulation:
 
     def _add_up(self, count: int) -> None:
         """Summarise ``count`` substeps, and take the force of the row into that of the control step; NaN stays."""
-        p, before = self.proprioception, self._force_before
-        force = kernels.summarise(self._samples, count, p.mean, p.peak, p.last)
-        self.contact_force = force if force != force or force > before else before
+        own = self.proprioception
+        self.contact_force = kernels.summarise(self._samples, count, own.mean, own.peak, own.last)
+        if self.contact_force <= self._force_before:
+            self.contact_force = self._force_before
 
-    def _remember(self, wrenches: list[NDArray[np.float64]]) -> None:
+    def _remember(self, wrenches: list[Floats]) -> None:
         """Fill the buffers that robosuite fills in the first substep; the acceleration is its running estimate."""
-        for (robot, arm), wrench, sample in zip(
-            self.parts, wrenches, self._samples[:, 0], strict=True
-        ):
+        for a, (robot, arm) in enumerate(self.parts):
             velocities = robot.recent_ee_vel_buffer[arm]
-            robot.recent_ee_forcetorques[arm].push(wrench)
-            velocities.push(sample[kernels.VELOCITY])
+            robot.recent_ee_forcetorques[arm].push(wrenches[a])
+            velocities.push(self._samples[a, 0, kernels.VELOCITY])
             changes = robot.control_freq * np.diff(velocities.buf, axis=0)
             recent = np.vstack([robot.recent_ee_acc[arm].current, changes])
             robot.recent_ee_acc[arm].push(recent.mean(axis=0))
 
-    def _gripper(
-        self, start: int, robot: Any, arm: str
-    ) -> Callable[[NDArray[np.float64]], None] | None:
-        """Return a function that moves the gripper of an arm by an action whose part of this robot is at ``start``."""
-        name = robot.get_gripper_name(arm)
-        low, high = robot._action_split_indexes.get(name, (0, 0))
-        if low == high:
-            return None
-        controller, motors = (
-            robot.composite_controller.part_controllers[name],
-            robot._ref_actuators_indexes_dict[name],
-        )
-        c, gripper, ctrl, motors = (
-            controller,
-            robot.gripper[arm],
-            self.views.ctrl,
-            np.asarray(motors, np.int64),
-        )
-        scaling = scaling_of(c, c.control_dim)[None]
-        middle, half = (
-            0.5 * (c.actuator_max + c.actuator_min),
-            0.5 * (c.actuator_max - c.actuator_min),
-        )
-        ranges = np.array([middle, half, *self.views.actuator_ctrlrange[motors].T])
-
-        def move(action: NDArray[np.float64]) -> None:
-            # As robosuite's controller does it, less its reading of the joints, which nothing here uses.
-            asked = np.asarray(
-                gripper.format_action(action[start + low : start + high]), np.float64
-            )
-            move_gripper(asked, scaling, ranges, motors, ctrl)
-
-        return move
-
     def hand_change(self, a: int, turns: Floats) -> Floats:
         """Return the change (6,) of the pose of arm ``a``'s hand, in the frame of actions, by turns (n,) of joints."""
+        arm = self.arms[a]
         jacobian = np.zeros((6, self.model.nv))
-        mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], int(self.arms.site[a]))
-        change = jacobian[:, self.arms.dofs[a, : len(turns)]] @ turns
-        base = int(self.arms.base[a])
-        if base < 0:
+        mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], arm.site)
+        change = jacobian[:, arm.dofs[: len(turns)]] @ turns
+        if arm.frame < 0:
             return change
-        frame = self.data.site_xmat[base].reshape(3, 3)
+        frame = self.data.site_xmat[arm.frame].reshape(3, 3)
         return np.concatenate([frame.T @ change[:3], frame.T @ change[3:]])
 
     @property

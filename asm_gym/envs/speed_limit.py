@@ -24,20 +24,19 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled, inner
+from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed import SpeedLimit, allowed_share
-from asm_gym.envs.compiled_substeps import bind
-from asm_gym.envs.control import REACHES
-from asm_gym.envs.mujoco_views import JOINT_ANGLES, UNKNOWN_CHANGE, Arms, Bound, Floats, Views
+from asm_gym.envs.control import REACHES, length
+from asm_gym.envs.mujoco_views import JOINT_ANGLES, UNKNOWN_CHANGE, Arm, Arms, Floats, Views
 
-BESIDE = (
-    0.3  # nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m]
-)
+# Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].
+BESIDE = 0.3
 LIGHT = 1e-12  # no inverse mass is taken to be less [1/kg]
 
-ASKED, PRESENT = range(2)
-"""Rows of ``Motions``: what the action asks for, and what the hand does now."""
+# Rows of ``Motions``.
+ASKED = 0  # what the action asks for
+PRESENT = 1  # what the hand does now
 
 Action = NDArray[np.float32]
 
@@ -114,52 +113,42 @@ def add_direction(views: Views, base: int, number: int, speed: float, twist: Flo
     column = number % 3
     first = number - column  # 0 for linear, 3 for angular velocity
     for axis in range(3):
-        cosine = 0.0
+        cosine = 1.0 * (axis == column)
         if base >= 0:
             cosine = views.site_xmat[base, 3 * axis + column]
-        elif axis == column:
-            cosine = 1.0
         twist[first + axis] += cosine * speed
 
 
 @partial(inner, inlined=True)
 def read_asked(
     views: Views,
-    arms: Arms,
-    a: int,
+    arm: Arm,
     rest: Action,
     action: Action,
     motions: Motions,
 ) -> None:
-    """Write the twist that the action asks of arm ``a``'s hand."""
+    """Write the twist that the action asks of an arm's hand."""
     twist = motions.twists[ASKED]
     for axis in range(6):
         twist[axis] = 0.0
-    for i in range(arms.inputs[a]):
-        number = arms.first[a] + i
-        speed = arms.speeds[a, i] * (action[number] - rest[number])
-        if arms.changes[a] == JOINT_ANGLES:
-            add_joint(motions.jacobian, arms.dofs[a, i], speed, twist)
+    for i in range(arm.inputs):
+        number = arm.first + i
+        speed = arm.speeds[i] * (action[number] - rest[number])
+        if arm.changes == JOINT_ANGLES:
+            add_joint(motions.jacobian, arm.dofs[i], speed, twist)
         else:
-            add_direction(views, arms.base[a], i, speed, twist)
+            add_direction(views, arm.frame, i, speed, twist)
 
 
 @partial(inner, inlined=True)
-def read_present(views: Views, arms: Arms, a: int, motions: Motions) -> None:
-    """Write the twist that arm ``a``'s hand has now."""
+def read_present(views: Views, arm: Arm, motions: Motions) -> None:
+    """Write the twist that an arm's hand has now."""
     twist = motions.twists[PRESENT]
     for axis in range(6):
         twist[axis] = 0.0
-    for i in range(arms.joints[a]):
-        dof = arms.dofs[a, i]
+    for i in range(arm.joints):
+        dof = arm.dofs[i]
         add_joint(motions.jacobian, dof, views.qvel[dof], twist)
-
-
-@inner
-def length(vector: Floats) -> float:
-    """Return the length of three numbers."""
-    x, y, z = vector
-    return np.sqrt(x * x + y * y + z * z)
 
 
 @inner
@@ -192,7 +181,7 @@ def share_of(
 ) -> float:
     """Return the share that arm ``a``'s hand may have of a motion."""
     twist = motions.twists[row]
-    place = views.site_xpos[arms.site[a]]
+    place = views.site_xpos[arms[a].site]
     along = 0.0
     if limit.grid.size > 0:
         along = momentum(views, motions, row)
@@ -200,20 +189,20 @@ def share_of(
 
 
 @partial(inner, inlined=True)
-def is_beside_base(views: Views, arms: Arms, a: int) -> bool:
-    """Whether arm ``a``'s hand is near the axis of its own base."""
-    hand = views.site_xpos[arms.site[a]]
-    base = views.xpos[arms.root[a]]
+def is_beside_base(views: Views, arm: Arm) -> bool:
+    """Whether an arm's hand is near the axis of its own base."""
+    hand = views.site_xpos[arm.site]
+    base = views.xpos[arm.root]
     x = hand[0] - base[0]
     y = hand[1] - base[1]
     return np.hypot(x, y) < BESIDE
 
 
 @partial(inner, inlined=True)
-def scale_part(arms: Arms, a: int, share: np.float32, rest: Action, action: Action) -> None:
-    """Leave a share of arm ``a``'s part of an action, in place."""
-    first = arms.first[a]
-    for number in range(first, first + arms.inputs[a]):
+def scale_part(arm: Arm, share: np.float32, rest: Action, action: Action) -> None:
+    """Leave a share of an arm's part of an action, in place."""
+    first = arm.first
+    for number in range(first, first + arm.inputs):
         asked = action[number] - rest[number]
         action[number] = rest[number] + share * asked
 
@@ -228,17 +217,18 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         slowed: a copy of it, in which the parts of arms that would be too fast are replaced.
     """
     views, arms, rest, limits, motions, brake_speeds = bound.parts
-    for a in range(len(arms.joints)):
-        limit = limits[int(is_beside_base(views, arms, a))]
+    for a in range(len(arms)):
+        arm = arms[a]
+        limit = limits[int(is_beside_base(views, arm))]
         brake_speeds[a] = limit.hand_speed
-        if arms.changes[a] == UNKNOWN_CHANGE:
+        if arm.changes == UNKNOWN_CHANGE:
             continue
 
         linear = motions.jacobian.ctypes.data
         angular = motions.jacobian[3:].ctypes.data
-        _site_jacobian(views.model, views.data, linear, angular, arms.site[a])
-        read_asked(views, arms, a, rest, action, motions)
-        read_present(views, arms, a, motions)
+        _site_jacobian(views.model, views.data, linear, angular, arm.site)
+        read_asked(views, arm, rest, action, motions)
+        read_present(views, arm, motions)
         share = share_of(views, arms, a, limit, motions, ASKED)
         present_share = share_of(views, arms, a, limit, motions, PRESENT)
 
@@ -248,4 +238,4 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
         if fastest > limit.hand_speed:
             brake_speeds[a] = fastest
         if share < 1.0:
-            scale_part(arms, a, np.float32(share), rest, slowed)
+            scale_part(arm, np.float32(share), rest, slowed)

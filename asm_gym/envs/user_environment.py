@@ -21,6 +21,14 @@ UNITS = {
 }
 """Of what robosuite senses, by what its name holds; the first that fits."""
 
+HEADLESS = {
+    "ignore_done": True,
+    "control_freq": 20,
+    "has_renderer": False,
+    "has_offscreen_renderer": False,
+    "use_camera_obs": False,
+}
+
 
 class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """``make(robots=…, …)``, observed by all that it senses; what the robots sense, and the action, are its stream."""
@@ -29,43 +37,40 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __init__(self, make: type[Any], **arguments: Any) -> None:
         import_robosuite()  # which fits it to MuJoCo
-        headless = dict.fromkeys(
-            ("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False
-        )
-        self.robosuite_env: Any = make(
-            **{"ignore_done": True, "control_freq": 20, **headless, **arguments}
-        )
+        self.robosuite_env: Any = make(**(HEADLESS | arguments))
         self.dt = 1.0 / self.robosuite_env.control_freq
         self._seeded = False
+        self._all: list[str] = []  # that is observed
+        self._own: list[str] = []  # that the robots sense
+        prefixes = tuple(robot.robot_model.naming_prefix for robot in self.robosuite_env.robots)
+        channels: list[Channel] = []
         sensed = self.robosuite_env._get_observations(force_update=True)
-        numbers = {
-            k: np.size(v) for k, v in sensed.items() if not k.endswith("-state") and np.size(v)
-        }
-        own = tuple(robot.robot_model.naming_prefix for robot in self.robosuite_env.robots)
-        self._all, self._own = tuple(numbers), tuple(k for k in numbers if k.startswith(own))
-        self.observation_space = gym.spaces.Box(
-            -np.inf, np.inf, (sum(numbers.values()),), np.float32
-        )
-        low, high = self.robosuite_env.action_spec
-        self.action_space = gym.spaces.Box(
-            low.astype(np.float32), high.astype(np.float32), dtype=np.float32
-        )
-        channels = [
-            Channel(k, numbers[k], _unit(k), group="joint" if "joint" in k else "sense")
-            for k in self._own
-        ]
-        action = Channel("action", len(low), group=MOTOR)
+        for name, value in sensed.items():
+            if name.endswith("-state") or np.size(value) == 0:
+                continue
+            self._all.append(name)
+            if name.startswith(prefixes):
+                self._own.append(name)
+                group = "joint" if "joint" in name else "sense"
+                channels.append(Channel(name, np.size(value), _unit(name), group=group))
+
+        numbers = _row(sensed, self._all).shape
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, numbers, np.float32)
+        low, high = (bound.astype(np.float32) for bound in self.robosuite_env.action_spec)
+        self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
+        channels.append(Channel("action", len(low), group=MOTOR))
         robots = "+".join(robot.name for robot in self.robosuite_env.robots)
-        self.stream_spec = StreamSpec((*channels, action), self.dt, robots)
+        self.stream_spec = StreamSpec(tuple(channels), self.dt, robots)
 
     @property
     def action_means(self) -> str | None:
         """``"delta"`` where all controllers of the arms take changes of pose or angles; else None."""
-        parts = [(robot, arm) for robot in self.robosuite_env.robots for arm in robot.arms]
-        controllers = [robot.composite_controller.part_controllers[arm] for robot, arm in parts]
-        return (
-            "delta" if all(getattr(c, "input_type", "") == "delta" for c in controllers) else None
-        )
+        for robot in self.robosuite_env.robots:
+            for arm in robot.arms:
+                controller = robot.composite_controller.part_controllers[arm]
+                if getattr(controller, "input_type", "") != "delta":
+                    return None
+        return "delta"
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -75,9 +80,8 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             reseed(self.robosuite_env, self.np_random)
             self._seeded = True
         sensed = self.robosuite_env.reset()
-        return _row(sensed, self._all), self._info(
-            sensed, np.zeros(self.action_space.shape or (), np.float32)
-        )
+        still = np.zeros(self.stream_spec.channels[-1].size, np.float32)
+        return _row(sensed, self._all), self._info(sensed, still)
 
     def step(
         self, action: NDArray[np.float32]
@@ -93,9 +97,12 @@ class OwnRobosuite(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return {"stream": stream, "success": bool(self.robosuite_env._check_success())}
 
 
-def _row(sensed: dict[str, Any], names: tuple[str, ...]) -> NDArray[np.float32]:
-    return np.asarray(np.concatenate([np.ravel(sensed[name]) for name in names]), np.float32)
+def _row(sensed: dict[str, Any], names: list[str]) -> NDArray[np.float32]:
+    return np.concatenate([np.ravel(sensed[name]) for name in names], dtype=np.float32)
 
 
 def _unit(name: str) -> str:
-    return next((unit for part, unit in UNITS.items() if part in name), "1")
+    for part, unit in UNITS.items():
+        if part in name:
+            return unit
+    return "1"

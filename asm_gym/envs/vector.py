@@ -20,6 +20,8 @@ from asm_gym.validation import check_number
 
 Result = TypeVar("Result")
 Mask = NDArray[np.bool_]
+Work = Callable[[list[int]], list[Any]]  # for members, by number
+Answers = SimpleQueue[tuple[list[Any], BaseException | None]]
 
 
 class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
@@ -56,19 +58,15 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         threads: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        wanted = cores() if threads is None else check_number("threads", threads, low=1, whole=True)
+        if threads is None:
+            threads = cores()
+        check_number("threads", threads, low=1, whole=True)
         super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
-        self.threads = min(wanted, self.num_envs)
+        self.threads = min(threads, self.num_envs)
         parts = np.array_split(np.arange(self.num_envs), self.threads)
         # numbers of the members of each thread
         self._here, *others = (part.tolist() for part in parts)
-        self._elsewhere: list[tuple[SimpleQueue[Any], Thread, list[int]]] = []
-        for members in others:
-            asked: SimpleQueue[Any] = SimpleQueue()
-            self._elsewhere.append(
-                (asked, Thread(target=_serve, args=(asked,), daemon=True), members)
-            )
-            self._elsewhere[-1][1].start()
+        self._elsewhere = [_Worker(members) for members in others]
 
     def _of_each(self, what: Callable[[int], Result], which: Mask | None = None) -> list[Result]:
         """Return ``what`` of each member's number, or of those of ``which`` (n,), each on its member's thread.
@@ -79,30 +77,29 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         def work(members: list[int]) -> list[Result]:
             return [what(i) for i in members if which is None or which[i]]
 
-        answers: list[SimpleQueue[tuple[list[Result], BaseException | None]]] = []
-        for asked, _, members in self._elsewhere:
-            answers.append(SimpleQueue())
-            asked.put((partial(work, members), answers[-1]))
+        queues = [worker.begin(work) for worker in self._elsewhere]
         try:
-            found = work(self._here)
+            results = work(self._here)
         finally:
-            rest = [answer.get() for answer in answers]
-        for more, error in rest:
+            answers = [queue.get() for queue in queues]
+        for more, error in answers:
             if error is not None:
                 raise error
-            found += more
-        return found
+            results += more
+        return results
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        n, options = self.num_envs, dict(options or {})
+        n = self.num_envs
+        options = dict(options or {})
         begun = np.asarray(options.pop("reset_mask", np.ones(n, bool)))
-        seeds = (
-            [None if seed is None else seed + i for i in range(n)]
-            if np.ndim(seed) == 0
-            else list(seed)
-        )
+        if seed is None:
+            seeds = [None] * n
+        elif np.ndim(seed) == 0:
+            seeds = [seed + i for i in range(n)]
+        else:
+            seeds = list(seed)
         if len(seeds) != n or begun.dtype != bool or begun.shape != (n,):
             raise ValueError(
                 f"seed and reset_mask must have {n} entries (one an environment), got {seed} and {begun}"
@@ -127,23 +124,26 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
                 f"actions must have {self.num_envs} rows, one for each environment, got {len(given)}"
             )
         outcomes = self._of_each(lambda i: self._outcome(i, given[i]))
-        self._env_obs, rewards, terminated, truncated, infos = map(
-            list, zip(*outcomes, strict=True)
-        )
-        ended = np.array(terminated, bool), np.array(truncated, bool)
-        self._autoreset_envs = ended[0] | ended[1]
-        return self._stacked(), np.array(rewards, np.float64), *ended, self._merged(infos)
+        observations, rewards, terminated, truncated, infos = zip(*outcomes, strict=True)
+        self._env_obs = list(observations)
+        is_terminated = np.array(terminated, bool)
+        is_truncated = np.array(truncated, bool)
+        self._autoreset_envs = is_terminated | is_truncated
+        returns = np.array(rewards, np.float64)
+        return self._stacked(), returns, is_terminated, is_truncated, self._merged(infos)
 
     def _outcome(self, i: int, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step member ``i``, or begin its next episode."""
-        env, mode = self.envs[i], self.autoreset_mode
-        if self._autoreset_envs[i] and mode == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded(
-                f"the episode of environment {i} has ended: reset it with reset_mask"
-            )
-        if self._autoreset_envs[i] and mode == AutoresetMode.NEXT_STEP:
-            observation, info = env.reset()
-            return observation, 0.0, False, False, info
+        env = self.envs[i]
+        mode = self.autoreset_mode
+        if self._autoreset_envs[i]:
+            if mode == AutoresetMode.DISABLED:
+                raise gym.error.ResetNeeded(
+                    f"the episode of environment {i} has ended: reset it with reset_mask"
+                )
+            if mode == AutoresetMode.NEXT_STEP:
+                observation, info = env.reset()
+                return observation, 0.0, False, False, info
         observation, reward, terminated, truncated, info = env.step(action)
         if mode == AutoresetMode.SAME_STEP and (terminated or truncated):
             final = {"final_obs": observation, "final_info": info}
@@ -159,17 +159,14 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         batch: Any = create_empty_array(space, self.num_envs, np.empty)
         return concatenate(space, self._env_obs, batch)
 
-    def _merged(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
+    def _merged(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """Return the infos of all members, as ``_add_info`` puts them together one by one."""
         merged: dict[str, Any] = {}
-        for key, first in infos[0].items():
-            form, values = _form(first), [info.get(key) for info in infos]
-            if (
-                form is not None
-                and key != "final_obs"
-                and all(_form(value) == form for value in values)
-            ):
-                merged[key], merged[f"_{key}"] = np.array(values), np.ones(self.num_envs, bool)
+        for key in infos[0]:
+            values = [info.get(key) for info in infos]
+            if key != "final_obs" and _are_alike(values):
+                merged[key] = np.array(values)
+                merged[f"_{key}"] = np.ones(self.num_envs, bool)
         stacked = set(merged)
         for i, info in enumerate(infos):
             rest = {key: value for key, value in info.items() if key not in stacked}
@@ -178,8 +175,10 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         def called(i: int) -> Any:
-            found = self.envs[i].get_wrapper_attr(name)
-            return found(*args, **kwargs) if callable(found) else found
+            attribute = self.envs[i].get_wrapper_attr(name)
+            if callable(attribute):
+                return attribute(*args, **kwargs)
+            return attribute
 
         return tuple(self._of_each(called))
 
@@ -191,32 +190,52 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
             try:
                 self._of_each(lambda i: self.envs[i].close())
             finally:
-                for asked, thread, _ in self._elsewhere:
-                    asked.put(None)
-                    thread.join()
+                for worker in self._elsewhere:
+                    worker.end()
 
 
-def _serve(asked: SimpleQueue[Any]) -> None:
-    """Do what is asked until that is None, and answer each; a ``ThreadPoolExecutor`` takes four times as long."""
-    while (request := asked.get()) is not None:
-        work, answer = request
-        try:
-            answer.put((work(), None))
-        except BaseException as error:
-            answer.put(([], error))
+class _Worker:
+    """A thread that does work for its members until it is ended; a ``ThreadPoolExecutor`` takes four times as long."""
+
+    def __init__(self, members: list[int]) -> None:
+        self._members = members
+        self._tasks: SimpleQueue[tuple[Work, Answers] | None] = SimpleQueue()
+        self._thread = Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def begin(self, work: Work) -> Answers:
+        """Begin work; return the queue that will hold its results, or its exception."""
+        answers: Answers = SimpleQueue()
+        self._tasks.put((work, answers))
+        return answers
+
+    def end(self) -> None:
+        self._tasks.put(None)
+        self._thread.join()
+
+    def _serve(self) -> None:
+        while (task := self._tasks.get()) is not None:
+            work, answers = task
+            try:
+                answers.put((work(self._members), None))
+            except BaseException as error:
+                answers.put(([], error))
 
 
 def cores() -> int:
     """Return how many cores this process may run on."""
-    affinity = getattr(os, "sched_getaffinity", None)  # of Linux
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):  # of Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-def _form(value: Any) -> Any:
-    """Return what numbers or arrays of several members must have in common to make one array; None for other values."""
-    if isinstance(value, np.ndarray):
-        return value.shape, value.dtype
-    return type(value) if isinstance(value, int | float | np.number) else None
+def _are_alike(values: list[Any]) -> bool:
+    """Whether values of several members are numbers of one type, or arrays of one shape and type."""
+    first = values[0]
+    if isinstance(first, np.ndarray):
+        form = (first.shape, first.dtype)
+        return all(isinstance(v, np.ndarray) and (v.shape, v.dtype) == form for v in values)
+    return isinstance(first, int | float | np.number) and len(set(map(type, values))) == 1
 
 
 def make(num_envs: int = 1, task: str = "Lift", **settings: Any) -> ThreadedVectorEnv:

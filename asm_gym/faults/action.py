@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.faults.base import LONGEST, Clock, HookedFault, Interface, within
+from asm_gym.faults.base import LONGEST, Clock, HookedFault, Interface, delayed, within
 from asm_gym.validation import check_number
 
 Action = NDArray[np.float32]
@@ -25,14 +25,12 @@ class ActionFault(HookedFault):
     anywhere = True
     hooks = "deliveries"
     groups = ("joint", "torque", "hand")
-    grippers_too: ClassVar[bool] = (
-        False  # whether it acts on the numbers that command grippers as well
-    )
+    # whether it acts on the numbers that command grippers as well
+    grippers_too: ClassVar[bool] = False
 
     def check(self, env: Interface) -> None:
-        check_number(
-            "axis", getattr(self, "axis", 0), low=0, high=len(_arm_axes(env)) - 1, whole=True
-        )
+        last = len(_arm_axes(env)) - 1
+        check_number("axis", getattr(self, "axis", 0), low=0, high=last, whole=True)
 
     @abstractmethod
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
@@ -40,9 +38,9 @@ class ActionFault(HookedFault):
 
     def hook(self, env: Interface, clock: Clock) -> Callable[[Action], Action]:
         memory: list[Action] = []
-        axes = (
-            np.arange(gym.spaces.flatdim(env.action_space)) if self.grippers_too else _arm_axes(env)
-        )
+        axes = _arm_axes(env)
+        if self.grippers_too:
+            axes = np.arange(gym.spaces.flatdim(env.action_space))
 
         def change(action: Action) -> Action:
             delivered = action.copy()
@@ -66,8 +64,7 @@ class ActionDelay(ActionFault):
     steps: int = within(4, low=1, high=LONGEST)
 
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
-        memory.append(commanded)
-        return memory.pop(0) if len(memory) > self.steps else memory[0]
+        return delayed(commanded, self.steps, memory)
 
 
 class ActionDrop(ActionFault):
@@ -76,7 +73,9 @@ class ActionDrop(ActionFault):
     probability: float = within(0.5, low=0, high=1)
 
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Any:
-        return 0.0 if self.rng(2 + k).random() < self.probability else commanded
+        if self.rng(2 + k).random() < self.probability:
+            return 0.0
+        return commanded
 
 
 class ActionBias(ActionFault):

@@ -24,8 +24,12 @@ class MotorFault(JointFault, EditingFault):
     """One that edits a joint or its motor."""
 
     channels = (
-        *("measured_torque", "commanded_torque", "external_torque", "external_torque_peak"),
-        *("joint_velocity", "joint_position"),
+        "measured_torque",
+        "commanded_torque",
+        "external_torque",
+        "external_torque_peak",
+        "joint_velocity",
+        "joint_position",
     )
 
 
@@ -35,8 +39,10 @@ class WeakJoint(MotorFault):
     strength: float = within(0.5, low=0, high=1)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        motor, loss = (int(env.simulation.motors[self.joint]), 0), 1.0 - self.strength
-        return [(env.simulation.model.actuator_gear, [motor], lambda gear: gear * (1.0 - loss))]
+        gears = env.simulation.model.actuator_gear
+        motor = (int(env.simulation.motors[self.joint]), 0)
+        loss = 1.0 - self.strength
+        return [(gears, [motor], lambda gear: gear * (1.0 - loss))]
 
 
 class JointFriction(MotorFault):
@@ -49,7 +55,8 @@ class JointFriction(MotorFault):
     viscous: float = within(2.0, low=0, high=1e4)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        model, dof = env.simulation.model, int(env.simulation.dofs[self.joint])
+        model = env.simulation.model
+        dof = int(env.simulation.dofs[self.joint])
         return [
             (model.dof_frictionloss, [dof], lambda friction: friction + self.newton_metres),
             (model.dof_damping, [dof], lambda damping: damping + self.viscous),
@@ -69,9 +76,10 @@ class Backlash(JointFault, HookedFault):
 
         def play(row: Floats) -> None:
             nonlocal reading
-            reading = row[position] = float(
-                np.clip(reading, row[position] - self.gap, row[position] + self.gap)
-            )
+            least = row[position] - self.gap
+            most = row[position] + self.gap
+            reading = float(np.clip(reading, least, most))
+            row[position] = reading
 
         return play
 
@@ -108,11 +116,13 @@ class WeakGripper(GripperFault, EditingFault):
     strength: float = within(0.2, low=0, high=1)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        model, loss = env.simulation.model, 1.0 - self.strength
-        arms = [
-            robot._ref_joint_gripper_actuator_indexes[arm] or ()
-            for robot, arm in env.simulation.parts
-        ]
-        motors = [int(motor) for arm in arms for motor in arm]
-        parameters = model.actuator_gainprm, model.actuator_biasprm
-        return [(array, motors, lambda nominal: nominal * (1.0 - loss)) for array in parameters]
+        model = env.simulation.model
+        loss = 1.0 - self.strength
+        motors: list[int] = []
+        for robot, arm in env.simulation.parts:
+            motors += map(int, robot._ref_joint_gripper_actuator_indexes[arm] or ())
+
+        def weaken(nominal: Floats) -> Floats:
+            return nominal * (1.0 - loss)
+
+        return [(model.actuator_gainprm, motors, weaken), (model.actuator_biasprm, motors, weaken)]

@@ -16,7 +16,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from asm_gym.faults import action, sensor
-from asm_gym.faults.base import Fault, Interface
+from asm_gym.faults.base import Fault, Interface, graded
 from asm_gym.faults.suite import SEVERITIES
 from asm_gym.spec import MOTOR, StreamSpec, flat
 from asm_gym.stream_source import StreamSource
@@ -40,9 +40,8 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             )
         self._source = StreamSource(env)
         spec = self._source.spec
-        self.measured_spec = StreamSpec(
-            tuple(c for c in spec.channels if c.group != MOTOR), spec.dt, spec.source
-        )
+        sensed = tuple(c for c in spec.channels if c.group != MOTOR)
+        self.measured_spec = StreamSpec(sensed, spec.dt, spec.source)
         self.corruptions: list[Callable[[NDArray[np.float64]], None]] = []
         self.deliveries: list[Callable[[NDArray[np.float32]], NDArray[np.float32]]] = []
         self.measured = np.zeros(self.measured_spec.size)
@@ -88,53 +87,47 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 def _boxes(space: gym.Space[Any]) -> bool:
-    parts = space.values() if isinstance(space, spaces.Dict) else ()
-    return all(map(_boxes, parts)) if parts else isinstance(space, spaces.Box)
+    if isinstance(space, spaces.Dict) and space.spaces:
+        return all(map(_boxes, space.values()))
+    return isinstance(space, spaces.Box)
 
 
 class Target(NamedTuple):
     """What is drawn for an episode: the sensor and the action axis that a fault acts on."""
 
     channel: str
-    element: int
+    element: int | None  # None for the whole channel
     sigma: float  # of that sensor
     axis: int  # of the action
-    half: float  # of that axis's range
-    everything: tuple[str, ...]  # channels
-
-    @property
-    def sensor(self) -> dict[str, Any]:
-        return {"channel": self.channel, "element": self.element}
+    reach: float  # half of that axis's range, at most ``FARTHEST_REACH``
 
 
-Kind = Callable[[Target, int], tuple[Fault, ...]]
+FARTHEST_REACH = 5.0  # [action units]
 
+_ON_SENSOR = {"channel": "channel", "element": "element"}
+_ON_AXIS = {"axis": "axis"}
 
-def _all(d: Target, kind: type[sensor.SensorFault], **how: Any) -> tuple[Fault, ...]:
-    """Return the same fault of every channel."""
-    return tuple(kind(channel=name, element=None, **how) for name in d.everything)
-
-
-KINDS: dict[str, Kind] = {
-    "frozen_sense": lambda d, s: (sensor.Freeze(**d.sensor, duration=(5, 15, None)[s]),),
-    "sense_offset": lambda d, s: (sensor.Bias(**d.sensor, amount=(1, 3, 10)[s] * d.sigma),),
-    "sense_drift": lambda d, s: (sensor.Drift(**d.sensor, rate=(0.05, 0.2, 0.8)[s] * d.sigma),),
-    "sense_noise": lambda d, s: (sensor.Noise(**d.sensor, std=(0.3, 1, 3)[s] * d.sigma),),
-    "sense_scale": lambda d, s: (sensor.Scale(**d.sensor, factor=(1.05, 1.15, 1.5)[s]),),
-    "sense_dropout": lambda d, s: (sensor.Dropout(**d.sensor, probability=(0.05, 0.2, 0.5)[s]),),
-    "sense_delay": lambda d, s: (sensor.Delay(**d.sensor, steps=(1, 3, 6)[s]),),
-    "late_rows": lambda d, s: _all(d, sensor.Delay, steps=(1, 3, 6)[s]),
-    "lost_rows": lambda d, s: _all(d, sensor.Freeze, duration=(1, 5, 15)[s]),
-    "action_scale": lambda d, s: (action.ActionScale(factor=(0.9, 0.75, 0.5)[s]),),
-    "action_delay": lambda d, s: (action.ActionDelay(steps=(1, 3, 6)[s]),),
-    "action_drop": lambda d, s: (action.ActionDrop(probability=(0.1, 0.3, 0.7)[s]),),
-    "action_repeat": lambda d, s: (action.ActionRepeat(steps=(2, 4, 8)[s]),),
-    "action_bias": lambda d, s: (
-        action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s] * min(d.half, 5.0)),
-    ),
-    "sign_flip": lambda d, s: (action.SignFlip(axis=d.axis, duration=(3, 10, None)[s]),),
+KINDS: dict[str, Callable[[Target, int], Fault]] = {
+    "frozen_sense": graded(sensor.Freeze, _ON_SENSOR, duration=(5, 15, None)),
+    "sense_offset": graded(sensor.Bias, _ON_SENSOR, unit="sigma", amount=(1, 3, 10)),
+    "sense_drift": graded(sensor.Drift, _ON_SENSOR, unit="sigma", rate=(0.05, 0.2, 0.8)),
+    "sense_noise": graded(sensor.Noise, _ON_SENSOR, unit="sigma", std=(0.3, 1, 3)),
+    "sense_scale": graded(sensor.Scale, _ON_SENSOR, factor=(1.05, 1.15, 1.5)),
+    "sense_dropout": graded(sensor.Dropout, _ON_SENSOR, probability=(0.05, 0.2, 0.5)),
+    "sense_delay": graded(sensor.Delay, _ON_SENSOR, steps=(1, 3, 6)),
+    "late_rows": graded(sensor.Delay, _ON_SENSOR, steps=(1, 3, 6)),
+    "lost_rows": graded(sensor.Freeze, _ON_SENSOR, duration=(1, 5, 15)),
+    "action_scale": graded(action.ActionScale, factor=(0.9, 0.75, 0.5)),
+    "action_delay": graded(action.ActionDelay, steps=(1, 3, 6)),
+    "action_drop": graded(action.ActionDrop, probability=(0.1, 0.3, 0.7)),
+    "action_repeat": graded(action.ActionRepeat, steps=(2, 4, 8)),
+    "action_bias": graded(action.ActionBias, _ON_AXIS, unit="reach", amount=(0.05, 0.15, 0.4)),
+    "sign_flip": graded(action.SignFlip, _ON_AXIS, duration=(3, 10, None)),
 }
-"""Faults of each kind for an episode, at severity 0 to 2. Lost rows: every sensor keeps its last value meanwhile."""
+"""The fault of each kind for an episode, at severity 0 to 2."""
+
+# Of these kinds, every channel has the fault: lost rows keep the last value of every sensor meanwhile.
+_OF_EVERY_CHANNEL = ("late_rows", "lost_rows")
 
 
 def sigmas(env: Interface, streams: list[NDArray[np.float32]]) -> NDArray[np.float64]:
@@ -144,7 +137,8 @@ def sigmas(env: Interface, streams: list[NDArray[np.float32]]) -> NDArray[np.flo
     """
     spread = np.min([np.std(stream, axis=0, dtype=np.float64) for stream in streams], axis=0)
     noise = env.measured_spec.noise
-    return np.where(spread > 0, np.where(noise > 0, noise, spread), 0.0)
+    sigma = np.where(noise > 0, noise, spread)
+    return np.where(spread > 0, sigma, 0.0)
 
 
 def faults_anywhere(
@@ -159,16 +153,28 @@ def faults_anywhere(
             "no sensor reading of this environment changes, so no sensor can be faulty"
         )
     rng = np.random.default_rng([seed, 2])
-    spec, struck = env.measured_spec, int(rng.choice(moving))
-    name, place = next(
-        (n, span) for n, span in spec.slices.items() if span.start <= struck < span.stop
-    )
-    # (A,)
-    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low)).astype(np.float64)
+    target = _drawn(env, sigma, int(rng.choice(moving)), rng)
+    targets = [target]
+    if kind in _OF_EVERY_CHANNEL:
+        channels = env.measured_spec.slices
+        targets = [target._replace(channel=name, element=None) for name in channels]
+    level = SEVERITIES.index(severity)
+    faults = [KINDS[kind](each, level) for each in targets]
+    return tuple(replace(fault, onset=onset, seed=seed) for fault in faults)
+
+
+def _drawn(
+    env: Interface, sigma: NDArray[np.float64], number: int, rng: np.random.Generator
+) -> Target:
+    """Return the target that holds one number of the measured row; its axis of the action is drawn."""
+    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low))  # (A,)
     axis = int(rng.integers(len(halves)))
-    element, spread, half = struck - place.start, float(sigma[struck]), float(halves[axis])
-    drawn = Target(name, element, spread, axis, half, tuple(spec.slices))
-    return tuple(
-        replace(fault, onset=onset, seed=seed)
-        for fault in KINDS[kind](drawn, SEVERITIES.index(severity))
+    slices = env.measured_spec.slices
+    channel = next(name for name, span in slices.items() if number < span.stop)
+    return Target(
+        channel=channel,
+        element=number - slices[channel].start,
+        sigma=float(sigma[number]),
+        axis=axis,
+        reach=min(float(halves[axis]), FARTHEST_REACH),
     )

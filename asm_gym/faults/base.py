@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import Field, dataclass, field, fields
 from typing import Any, ClassVar, dataclass_transform
@@ -20,7 +20,6 @@ Floats = NDArray[np.float64]
 MOST = 1e9  # no parameter is larger, so that nothing overflows
 LONGEST = 10_000  # the longest delay [control steps]
 
-
 Interface = Any
 """What faults of sensors and actions act on: ``RobosuiteEnv``, or the ``FaultyInterface`` of any other environment."""
 
@@ -33,9 +32,11 @@ class Clock:
 
 
 def within(
-    default: Any, *, low: float | None = None, high: float | None = None, above: float | None = None
+    default: Any, *, low: float | None = -MOST, high: float = MOST, above: float | None = None
 ) -> Any:
     """Declare a parameter of a fault, and its bounds."""
+    if above is not None:
+        low = None
     return field(default=default, metadata={"low": low, "high": high, "above": above})
 
 
@@ -137,7 +138,8 @@ class HookedFault(Fault):
 
     @contextmanager
     def applied(self, env: Any, clock: Clock) -> Iterator[None]:
-        functions, function = getattr(env, self.hooks), self.hook(env, clock)
+        functions = getattr(env, self.hooks)
+        function = self.hook(env, clock)
         functions.append(function)
         try:
             yield
@@ -150,10 +152,7 @@ class JointFault(Fault):
 
     joint: int = 3
     # those in which it shows first
-    channels: ClassVar[tuple[str, ...]] = (
-        "joint_position",
-        "joint_velocity",
-    )
+    channels: ClassVar[tuple[str, ...]] = ("joint_position", "joint_velocity")
 
     def check(self, env: RobosuiteEnv) -> None:
         check_number(
@@ -165,38 +164,78 @@ class JointFault(Fault):
         )
 
     def labels(self, env: Interface) -> frozenset[str]:
-        return frozenset(
-            env.measured_spec.labels[self.element(env, name)] for name in self.channels
-        )
+        labels = env.measured_spec.labels
+        return frozenset(labels[self.element(env, name)] for name in self.channels)
 
     def element(self, env: Interface, channel: str) -> int:
         """Return the index of the joint's number of a channel in a measured row."""
-        spans = [span for name, span in env.measured_spec.slices.items() if name.endswith(channel)]
-        return int(np.concatenate([np.arange(span.start, span.stop) for span in spans])[self.joint])
+        indices: list[int] = []
+        for name, span in env.measured_spec.slices.items():
+            if name.endswith(channel):
+                indices += range(span.start, span.stop)
+        return indices[self.joint]
 
 
 def _check(parameter: Field[Any], value: Any) -> None:
     """Raise ValueError unless a parameter is of its type and within its bounds."""
-    low, high, above = (parameter.metadata.get(bound) for bound in ("low", "high", "above"))
-    low = -MOST if low is None and above is None else low
-    high = MOST if high is None else high
-    name, kind = parameter.name, parameter.type
+    name = parameter.name
+    kind = parameter.type
+    bounds = parameter.metadata or {"low": -MOST, "high": MOST, "above": None}
     if kind == "float":
-        check_number(name, value, low=low, high=high, above=above)
+        check_number(name, value, **bounds)
     elif kind == "int" or (kind == "int | None" and value is not None):
-        check_number(name, value, low=low, high=high, whole=True)
+        check_number(name, value, whole=True, **bounds)
     elif kind == "Vector3":
-        check_numbers(name, value, 3, low=low, high=high)
+        check_numbers(name, value, 3, low=bounds["low"], high=bounds["high"])
         if name == "direction" and not np.linalg.norm(value) > 0:
             raise ValueError(f"direction must not be all zero, got {value}")
-    elif kind == "str" and not (isinstance(value, str) and not value):
+    elif kind == "str" and not _is_empty(value):
         check_text(name, value)
 
 
-def along(direction: Vector3) -> Floats:
-    """Return a direction (3,) at length 1."""
+def _is_empty(value: Any) -> bool:
+    return isinstance(value, str) and not value
+
+
+def steady_force(env: RobosuiteEnv, body: int, newtons: float, direction: Vector3) -> Edit:
+    """Return the edit that pushes a body along a direction in the world's axes."""
     way = np.asarray(direction, np.float64)
-    return way / float(np.linalg.norm(way))
+    force = newtons * (way / float(np.linalg.norm(way)))
+    forces = env.simulation.data.xfrc_applied
+    return forces, [(body, slice(0, 3))], lambda others: others + force
+
+
+def delayed(now: Any, steps: int, memory: list[Any]) -> Any:
+    """Return what was given ``steps`` calls ago, or the first that ``memory`` holds."""
+    memory.append(now)
+    if len(memory) > steps:
+        return memory.pop(0)
+    return memory[0]
+
+
+def graded(
+    kind: type[Fault], drawn: Mapping[str, str] | None = None, unit: str = "", **parameters: Any
+) -> Callable[[Any, int], Fault]:
+    """Return a function that makes the fault of a kind for an episode and a severity, 0 to 2.
+
+    Args:
+        kind: of the fault.
+        drawn: for parameters that are drawn for the episode, the attribute of what was drawn.
+        unit: the attribute that graded parameters are multiplied by.
+        parameters: the others; where one is a tuple, it is graded: a value for each severity.
+    """
+
+    def make(episode: Any, severity: int) -> Fault:
+        values = {name: getattr(episode, attribute) for name, attribute in (drawn or {}).items()}
+        for name, value in parameters.items():
+            if isinstance(value, tuple):
+                value = value[severity]
+                if unit:
+                    value *= getattr(episode, unit)
+            values[name] = value
+        return kind(**values)
+
+    return make
 
 
 def body_id(env: RobosuiteEnv, name: str) -> int:

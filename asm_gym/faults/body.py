@@ -17,8 +17,8 @@ from asm_gym.faults.base import (
     Fault,
     Floats,
     Vector3,
-    along,
     body_id,
+    steady_force,
     within,
 )
 
@@ -43,9 +43,7 @@ class Push(BodyFault, EditingFault):
     direction: Vector3 = (0.0, 1.0, 0.0)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        force = self.newtons * along(self.direction)
-        where = (body_id(env, self.body), slice(0, 3))
-        return [(env.simulation.data.xfrc_applied, [where], lambda others: others + force)]
+        return [steady_force(env, body_id(env, self.body), self.newtons, self.direction)]
 
 
 class Payload(BodyFault, EditingFault):
@@ -55,13 +53,8 @@ class Payload(BodyFault, EditingFault):
     kilograms: float = within(1.0, above=0, high=1e3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [
-            (
-                env.simulation.model.body_mass,
-                [body_id(env, self.body)],
-                lambda mass: mass + self.kilograms,
-            )
-        ]
+        masses = env.simulation.model.body_mass
+        return [(masses, [body_id(env, self.body)], lambda mass: mass + self.kilograms)]
 
 
 Force = Callable[[Floats, Floats], Floats]
@@ -77,15 +70,13 @@ class ForceField(BodyFault):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
-        model, data, body = env.simulation.model, env.simulation.data, body_id(env, self.body)
-        velocity = np.zeros(6)
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-        force = self.force(env, data.xipos[body].copy(), velocity[3:].copy())
+        data = env.simulation.data
+        body = body_id(env, self.body)
+        force = self.force(env, data.xipos[body].copy(), _velocity(env, body))
         with env.edits.edit(data.xfrc_applied, (body, slice(0, 3))) as change:
 
             def update(substep: int) -> None:
-                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, velocity, 0)
-                now = force(data.xipos[body], velocity[3:])
+                now = force(data.xipos[body], _velocity(env, body))
                 change(lambda others: others + now)
 
             env.substep_hooks.append(update)
@@ -93,6 +84,15 @@ class ForceField(BodyFault):
                 yield
             finally:
                 env.substep_hooks.remove(update)
+
+
+def _velocity(env: RobosuiteEnv, body: int) -> Floats:
+    """Return the velocity (3,) of a body [m/s]."""
+    twist = np.zeros(6)
+    kind = mujoco.mjtObj.mjOBJ_BODY
+    simulation = env.simulation
+    mujoco.mj_objectVelocity(simulation.model, simulation.data, kind, body, twist, 0)
+    return twist[3:]
 
 
 class Collision(ForceField):
@@ -109,16 +109,16 @@ class Collision(ForceField):
 
     def force(self, env: RobosuiteEnv, position: Floats, velocity: Floats) -> Force:
         speed = float(np.linalg.norm(velocity))
-        into = velocity / speed if speed > 1e-3 else np.array([0.0, 0.0, -1.0])
+        into = np.array([0.0, 0.0, -1.0])
+        if speed > 1e-3:
+            into = velocity / speed
         wall = float(position @ into) + self.gap
 
         def push(at: Floats, v: Floats) -> Floats:
             depth = float(at @ into) - wall
-            size = (
-                self.stiffness * depth + self.damping * max(0.0, float(v @ into))
-                if depth > 0
-                else 0.0
-            )
+            size = 0.0
+            if depth > 0:
+                size = self.stiffness * depth + self.damping * max(0.0, float(v @ into))
             return -min(size, self.newtons) * into
 
         return push

@@ -9,7 +9,16 @@ import mujoco
 import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import Clock, Edit, EditingFault, Fault, Floats, Vector3, along, within
+from asm_gym.faults.base import (
+    Clock,
+    Edit,
+    EditingFault,
+    Fault,
+    Floats,
+    Vector3,
+    steady_force,
+    within,
+)
 from asm_gym.validation import check_choice
 
 _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
@@ -34,15 +43,17 @@ class ObjectFault(Fault):
 
     def joint_of(self, env: RobosuiteEnv) -> int:
         """Return the object's free joint."""
-        found = movable(env)
-        if not found:
+        joints = movable(env)
+        if not joints:
             raise ValueError(f"{env.task.name} has no loose object that {self.name} could act on")
         if self.object:
-            check_choice("object", self.object, found)
-            return found[self.object]
-        # Those out of play lie metres away.
-        near = [j for j in found.values() if np.abs(_position(env, j)[:2]).max() < 2.0]
-        return near[0] if near else next(iter(found.values()))
+            check_choice("object", self.object, joints)
+            return joints[self.object]
+        for joint in joints.values():
+            # Those out of play lie metres away.
+            if np.abs(_position(env, joint)[:2]).max() < 2.0:
+                return joint
+        return next(iter(joints.values()))
 
     def body_of(self, env: RobosuiteEnv) -> int:
         """Return the object's body."""
@@ -74,12 +85,9 @@ class Slip(ObjectFault, EditingFault):
         own = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.body_of(env)]
         touching = (model.geom_contype | model.geom_conaffinity) != 0
         geoms = np.flatnonzero(own & touching).tolist()
+        sliding = [(geom, slice(0, 1)) for geom in geoms]
         return [
-            (
-                model.geom_friction,
-                [(geom, slice(0, 1)) for geom in geoms],
-                lambda mu: mu * (self.friction / mu),
-            ),
+            (model.geom_friction, sliding, lambda mu: mu * (self.friction / mu)),
             # Between two surfaces the higher friction counts, unless one has priority.
             (model.geom_priority, geoms, lambda priority: priority + 1),
         ]
@@ -92,9 +100,7 @@ class Snatch(ObjectFault, EditingFault):
     direction: Vector3 = (0.0, 1.0, 0.3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        force = self.newtons * along(self.direction)
-        where = (self.body_of(env), slice(0, 3))
-        return [(env.simulation.data.xfrc_applied, [where], lambda others: others + force)]
+        return [steady_force(env, self.body_of(env), self.newtons, self.direction)]
 
 
 class Teleport(ObjectFault):
@@ -123,13 +129,8 @@ class Heavy(ObjectFault, EditingFault):
     kilograms: float = within(0.5, above=0, high=1e3)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [
-            (
-                env.simulation.model.body_mass,
-                [self.body_of(env)],
-                lambda mass: mass + self.kilograms,
-            )
-        ]
+        masses = env.simulation.model.body_mass
+        return [(masses, [self.body_of(env)], lambda mass: mass + self.kilograms)]
 
 
 class ObjectMass(ObjectFault, EditingFault):
@@ -138,6 +139,5 @@ class ObjectMass(ObjectFault, EditingFault):
     factor: float = within(1.1, above=0, high=100)
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
-        return [
-            (env.simulation.model.body_mass, [self.body_of(env)], lambda mass: mass * self.factor)
-        ]
+        masses = env.simulation.model.body_mass
+        return [(masses, [self.body_of(env)], lambda mass: mass * self.factor)]

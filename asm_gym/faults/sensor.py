@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import LONGEST, Clock, Floats, HookedFault, Interface, JointFault, within
+from asm_gym.faults.base import (
+    LONGEST,
+    Clock,
+    Floats,
+    HookedFault,
+    Interface,
+    JointFault,
+    delayed,
+    within,
+)
 from asm_gym.validation import check_choice, check_number
 
 
@@ -39,9 +48,8 @@ class SensorFault(HookedFault):
         span = np.arange(spec.size)[spec.slices[self.channel]]
         if self.element is None:
             return span
-        check_number(
-            f"element of {self.channel}", self.element, low=0, high=len(span) - 1, whole=True
-        )
+        last = len(span) - 1
+        check_number(f"element of {self.channel}", self.element, low=0, high=last, whole=True)
         return span[[self.element]]
 
     def labels(self, env: Interface) -> frozenset[str]:
@@ -118,7 +126,9 @@ class Dropout(SensorFault):
     probability: float = within(0.3, low=0, high=1)
 
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Any:
-        return 0.0 if self.rng(2 + k).random() < self.probability else true
+        if self.rng(2 + k).random() < self.probability:
+            return 0.0
+        return true
 
 
 class Freeze(SensorFault):
@@ -134,8 +144,7 @@ class Delay(SensorFault):
     steps: int = within(3, low=1, high=LONGEST)
 
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
-        memory.append(true)
-        return memory.pop(0) if len(memory) > self.steps else memory[0]
+        return delayed(true, self.steps, memory)
 
 
 class FrozenEncoder(JointFault, HookedFault):
@@ -144,10 +153,12 @@ class FrozenEncoder(JointFault, HookedFault):
     hooks = "corruptions"
 
     def hook(self, env: RobosuiteEnv, clock: Clock) -> Callable[[Floats], None]:
-        position, velocity = (self.element(env, name) for name in self.channels)
+        position = self.element(env, "joint_position")
+        velocity = self.element(env, "joint_velocity")
         stuck_at = env.measured[position]
 
         def freeze(row: Floats) -> None:
-            row[position], row[velocity] = stuck_at, 0.0
+            row[position] = stuck_at
+            row[velocity] = 0.0
 
         return freeze

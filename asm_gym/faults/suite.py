@@ -7,44 +7,59 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from gymnasium.spaces import flatdim
 
+from asm_gym.envs.arms import prefix_of
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import action, actuator, body, object, sensor
-from asm_gym.faults.base import Fault
+from asm_gym.faults.base import Fault, Vector3, graded
 from asm_gym.registries import Registry, target
 from asm_gym.validation import check_choice
 
 SEVERITIES = ("mild", "medium", "strong")
-DEVELOPMENT, TEST = "development", "test"
+DEVELOPMENT = "development"
+TEST = "test"
 
 GROUPS: dict[str, tuple[str, ...]] = {
     DEVELOPMENT: (
-        *("push", "payload", "weak_joint", "backlash", "weak_gripper"),
-        *("encoder_drift", "encoder_spikes", "encoder_delay", "torque_scale", "wrist_bias"),
-        *("action_drop", "action_repeat", "action_noise", "slip", "snatch"),
+        "push",
+        "payload",
+        "weak_joint",
+        "backlash",
+        "weak_gripper",
+        "encoder_drift",
+        "encoder_spikes",
+        "encoder_delay",
+        "torque_scale",
+        "wrist_bias",
+        "action_drop",
+        "action_repeat",
+        "action_noise",
+        "slip",
+        "snatch",
     ),
     TEST: (
-        *(
-            "collision",
-            "cable_pull",
-            "held_by_person",
-            "stuck_joint",
-            "joint_friction",
-            "gripper_opens",
-        ),
-        *("encoder_bias", "frozen_encoder", "encoder_noise", "encoder_dropout", "frozen_wrist"),
-        *(
-            "action_delay",
-            "action_bias",
-            "sign_flip",
-            "adversary",
-            "teleport",
-            "heavy_object",
-            "missing_object",
-        ),
+        "collision",
+        "cable_pull",
+        "held_by_person",
+        "stuck_joint",
+        "joint_friction",
+        "gripper_opens",
+        "encoder_bias",
+        "frozen_encoder",
+        "encoder_noise",
+        "encoder_dropout",
+        "frozen_wrist",
+        "action_delay",
+        "action_bias",
+        "sign_flip",
+        "adversary",
+        "teleport",
+        "heavy_object",
+        "missing_object",
     ),
 }
 """Kinds to choose settings by, and kinds to report: half of each family, drawn once; added kinds are in neither."""
@@ -58,80 +73,87 @@ class Drawn(NamedTuple):
     joint: int  # of the first arm
     axis: int  # of the action
     translation: int  # an axis of the action that moves the hand, not one that turns it
-    direction: tuple[float, float, float]
+    direction: Vector3
     link: str
     hand: str
     onset: int
     seed: int
 
     @property
-    def encoder(self) -> dict[str, Any]:
-        return {"channel": f"{self.prefix}joint_position", "element": self.joint}
+    def encoder(self) -> str:
+        return f"{self.prefix}joint_position"
+
+    @property
+    def torque_sensor(self) -> str:
+        return f"{self.prefix}measured_torque"
+
+    @property
+    def wrist_sensor(self) -> str:
+        return f"{self.prefix}wrist_force"
 
 
 Kind = Callable[[Drawn, int], Fault]
+
+# What kinds act on: parameters of the fault, and what is drawn for them.
+_ON_LINK = {"body": "link"}
+_ON_HAND = {"body": "hand"}
+_ON_JOINT = {"joint": "joint"}
+_ON_ENCODER = {"channel": "encoder", "element": "joint"}
+_ON_TORQUE_SENSOR = {"channel": "torque_sensor", "element": "joint"}
+_ON_WRIST_SENSOR = {"channel": "wrist_sensor", "element": "translation"}
+_ALONG = {"direction": "direction"}
 
 KINDS: Registry[Kind] = Registry(
     "kind of fault",
     "asm_gym.faults.suite:KINDS",
     {
-        "push": lambda d, s: body.Push(
-            body=d.link, newtons=(8.0, 20.0, 40.0)[s], direction=d.direction, duration=10
+        "push": graded(body.Push, _ON_LINK | _ALONG, newtons=(8.0, 20.0, 40.0), duration=10),
+        "payload": graded(body.Payload, _ON_HAND, kilograms=(0.25, 0.75, 2.0)),
+        "collision": graded(body.Collision, _ON_HAND, stiffness=(500, 2000, 8000), duration=20),
+        "cable_pull": graded(body.CablePull, _ON_HAND, stiffness=(50, 150, 400)),
+        "held_by_person": graded(
+            body.HeldByPerson, _ON_LINK, stiffness=(100, 300, 800), duration=30
         ),
-        "payload": lambda d, s: body.Payload(body=d.hand, kilograms=(0.25, 0.75, 2.0)[s]),
-        "collision": lambda d, s: body.Collision(
-            body=d.hand, stiffness=(500, 2000, 8000)[s], duration=20
+        "weak_joint": graded(actuator.WeakJoint, _ON_JOINT, strength=(0.9, 0.7, 0.4)),
+        "stuck_joint": graded(
+            actuator.JointFriction,
+            _ON_JOINT,
+            newton_metres=1000.0,
+            viscous=0.0,
+            duration=(4, 12, None),
         ),
-        "cable_pull": lambda d, s: body.CablePull(body=d.hand, stiffness=(50, 150, 400)[s]),
-        "held_by_person": lambda d, s: body.HeldByPerson(
-            body=d.link, stiffness=(100, 300, 800)[s], duration=30
+        "joint_friction": graded(
+            actuator.JointFriction, _ON_JOINT, newton_metres=(0.5, 2, 6), viscous=(0.5, 2, 6)
         ),
-        "weak_joint": lambda d, s: actuator.WeakJoint(joint=d.joint, strength=(0.9, 0.7, 0.4)[s]),
-        "stuck_joint": lambda d, s: actuator.JointFriction(
-            joint=d.joint, newton_metres=1000.0, viscous=0.0, duration=(4, 12, None)[s]
+        "backlash": graded(actuator.Backlash, _ON_JOINT, gap=(0.003, 0.01, 0.03)),
+        "gripper_opens": graded(actuator.GripperOpens, duration=(2, 8, None)),
+        "weak_gripper": graded(actuator.WeakGripper, strength=(0.5, 0.2, 0.05)),
+        "encoder_bias": graded(sensor.Bias, _ON_ENCODER, amount=(0.01, 0.03, 0.1)),
+        "encoder_drift": graded(sensor.Drift, _ON_ENCODER, rate=(5e-4, 2e-3, 8e-3)),
+        "frozen_encoder": graded(sensor.FrozenEncoder, _ON_JOINT, duration=(5, 15, None)),
+        "encoder_noise": graded(sensor.Noise, _ON_ENCODER, std=(2e-3, 1e-2, 5e-2)),
+        "encoder_spikes": graded(sensor.Spikes, _ON_ENCODER, amount=(0.02, 0.1, 0.5)),
+        "encoder_delay": graded(sensor.Delay, _ON_ENCODER, steps=(1, 2, 5)),
+        "encoder_dropout": graded(sensor.Dropout, _ON_ENCODER, probability=(0.05, 0.2, 0.5)),
+        "torque_scale": graded(sensor.Scale, _ON_TORQUE_SENSOR, factor=(1.05, 1.15, 1.5)),
+        "wrist_bias": graded(sensor.Bias, _ON_WRIST_SENSOR, amount=(0.5, 2.0, 8.0)),
+        "frozen_wrist": graded(
+            sensor.Freeze, channel="wrist_force", element=None, duration=(5, 15, None)
         ),
-        "joint_friction": lambda d, s: actuator.JointFriction(
-            joint=d.joint, newton_metres=(0.5, 2, 6)[s], viscous=(0.5, 2, 6)[s]
+        "action_delay": graded(action.ActionDelay, steps=(1, 3, 6)),
+        "action_drop": graded(action.ActionDrop, probability=(0.1, 0.3, 0.7)),
+        "action_bias": graded(action.ActionBias, {"axis": "axis"}, amount=(0.05, 0.15, 0.4)),
+        "action_repeat": graded(action.ActionRepeat, steps=(2, 4, 8)),
+        "sign_flip": graded(action.SignFlip, {"axis": "translation"}, duration=(3, 10, None)),
+        "action_noise": graded(action.ActionNoise, share=(0.15, 0.4, 1.0)),
+        "adversary": graded(action.Adversary, size=(0.05, 0.15, 0.4)),
+        "slip": graded(object.Slip, friction=(0.4, 0.15, 0.03)),
+        "snatch": graded(object.Snatch, _ALONG, newtons=(3, 10, 30), duration=10),
+        "teleport": graded(
+            object.Teleport, offset=((0.01, 0.01, 0.0), (0.03, 0.03, 0.0), (0.08, 0.08, 0.0))
         ),
-        "backlash": lambda d, s: actuator.Backlash(joint=d.joint, gap=(0.003, 0.01, 0.03)[s]),
-        "gripper_opens": lambda d, s: actuator.GripperOpens(duration=(2, 8, None)[s]),
-        "weak_gripper": lambda d, s: actuator.WeakGripper(strength=(0.5, 0.2, 0.05)[s]),
-        "encoder_bias": lambda d, s: sensor.Bias(**d.encoder, amount=(0.01, 0.03, 0.1)[s]),
-        "encoder_drift": lambda d, s: sensor.Drift(**d.encoder, rate=(5e-4, 2e-3, 8e-3)[s]),
-        "frozen_encoder": lambda d, s: sensor.FrozenEncoder(
-            joint=d.joint, duration=(5, 15, None)[s]
-        ),
-        "encoder_noise": lambda d, s: sensor.Noise(**d.encoder, std=(2e-3, 1e-2, 5e-2)[s]),
-        "encoder_spikes": lambda d, s: sensor.Spikes(**d.encoder, amount=(0.02, 0.1, 0.5)[s]),
-        "encoder_delay": lambda d, s: sensor.Delay(**d.encoder, steps=(1, 2, 5)[s]),
-        "encoder_dropout": lambda d, s: sensor.Dropout(
-            **d.encoder, probability=(0.05, 0.2, 0.5)[s]
-        ),
-        "torque_scale": lambda d, s: sensor.Scale(
-            channel=d.prefix + "measured_torque", element=d.joint, factor=(1.05, 1.15, 1.5)[s]
-        ),
-        "wrist_bias": lambda d, s: sensor.Bias(
-            channel=d.prefix + "wrist_force", element=d.translation, amount=(0.5, 2.0, 8.0)[s]
-        ),
-        "frozen_wrist": lambda d, s: sensor.Freeze(
-            channel="wrist_force", element=None, duration=(5, 15, None)[s]
-        ),
-        "action_delay": lambda d, s: action.ActionDelay(steps=(1, 3, 6)[s]),
-        "action_drop": lambda d, s: action.ActionDrop(probability=(0.1, 0.3, 0.7)[s]),
-        "action_bias": lambda d, s: action.ActionBias(axis=d.axis, amount=(0.05, 0.15, 0.4)[s]),
-        "action_repeat": lambda d, s: action.ActionRepeat(steps=(2, 4, 8)[s]),
-        "sign_flip": lambda d, s: action.SignFlip(axis=d.translation, duration=(3, 10, None)[s]),
-        "action_noise": lambda d, s: action.ActionNoise(share=(0.15, 0.4, 1.0)[s]),
-        "adversary": lambda d, s: action.Adversary(size=(0.05, 0.15, 0.4)[s]),
-        "slip": lambda d, s: object.Slip(friction=(0.4, 0.15, 0.03)[s]),
-        "snatch": lambda d, s: object.Snatch(
-            newtons=(3, 10, 30)[s], direction=d.direction, duration=10
-        ),
-        "teleport": lambda d, s: object.Teleport(
-            offset=((0.01, 0.03, 0.08)[s], (0.01, 0.03, 0.08)[s], 0.0)
-        ),
-        "heavy_object": lambda d, s: object.Heavy(kilograms=(0.1, 0.4, 1.5)[s]),
-        "missing_object": lambda d, _: object.Missing(),
+        "heavy_object": graded(object.Heavy, kilograms=(0.1, 0.4, 1.5)),
+        "missing_object": graded(object.Missing),
     },
 )
 """The fault of each kind for an episode, at severity 0 to 2; ``suite_fault`` sets when it begins."""
@@ -142,7 +164,10 @@ def kinds_of(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name not in GROUPS:
             check_choice("kind of fault", name, KINDS)
-    return tuple(dict.fromkeys(kind for name in names for kind in GROUPS.get(name, (name,))))
+    kinds: dict[str, None] = {}  # in order, each once
+    for name in names:
+        kinds |= dict.fromkeys(GROUPS.get(name, (name,)))
+    return tuple(kinds)
 
 
 def register_fault(name: str, make: Kind | str) -> None:
@@ -164,16 +189,25 @@ def register_fault(name: str, make: Kind | str) -> None:
 def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
     """Draw what the faults of the episode with this seed act on."""
     rng = np.random.default_rng([seed, 2])
-    robot, model = env.robosuite_env.robots[0], env.simulation.model
-    axes = env.action_space.shape[0] - len(env.gripper_actions)  # type: ignore[index]
+    robot = env.robosuite_env.robots[0]
+    model = env.simulation.model
     direction = rng.standard_normal(3)
-    x, y, z = (float(v) for v in direction / np.linalg.norm(direction))
-    elbow = model.jnt_bodyid[model.actuator_trnid[env.simulation.motors[4], 0]]
+    x, y, z = (direction / np.linalg.norm(direction)).tolist()
     joint = int(rng.integers(len(robot._ref_joint_vel_indexes)))
-    axis, translation = int(rng.integers(axes)), int(rng.integers(3))
-    prefix, hand = "robot0_" if len(env.robots) > 1 else "", robot.robot_model.eef_name["right"]
+    axis = int(rng.integers(flatdim(env.action_space) - len(env.gripper_actions)))
+    translation = int(rng.integers(3))
+    elbow = model.jnt_bodyid[model.actuator_trnid[env.simulation.motors[4], 0]]
     return Drawn(
-        env, prefix, joint, axis, translation, (x, y, z), model.body(elbow).name, hand, onset, seed
+        env=env,
+        prefix=prefix_of(0, len(env.robots)),
+        joint=joint,
+        axis=axis,
+        translation=translation,
+        direction=(x, y, z),
+        link=model.body(elbow).name,
+        hand=robot.robot_model.eef_name["right"],
+        onset=onset,
+        seed=seed,
     )
 
 
