@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.linear import along, gram
+from asm_gym.memory.linear_association import along, gram
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_shapes

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.association import Association, association_shapes, no_doubt
+from asm_gym.memory.association import Association, ChangeLayout, association_shapes
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.linear import check_inputs, specialise
+from asm_gym.memory.linear_association import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.base import Progress
@@ -88,8 +88,15 @@ class MemoryModel(ScaledModel):
         trajectories = [
             Trajectory(r.senses[::lag], r.commands[::lag], r.inputs[lag:]) for r in readings
         ]
-        layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
-        trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
+        trained = train(
+            trajectories,
+            self._layout(senses),
+            self.hidden_size,
+            self.schedule,
+            rng,
+            progress,
+            dynamics=self.dynamics,
+        )
         learned = {**senses.arrays, "energy": trained.energy}
         self.crossfitted = {}
         ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
@@ -101,7 +108,7 @@ class MemoryModel(ScaledModel):
         network, completion = trained.network, Completion.fit(senses, streams)
         filled = completion.named() if completion is not None else {}
         return self.restore(
-            {**learned, **network.weights._asdict(), **network.association._asdict(), **filled}
+            {**learned, **network.weights._asdict(), **network.association.named(), **filled}
         )
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
@@ -111,20 +118,16 @@ class MemoryModel(ScaledModel):
         """
         senses, lag = self.senses_, self.lag
         inputs = np.concatenate([senses.read_episode(e.stream).inputs[lag:] for e in episodes])
-        changes = np.ascontiguousarray(inputs[:, senses.changes])
-        layout = senses.groups, senses.changes, self._units_each(senses)
-        now = specialise(self.network.association, inputs, changes, *layout)
+        now = specialise(self.network.association, inputs, self._layout(senses))
         kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
         return self.restore(
-            {**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()}
+            {**{n: a for n, a in self.learned_.items() if n in kept}, **now.named()}
         )
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler.of(self.spec, learned, self.lag)
         X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
-        if "R" not in learned:  # made before leverage was learned
-            learned = {**learned, **no_doubt(senses.inputs, X)}
         if (found := dynamics_of(learned)) != self.dynamics:
             raise ValueError(
                 f"this is a memory of dynamics={found!r}, which cannot be loaded as {self.dynamics!r}"
@@ -132,7 +135,8 @@ class MemoryModel(ScaledModel):
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)
         shapes = temporal | association_shapes(senses.inputs, units, X)
-        shapes["R"] = (senses.inputs if len(learned["R"]) else 0, senses.inputs)
+        if not len(learned.get("R", ())):  # leverage was not learned, from few rows
+            shapes["R"] = (0, senses.inputs)
         if skills:
             shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
         if missing := [name for name in shapes if name not in learned]:
@@ -141,7 +145,7 @@ class MemoryModel(ScaledModel):
             )
         check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
-        association = Association(**{n: arrays[n] for n in Association._fields})
+        association = Association.from_named(arrays)
         how = (
             self.schedule.iterations,
             self.schedule.prior_precision,
@@ -181,6 +185,7 @@ class MemoryModel(ScaledModel):
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 
-    def _units_each(self, senses: StreamScaler) -> int:
-        """Return the hidden units of association for each group."""
-        return max(1, self.association_size // (int(senses.groups.max()) + 1))
+    def _layout(self, senses: StreamScaler) -> ChangeLayout:
+        """Return the layout of the inputs, with the hidden units of association for each group."""
+        groups = int(senses.groups.max()) + 1
+        return ChangeLayout.of(senses, max(1, self.association_size // groups))

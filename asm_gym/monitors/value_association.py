@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.linear import check_inputs
+from asm_gym.memory.linear_association import check_inputs
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.arm_inputs import WIDTHS, Derived, forces, motion
 from asm_gym.monitors.base import Progress

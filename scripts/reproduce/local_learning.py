@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
-from asm_gym.memory.energy import STEEPEST, STRIDE, infer
+from asm_gym.memory.energy import STEEPEST, STRIDE, Inference, infer
 from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
 from asm_gym.memory.traces import (
     DECAYS,
@@ -95,6 +95,7 @@ def local(
 ) -> Changes:
     """Return Σ_t of the Hebbian changes along a batch of episodes of one length, with the weights held still."""
     w, curvature = weights, pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
+    inference = Inference(pi_z, 1.0, curvature, iterations)
     sensory = batch.senses.shape[2]
     c = np.zeros((batch.senses.shape[1], w.W_C.shape[1]), np.float32)
     total = {name: np.zeros(getattr(w, name).shape) for name in COMPARED}
@@ -106,7 +107,7 @@ def local(
             taken = np.hstack([action, u[:, -1:]])
         past = direct(c, taken, w.W_D)
         left = np.hstack([x, u[:, :-1]]) - past
-        z = infer(mu, left, w.W_F, pi_z, np.ones_like(left), curvature, iterations)
+        z = infer(mu, left, w.W_F, np.ones_like(left), inference)
         settled, missed = left - sense(z, w.W_F), left - sense(mu, w.W_F)
         change = hebbian_change(c, taken, mu, z, settled, pi_z)
         for name in COMPARED:

@@ -26,7 +26,8 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
-from asm_gym.memory.linear import check_inputs, learn_linear
+from asm_gym.memory.association import ChangeLayout
+from asm_gym.memory.linear_association import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.arm_inputs import WIDTHS, Derived, forces, speeds
 from asm_gym.monitors.base import Progress
@@ -118,7 +119,7 @@ class LinearAssociation(ScaledModel):
         senses = StreamScaler.fit(self.spec, streams, self.lag)
         check_inputs(senses.inputs)
         a = np.concatenate([senses.read_episode(s).inputs[self.lag :] for s in streams])
-        D = learn_linear(a, senses.groups, senses.changes)
+        D = learn_linear(a, ChangeLayout.of(senses))
         left = np.sqrt(np.mean((a[:, senses.changes] - a @ D.T) ** 2, axis=0))
         return self.restore({**senses.arrays, "D": D, "remainder": np.maximum(left, FAINTEST)})
 
