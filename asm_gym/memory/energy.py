@@ -58,7 +58,8 @@ def inner_kernel(function: F) -> F:
 def activate(z: Array) -> Array:
     """Return tanh(z) to 5e-7, by Eigen's ratio of polynomials, which unlike libm's runs in vector registers."""
     out = np.empty_like(z)
-    flat, result = z.reshape(-1), out.reshape(-1)
+    flat = z.reshape(-1)
+    result = out.reshape(-1)
     for j in range(flat.size):
         v = min(max(flat[j], np.float32(-7.9)), np.float32(7.9))
         s = v * v
@@ -90,7 +91,10 @@ def outward(a: Array, W: Array) -> Array:
             q += a[0, j] * W[i + 1, j]
             r += a[0, j] * W[i + 2, j]
             s += a[0, j] * W[i + 3, j]
-        out[0, i], out[0, i + 1], out[0, i + 2], out[0, i + 3] = p, q, r, s
+        out[0, i] = p
+        out[0, i + 1] = q
+        out[0, i + 2] = r
+        out[0, i + 3] = s
     for i in range(whole, W.shape[0]):
         total = np.float32(0)
         for j in range(W.shape[1]):
