@@ -8,7 +8,7 @@ import pytest
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.memory.energy import Inference, infer
-from asm_gym.memory.learning import Moment, Schedule
+from asm_gym.memory.learning import Schedule, Turn
 from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.settling import (
     SettlingErrors,
@@ -234,7 +234,7 @@ def test_learning_is_that_of_the_published_equations(seed):
     never = np.zeros((3, 1), np.bool_)
     ours = z = np.zeros((3, H))
     for x, u in zip(senses, commands, strict=True):
-        ours, _ = learner.practise(ours, Moment(x, u, never), never, never, 1e-3)
+        ours, _ = learner.practise(ours, Turn(x, u, own=never, alone=never), 1e-3)
         z = theirs.learn(z, u, x, 1e-3)
     np.testing.assert_allclose(ours, z, atol=1e-6)
     for name, W in theirs.W.items():

@@ -167,23 +167,16 @@ def learn_association(
     U *= share[:, None]
     f = hidden_units(inputs, V)
     error = fresh_left - share * predicted
-    W_S, b_S = learn_precision(f, error, rng, tick)
-    span_S = usual_span(f, W_S, b_S)
-    error *= np.exp(np.float32(-0.5) * log_variance(f, W_S, b_S, span_S))
-    scale = learn_leverage_scale(error, far)
-    error /= np.sqrt(scale[0] + scale[1] * far)
+    expected_size, error = learn_expected_size(error, f, far, rng, tick)
     R, Q = inverse_of(inputs, layout)
     association = Association(
         V=V,
         U=U * remainder[:, None],
         D=D,
-        W_S=W_S,
-        b_S=b_S,
-        span_S=span_S,
         remainder=remainder,
         R=R,
         Q=Q,
-        leverage_scale=scale,
+        **expected_size,
     )
     return association, error
 
@@ -213,6 +206,22 @@ def _unexplained(inputs: Array, delta: Array, D: Array) -> tuple[Array, Array]:
     left = delta - outward(inputs, D)
     remainder = np.maximum(np.sqrt(np.mean(left**2, axis=0)), SMALLEST_SPREAD)
     return left / remainder, remainder
+
+
+def learn_expected_size(
+    error: Array, f: Array, far: Array, rng: np.random.Generator, tick: Tick
+) -> tuple[dict[str, Array], Array]:
+    """Learn how large errors (N, X) are, by hidden units (N, M) and leverage (N, X).
+
+    Returns:
+        W_S, b_S, span_S and leverage_scale of ``Association``, and the normalised errors (N, X).
+    """
+    W_S, b_S = learn_precision(f, error, rng, tick)
+    span_S = usual_span(f, W_S, b_S)
+    precision = np.exp(np.float32(-0.5) * log_variance(f, W_S, b_S, span_S))
+    scale = learn_leverage_scale(error * precision, far)
+    normalised = error * precision / np.sqrt(scale[0] + scale[1] * far)
+    return {"W_S": W_S, "b_S": b_S, "span_S": span_S, "leverage_scale": scale}, normalised
 
 
 def learn_leverage_scale(error: Array, far: Array) -> Array:

@@ -159,7 +159,8 @@ class Completion:
         E = np.flatnonzero(self.involved(missing))
         P = self.precision
         places = np.flatnonzero(missing[self.spec.sensory])  # sensory entries come first in y
-        W: Floats = -np.linalg.solve(P[np.ix_(E, E)], P[E])[np.searchsorted(E, places)]
+        solution = np.linalg.solve(P[np.ix_(E, E)], P[E]).astype(np.float64)
+        W = -solution[np.searchsorted(E, places)]
         W[:, E] = 0.0
         return places, W
 

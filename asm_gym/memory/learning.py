@@ -121,6 +121,20 @@ class Moment(NamedTuple):
     begins: NDArray[np.bool_]  # (B, 1) whether an episode begins
 
 
+class Turn(NamedTuple):
+    """One row of B streams to learn from, and which of them run on alone."""
+
+    senses: Array  # (B, S)
+    commands: Array  # (B, A + 1)
+    own: NDArray[np.bool_]  # (B, 1) streams that take their own action
+    alone: NDArray[np.bool_]  # (B, 1) streams whose next state follows from the prediction
+
+    def commands_with(self, action: Array) -> Array:
+        """Return the commands (B, A + 1) that are taken where ``action`` (B, A) is the streams' own."""
+        taken = np.where(self.own, action, self.commands[:, :-1])
+        return np.hstack([taken, self.commands[:, -1:]])
+
+
 class Learner(ABC):
     """A temporal network that learns: its weights, their running moments, and the norm that inference needs.
 
@@ -165,23 +179,8 @@ class Learner(ABC):
         """Return the state (B, Z) before an episode."""
 
     @abstractmethod
-    def practise(
-        self,
-        state: Array,
-        now: Moment,
-        own: NDArray[np.bool_],
-        alone: NDArray[np.bool_],
-        rate: float,
-    ) -> tuple[Array, float]:
-        """Learn from one row; return the next state (B, Z) and the energy summed over the batch.
-
-        Streams take their ``own`` action (B, 1); where ``alone`` (B, 1), their next state follows from the prediction.
-        """
-
-
-def own_commands(commands: Array, own: NDArray[np.bool_], action: Array) -> Array:
-    """Return the commands (B, A + 1) where some streams (B, 1) take their ``own`` action (B, A)."""
-    return np.hstack([np.where(own, action, commands[:, :-1]), commands[:, -1:]])
+    def practise(self, state: Array, turn: Turn, rate: float) -> tuple[Array, float]:
+        """Learn from one row; return the next state (B, Z) and the energy summed over the batch."""
 
 
 def one_after_another(
@@ -230,7 +229,8 @@ class Practice:
             self._alone = cue_ends & (self.rng.random(self.cue.shape) < free)
             if not self.learner.early:
                 own = self._alone
-            self.state, energy = self.learner.practise(state, now, own, self._alone, rate)
+            turn = Turn(now.senses, now.commands, own, self._alone)
+            self.state, energy = self.learner.practise(state, turn, rate)
             total += energy
         return total
 

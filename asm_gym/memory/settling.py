@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, Inference, activate, infer, inner_kernel, outward
 from asm_gym.memory.learning import (
     Learner,
-    Moment,
     Schedule,
     Tick,
     Trajectory,
+    Turn,
     coincidence,
-    own_commands,
 )
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, learned_network
 from asm_gym.scaling import ScaledRows
@@ -51,8 +50,13 @@ class SettlingWeights(NamedTuple):
 
 def settling_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of ``SettlingWeights`` by name."""
-    H, S, A = hidden, sensory, motor
-    return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (S, H), "b_F": (S,), "W_A": (A, H)}
+    return {
+        "W_H": (hidden, hidden),
+        "W_U": (hidden, motor + 1),
+        "W_F": (sensory, hidden),
+        "b_F": (sensory,),
+        "W_A": (motor, hidden),
+    }
 
 
 @inner_kernel
@@ -178,35 +182,28 @@ class SettlingLearner(Learner):
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, len(self.weights.W_H)), np.float32)
 
-    def practise(
-        self,
-        state: Array,
-        now: Moment,
-        own: NDArray[np.bool_],
-        alone: NDArray[np.bool_],
-        rate: float,
-    ) -> tuple[Array, float]:
+    def practise(self, state: Array, turn: Turn, rate: float) -> tuple[Array, float]:
         w = self.weights
         inference = self.inference
         pi_z = inference.prior_precision
         pi_x = inference.sensory_precision
         carried = carry_over(w, state)
-        taken = now.commands
-        if own.any():
-            taken = own_commands(now.commands, own, carried.action)
+        taken = turn.commands
+        if turn.own.any():
+            taken = turn.commands_with(carried.action)
         mu = carried.state + outward(taken, w.W_U)
-        left = now.senses - w.b_F
+        left = turn.senses - w.b_F
         z = infer(mu, left, w.W_F, np.full_like(left, pi_x), inference)
 
         of_state = z - mu
         of_senses = left - outward(activate(z), w.W_F)
-        of_action = now.commands[:, :-1] - carried.action
+        of_action = turn.commands[:, :-1] - carried.action
         energy = 0.5 * float(
             pi_z * np.sum(of_state**2) + pi_x * np.sum(of_senses**2) + np.sum(of_action**2)
         )
         errors = SettlingErrors(pi_z * of_state, pi_x * of_senses, of_action)
         self.learn(settling_change(state, taken, carried.h, errors, z, w.W_A), rate)
-        return np.where(alone, mu, z), energy
+        return np.where(turn.alone, mu, z), energy
 
 
 def learn_settling(

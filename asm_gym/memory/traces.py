@@ -35,12 +35,11 @@ from asm_gym.memory.energy import (
 )
 from asm_gym.memory.learning import (
     Learner,
-    Moment,
     Schedule,
     Tick,
     Trajectory,
+    Turn,
     coincidence,
-    own_commands,
 )
 from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, learned_network
 from asm_gym.scaling import ScaledRows
@@ -248,33 +247,26 @@ class TracesLearner(Learner):
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, self.weights.W_C.shape[1]), np.float32)
 
-    def practise(
-        self,
-        state: Array,
-        now: Moment,
-        own: NDArray[np.bool_],
-        alone: NDArray[np.bool_],
-        rate: float,
-    ) -> tuple[Array, float]:
+    def practise(self, state: Array, turn: Turn, rate: float) -> tuple[Array, float]:
         w = self.weights
         inference = self.inference
         pi_z = inference.prior_precision
         pi_x = inference.sensory_precision
-        sensory = now.senses.shape[1]
+        sensory = turn.senses.shape[1]
         mu = expect(state, w.W_C)
-        taken = now.commands
-        if own.any():
-            expected = direct(state, now.commands, w.W_D) + sense(mu, w.W_F)
-            taken = own_commands(now.commands, own, expected[:, sensory:])
+        taken = turn.commands
+        if turn.own.any():
+            expected = direct(state, turn.commands, w.W_D) + sense(mu, w.W_F)
+            taken = turn.commands_with(expected[:, sensory:])
 
         past = direct(state, taken, w.W_D)
-        left = np.hstack([now.senses, now.commands[:, :-1]]) - past  # (B, S + A)
+        left = np.hstack([turn.senses, turn.commands[:, :-1]]) - past  # (B, S + A)
         z = infer(mu, left, w.W_F, np.full_like(left, pi_x), inference)
         error = np.float32(pi_x) * (left - sense(z, w.W_F))
         of_state = float(np.sum((z - mu) ** 2))
         energy = 0.5 * float(pi_z * of_state + float(np.sum(error**2)) / pi_x)
         expected = past + sense(mu, w.W_F)
-        senses = np.where(alone, expected[:, :sensory], now.senses)
+        senses = np.where(turn.alone, expected[:, :sensory], turn.senses)
         self.learn(hebbian_change(state, taken, mu, z, error, pi_z), rate)
         return advance(state, np.hstack([senses, taken]), w.gains), energy
 
