@@ -166,8 +166,8 @@ def learn_association(
     share = trust(fresh_left, predicted)
     U *= share[:, None]
     f = hidden_units(inputs, V)
-    error = fresh_left - share * predicted
-    expected_size, error = learn_expected_size(error, f, far, rng, tick)
+    unexplained = fresh_left - share * predicted
+    expected_size, normalised = learn_expected_size(unexplained, f, far, rng, tick)
     R, Q = inverse_of(inputs, layout)
     association = Association(
         V=V,
@@ -178,7 +178,7 @@ def learn_association(
         Q=Q,
         **expected_size,
     )
-    return association, error
+    return association, normalised
 
 
 def _learn_from_few(
