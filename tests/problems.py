@@ -7,7 +7,12 @@ from typing import Any
 import numba
 import numpy as np
 
-from asm_gym.memory.association import Association, association_shapes, no_doubt, unbounded
+from asm_gym.memory.association import (
+    Association,
+    association_shapes,
+    unbounded,
+    without_leverage,
+)
 from asm_gym.memory.learning import Schedule, Trajectory
 
 CHANGES = slice(5, 10)
@@ -49,7 +54,7 @@ def some_association(
     shapes = association_shapes(inputs, units, changes).values()
     drawn = Association(*(rng.normal(scale=0.3, size=s).astype(np.float32) for s in shapes))
     known = {"remainder": np.exp(drawn.remainder), "span_S": unbounded(changes)}
-    return drawn._replace(**known, **no_doubt(inputs, changes))
+    return drawn._replace(**known, **without_leverage(inputs, changes))
 
 
 def some_rows(steps: int, batch: int, sensory: int, motor: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,8 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.memory import association_learning
 from asm_gym.memory.association import (
+    ChangeLayout,
+    Wiring,
     complete,
     hidden_units,
     leverage,
@@ -25,17 +27,19 @@ from asm_gym.memory.association_learning import (
     association_change,
     crossfit,
     learn_association,
-    learn_doubt,
+    learn_leverage_scale,
     learn_precision,
     thirds,
 )
-from asm_gym.memory.linear import LEAST_VARIANCE, conditional, inverse_of, moments
+from asm_gym.memory.linear_association import LEAST_VARIANCE, conditional, inverse_of, moments
 from asm_gym.memory.traces import direct_synapses, hebbian_change, initial_weights
 from asm_gym.monitors import NeuralASM, make_monitor
+from asm_gym.scaling import ScaledRows
 from tests.problems import CHANGES, called, energy
 from tests.streams import frozen, sine_episodes, sine_spec
 
 GROUPS = np.array([0, 0, 1, 2, 2])
+LAYOUT = ChangeLayout(13, CHANGES, GROUPS, units=4)
 
 
 @pytest.mark.parametrize("rows", [8000, 3 * PRECISION_BATCH * PRECISION_BATCHES])
@@ -54,7 +58,7 @@ def test_precision_recovers_noise_that_depends_on_context(rows, monkeypatch):
 
 
 def test_no_group_predicts_itself():
-    exists = synapses(GROUPS, CHANGES, 13, size=4)
+    exists = synapses(LAYOUT)
     reaches = (exists.U @ exists.V > 0) | (exists.D > 0)  # (X, I)
     assert np.array_equal(reaches[:, CHANGES], GROUPS[:, None] != GROUPS)
     assert reaches[:, :5].all()
@@ -118,21 +122,20 @@ def test_hidden_units_learn_what_is_not_linear():
         np.float32
     )
     a = np.hstack([delta, np.ones((len(delta), 2))]).astype(np.float32)
-    w, _ = learn_association(
-        a, delta, np.array([0, 0, 1, 1]), slice(0, 4), 20, np.random.default_rng(1)
-    )
+    layout = ChangeLayout(6, slice(0, 4), np.array([0, 0, 1, 1]), units=20)
+    w, _ = learn_association(a, layout, np.random.default_rng(1))
     left = (delta - complete(hidden_units(a, w.V), a, w.U, w.D))[:, 2:].std()
     assert left < 0.45  # 0.65 by a line, 0.05 by the noise alone
 
 
-def test_doubt_is_learned_from_how_errors_grow_with_leverage():
+def test_the_leverage_scale_is_learned_from_how_errors_grow_with_leverage():
     rng = np.random.default_rng(0)
     far = np.exp(rng.normal(size=(20_000, 3)) + 3.0).astype(np.float32)
     truth = np.array([0.0, 0.1, 1.0])
     errors = rng.normal(size=far.shape) * np.sqrt(
         (1 + truth * far / np.median(far, axis=0)) / (1 + truth)
     )
-    steady, slope, most = learn_doubt(errors.astype(np.float32), far)
+    steady, slope, most = learn_leverage_scale(errors.astype(np.float32), far)
     np.testing.assert_allclose(1 / steady - 1, truth, rtol=0.5, atol=0.02)
     np.testing.assert_allclose(steady + slope * np.median(far, axis=0), 1.0, rtol=1e-4)
     # a fault that takes the body further is excused no more
@@ -144,10 +147,19 @@ def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
     cause = rng.normal(size=(1500, 96))
     caused = cause @ rng.normal(size=(96, 4)) + rng.normal(size=(1500, 4))
     a = np.hstack([caused, cause, np.ones((1500, 1))]).astype(np.float32)
-    delta, groups = np.ascontiguousarray(a[:, :4]), np.arange(4)
-    w, errors = learn_association(a, delta, groups, slice(0, 4), 1, np.random.default_rng(1))
-    rows = a, delta, np.ones((1500, 1), np.float32)
-    shown, _ = called(normalised_errors)(*rows, *w[:7], spans(w.U), *w[7:], groups, 0)
+    layout = ChangeLayout(a.shape[1], slice(0, 4), np.arange(4), units=1)
+    w, errors = learn_association(a, layout, np.random.default_rng(1))
+    rows = ScaledRows(
+        senses=a,
+        seen=np.ones_like(a),
+        commands=a,
+        inputs=a,
+        changes=np.ascontiguousarray(a[:, :4]),
+        whole=np.ones((1500, 1), np.float32),
+        finite=np.ones(a.shape, bool),
+    )
+    wiring = Wiring(spans(w.U), layout.groups, layout.changes_last)
+    shown, _ = called(normalised_errors)(rows, w, wiring)
     assert np.mean(errors**2) > 1.05 * np.mean(shown**2)
     assert 0.8 < np.mean(errors**2) < 1.2
 
@@ -155,7 +167,7 @@ def test_errors_of_learned_rows_are_those_of_a_memory_that_had_not_seen_them():
 @pytest.mark.parametrize("batch", [1, 40])
 def test_leverage_is_the_distance_of_each_group_s_inputs_by_an_inverse_of_their_own(batch):
     a = mixed_rows()
-    found = leverage(a[:batch], *inverse_of(a, GROUPS, CHANGES), GROUPS, CHANGES.start)
+    found = leverage(a[:batch], *inverse_of(a, LAYOUT), GROUPS, LAYOUT.changes_last)
     for g in range(3):
         others = np.setdiff1d(np.arange(13), np.arange(5, 10)[g == GROUPS])
         b = a[:, others].astype(np.float64)
@@ -182,7 +194,7 @@ def test_crossfit_predicts_every_row_without_it():
 @pytest.mark.parametrize("penalty", [1e-6, 0.1, 10.0])
 def test_one_inverse_gives_the_ridge_regression_of_every_group_on_all_else(penalty):
     a = mixed_rows().astype(np.float64)
-    D = conditional(moments(a), penalty, GROUPS, CHANGES)
+    D = conditional(moments(a), penalty, LAYOUT)
     for g in range(3):
         own = np.arange(5, 10)[g == GROUPS]
         others = np.setdiff1d(np.arange(12), own)

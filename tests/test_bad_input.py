@@ -70,7 +70,7 @@ def test_senses_that_tell_nothing_are_named_and_no_precision_is_infinite(change)
     assert mute_channels(sine_episodes(12)) == []
     monitor = fresh("neural_asm", episodes[0].spec).fit(episodes)
     known = monitor.model.network.association
-    assert known.doubt[1].max() > 0
+    assert known.leverage_scale[1].max() > 0
     assert all(np.isfinite(array).all() for array in known)
     stream = changed(sine_episodes(1, seed=2), change)[0].stream.astype(np.float64)
     stream[10] = 1e9

@@ -18,7 +18,7 @@ rng = np.random.default_rng(0)
 mu, x, W = (rng.standard_normal(shape).astype(np.float32) for shape in ((64, 256), (64, 107), (107, 256)))
 precision = np.ones_like(x)
 print(must_compile(energy.infer), end=" ")
-z = energy.infer(np.tanh(mu), x, 0.04 * W, 30.0, precision, 60.0, 20)
+z = energy.infer(np.tanh(mu), x, 0.04 * W, precision, energy.Inference(30.0, 1.0, 60.0, 20))
 print(*(part.tobytes().hex()[:100_000] for part in (z, energy.activate(z))))
 """
 LOADED_FIRST = INFER.replace("z = inf", "energy.activate(mu)\nz = inf")

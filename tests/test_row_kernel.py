@@ -49,8 +49,9 @@ def expected_by(asm, state, rows):
     sure = np.where(history.steps < lag, 0.0, np.where(history.steps < 2 * lag, UNSURE, 1.0))
     errors = reading.whole * left * np.exp(-0.5 * spread) * sure[:, None]
     if len(a.R):
-        far = np.minimum(leverages(a.R, reading.inputs, model.senses_), a.doubt[2])
-        errors /= np.sqrt(a.doubt[0] + a.doubt[1] * far)
+        steady, slope, most = a.leverage_scale
+        far = np.minimum(leverages(a.R, reading.inputs, model.senses_), most)
+        errors /= np.sqrt(steady + slope * far)
     skill = state.skill
     if asm.skills_:
         p = certainty(np.hstack([units, expected]), model.learned_["W_K"], model.learned_["b_K"])

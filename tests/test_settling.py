@@ -7,10 +7,11 @@ import pytest
 
 from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
-from asm_gym.memory.energy import infer
-from asm_gym.memory.learning import Moment, Schedule
+from asm_gym.memory.energy import Inference, infer
+from asm_gym.memory.learning import Schedule, Turn
 from asm_gym.memory.recall import follow, run_on
 from asm_gym.memory.settling import (
+    SettlingErrors,
     SettlingLearner,
     SettlingNetwork,
     SettlingWeights,
@@ -77,16 +78,17 @@ def settle_in_double(w: SettlingWeights, before, u, x, pi_z=2.0, pi_x=1.5):
         np.tanh(before) @ w.W_H.T + u @ w.W_U.T,
         pi_z + pi_x * np.linalg.norm(w.W_F, 2) ** 2,
     )
-    return infer(mu, x - w.b_F, w.W_F, pi_z, np.full_like(x, pi_x), curvature, 3000)
+    inference = Inference(pi_z, pi_x, curvature, 3000)
+    return infer(mu, x - w.b_F, w.W_F, np.full_like(x, pi_x), inference)
 
 
 def changes(w: SettlingWeights, before, u, x, z, pi_z=2.0, pi_x=1.5) -> SettlingWeights:
     carried = np.tanh(before) @ w.W_H.T
     mu, h = carried + u @ w.W_U.T, carried + w.W_U[:, -1]
-    errors = (
-        pi_z * (z - mu),
-        pi_x * (x - w.b_F - np.tanh(z) @ w.W_F.T),
-        u[:, :-1] - np.tanh(h) @ w.W_A.T,
+    errors = SettlingErrors(
+        state=pi_z * (z - mu),
+        senses=pi_x * (x - w.b_F - np.tanh(z) @ w.W_F.T),
+        action=u[:, :-1] - np.tanh(h) @ w.W_A.T,
     )
     return settling_change(before, u, h, errors, z, w.W_A)
 
@@ -232,7 +234,7 @@ def test_learning_is_that_of_the_published_equations(seed):
     never = np.zeros((3, 1), np.bool_)
     ours = z = np.zeros((3, H))
     for x, u in zip(senses, commands, strict=True):
-        ours, _ = learner.practise(ours, Moment(x, u, never), never, never, 1e-3)
+        ours, _ = learner.practise(ours, Turn(x, u, own=never, alone=never), 1e-3)
         z = theirs.learn(z, u, x, 1e-3)
     np.testing.assert_allclose(ours, z, atol=1e-6)
     for name, W in theirs.W.items():

@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asm_gym.memory.energy import STRIDE, activate, energy_gradient, feedback, infer, outward
+from asm_gym.memory.energy import (
+    STRIDE,
+    Inference,
+    activate,
+    energy_gradient,
+    feedback,
+    infer,
+    outward,
+)
 from asm_gym.memory.learning import (
     LONGEST_CUE,
     Practice,
@@ -71,7 +79,7 @@ def test_energy_never_rises_during_inference(seed, weight, reach):
     W_F, x = W_F * weight, x * reach
     curvature = pi_z + pi_x.max() * np.linalg.norm(W_F, 2) ** 2
     energies = [
-        energy(infer(mu, x, W_F, pi_z, pi_x, curvature, k), mu, x, W_F, pi_z, pi_x)
+        energy(infer(mu, x, W_F, pi_x, Inference(pi_z, 1.0, curvature, k)), mu, x, W_F, pi_z, pi_x)
         for k in range(15)
     ]
     assert (np.diff(energies, axis=0) / (1.0 + energies[0])).max() <= 1e-6
@@ -85,10 +93,10 @@ def test_inference_is_gradient_descent_that_unseen_senses_do_not_move():
         back = (pi_x * (x - f @ W_F.T)) @ W_F
         bend = 0.77 * np.abs(back).max(axis=1, keepdims=True)
         z = z - float(STRIDE) / (9.0 + bend) * (pi_z * (z - mu) - (1 - f**2) * back)
-    np.testing.assert_allclose(infer(mu, x, W_F, pi_z, pi_x, 9.0, 6), z, atol=1e-5)
+    np.testing.assert_allclose(infer(mu, x, W_F, pi_x, Inference(pi_z, 1.0, 9.0, 6)), z, atol=1e-5)
     seen, other = np.ones_like(x), x.copy()
     seen[:, 1], other[:, 1] = 0, 77.0
-    a, b = (infer(mu, v, W_F, pi_z, seen, 20.0, 5) for v in (x, other))
+    a, b = (infer(mu, v, W_F, seen, Inference(pi_z, 1.0, 20.0, 5)) for v in (x, other))
     assert a.tobytes() == b.tobytes()
 
 

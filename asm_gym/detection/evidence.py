@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.base import Array, Floats
-from asm_gym.memory.linear import check_inputs, gram
+from asm_gym.memory.linear_association import check_inputs, gram
 
 POWER = 8  # p
 CONTEXT_GAIN = 0.2  # weight of the newest row in the running mean of the context

@@ -7,18 +7,22 @@ Every synapse descends its own term of
 
     F = ½ Π_z ‖z - μ‖² + ½ Π_x ‖[x, a] - [x̂, â](z)‖² + Σ_i σ_i ρ(e_i/σ_i),     e = Δ - D a - U f(V a)
     ρ(r) = ½ r² for |r| ≤ 1, |r| - ½ beyond;     D in closed form, for ρ(r) = ½ r²
+
+A further network is a file like ``settling``: its weights with their shapes, a compiled step for the row kernel
+(``monitors.row_kernel.follow``), a ``TemporalNetwork``, a ``Learner``, a ``Learn`` function, and an entry below.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from asm_gym.memory.association import ChangeLayout
 from asm_gym.memory.association_learning import ALL_TICKS, learn_association
-from asm_gym.memory.learning import Schedule, Trajectory, passes
+from asm_gym.memory.learning import Schedule, Trajectory, passes, row_count
 from asm_gym.memory.settling import (
     SettlingNetwork,
     SettlingWeights,
@@ -28,15 +32,17 @@ from asm_gym.memory.settling import (
 from asm_gym.memory.temporal import Learn, TemporalNetwork, Trained
 from asm_gym.memory.traces import Network, Weights, learn_traces, weight_shapes
 
-TRACES, SETTLING = "traces", "settling"
+TRACES = "traces"
+SETTLING = "settling"
 
 
 class Dynamics(NamedTuple):
     """A kind of temporal network."""
 
-    # of its synapses by name, for H, S and A
-    shapes: Callable[[int, int, int], dict[str, tuple[int, ...]]]
-    weights: Callable[..., Any]  # all synapses together
+    shapes: Callable[
+        [int, int, int], dict[str, tuple[int, ...]]
+    ]  # of its weights by name, for H, S and A
+    weights: Callable[..., Any]  # the record of its weights, built by keywords
     network: Callable[..., TemporalNetwork]
     learn: Learn
     iterations: int  # default
@@ -44,22 +50,36 @@ class Dynamics(NamedTuple):
 
 
 DYNAMICS = {
-    TRACES: Dynamics(weight_shapes, Weights, Network, learn_traces, 5, 30.0),
-    SETTLING: Dynamics(settling_shapes, SettlingWeights, SettlingNetwork, learn_settling, 20, 1.0),
+    TRACES: Dynamics(
+        shapes=weight_shapes,
+        weights=Weights,
+        network=Network,
+        learn=learn_traces,
+        iterations=5,
+        prior_precision=30.0,
+    ),
+    SETTLING: Dynamics(
+        shapes=settling_shapes,
+        weights=SettlingWeights,
+        network=SettlingNetwork,
+        learn=learn_settling,
+        iterations=20,
+        prior_precision=1.0,
+    ),
 }
 
 
 def dynamics_of(names: Collection[str]) -> str:
     """Return the dynamics whose arrays have these names."""
-    return SETTLING if "W_H" in names else TRACES
+    if "W_H" in names:
+        return SETTLING
+    return TRACES
 
 
 def train(
     trajectories: Sequence[Trajectory],
-    groups: NDArray[np.intp],
-    changes: slice,
+    layout: ChangeLayout,
     hidden: int,
-    units: int,
     schedule: Schedule,
     rng: np.random.Generator,
     progress: Callable[[int, int], object] | None = None,
@@ -67,25 +87,30 @@ def train(
 ) -> Trained:
     """Learn the synapses through time, then those of association, from whole episodes.
 
-    ``hidden`` and ``schedule`` are of the temporal network, one of ``DYNAMICS``; ``groups``, ``changes`` and ``units``
-    are as in ``association.synapses``; ``progress`` is called with steps done and their total.
+    Args:
+        trajectories: the episodes.
+        layout: of the inputs of association.
+        hidden: units H of the temporal network.
+        schedule: how the temporal network learns.
+        rng: draws initial weights and the order of the rows.
+        progress: is called with steps done and their total.
+        dynamics: name of the temporal network, one of ``DYNAMICS``.
     """
-    done, total = 0, passes(trajectories, schedule) + ALL_TICKS
+    total = passes(trajectories, schedule) + ALL_TICKS
+    steps = count(1)
 
     def tick() -> None:
-        nonlocal done
-        done += 1
         if progress is not None:
-            progress(done, total)
+            progress(next(steps), total)
 
-    network, energy, _ = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
-    inputs, lengths = (
-        np.concatenate([t.inputs for t in trajectories]),
-        [len(t.inputs) for t in trajectories],
-    )
-    deltas, layout = np.ascontiguousarray(inputs[:, changes]), (groups, changes, units)
-    independent = sum(len(t.senses) for t in trajectories)  # changes over several rows overlap
+    trained = DYNAMICS[dynamics].learn(trajectories, hidden, schedule, rng, tick)
     association, errors = learn_association(
-        inputs, deltas, *layout, rng, tick, lengths, independent
+        np.concatenate([t.inputs for t in trajectories]),
+        layout,
+        rng,
+        tick,
+        lengths=[len(t.inputs) for t in trajectories],
+        independent=row_count(trajectories),  # changes over several rows overlap
     )
-    return Trained(network.with_association(association), energy, errors)
+    network = trained.network.with_association(association)
+    return Trained(network, trained.energy, errors)

@@ -13,7 +13,7 @@ Source: Millidge et al. 2024 (PLOS Comput Biol), with f = tanh.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded here, so that its threads can be limited)
@@ -27,6 +27,19 @@ Scalar = float | np.floating[Any]
 STEEPEST = np.float32(0.77)  # above the largest |f''|, which is 4 / (3√3) for tanh
 STRIDE = np.float32(1.5)  # step of inference times the curvature; inference diverges from 2 on
 STILL = np.float32(1e-8)  # inference ends when no unit moves further in a step
+
+
+class Inference(NamedTuple):
+    """Precisions of the temporal network, and how far its state descends the energy.
+
+    All numbers are of single precision, or the compiled loops would compute in double.
+    """
+
+    prior_precision: Scalar  # Π_z
+    sensory_precision: Scalar  # Π_x of a sense that is not missing
+    curvature: Scalar  # Π_z + Π_x ‖W_F‖²
+    iterations: int  # most steps
+
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -45,7 +58,8 @@ def inner_kernel(function: F) -> F:
 def activate(z: Array) -> Array:
     """Return tanh(z) to 5e-7, by Eigen's ratio of polynomials, which unlike libm's runs in vector registers."""
     out = np.empty_like(z)
-    flat, result = z.reshape(-1), out.reshape(-1)
+    flat = z.reshape(-1)
+    result = out.reshape(-1)
     for j in range(flat.size):
         v = min(max(flat[j], np.float32(-7.9)), np.float32(7.9))
         s = v * v
@@ -77,7 +91,10 @@ def outward(a: Array, W: Array) -> Array:
             q += a[0, j] * W[i + 1, j]
             r += a[0, j] * W[i + 2, j]
             s += a[0, j] * W[i + 3, j]
-        out[0, i], out[0, i + 1], out[0, i + 2], out[0, i + 3] = p, q, r, s
+        out[0, i] = p
+        out[0, i + 1] = q
+        out[0, i + 2] = r
+        out[0, i + 3] = s
     for i in range(whole, W.shape[0]):
         total = np.float32(0)
         for j in range(W.shape[1]):
@@ -159,16 +176,14 @@ def energy_gradient(
 
 
 @kernel
-def infer(
-    mu: Array, x: Array, W_F: Array, pi_z: Scalar, pi_x: Array, curvature: Scalar, iterations: int
-) -> Array:
-    """Return z_t (B, H) after at most so many steps down the energy from μ; ``curvature`` is Π_z + max Π_x ‖W_F‖²."""
+def infer(mu: Array, x: Array, W_F: Array, pi_x: Array, inference: Inference) -> Array:
+    """Return z_t (B, H) after at most so many steps down the energy from μ; ``x`` and Π_x as in ``energy_gradient``."""
     z = mu.copy()
-    for _ in range(iterations):
-        gradient, bend = energy_gradient(z, mu, x, W_F, pi_z, pi_x)
+    for _ in range(inference.iterations):
+        gradient, bend = energy_gradient(z, mu, x, W_F, inference.prior_precision, pi_x)
         farthest = np.float32(0)
         for n in range(z.shape[0]):
-            step = STRIDE / (curvature + bend[n])
+            step = STRIDE / (inference.curvature + bend[n])
             for j in range(z.shape[1]):
                 move = step * gradient[n, j]
                 z[n, j] -= move

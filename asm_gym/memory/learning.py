@@ -13,27 +13,23 @@ Sources: Kingma and Ba 2015 (ICLR) for the step size; Tang et al. 2023 (NeurIPS)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, kernel
+from asm_gym.memory.energy import Array, Inference, kernel
 
 Tick = Callable[[], None]
 """Reports progress."""
 
 LONGEST_CUE = 30  # a stream reads fewer rows than this before it may run on alone
-# largest number of batches without and with running on alone
-UPDATES, RECALL_UPDATES = (
-    10_000,
-    50_000,
-)
-REFERENCE_WIDTH = (
-    256  # hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
-)
+UPDATES = 10_000  # largest number of batches
+RECALL_UPDATES = 50_000  # largest number of batches where streams run on alone
+# hidden units up to which ``learning_rate`` is used as it is; it is scaled down beyond
+REFERENCE_WIDTH = 256
 
 
 class Trajectory(NamedTuple):
@@ -60,7 +56,8 @@ def shuffled(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArra
     """Yield batches of indices without end, each of ``count`` once before any comes again."""
     while True:
         order = rng.permutation(count)
-        yield from (order[start : start + size] for start in range(0, count, size))
+        for start in range(0, count, size):
+            yield order[start : start + size]
 
 
 def cosine_decay(rate: float, progress: float) -> float:
@@ -93,7 +90,9 @@ class Synapse:
 
     def __init__(self, W: Array) -> None:
         self.W = W
-        self.mean, self.square, self.count = np.zeros(W.size, W.dtype), np.zeros(W.size, W.dtype), 0
+        self.mean = np.zeros(W.size, W.dtype)
+        self.square = np.zeros(W.size, W.dtype)
+        self.count = 0
 
     def learn(self, change: Array, rate: float) -> None:
         """Take a step of about ``rate`` a synapse along ``change``, which has the shape of ``W``."""
@@ -105,8 +104,10 @@ class Synapse:
 @kernel
 def power_iteration(W: Array, v: Array) -> tuple[float, Array]:
     """Take a step towards ‖W‖² (spectral) and its right singular vector ``v`` (H,); return both, ‖v‖ = 1."""
-    through, back = np.empty(W.shape[0], v.dtype), np.empty(v.shape, v.dtype)
-    np.dot(W, v, through)  # numba takes half as long where the result exists already
+    # numba takes half as long where the results exist already
+    through = np.empty(W.shape[0], v.dtype)
+    back = np.empty(v.shape, v.dtype)
+    np.dot(W, v, through)
     np.dot(through, W, back)
     norm = np.sqrt(np.sum(back * back))
     return norm, back / (norm + np.float32(1e-12))
@@ -120,57 +121,74 @@ class Moment(NamedTuple):
     begins: NDArray[np.bool_]  # (B, 1) whether an episode begins
 
 
+class Turn(NamedTuple):
+    """One row of B streams to learn from, and which of them run on alone."""
+
+    senses: Array  # (B, S)
+    commands: Array  # (B, A + 1)
+    own: NDArray[np.bool_]  # (B, 1) streams that take their own action
+    alone: NDArray[np.bool_]  # (B, 1) streams whose next state follows from the prediction
+
+    def commands_with(self, action: Array) -> Array:
+        """Return the commands (B, A + 1) that are taken where ``action`` (B, A) is the streams' own."""
+        taken = np.where(self.own, action, self.commands[:, :-1])
+        return np.hstack([taken, self.commands[:, -1:]])
+
+
 class Learner(ABC):
     """A temporal network that learns: its weights, their running moments, and the norm that inference needs.
 
     Args:
-        weights: the synapses through time, a NamedTuple with an array ``W_F``; changed in place.
-        names: of those that are learned.
-        schedule, rng: how to learn; draws the first direction of the power iteration.
+        weights: the synapses through time, a NamedTuple with an array ``W_F`` (N, H); changed in place.
+        schedule: how to learn.
+        rng: draws the first direction of the power iteration.
     """
 
-    early: int  # 1 if running alone is drawn for the row to come, 0 if for the row itself
+    learned: tuple[str, ...]  # names of the weights that are learned
+    early: bool  # whether running alone is drawn for the row to come, not for the row itself
+    scalar: type[Any]  # of the precisions; numba computes in the wider type of scalars and arrays
 
-    def __init__(
-        self, weights: Any, names: Collection[str], schedule: Schedule, rng: np.random.Generator
-    ) -> None:
-        self.weights, self.schedule = weights, schedule
-        self.synapses = {name: Synapse(getattr(weights, name)) for name in names}
+    def __init__(self, weights: Any, schedule: Schedule, rng: np.random.Generator) -> None:
+        self.weights = weights
+        self.schedule = schedule
+        self.synapses = {name: Synapse(getattr(weights, name)) for name in self.learned}
         self._direction = rng.standard_normal(weights.W_F.shape[1]).astype(weights.W_F.dtype)
         for _ in range(20):
-            self.norm, self._direction = power_iteration(weights.W_F, self._direction)
+            self._follow_norm()
+
+    def _follow_norm(self) -> None:
+        self.norm, self._direction = power_iteration(self.weights.W_F, self._direction)
+
+    @property
+    def inference(self) -> Inference:
+        """How to infer the state by the weights as they are."""
+        pi_z = self.scalar(self.schedule.prior_precision)
+        pi_x = self.scalar(self.schedule.sensory_precision)
+        curvature = self.scalar(pi_z + pi_x * self.norm)
+        return Inference(pi_z, pi_x, curvature, self.schedule.iterations)
 
     def learn(self, change: Any, rate: float) -> None:
         """Move every synapse along its array in ``change``."""
         for name, synapse in self.synapses.items():
             synapse.learn(getattr(change, name), rate)
         # W_F moves little in a step, so one iteration keeps the norm up to date.
-        self.norm, self._direction = power_iteration(self.weights.W_F, self._direction)
+        self._follow_norm()
 
     @abstractmethod
     def at_rest(self, size: int) -> Array:
         """Return the state (B, Z) before an episode."""
 
     @abstractmethod
-    def practise(
-        self,
-        state: Array,
-        now: Moment,
-        own: NDArray[np.bool_],
-        alone: NDArray[np.bool_],
-        rate: float,
-    ) -> tuple[Array, float]:
-        """Learn from one row; return the next state (B, Z) and the energy summed over the batch.
-
-        Streams take their ``own`` action (B, 1); where ``alone`` (B, 1), their next state follows from the prediction.
-        """
+    def practise(self, state: Array, turn: Turn, rate: float) -> tuple[Array, float]:
+        """Learn from one row; return the next state (B, Z) and the energy summed over the batch."""
 
 
 def one_after_another(
     trajectories: Sequence[Trajectory], size: int, rng: np.random.Generator
 ) -> Iterator[Moment]:
     """Yield rows of ``size`` endless streams of episodes, each begun at a random row."""
-    senses, commands = (np.concatenate([t[k] for t in trajectories]) for k in range(2))
+    senses = np.concatenate([t.senses for t in trajectories])
+    commands = np.concatenate([t.commands for t in trajectories])
     length = np.array([len(t.senses) for t in trajectories])
     start = np.cumsum(length) - length
     order = shuffled(len(trajectories), 1, rng)
@@ -181,14 +199,16 @@ def one_after_another(
         yield Moment(senses[row], commands[row], (step == 0)[:, None])
         step = step + 1
         for n in np.flatnonzero(step == length[episode]):
-            episode[n], step[n] = next(order)[0], 0
+            episode[n] = next(order)[0]
+            step[n] = 0
 
 
 class Practice:
     """``size`` streams that a learner follows; ``rng`` draws their cues and which run on alone."""
 
     def __init__(self, learner: Learner, size: int, rng: np.random.Generator) -> None:
-        self.learner, self.rng = learner, rng
+        self.learner = learner
+        self.rng = rng
         self.state = learner.at_rest(size)
         self.cue = np.full((size, 1), LONGEST_CUE)
         # rows since the episode began, or since the stream began
@@ -197,51 +217,54 @@ class Practice:
 
     def run(self, moments: Iterable[Moment], rate: float, free: float) -> float:
         """Learn from the moments, alone after the cue with probability ``free``; return the sum of all energies."""
-        total, early = 0.0, self.learner.early
+        total = 0.0
         for now in moments:
             state = np.where(now.begins, np.float32(0), self.state)
             self._steps = np.where(now.begins, 0, self._steps) + 1
-            self.cue = np.where(
-                now.begins, self.rng.integers(1, LONGEST_CUE, self.cue.shape), self.cue
-            )
-            before = self._alone & ~now.begins
-            self._alone = (self._steps + early > self.cue) & (
-                self.rng.random(self.cue.shape) < free
-            )
-            own = before if early else self._alone
-            self.state, energy = self.learner.practise(state, now, own, self._alone, rate)
+            cue = self.rng.integers(1, LONGEST_CUE, self.cue.shape)
+            self.cue = np.where(now.begins, cue, self.cue)
+
+            own = self._alone & ~now.begins
+            cue_ends = self._steps + self.learner.early > self.cue
+            self._alone = cue_ends & (self.rng.random(self.cue.shape) < free)
+            if not self.learner.early:
+                own = self._alone
+            turn = Turn(now.senses, now.commands, own, self._alone)
+            self.state, energy = self.learner.practise(state, turn, rate)
             total += energy
         return total
 
 
 def practise(
-    learner: Learner,
-    hidden: int,
-    trajectories: Sequence[Trajectory],
-    schedule: Schedule,
-    rng: np.random.Generator,
-    tick: Tick,
+    learner: Learner, trajectories: Sequence[Trajectory], rng: np.random.Generator, tick: Tick
 ) -> NDArray[np.float64]:
     """Pass over the episodes with a decaying rate, more and more alone; return the mean energy of each pass."""
+    schedule = learner.schedule
+    hidden = learner.weights.W_F.shape[1]
+    highest_rate = schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden)
     streams = Practice(learner, schedule.batch_size, rng)
-    epochs, widest = (
-        passes(trajectories, schedule),
-        schedule.learning_rate * min(1.0, REFERENCE_WIDTH / hidden),
-    )
     moments = one_after_another(trajectories, schedule.batch_size, rng)
-    steps = -(-sum(len(t.senses) for t in trajectories) // schedule.batch_size)
-    curve = np.zeros(epochs)
-    for epoch in range(epochs):
-        progress = epoch / epochs
+    steps = -(-row_count(trajectories) // schedule.batch_size)
+    curve = np.zeros(passes(trajectories, schedule))
+    for epoch in range(len(curve)):
+        progress = epoch / len(curve)
+        rate = cosine_decay(highest_rate, progress)
         free = schedule.free_running_probability * min(1.0, 2 * progress)
-        energy = streams.run(islice(moments, steps), cosine_decay(widest, progress), free)
+        energy = streams.run(islice(moments, steps), rate, free)
         curve[epoch] = energy / (steps * schedule.batch_size)
         tick()
     return curve
 
 
+def row_count(trajectories: Sequence[Trajectory]) -> int:
+    """Return the number of rows of all episodes."""
+    return sum(len(t.senses) for t in trajectories)
+
+
 def passes(trajectories: Sequence[Trajectory], schedule: Schedule) -> int:
     """Return the number of passes over all episodes: ``epochs``, fewer with very many episodes."""
-    updates = sum(len(t.senses) for t in trajectories) / schedule.batch_size
-    most = RECALL_UPDATES if schedule.free_running_probability > 0 else UPDATES
+    updates = row_count(trajectories) / schedule.batch_size
+    most = UPDATES
+    if schedule.free_running_probability > 0:
+        most = RECALL_UPDATES
     return max(1, min(schedule.epochs, round(most / updates)))

@@ -27,35 +27,34 @@ from asm_gym.memory.association_learning import association_change
 from asm_gym.memory.energy import Array
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 from asm_gym.scaling import StreamScaler
-from asm_gym.spec import MOTOR, StreamSpec
+from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.validation import check_shapes
 
-# largest number of batches, and of passes over the rows; rows of a batch
-UPDATES, PASSES, BATCH = (
-    12_000,
-    100,
-    256,
-)
-RATE, FORGETTING = 3e-3, 0.3  # step size, and λ
+UPDATES = 12_000  # most batches
+PASSES = 100  # most passes over the rows
+BATCH = 256  # rows of a batch
+RATE = 3e-3  # largest step size
+FORGETTING = 0.3  # λ
 FINE = 8.0  # κ of relative positions of objects, where a centimetre decides
-PLACED = (
-    4.0  # κ of the position of the hand: objects are put down at places that nothing else marks
-)
+# κ of the position of the hand: objects are put down at places that nothing else marks
+PLACED = 4.0
 FARTHEST = 100.0  # inputs are clipped to this
 
 
 @lru_cache(maxsize=8)
 def fineness(spec: StreamSpec) -> NDArray[np.float64]:
     """Return κ (D,); 0 for commands and for what is measured per second."""
+    return np.repeat([_fineness_of(c) for c in spec.channels], [c.size for c in spec.channels])
 
-    def of(name: str, unit: str, group: str) -> float:
-        if group == MOTOR or unit.endswith("/s"):
-            return 0.0
-        if group == "hand" and unit == "m":
-            return PLACED
-        return FINE if group == "object" and "_to_" in name and "quat" not in name else 1.0
 
-    return np.array([of(c.name, c.unit, c.group) for c in spec.channels for _ in range(c.size)])
+def _fineness_of(channel: Channel) -> float:
+    if channel.group == MOTOR or channel.unit.endswith("/s"):
+        return 0.0
+    if channel.group == "hand" and channel.unit == "m":
+        return PLACED
+    if channel.group == "object" and "_to_" in channel.name and "quat" not in channel.name:
+        return FINE
+    return 1.0
 
 
 def situation(senses: StreamScaler, rows: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
@@ -90,34 +89,40 @@ class Motor(NamedTuple):
         """Restore what ``named`` returned; None where it is absent. Raises ValueError where it does not fit."""
         if "motor_U" not in learned:
             return None
-        units, motor = learned["motor_U"].shape[-1], len(senses.spec.motor)
+        units = learned["motor_U"].shape[-1]
+        motor = len(senses.spec.motor)
         inputs = int(np.count_nonzero(fineness(senses.spec))) + 1
-        shapes: dict[str, tuple[int, ...]] = {
-            "V": (units, inputs),
-            "U": (motor, units),
-            "D": (motor, inputs),
+        shapes = {
+            "motor_V": (units, inputs),
+            "motor_U": (motor, units),
+            "motor_D": (motor, inputs),
+            "motor_mean": (motor,),
+            "motor_spread": (motor,),
         }
-        shapes |= {"mean": (motor,), "spread": (motor,)}
-        check_shapes(learned, {f"motor_{name}": shape for name, shape in shapes.items()})
-        return cls(**{name: learned[f"motor_{name}"] for name in shapes})
+        check_shapes(learned, shapes)
+        return cls._make(learned[name] for name in shapes)
 
 
 def learn_motor(m: Array, commands: Array, units: int, rng: np.random.Generator) -> Motor:
     """Learn M ``units`` from situations (N, I) and the next command in each (N, A), in random order."""
     if units < 1:
         raise ValueError(f"units must be at least 1, got {units}")
-    mean, spread = commands.mean(axis=0, dtype=np.float64), commands.std(axis=0, dtype=np.float64)
+    mean = commands.mean(axis=0, dtype=np.float64)
+    spread = commands.std(axis=0, dtype=np.float64)
     spread = np.where(spread > 0, spread, 1.0)
     wanted = ((commands - mean) / spread).astype(np.float32)
-    (_, inputs), A = m.shape, commands.shape[1]
+    motor = commands.shape[1]
+    inputs = m.shape[1]
     V = (rng.standard_normal((units, inputs)) / np.sqrt(inputs)).astype(np.float32)
-    weights = V, np.zeros((A, units), np.float32), np.zeros((A, inputs), np.float32)
-    synapses, plain = [Synapse(W) for W in weights], np.ones(A, np.float32)
+    U = np.zeros((motor, units), np.float32)
+    D = np.zeros((motor, inputs), np.float32)
+    synapses = [Synapse(W) for W in (V, U, D)]
+    no_scale = np.ones(motor, np.float32)
     updates = max(1, min(UPDATES, PASSES * len(m) // BATCH))
     for n, rows in zip(range(updates), shuffled(len(m), BATCH, rng), strict=False):
-        change, _ = association_change(m[rows], wanted[rows], plain, *weights, bound=np.inf)
+        change, _ = association_change(m[rows], wanted[rows], no_scale, V, U, D, bound=np.inf)
         rate = cosine_decay(RATE, n / updates)
         for synapse, product in zip(synapses, change, strict=True):
             synapse.W *= np.float32(1.0 - FORGETTING * rate)
             synapse.learn(product, rate)
-    return Motor(*weights, mean, spread)
+    return Motor(V, U, D, mean, spread)

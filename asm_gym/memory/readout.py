@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import Array, inner_kernel, outward
 from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
-UPDATES, BATCH, RATE = 6000, 512, 1e-2
+UPDATES = 6000  # batches
+BATCH = 512  # rows of a batch
+RATE = 1e-2  # largest step size
 KEPT = np.float32(0.9)  # 1 - λ
 SMALLEST = np.float32(1e-6)  # smallest p whose logarithm is taken
 
@@ -35,22 +37,26 @@ def certainty(units: Array, W_K: Array, b_K: Array) -> NDArray[np.float32]:
 @inner_kernel
 def add_up(L: Array, units: Array, state: Array, W_K: Array, b_K: Array) -> Array:
     """Return L_t (B, K) from L_{t-1}, f(h) (B, M) and f(μ) (B, H), which is not used where W_K has M columns only."""
-    rates, M = np.empty((L.shape[0], W_K.shape[1]), units.dtype), units.shape[1]
+    M = units.shape[1]
+    rates = np.empty((L.shape[0], W_K.shape[1]), units.dtype)
     for n in range(L.shape[0]):
         for i in range(W_K.shape[1]):
             rates[n, i] = units[n, i] if i < M else state[n, i - M]
-    drive, added = outward(rates, W_K), np.empty_like(L)
+    drives = outward(rates, W_K)
+    evidence = np.empty_like(L)
     for n in range(L.shape[0]):
-        most, total = np.float32(-np.inf), np.float32(0)
+        drive = drives[n]
+        most = np.float32(-np.inf)
         for k in range(len(b_K)):
-            drive[n, k] += b_K[k]
-            most = max(most, drive[n, k])
+            drive[k] += b_K[k]
+            most = max(most, drive[k])
+        total = np.float32(0)
         for k in range(len(b_K)):
-            drive[n, k] = np.exp(drive[n, k] - most)
-            total += drive[n, k]
+            drive[k] = np.exp(drive[k] - most)
+            total += drive[k]
         for k in range(len(b_K)):
-            added[n, k] = KEPT * L[n, k] + np.log(drive[n, k] / total + SMALLEST)
-    return added
+            evidence[n, k] = KEPT * L[n, k] + np.log(drive[k] / total + SMALLEST)
+    return evidence
 
 
 def learn_readout(
@@ -63,13 +69,12 @@ def learn_readout(
 
     ``rates`` returns the firing rates (B, M) of the rows of B indices, as all of them at once might not fit.
     """
-    W_K, b_K = (
-        np.zeros((count, rates(np.arange(1)).shape[1]), np.float32),
-        np.zeros(count, np.float32),
-    )
-    weights, bias = Synapse(W_K), Synapse(b_K)
-    # (K,) n
-    rarity = (len(skill) / (count * np.bincount(skill, minlength=count))).astype(np.float32)
+    W_K = np.zeros((count, rates(np.arange(1)).shape[1]), np.float32)
+    b_K = np.zeros(count, np.float32)
+    weights = Synapse(W_K)
+    bias = Synapse(b_K)
+    frequency = np.bincount(skill, minlength=count)
+    rarity = (len(skill) / (count * frequency)).astype(np.float32)  # (K,) n
     for n, rows in zip(range(UPDATES), shuffled(len(skill), BATCH, rng), strict=False):
         f = np.ascontiguousarray(rates(rows), np.float32)
         error = np.eye(count, dtype=np.float32)[skill[rows]] - certainty(f, W_K, b_K)

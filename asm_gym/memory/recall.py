@@ -36,29 +36,30 @@ def follow(network: TemporalNetwork, c: Array, senses: Array, commands: Array) -
     steps = []
     for x, u in zip(senses, commands, strict=True):
         seen = np.isfinite(x)
-        steps.append(
-            network.follow(c, u, np.where(seen, x, np.float32(0)), seen.astype(np.float32))
-        )
-        c = steps[-1].traces
+        known = np.where(seen, x, np.float32(0))
+        step = network.follow(c, u, known, seen.astype(np.float32))
+        steps.append(step)
+        c = step.traces
     return _stacked(steps, network)
 
 
 def run_on(network: TemporalNetwork, c: Array, steps: int) -> Recalled:
     """Recall ``steps`` rows offline from the carried state ``c`` (B, I)."""
-    made = []
+    recalled = []
     for _ in range(steps):
-        made.append(network.run_on(c))
-        c = made[-1].traces
-    return _stacked(made, network)
+        step = network.run_on(c)
+        recalled.append(step)
+        c = step.traces
+    return _stacked(recalled, network)
 
 
 def to_rows(reader: StreamScaler, recalled: Recalled) -> NDArray[np.float64]:
     """Return the predictions (T, B, D) in the units of the stream."""
     T, B, _ = recalled.senses.shape
-    sensory, motor = reader.spec.sensory, reader.spec.motor
-    standard = np.zeros((T, B, reader.spec.size))
-    standard[:, :, sensory] = recalled.senses[:, :, : len(sensory)]
-    standard[:, :, motor] = recalled.commands
+    spec = reader.spec
+    standard = np.zeros((T, B, spec.size))
+    standard[:, :, spec.sensory] = recalled.senses[:, :, : len(spec.sensory)]
+    standard[:, :, spec.motor] = recalled.commands
     return reader.mean + reader.spread * standard
 
 
@@ -66,13 +67,15 @@ def continued(
     network: TemporalNetwork, reader: StreamScaler, cue: NDArray[np.floating[Any]], steps: int
 ) -> NDArray[np.float64]:
     """Return the (steps, D) rows after a cue (T, D), in the units of the stream. Raises as ``check_cue`` does."""
-    rows, lag = check_cue(reader, cue, steps), reader.lag
+    rows = check_cue(reader, cue, steps)
+    lag = reader.lag
     # Every l-th row follows from those l before: l interleaved streams, recalled side by side.
     reading = reader.read_episode(rows[len(rows) % lag :])
-    senses, commands = (x.reshape(-1, lag, x.shape[1]) for x in (reading.senses, reading.commands))
+    senses = reading.senses.reshape(-1, lag, reading.senses.shape[1])
+    commands = reading.commands.reshape(-1, lag, reading.commands.shape[1])
     cued = follow(network, network.at_rest(lag), senses, commands)
-    recalled = to_rows(reader, run_on(network, cued.traces, -(-steps // lag)))
-    return recalled.reshape(-1, reader.spec.size)[:steps]
+    recalled = run_on(network, cued.traces, -(-steps // lag))
+    return to_rows(reader, recalled).reshape(-1, reader.spec.size)[:steps]
 
 
 def check_cue(
@@ -80,7 +83,8 @@ def check_cue(
 ) -> NDArray[np.float64]:
     """Return the cue (T, D) as floats. Raises ValueError unless ``steps`` rows can be recalled from it."""
     check_number("steps", steps, low=1, high=MOST_STEPS, whole=True)
-    rows, least = np.asarray(cue, np.float64), 2 * reader.lag
+    rows = np.asarray(cue, np.float64)
+    least = 2 * reader.lag
     if rows.ndim != 2:
         raise ValueError(f"a cue has the shape (T, {reader.spec.size}), got {rows.shape}")
     reader.spec.check_row(rows)

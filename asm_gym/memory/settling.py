@@ -22,23 +22,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.energy import Array, Scalar, activate, infer, inner_kernel, outward
+from asm_gym.memory.energy import Array, Inference, activate, infer, inner_kernel, outward
 from asm_gym.memory.learning import (
     Learner,
-    Moment,
     Schedule,
     Tick,
     Trajectory,
+    Turn,
     coincidence,
-    practise,
 )
-from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
+from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, learned_network
+from asm_gym.scaling import ScaledRows
 
-# smallest initial weight of a unit on its own last state, and the gain from all others
-LEAST, FAINT = (
-    0.9,
-    0.1,
-)
+LEAST = 0.9  # smallest initial weight of a unit on its own last state
+FAINT = 0.1  # gain of the initial weights from all other units
 
 
 class SettlingWeights(NamedTuple):
@@ -53,34 +50,31 @@ class SettlingWeights(NamedTuple):
 
 def settling_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of ``SettlingWeights`` by name."""
-    H, S, A = hidden, sensory, motor
-    return {"W_H": (H, H), "W_U": (H, A + 1), "W_F": (S, H), "b_F": (S,), "W_A": (A, H)}
+    return {
+        "W_H": (hidden, hidden),
+        "W_U": (hidden, motor + 1),
+        "W_F": (sensory, hidden),
+        "b_F": (sensory,),
+        "W_A": (motor, hidden),
+    }
 
 
 @inner_kernel
 def settle(
-    z: Array,
-    u: Array,
-    x: Array,
-    seen: Array,
-    W_H: Array,
-    W_U: Array,
-    W_F: Array,
-    b_F: Array,
-    pi_z: Scalar,
-    pi_x: Scalar,
-    curvature: Scalar,
-    iterations: int,
+    z: Array, rows: ScaledRows, weights: SettlingWeights, inference: Inference
 ) -> tuple[Array, Array]:
-    """Return f(μ_t) (B, H) and z_t (B, H) from the state before, the action and 1 (B, A + 1), and the senses (B, S)."""
-    mu, driven = outward(activate(z), W_H), outward(u, W_U)
-    left, precision = np.empty_like(x), np.empty_like(x)
-    for n in range(x.shape[0]):
+    """Return f(μ_t) (B, H) and z_t (B, H) from the states before (B, H) and the next rows of B streams."""
+    mu = outward(activate(z), weights.W_H)
+    driven = outward(rows.commands, weights.W_U)
+    left = np.empty_like(rows.senses)
+    precision = np.empty_like(rows.senses)
+    for n in range(mu.shape[0]):
         for i in range(mu.shape[1]):
             mu[n, i] += driven[n, i]
-        for i in range(x.shape[1]):
-            left[n, i], precision[n, i] = x[n, i] - b_F[i], pi_x * seen[n, i]
-    return activate(mu), infer(mu, left, W_F, pi_z, precision, curvature, iterations)
+        for i in range(left.shape[1]):
+            left[n, i] = rows.senses[n, i] - weights.b_F[i]
+            precision[n, i] = inference.sensory_precision * rows.seen[n, i]
+    return activate(mu), infer(mu, left, weights.W_F, precision, inference)
 
 
 class SettlingNetwork(TemporalNetwork):
@@ -100,67 +94,80 @@ class SettlingNetwork(TemporalNetwork):
         return np.zeros((batch, self.hidden_size), np.float32)
 
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
-        w, precision = self.weights, self.sensory_precision * seen
-        mu, action = self._expected(c, u)
-        z = infer(
-            mu, x - w.b_F, w.W_F, self.prior_precision, precision, self.curvature, self.iterations
-        )
-        return Step(mu, np.hstack([self._sense(mu), action]), z, z)
+        w = self.weights
+        carried = carry_over(w, c)
+        mu = carried.state + outward(u, w.W_U)
+        precision = self.inference.sensory_precision * seen
+        z = infer(mu, x - w.b_F, w.W_F, precision, self.inference)
+        return Step(mu, self._expected(mu, carried), z, z)
 
     def run_on(self, c: Array) -> Step:
-        u = np.zeros((len(c), self.motor + 1), c.dtype)
-        u[:, -1] = 1.0
-        _, u[:, :-1] = self._expected(c, u)
-        mu, action = self._expected(c, u)
-        return Step(mu, np.hstack([self._sense(mu), action]), mu, mu)
+        carried = carry_over(self.weights, c)
+        u = np.hstack([carried.action, np.ones((len(c), 1), c.dtype)])
+        mu = carried.state + outward(u, self.weights.W_U)
+        return Step(mu, self._expected(mu, carried), mu, mu)
 
-    def _sense(self, z: Array) -> Array:
-        """Return x̂ (B, S)."""
-        return outward(activate(z), self.weights.W_F) + self.weights.b_F
+    def _expected(self, mu: Array, carried: Carried) -> Array:
+        """Return x̂ and â (B, S + A)."""
+        senses = outward(activate(mu), self.weights.W_F) + self.weights.b_F
+        return np.hstack([senses, carried.action])
 
-    def _expected(self, z: Array, u: Array) -> tuple[Array, Array]:
-        """Return μ_t (B, H), and â_t (B, A), which does not depend on the action."""
-        w = self.weights
-        carried = outward(activate(z), w.W_H)
-        return carried + outward(u, w.W_U), outward(activate(carried + w.W_U[:, -1]), w.W_A)
+
+class Carried(NamedTuple):
+    """What follows from the state before, whatever is commanded."""
+
+    state: Array  # (B, H) W_H f(z_{t-1})
+    h: Array  # (B, H) the state of no action
+    action: Array  # (B, A) â
+
+
+def carry_over(weights: SettlingWeights, z: Array) -> Carried:
+    """Return what follows from the states ``z`` (B, H)."""
+    state = outward(activate(z), weights.W_H)
+    h = state + weights.W_U[:, -1]
+    return Carried(state, h, outward(activate(h), weights.W_A))
 
 
 def initial_settling_weights(
     hidden: int, sensory: int, motor: int, rng: np.random.Generator, least: float = LEAST
 ) -> SettlingWeights:
     """Return random weights of about unit gain, W_H near the identity, with ``least`` to 1 on its diagonal."""
-    weights = {
-        n: np.zeros(shape, np.float32)
-        for n, shape in settling_shapes(hidden, sensory, motor).items()
-    }
-    for name in ("W_H", "W_U", "W_F", "W_A"):
-        W = weights[name]
-        W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
-    weights["W_H"][:] = FAINT * weights["W_H"] + np.diag(
-        np.linspace(least, 1.0, hidden, dtype=np.float32)
+    weights = SettlingWeights._make(
+        np.zeros(shape, np.float32) for shape in settling_shapes(hidden, sensory, motor).values()
     )
-    return SettlingWeights(**weights)
+    for W in (weights.W_H, weights.W_U, weights.W_F, weights.W_A):
+        W[:] = rng.standard_normal(W.shape) / np.sqrt(W.shape[1])
+    own = np.linspace(least, 1.0, hidden, dtype=np.float32)
+    weights.W_H[:] = FAINT * weights.W_H + np.diag(own)
+    return weights
+
+
+class SettlingErrors(NamedTuple):
+    """Errors of a row at the inferred state."""
+
+    state: Array  # (B, H) Π_z ε_z
+    senses: Array  # (B, S) Π_x ε_x
+    action: Array  # (B, A) ε_a
 
 
 def settling_change(
-    before: Array, u: Array, h: Array, errors: tuple[Array, Array, Array], z: Array, W_A: Array
+    before: Array, u: Array, h: Array, errors: SettlingErrors, z: Array, W_A: Array
 ) -> SettlingWeights:
     """Return the change of each array: local products, averaged over the batch.
 
     ``before``, ``h`` and ``z`` (B, H) are the state before, that of the motor prediction, and the inferred one; ``u``
-    (B, A + 1) is the action of μ and 1; ``errors`` are Π_z ε_z (B, H), Π_x ε_x (B, S) at ``z``, and ε_a (B, A).
+    (B, A + 1) is the action of μ and 1.
     """
-    state, senses, action = errors
     f = activate(h)
-    motor = (np.float32(1) - f * f) * (action @ W_A)  # (B, H) ε_h
-    W_U = coincidence(state, u)
+    motor = (np.float32(1) - f * f) * (errors.action @ W_A)  # (B, H) ε_h
+    W_U = coincidence(errors.state, u)
     W_U[:, -1] += motor.mean(axis=0)
     return SettlingWeights(
-        W_H=coincidence(state + motor, activate(before)),
+        W_H=coincidence(errors.state + motor, activate(before)),
         W_U=W_U,
-        W_F=coincidence(senses, activate(z)),
-        b_F=senses.mean(axis=0),
-        W_A=coincidence(action, f),
+        W_F=coincidence(errors.senses, activate(z)),
+        b_F=errors.senses.mean(axis=0),
+        W_A=coincidence(errors.action, f),
     )
 
 
@@ -168,44 +175,35 @@ class SettlingLearner(Learner):
     """The settling network as it learns."""
 
     weights: SettlingWeights
-    early = 1
-
-    def __init__(
-        self, weights: SettlingWeights, schedule: Schedule, rng: np.random.Generator
-    ) -> None:
-        super().__init__(weights, SettlingWeights._fields, schedule, rng)
+    learned = SettlingWeights._fields
+    early = True
+    scalar = np.float32
 
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, len(self.weights.W_H)), np.float32)
 
-    def practise(
-        self,
-        state: Array,
-        now: Moment,
-        own: NDArray[np.bool_],
-        alone: NDArray[np.bool_],
-        rate: float,
-    ) -> tuple[Array, float]:
-        w, how, x, u, taken = self.weights, self.schedule, now.senses, now.commands, now.commands
-        pi_z, pi_x = np.float32(how.prior_precision), np.float32(how.sensory_precision)
-        carried = outward(activate(state), w.W_H)
-        h = carried + w.W_U[:, -1]
-        if own.any():
-            taken = np.hstack([np.where(own, outward(activate(h), w.W_A), u[:, :-1]), u[:, -1:]])
-        mu, left, curvature = (
-            carried + outward(taken, w.W_U),
-            x - w.b_F,
-            np.float32(pi_z + pi_x * self.norm),
-        )
-        z = infer(mu, left, w.W_F, pi_z, np.full_like(x, pi_x), curvature, how.iterations)
-        of_state, of_senses = z - mu, left - outward(activate(z), w.W_F)
-        of_action = np.ascontiguousarray(u[:, :-1]) - outward(activate(h), w.W_A)
+    def practise(self, state: Array, turn: Turn, rate: float) -> tuple[Array, float]:
+        w = self.weights
+        inference = self.inference
+        pi_z = inference.prior_precision
+        pi_x = inference.sensory_precision
+        carried = carry_over(w, state)
+        taken = turn.commands
+        if turn.own.any():
+            taken = turn.commands_with(carried.action)
+        mu = carried.state + outward(taken, w.W_U)
+        left = turn.senses - w.b_F
+        z = infer(mu, left, w.W_F, np.full_like(left, pi_x), inference)
+
+        of_state = z - mu
+        of_senses = left - outward(activate(z), w.W_F)
+        of_action = turn.commands[:, :-1] - carried.action
         energy = 0.5 * float(
             pi_z * np.sum(of_state**2) + pi_x * np.sum(of_senses**2) + np.sum(of_action**2)
         )
-        errors = pi_z * of_state, pi_x * of_senses, of_action
-        self.learn(settling_change(state, taken, h, errors, z, w.W_A), rate)
-        return np.where(alone, mu, z), energy
+        errors = SettlingErrors(pi_z * of_state, pi_x * of_senses, of_action)
+        self.learn(settling_change(state, taken, carried.h, errors, z, w.W_A), rate)
+        return np.where(turn.alone, mu, z), energy
 
 
 def learn_settling(
@@ -216,12 +214,12 @@ def learn_settling(
     tick: Tick,
 ) -> Trained:
     """Learn the synapses through time; see ``temporal.Learn``."""
-    sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
     # A network that runs on alone must keep its state; one that reads hundreds of rows would drift if it kept all.
-    least = 1.0 if schedule.free_running_probability > 0 else LEAST
-    weights = initial_settling_weights(hidden, sensory, commands - 1, rng, least)
-    energy = practise(
-        SettlingLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick
-    )
-    how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
-    return Trained(SettlingNetwork(weights, unassociated(), *how), energy)
+    least = LEAST
+    if schedule.free_running_probability > 0:
+        least = 1.0
+    sensory = trajectories[0].senses.shape[1]
+    motor = trajectories[0].commands.shape[1] - 1
+    weights = initial_settling_weights(hidden, sensory, motor, rng, least)
+    learner = SettlingLearner(weights, schedule, rng)
+    return learned_network(SettlingNetwork, learner, trajectories, rng, tick)

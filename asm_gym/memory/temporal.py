@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.memory.association import Association, association_shapes, spans
-from asm_gym.memory.energy import Array, Scalar
-from asm_gym.memory.learning import Schedule, Tick, Trajectory
+from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.energy import Array, Inference
+from asm_gym.memory.learning import Learner, Schedule, Tick, Trajectory, practise
 
 Rows = NDArray[np.float64]
 
@@ -47,17 +47,19 @@ class RowHistory(NamedTuple):
 
     def past(self, rows: Rows) -> tuple[Rows, Rows]:
         """Return the rows l before ``rows`` (B, D), and as long before those; at first nothing moves."""
-        before, earlier = self.before[:, 0], self.earlier[:, 0]
-        if self.steps.min() < 2 * self.lag:
-            before = np.where(self.steps[:, None] >= self.lag, before, rows)
-            earlier = np.where(self.steps[:, None] >= 2 * self.lag, earlier, before)
+        steps = self.steps[:, None]
+        before = np.where(steps >= self.lag, self.before[:, 0], rows)
+        earlier = np.where(steps >= 2 * self.lag, self.earlier[:, 0], before)
         return before, earlier
 
     def followed_by(self, rows: Rows) -> RowHistory:
         """Return the history after the next rows (B, D)."""
-        kept = (self.before, rows), (self.earlier, self.past(rows)[0])
-        before, earlier = (np.concatenate([old[:, 1:], new[:, None]], axis=1) for old, new in kept)
-        return RowHistory(before, earlier, self.steps + 1)
+        last, _ = self.past(rows)
+        return RowHistory(
+            before=np.concatenate([self.before[:, 1:], rows[:, None]], axis=1),
+            earlier=np.concatenate([self.earlier[:, 1:], last[:, None]], axis=1),
+            steps=self.steps + 1,
+        )
 
 
 class MemoryState(NamedTuple):
@@ -80,9 +82,15 @@ class Step(NamedTuple):
 
 
 class TemporalNetwork(ABC):
-    """A network whose weights, among them ``W_F`` (N, H), no longer change; precisions are Π_z and Π_x."""
+    """A network whose weights no longer change.
 
-    weights: Any
+    Args:
+        weights: the synapses, a NamedTuple with an array ``W_F`` (N, H).
+        association: the synapses between senses.
+        iterations: most steps of inference.
+        prior_precision: Π_z.
+        sensory_precision: Π_x.
+    """
 
     def __init__(
         self,
@@ -93,32 +101,26 @@ class TemporalNetwork(ABC):
         sensory_precision: float,
     ) -> None:
         self.weights = weights
-        self.association, self.spans = association, spans(association.U)
-        self.iterations = iterations
-        # All in single precision, or the compiled loops would compute in double.
-        self.prior_precision, self.sensory_precision = (
-            np.float32(prior_precision),
-            np.float32(sensory_precision),
-        )
+        self.association = association
         norm = float(np.linalg.norm(weights.W_F.astype(np.float64), 2))
-        self.curvature = np.float32(prior_precision + sensory_precision * norm**2)
+        self.inference = Inference(
+            prior_precision=np.float32(prior_precision),
+            sensory_precision=np.float32(sensory_precision),
+            curvature=np.float32(prior_precision + sensory_precision * norm**2),
+            iterations=iterations,
+        )
 
     def with_association(self, association: Association) -> Self:
         """Return a copy with other synapses between senses."""
         other = copy.copy(self)
-        other.association, other.spans = association, spans(association.U)
+        other.association = association
         return other
 
     def with_iterations(self, iterations: int) -> Self:
         """Return a copy with another number of inference steps."""
         other = copy.copy(self)
-        other.iterations = iterations
+        other.inference = self.inference._replace(iterations=iterations)
         return other
-
-    @property
-    def inference(self) -> tuple[Scalar, Scalar, Scalar, int]:
-        """Π_z, Π_x, the curvature, and iterations."""
-        return self.prior_precision, self.sensory_precision, self.curvature, self.iterations
 
     @property
     @abstractmethod
@@ -158,8 +160,26 @@ Learn = Callable[[Sequence[Trajectory], int, Schedule, np.random.Generator, Tick
 """Learns the synapses through time, of H hidden units; ticks after each epoch. The network has no association yet."""
 
 
+def learned_network(
+    kind: type[TemporalNetwork],
+    learner: Learner,
+    trajectories: Sequence[Trajectory],
+    rng: np.random.Generator,
+    tick: Tick,
+) -> Trained:
+    """Let a learner pass over the episodes; return the network of its weights."""
+    energy = practise(learner, trajectories, rng, tick)
+    network = kind(
+        learner.weights,
+        unassociated(),
+        learner.schedule.iterations,
+        learner.schedule.prior_precision,
+        learner.schedule.sensory_precision,
+    )
+    return Trained(network, energy)
+
+
 def unassociated() -> Association:
     """Return an association without units."""
-    return Association(
-        *(np.zeros(shape, np.float32) for shape in association_shapes(1, 0, 0).values())
-    )
+    shapes = association_shapes(1, 0, 0).values()
+    return Association._make(np.zeros(shape, np.float32) for shape in shapes)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from asm_gym.memory.energy import (
     Array,
+    Inference,
     Scalar,
     activate,
     beside,
@@ -34,14 +35,14 @@ from asm_gym.memory.energy import (
 )
 from asm_gym.memory.learning import (
     Learner,
-    Moment,
     Schedule,
     Tick,
     Trajectory,
+    Turn,
     coincidence,
-    practise,
 )
-from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, unassociated
+from asm_gym.memory.temporal import Step, TemporalNetwork, Trained, learned_network
+from asm_gym.scaling import ScaledRows
 
 DECAYS = np.array([0.0, 0.5, 0.75, 0.875, 0.9375, 0.97, 0.985, 0.995], np.float32)  # λ (K,)
 FAINTEST = 1e-3  # smallest root mean square of a trace that is scaled
@@ -63,15 +64,15 @@ def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
     """Return g (K,) that give each trace of these episodes (T, R) a mean square of 1."""
     plain = np.float32(1) - DECAYS
     ordered = sorted(episodes, key=len, reverse=True)
-    squares, width = np.zeros(len(DECAYS)), ordered[0].shape[1]
+    width = ordered[0].shape[1]
+    squares = np.zeros(len(DECAYS))
     traces = np.zeros((len(ordered), len(DECAYS) * width), np.float32)
     for t in range(len(ordered[0])):
         rows = np.array([episode[t] for episode in ordered if t < len(episode)], np.float32)
         traces = advance(traces[: len(rows)], rows, plain)
-        squares += np.sum(
-            traces.reshape(len(rows), len(DECAYS), width) ** 2, axis=(0, 2), dtype=np.float64
-        )
-    count = width * sum(len(episode) for episode in episodes)
+        by_decay = traces.reshape(len(rows), len(DECAYS), width)
+        squares += np.sum(by_decay**2, axis=(0, 2), dtype=np.float64)
+    count = width * sum(map(len, episodes))
     return (plain / np.maximum(np.sqrt(squares / count), FAINTEST)).astype(np.float32)
 
 
@@ -86,11 +87,12 @@ class Weights(NamedTuple):
 
 def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of ``Weights`` by name."""
-    H, N, traces = hidden, sensory + motor, len(DECAYS) * (sensory + motor + 1)
+    predicted = sensory + motor
+    traces = len(DECAYS) * (predicted + 1)
     return {
-        "W_C": (H, traces),
-        "W_F": (N, H),
-        "W_D": (N, traces + motor + 1),
+        "W_C": (hidden, traces),
+        "W_F": (predicted, hidden),
+        "W_D": (predicted, traces + motor + 1),
         "gains": (len(DECAYS),),
     }
 
@@ -122,42 +124,40 @@ def sense(z: Array, W_F: Array) -> Array:
 
 @inner_kernel
 def carry(
-    c: Array,
-    u: Array,
-    x: Array,
-    seen: Array,
-    W_C: Array,
-    W_F: Array,
-    W_D: Array,
-    gains: Array,
-    pi_z: Scalar,
-    pi_x: Scalar,
-    curvature: Scalar,
-    iterations: int,
-    context: bool,
+    c: Array, rows: ScaledRows, weights: Weights, inference: Inference, wants_context: bool
 ) -> tuple[Array, Array]:
-    """Return f(μ_t) (B, H), 0 unless ``context`` or a sense is missing, and c_t (B, I)."""
-    B, S = x.shape
-    rows, whole = beside(x, u), True
-    for n in range(B):
-        for i in range(S):
-            whole = whole and seen[n, i] != 0
-    mu = np.zeros((B, W_C.shape[0]), c.dtype)
-    if context or not whole:
-        mu = outward(c, W_C)
+    """Return f(μ_t) (B, H), 0 unless wanted or a sense is missing, and c_t (B, I), after the next rows of B streams."""
+    sensed = beside(rows.senses, rows.commands)
+    whole = rows.seen.all()
+    mu = np.zeros((c.shape[0], weights.W_C.shape[0]), c.dtype)
+    if wants_context or not whole:
+        mu = outward(c, weights.W_C)
     if not whole:
-        past = outward(beside(c, u), W_D)  # (B, S + A)
-        left, precision = np.empty_like(past), np.empty_like(past)
-        for n in range(B):
-            for i in range(past.shape[1]):
-                left[n, i] = rows[n, i] - past[n, i]
-                precision[n, i] = pi_x * seen[n, i] if i < S else pi_x
-        found = sense(infer(mu, left, W_F, pi_z, precision, curvature, iterations), W_F)
-        for n in range(B):
-            for i in range(S):
-                if seen[n, i] == 0:
-                    rows[n, i] = past[n, i] + found[n, i]
-    return activate(mu), advance(c, rows, gains)
+        fill_missing(sensed, c, mu, rows, weights, inference)
+    return activate(mu), advance(c, sensed, weights.gains)
+
+
+@inner_kernel
+def fill_missing(
+    sensed: Array, c: Array, mu: Array, rows: ScaledRows, weights: Weights, inference: Inference
+) -> None:
+    """Write what is inferred of missing senses into ``sensed`` (B, S + A + 1), from c (B, I) and μ (B, H)."""
+    S = rows.senses.shape[1]
+    past = outward(beside(c, rows.commands), weights.W_D)  # (B, S + A)
+    left = np.empty_like(past)
+    precision = np.empty_like(past)
+    for n in range(past.shape[0]):
+        for i in range(past.shape[1]):
+            left[n, i] = sensed[n, i] - past[n, i]
+            precision[n, i] = inference.sensory_precision
+            if i < S:
+                precision[n, i] *= rows.seen[n, i]
+
+    state = sense(infer(mu, left, weights.W_F, precision, inference), weights.W_F)
+    for n in range(past.shape[0]):
+        for i in range(S):
+            if rows.seen[n, i] == 0:
+                sensed[n, i] = past[n, i] + state[n, i]
 
 
 class Network(TemporalNetwork):
@@ -178,23 +178,27 @@ class Network(TemporalNetwork):
 
     def follow(self, c: Array, u: Array, x: Array, seen: Array) -> Step:
         w = self.weights
-        mu, past = expect(c, w.W_C), direct(c, u, w.W_D)
-        precision = self.sensory_precision * np.hstack([seen, np.ones_like(u[:, :-1])])
-        left = np.hstack([x, u[:, :-1]]) - past
-        z = infer(mu, left, w.W_F, self.prior_precision, precision, self.curvature, self.iterations)
-        whole = np.where(seen > 0, x, (past + sense(z, w.W_F))[:, : x.shape[1]])
+        mu = expect(c, w.W_C)
+        past = direct(c, u, w.W_D)
+        action = u[:, :-1]
+        precision = self.inference.sensory_precision * np.hstack([seen, np.ones_like(action)])
+        z = infer(mu, np.hstack([x, action]) - past, w.W_F, precision, self.inference)
+        inferred = past + sense(z, w.W_F)
+        whole = np.where(seen > 0, x, inferred[:, : x.shape[1]])
         return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w.gains))
 
     def run_on(self, c: Array) -> Step:
         w = self.weights
-        S, A = w.W_F.shape[0] - self.motor, self.motor
+        sensory = w.W_F.shape[0] - self.motor
         mu = expect(c, w.W_C)
         state = sense(mu, w.W_F)
-        u = np.zeros((len(c), A + 1), np.float32)
+        u = np.zeros((len(c), self.motor + 1), np.float32)
         u[:, -1] = 1.0
-        u[:, :A] = (direct(c, u, w.W_D) + state)[:, S:]  # no synapse leads from an action to itself
+        # No synapse leads from an action to itself.
+        u[:, :-1] = (direct(c, u, w.W_D) + state)[:, sensory:]
         expected = direct(c, u, w.W_D) + state
-        return Step(mu, expected, mu, advance(c, np.hstack([expected[:, :S], u]), w.gains))
+        traces = advance(c, np.hstack([expected[:, :sensory], u]), w.gains)
+        return Step(mu, expected, mu, traces)
 
 
 class HebbianChange(NamedTuple):
@@ -208,15 +212,20 @@ class HebbianChange(NamedTuple):
 def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Generator) -> Weights:
     """Return random weights of about unit gain into the state and of gain 0.1 out of it, and no direct ones."""
     shapes = weight_shapes(hidden, sensory, motor)
-    W_C, W_F = (
-        (gain * rng.standard_normal(shapes[name]) / np.sqrt(shapes[name][1])).astype(np.float32)
-        for name, gain in (("W_C", 1.0), ("W_F", 0.1))
+    return Weights(
+        W_C=_random(shapes["W_C"], 1.0, rng),
+        W_F=_random(shapes["W_F"], 0.1, rng),
+        W_D=np.zeros(shapes["W_D"], np.float32),
+        gains=np.float32(1) - DECAYS,
     )
-    return Weights(W_C, W_F, np.zeros(shapes["W_D"], np.float32), np.float32(1) - DECAYS)
+
+
+def _random(shape: tuple[int, ...], gain: float, rng: np.random.Generator) -> Array:
+    return (gain * rng.standard_normal(shape) / np.sqrt(shape[1])).astype(np.float32)
 
 
 def hebbian_change(
-    c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: float
+    c: Array, u: Array, mu: Array, z: Array, error: Array, pi_z: Scalar
 ) -> HebbianChange:
     """Apply the local learning rules to traces (B, I), action and 1 (B, A + 1), μ and z (B, H), and Π_x ε_x at z."""
     motor = u.shape[1] - 1
@@ -231,39 +240,34 @@ class TracesLearner(Learner):
     """The network by traces as it learns."""
 
     weights: Weights
-    early = 0
-
-    def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
-        super().__init__(weights, HebbianChange._fields, schedule, rng)
+    learned = HebbianChange._fields
+    early = False
+    scalar = float
 
     def at_rest(self, size: int) -> Array:
         return np.zeros((size, self.weights.W_C.shape[1]), np.float32)
 
-    def practise(
-        self,
-        state: Array,
-        now: Moment,
-        own: NDArray[np.bool_],
-        alone: NDArray[np.bool_],
-        rate: float,
-    ) -> tuple[Array, float]:
-        w, pi_z, pi_x = self.weights, self.schedule.prior_precision, self.schedule.sensory_precision
-        x, u, taken, S = now.senses, now.commands, now.commands, now.senses.shape[1]
+    def practise(self, state: Array, turn: Turn, rate: float) -> tuple[Array, float]:
+        w = self.weights
+        inference = self.inference
+        pi_z = inference.prior_precision
+        pi_x = inference.sensory_precision
+        sensory = turn.senses.shape[1]
         mu = expect(state, w.W_C)
-        if own.any():
-            action = (direct(state, u, w.W_D) + sense(mu, w.W_F))[:, S:]
-            taken = np.hstack([np.where(own, action, u[:, :-1]), u[:, -1:]])
+        taken = turn.commands
+        if turn.own.any():
+            expected = direct(state, turn.commands, w.W_D) + sense(mu, w.W_F)
+            taken = turn.commands_with(expected[:, sensory:])
+
         past = direct(state, taken, w.W_D)
-        left = np.hstack([x, u[:, :-1]]) - past  # (B, S + A)
-        precision = np.full_like(left, pi_x)
-        z = infer(
-            mu, left, w.W_F, pi_z, precision, pi_z + pi_x * self.norm, self.schedule.iterations
-        )
+        left = np.hstack([turn.senses, turn.commands[:, :-1]]) - past  # (B, S + A)
+        z = infer(mu, left, w.W_F, np.full_like(left, pi_x), inference)
         error = np.float32(pi_x) * (left - sense(z, w.W_F))
-        change = hebbian_change(state, taken, mu, z, error, pi_z)
-        energy = 0.5 * (pi_z * float(np.sum((z - mu) ** 2)) + float(np.sum(error**2)) / pi_x)
-        senses = np.where(alone, (past + sense(mu, w.W_F))[:, :S], x)
-        self.learn(change, rate)
+        of_state = float(np.sum((z - mu) ** 2))
+        energy = 0.5 * float(pi_z * of_state + float(np.sum(error**2)) / pi_x)
+        expected = past + sense(mu, w.W_F)
+        senses = np.where(turn.alone, expected[:, :sensory], turn.senses)
+        self.learn(hebbian_change(state, taken, mu, z, error, pi_z), rate)
         return advance(state, np.hstack([senses, taken]), w.gains), energy
 
 
@@ -276,12 +280,10 @@ def learn_traces(
     gain: float = 1.0,
 ) -> Trained:
     """Learn the synapses through time; see ``temporal.Learn``. ``gain`` scales the initial weights onto the state."""
-    sensory, commands = trajectories[0].senses.shape[1], trajectories[0].commands.shape[1]
-    weights = initial_weights(hidden, sensory, commands - 1, rng)
+    sensory = trajectories[0].senses.shape[1]
+    motor = trajectories[0].commands.shape[1] - 1
+    weights = initial_weights(hidden, sensory, motor, rng)
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in trajectories])
     weights.W_C[:] *= np.float32(gain)
-    energy = practise(
-        TracesLearner(weights, schedule, rng), hidden, trajectories, schedule, rng, tick
-    )
-    how = schedule.iterations, schedule.prior_precision, schedule.sensory_precision
-    return Trained(Network(weights, unassociated(), *how), energy)
+    learner = TracesLearner(weights, schedule, rng)
+    return learned_network(Network, learner, trajectories, rng, tick)

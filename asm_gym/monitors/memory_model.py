@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.association import Association, association_shapes
+from asm_gym.memory.association import Association, ChangeLayout, association_shapes
 from asm_gym.memory.completion import Completion
 from asm_gym.memory.dynamics import DYNAMICS, TRACES, dynamics_of, train
 from asm_gym.memory.learning import Schedule, Trajectory
-from asm_gym.memory.linear import check_inputs, specialise
+from asm_gym.memory.linear_association import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
 from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, unwritten
@@ -91,8 +91,15 @@ class MemoryModel(ScaledModel):
             trajectories.append(
                 Trajectory(read.senses[::lag], read.commands[::lag], read.inputs[lag:])
             )
-        layout = senses.groups, senses.changes, self.hidden_size, self._units_each(senses)
-        trained = train(trajectories, *layout, self.schedule, rng, progress, self.dynamics)
+        trained = train(
+            trajectories,
+            self._layout(senses),
+            self.hidden_size,
+            self.schedule,
+            rng,
+            progress,
+            dynamics=self.dynamics,
+        )
         learned = {**senses.arrays, "energy": trained.energy}
         self.crossfitted = {}
         ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
@@ -105,7 +112,7 @@ class MemoryModel(ScaledModel):
         if completion is not None:
             learned |= completion.named()
         return self.restore(
-            {**learned, **network.weights._asdict(), **network.association._asdict()}
+            {**learned, **network.weights._asdict(), **network.association.named()}
         )
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
@@ -115,12 +122,10 @@ class MemoryModel(ScaledModel):
         """
         senses, lag = self.senses_, self.lag
         inputs = np.concatenate([senses.read_episode(e.stream).inputs[lag:] for e in episodes])
-        changes = np.ascontiguousarray(inputs[:, senses.changes])
-        layout = senses.groups, senses.changes, self._units_each(senses)
-        now = specialise(self.network.association, inputs, changes, *layout)
+        now = specialise(self.network.association, inputs, self._layout(senses))
         kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
         return self.restore(
-            {**{n: a for n, a in self.learned_.items() if n in kept}, **now._asdict()}
+            {**{n: a for n, a in self.learned_.items() if n in kept}, **now.named()}
         )
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
@@ -142,7 +147,7 @@ class MemoryModel(ScaledModel):
         require_arrays(learned, shapes)
         check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
-        association = Association(**{n: arrays[n] for n in Association._fields})
+        association = Association.from_named(arrays)
         how = (
             self.schedule.iterations,
             self.schedule.prior_precision,
@@ -183,6 +188,7 @@ class MemoryModel(ScaledModel):
         action = self.network.run_on(state.traces).expected[:, senses.size :]
         return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
 
-    def _units_each(self, senses: StreamScaler) -> int:
-        """Return the hidden units of association for each group."""
-        return max(1, self.association_size // (int(senses.groups.max()) + 1))
+    def _layout(self, senses: StreamScaler) -> ChangeLayout:
+        """Return the layout of the inputs, with the hidden units of association for each group."""
+        groups = int(senses.groups.max()) + 1
+        return ChangeLayout.of(senses, max(1, self.association_size // groups))

@@ -31,7 +31,8 @@ from asm_gym.detection.repetition import (
     pool_repetitions,
     step_repetition,
 )
-from asm_gym.memory.association import Association, normalised_errors
+from asm_gym.memory.association import Association, Wiring, normalised_errors
+from asm_gym.memory.energy import Inference
 from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
@@ -48,7 +49,7 @@ class RowWeights(NamedTuple):
     settling: SettlingWeights
     settles: bool
     association: Association
-    spans: NDArray[np.intp]
+    wiring: Wiring
     W_K: NDArray[np.float32]
     b_K: NDArray[np.float32]  # noqa: N815
     mean: NDArray[np.float64]
@@ -57,11 +58,7 @@ class RowWeights(NamedTuple):
     sensory: NDArray[np.intp]
     motor: NDArray[np.intp]
     slow: NDArray[np.intp]
-    groups: NDArray[np.intp]
-    prior_precision: np.float32
-    sensory_precision: np.float32
-    curvature: np.float32
-    iterations: int
+    inference: Inference
 
 
 def row_weights(
@@ -80,7 +77,7 @@ def row_weights(
         settling=SettlingWeights._make(map(single, settling)),
         settles=settles,
         association=Association._make(map(single, network.association)),
-        spans=network.spans,
+        wiring=Wiring.of(network.association, scaler),
         W_K=single(names["W_K"]),
         b_K=single(names["b_K"]),
         mean=np.array(scaler.mean, np.float64),
@@ -89,11 +86,7 @@ def row_weights(
         sensory=scaler.spec.sensory.copy(),
         motor=scaler.spec.motor.copy(),
         slow=scaler.slow,
-        groups=scaler.groups,
-        prior_precision=network.prior_precision,
-        sensory_precision=network.sensory_precision,
-        curvature=network.curvature,
-        iterations=network.iterations,
+        inference=network.inference,
     )
 
 
@@ -356,59 +349,14 @@ def carry_on(
 def follow(weights: RowWeights, traces: Any, reading: ScaledRows, wants_context: bool) -> Any:
     """Return f(μ_t) (B, H) and the new traces c_t (B, I)."""
     if weights.settles:
-        return settle(
-            z=traces,
-            u=reading.commands,
-            x=reading.senses,
-            seen=reading.seen,
-            W_H=weights.settling.W_H,
-            W_U=weights.settling.W_U,
-            W_F=weights.settling.W_F,
-            b_F=weights.settling.b_F,
-            pi_z=weights.prior_precision,
-            pi_x=weights.sensory_precision,
-            curvature=weights.curvature,
-            iterations=weights.iterations,
-        )
-    return carry(
-        c=traces,
-        u=reading.commands,
-        x=reading.senses,
-        seen=reading.seen,
-        W_C=weights.traces.W_C,
-        W_F=weights.traces.W_F,
-        W_D=weights.traces.W_D,
-        gains=weights.traces.gains,
-        pi_z=weights.prior_precision,
-        pi_x=weights.sensory_precision,
-        curvature=weights.curvature,
-        iterations=weights.iterations,
-        context=wants_context,
-    )
+        return settle(traces, reading, weights.settling, weights.inference)
+    return carry(traces, reading, weights.traces, weights.inference, wants_context)
 
 
 @partial(inner, inlined=True)
 def associate(weights: RowWeights, reading: ScaledRows) -> Any:
     """Return the errors (B, X) of what other senses predict, and the units (B, M)."""
-    association = weights.association
-    return normalised_errors(
-        inputs=reading.inputs,
-        changes=reading.changes,
-        whole=reading.whole,
-        V=association.V,
-        U=association.U,
-        D=association.D,
-        W_S=association.W_S,
-        b_S=association.b_S,
-        span_S=association.span_S,
-        remainder=association.remainder,
-        spans=weights.spans,
-        R=association.R,
-        Q=association.Q,
-        doubt=association.doubt,
-        groups=weights.groups,
-        first=reading.finite.shape[1],
-    )
+    return normalised_errors(reading, weights.association, weights.wiring)
 
 
 @inner

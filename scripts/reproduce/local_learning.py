@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from asm_gym.evaluation.figures import figure
-from asm_gym.memory.energy import STEEPEST, STRIDE, infer
+from asm_gym.memory.energy import STEEPEST, STRIDE, Inference, infer
 from asm_gym.memory.learning import Practice, Schedule, Trajectory, cosine_decay, one_after_another
 from asm_gym.memory.traces import (
     DECAYS,
@@ -114,6 +114,7 @@ def local(
     """
     _, streams, sensory = batch.senses.shape
     curvature = pi_z + float(np.linalg.norm(weights.W_F, 2)) ** 2
+    inference = Inference(pi_z, 1.0, curvature, iterations)
     c = np.zeros((streams, weights.W_C.shape[1]), np.float32)
     total = {name: np.zeros(getattr(weights, name).shape) for name in COMPARED}
     energy = 0.0
@@ -132,11 +133,11 @@ def local(
             read = (past + state)[:, :sensory]
 
         left = np.hstack([x, u[:, :-1]]) - past
-        z = infer(mu, left, weights.W_F, pi_z, np.ones_like(left), curvature, iterations)
+        z = infer(mu, left, weights.W_F, np.ones_like(left), inference)
         missed = left - sense(z, weights.W_F)
         change = hebbian_change(c, taken, mu, z, missed, pi_z)
-        for name, array in change._asdict().items():
-            total[name] += array
+        for name in COMPARED:
+            total[name] += getattr(change, name)
         prior = pi_z * np.sum((z - mu) ** 2)
         energy += 0.5 * float((prior + np.sum(missed**2)) / streams)
         error += 0.5 * float(np.sum((left - state) ** 2) / streams)

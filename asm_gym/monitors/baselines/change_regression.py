@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
-from asm_gym.memory.linear import check_inputs, learn_linear
+from asm_gym.memory.association import ChangeLayout
+from asm_gym.memory.linear_association import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
 from asm_gym.monitors.surprise import Progress
@@ -42,7 +43,7 @@ class LinearAssociation(ScaledModel):
         senses = self.senses_
         check_inputs(senses.inputs)
         inputs = np.concatenate([reading.inputs[self.lag :] for reading in readings])
-        D = learn_linear(inputs, senses.groups, senses.changes)
+        D = learn_linear(inputs, ChangeLayout.of(senses))
         squares = (inputs[:, senses.changes] - inputs @ D.T) ** 2
         remainder = np.maximum(np.sqrt(np.mean(squares, axis=0)), LEAST_SPREAD)
         return self.restore({**senses.arrays, "D": D, "remainder": remainder})

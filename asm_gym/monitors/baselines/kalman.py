@@ -18,7 +18,7 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
-from asm_gym.memory.linear import check_inputs
+from asm_gym.memory.linear_association import check_inputs
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
-from asm_gym.memory.linear import check_inputs
+from asm_gym.memory.linear_association import check_inputs
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next, require_arrays
 from asm_gym.monitors.surprise import Progress
