@@ -18,6 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym.exceptions import DamagedFile
 from asm_gym.policies.base import StatefulPolicy
 
 Array = NDArray[np.float32]
@@ -128,7 +129,7 @@ class NetworkPolicy(StatefulPolicy):
                 raise ValueError(f"its network is not of {RULE}")
             return cls(layers, trained_in=header["trained_in"], **scaling)
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+            raise DamagedFile(path, error) from error
 
 
 def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:

@@ -11,10 +11,11 @@ import gymnasium as gym
 from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
+from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
+from asm_gym.policies.scripted.stack import StackExpert
 from asm_gym.policies.scripted.sway import Arm, Swaying
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target

@@ -18,6 +18,7 @@ from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.exceptions import DamagedFile
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
 
@@ -51,9 +52,7 @@ def saved_parts(saved: Checkpoint) -> tuple[Arrays, dict[str, Any], dict[str, An
             "the file was written by an older version: make it anew with asm-gym fit or asm-gym babble"
         )
     if undeclared:
-        raise ValueError(
-            f"the checkpoint is damaged: its header declares no {', '.join(undeclared)}"
-        )
+        raise DamagedFile("the checkpoint", f"its header declares no {', '.join(undeclared)}")
     arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
     blocks, promised = arrays.pop(BLOCKS, None), header.get("promised", EPISODE)
     check_choice("promise", promised, (EPISODE, HOUR))
@@ -133,7 +132,7 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> A
         how = {n: value for n, value in saved.header["hyperparameters"].items() if n != RETIRED}
         return make(StreamSpec.from_json(saved.header["spec"]), **how).restore(saved)
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        raise DamagedFile(path, error) from error
 
 
 def rounded(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
