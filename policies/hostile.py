@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -20,12 +20,22 @@ Floats = NDArray[np.floating[Any]]
 
 
 class Hostile(StatefulPolicy):
-    """Acts by a ``rule``, whatever it observes, at a share ``speed`` of the full change of the hand's pose."""
+    """Acts by a rule, whatever it observes.
+
+    Args:
+        env: whose actions change the pose of a hand.
+        seed: of its random draws.
+        speed: share of the full change of the hand's pose.
+        rule: the first numbers of the action of each control step.
+    """
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, rule: Rule) -> None:
-        self._space: Any = env.action_space
-        self.size = int(np.prod(env.action_space.shape or ()))
-        self._rule, self._speed, self.seed = rule, speed, seed
+        space: Any = env.action_space
+        self._space = space
+        self._rule = rule
+        self._speed = speed
+        self.seed = seed
+        self.size = int(np.prod(space.shape))
         self.held = np.zeros(self.size)  # what a rule goes on with
 
     def begin(self, observation: Any) -> tuple[int, np.random.Generator]:
@@ -37,14 +47,12 @@ class Hostile(StatefulPolicy):
         step, rng = state
         first = self._speed * np.asarray(self._rule(self, step, rng), np.float64)
         action = np.pad(first, (0, self.size - len(first)))
-        return np.clip(action, self._space.low, self._space.high).astype(np.float32), (
-            step + 1,
-            rng,
-        )
+        action = np.clip(action, self._space.low, self._space.high)
+        return action.astype(np.float32), (step + 1, rng)
 
 
+# The first numbers of the action of a control step, (x, y, z), turns about them and grip; the others are 0.
 Rule = Callable[[Hostile, int, np.random.Generator], Floats | tuple[float, ...]]
-"""The first numbers of the action of a control step, (x, y, z), turns about them and grip; the others are 0."""
 
 
 def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
@@ -54,86 +62,106 @@ def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
     return policy.held
 
 
-class _Spoilt(StatefulPolicy):
-    """A scripted expert whose actions are spoilt on their way: ``stale``, ``flipped``, or downwards once it turns."""
+class SpoiltState(NamedTuple):
+    """Where an episode of a spoilt policy stands."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int, how: str) -> None:
+    step: int
+    inner: Any  # state of the policy whose actions are spoilt
+    actions: tuple[NDArray[np.float32], ...]  # its newest ones, the oldest first
+
+
+class _Spoilt(StatefulPolicy):
+    """A scripted expert whose actions are spoilt on their way.
+
+    Args:
+        env: an environment whose task has an expert.
+        seed: of the expert.
+        manner: ``"stale"``, ``"flipped"``, or ``"turns"``: downwards from ``TURNS_AT`` on.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int, manner: str) -> None:
         self._policy: Policy = make_policy("scripted", env, seed=seed)
         self._space: Any = env.action_space
-        self._how = how
+        self._manner = manner
 
-    def begin(self, observation: Any) -> tuple[int, Any, tuple[NDArray[np.float32], ...]]:
-        return 0, None, ()
+    def begin(self, observation: Any) -> SpoiltState:
+        return SpoiltState(step=0, inner=None, actions=())
 
     def act(
-        self, observation: Any, state: Any, deterministic: bool
-    ) -> tuple[NDArray[np.float32], Any]:
-        step, inner, late = state
-        action, inner = self._policy.predict(
-            observation, inner, np.array([step == 0]), deterministic
-        )
-        action = np.array(action, np.float32)
-        late = (*late, action.copy())[-LATE_STEPS - 1 :]
-        if self._how == "stale":
-            action = late[0]
-        elif self._how == "flipped":
+        self, observation: Any, state: SpoiltState, deterministic: bool
+    ) -> tuple[NDArray[np.float32], SpoiltState]:
+        begins = np.array([state.step == 0])
+        healthy, inner = self._policy.predict(observation, state.inner, begins, deterministic)
+        healthy = np.array(healthy, np.float32)
+        actions = (*state.actions, healthy)[-LATE_STEPS - 1 :]
+        action = healthy.copy()
+        if self._manner == "stale":
+            action = actions[0].copy()
+        elif self._manner == "flipped":
             action[:-1] = -action[:-1]
-        elif step >= TURNS_AT:
+        elif state.step >= TURNS_AT:
             action[:] = 0.0
             action[2] = self._space.low[2]
-        return action, (step + 1, inner, late)
+        return action, SpoiltState(state.step + 1, inner, actions)
+
+
+def _alternating(step: int, forth: int, back: int) -> float:
+    """Return 1 for ``forth`` control steps and -1 for ``back`` control steps, in turn."""
+    if step % (forth + back) < forth:
+        return 1.0
+    return -1.0
+
+
+def _squeezing(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
+    """Return an action that comes down with an open hand, and closes it."""
+    if step < 60:
+        return (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
+    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def _flinging(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
+    """Return an action that swings aside and back, and opens the hand on the way."""
+    aside = _alternating(step, 6, 6)
+    return (0.0, aside, 0.0, 0.0, 0.0, 0.0, aside)
+
+
+def _retreating(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
+    """Return an action that presses for 24 steps, and rests for 12: a trial comes after 10."""
+    if step % 36 < 24:
+        return (0.0, 0.0, -1.0)
+    return (0.0, 0.0, 0.0)
+
+
+def _first_rows(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
+    """Return an action that moves in the first rows only."""
+    if step < 12:
+        return (1.0, 0.0, -1.0, 0.0, 1.0, 0.0)
+    return (0.0,)
 
 
 RULES: dict[str, Rule] = {
-    "down": lambda policy, t, rng: (0.0, 0.0, -1.0),
-    "aside and down": lambda policy, t, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
-    "forward": lambda policy, t, rng: (1.0, 0.0, -0.3),
+    "down": lambda policy, step, rng: (0.0, 0.0, -1.0),
+    "aside and down": lambda policy, step, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
+    "forward": lambda policy, step, rng: (1.0, 0.0, -0.3),
     "bang-bang": _bang_bang,
-    "uniform": lambda policy, t, rng: rng.uniform(-1.0, 1.0, policy.size),
-    "ramp": lambda policy, t, rng: (0.0, 0.0, -min(1.0, t / 100)),
-    "hammering": lambda policy, t, rng: (0.0, 0.0, -1.0 if t % 20 < 12 else 1.0),
-    "grinding": lambda policy, t, rng: (np.cos(t / 5), np.sin(t / 5), -0.5),
-    "squeezing": lambda policy, t, rng: (
-        0.0,
-        0.0,
-        -1.0 * (t < 60),
-        0.0,
-        0.0,
-        0.0,
-        -1.0 if t < 60 else 1.0,
-    ),
-    "flinging": lambda policy, t, rng: (
-        0.0,
-        1.0 if t % 12 < 6 else -1.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        (-1.0) ** (t // 6),
-    ),
-    "to joint limits": lambda policy, t, rng: (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-    "into itself": lambda policy, t, rng: (-1.0, 0.0, -0.3),
-    "turning": lambda policy, t, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
-    "rolling": lambda policy, t, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
-    # a trial comes after 10
-    "waits for the hand-back": lambda policy, t, rng: (
-        0.0,
-        0.0,
-        -1.0 * (t % 36 < 24),
-    ),
-    "first rows": lambda policy, t, rng: (
-        1.0 * (t < 12),
-        0.0,
-        -1.0 * (t < 12),
-        0.0,
-        1.0 * (t < 12),
-        0.0,
-    ),
+    "uniform": lambda policy, step, rng: rng.uniform(-1.0, 1.0, policy.size),
+    "ramp": lambda policy, step, rng: (0.0, 0.0, -min(1.0, step / 100)),
+    "hammering": lambda policy, step, rng: (0.0, 0.0, -_alternating(step, 12, 8)),
+    "grinding": lambda policy, step, rng: (np.cos(step / 5), np.sin(step / 5), -0.5),
+    "squeezing": _squeezing,
+    "flinging": _flinging,
+    "to joint limits": lambda policy, step, rng: (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    "into itself": lambda policy, step, rng: (-1.0, 0.0, -0.3),
+    "turning": lambda policy, step, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
+    "rolling": lambda policy, step, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    "waits for the hand-back": _retreating,
+    "first rows": _first_rows,
 }
+
+# Hostile policies by name: made for an environment, with a seed and a share of the full speed.
 HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
     **{name: partial(Hostile, rule=rule) for name, rule in RULES.items()},
     "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
     "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
     "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),
 }
-"""Hostile policies by name: made for an environment, with a seed and a share of the full speed."""

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.policies.base import StatefulPolicy
-from asm_gym.policies.scripted.geometry import Pose, Vector, matrix, move, rotation
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, length, matrix, move, rotation
 from asm_gym.validation import check_number
 
 # Commands of a gripper.
@@ -220,5 +220,5 @@ def has_settled(velocity: Vector, since: int, usual: int) -> bool:
 
 def over_first(position: Vector, target: Vector) -> Vector:
     """Return how much higher (3,) than its target [m] a careful hand goes beside it, lest a finger comes down on it."""
-    aside = float(np.linalg.norm((position - target)[:2]))
-    return np.array([0.0, 0.0, np.clip(4 * (aside - STRAIGHT_DOWN), 0.0, HIGHEST_DETOUR)])
+    aside = length((position - target)[:2])
+    return np.clip(4 * (aside - STRAIGHT_DOWN), 0.0, HIGHEST_DETOUR) * UP

@@ -20,11 +20,13 @@ from asm_gym.policies.scripted.base import (
     over_first,
 )
 from asm_gym.policies.scripted.geometry import (
+    UP,
     Pose,
     Vector,
     about_vertical,
     angle_between,
     gripping,
+    length,
     move,
     wrapped,
     yaw,
@@ -77,7 +79,7 @@ class CarryScene(Scene):
     @property
     def aside(self) -> float:
         """Horizontal distance of the object from its place [m]."""
-        return float(np.linalg.norm((self.thing.at - self.plan.place)[:2]))
+        return length((self.thing.at - self.plan.place)[:2])
 
     @property
     def down(self) -> Vector:
@@ -98,17 +100,17 @@ class CarryScene(Scene):
         return float(min(turns, key=abs, default=0.0))
 
     def reach(self) -> Vector:
-        above = np.array([0.0, 0.0, self.plan.clearance]) + 0.3 * self.state.spread
+        above = self.plan.clearance * UP + 0.3 * self.state.spread
         target = self.grip + above
         # From afar, first high: the way may lead over a wall or another object.
-        if np.linalg.norm(self.offset[:2]) > 0.1:
+        if length(self.offset[:2]) > 0.1:
             target[2] = max(target[2], min(self.hand.at[2], target[2] + 0.1))
         return self.move(target, self._turning(self.grasping), self.gain)
 
     def is_above(self) -> bool:
-        aside = np.linalg.norm(self.offset[:2] - self.state.spread[:2] * 0.3)
+        aside = length(self.offset[:2] - self.state.spread[:2] * 0.3)
         is_above = aside < 0.02 and abs(self.offset[2] - self.plan.clearance) < 0.03
-        return bool(is_above and angle_between(self.hand.turned, self.grasping) < 0.15)
+        return is_above and angle_between(self.hand.turned, self.grasping) < 0.15
 
     def descend(self) -> Vector:
         target = self.grip
@@ -118,11 +120,11 @@ class CarryScene(Scene):
         return move(self.hand, target, self._turning(self.grasping), speed, self.gain)
 
     def is_around(self) -> bool:
-        distance = np.linalg.norm(self.offset)
-        return bool(distance < 0.011 or (self.state.since > 30 and distance < 0.02))
+        distance = length(self.offset)
+        return distance < 0.011 or (self.state.since > 30 and distance < 0.02)
 
     def is_astray(self) -> bool:
-        return bool(self.state.since > 60 or np.linalg.norm(self.offset[:2]) > 0.06)
+        return self.state.since > 60 or length(self.offset[:2]) > 0.06
 
     def grasp(self) -> Vector:
         if self.is_careful:
@@ -139,14 +141,14 @@ class CarryScene(Scene):
 
     def has_lost_it(self) -> bool:
         """Return whether the object fell; it may lie where it belongs."""
-        return bool(np.linalg.norm(self.offset) > LOST)
+        return length(self.offset) > LOST
 
     def is_lifted(self) -> bool:
         height = self.plan.place[2] + self.plan.over - 0.03
-        return bool(self.thing.at[2] > height or self.state.since > 60)
+        return self.thing.at[2] > height or self.state.since > 60
 
     def carry(self) -> Vector:
-        over = self.plan.place + np.array([0.0, 0.0, self.plan.over])
+        over = self.plan.place + self.plan.over * UP
         return self._move_held(over, self.state.speed)
 
     def is_over_place(self) -> bool:
@@ -174,7 +176,7 @@ class CarryScene(Scene):
     def is_down(self) -> bool:
         height = self.thing.at[2]
         bottom = self.plan.place[2]
-        return bool(height < bottom + 0.006 or (self.state.since > 50 and height < bottom + 0.03))
+        return height < bottom + 0.006 or (self.state.since > 50 and height < bottom + 0.03)
 
     def release(self) -> Vector:
         return self.move(self.state.anchor, self.down)
@@ -183,7 +185,7 @@ class CarryScene(Scene):
         return has_settled(self.fingers, self.state.since, usual=6)
 
     def retreat(self) -> Vector:
-        return self.move(self.state.anchor + np.array([0.0, 0.0, 0.12]), self.down)
+        return self.move(self.state.anchor + 0.12 * UP, self.down)
 
     def idle(self) -> Vector:
         return np.zeros(6)

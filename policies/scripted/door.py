@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Phase, Scene, State
-from asm_gym.policies.scripted.geometry import UP, Vector, about, angle_between
+from asm_gym.policies.scripted.geometry import UP, Vector, about, angle_between, length
 
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
 TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
@@ -62,7 +62,7 @@ class DoorScene(Scene):
     @property
     def distance(self) -> float:
         """Of the hand from where to hold the handle [m]."""
-        return float(np.linalg.norm(self.offset))
+        return length(self.offset)
 
     def facing(self, turned: float = 0.0) -> Vector:
         """Return the hand (3, 3) before the door, fingers above and below a handle ``turned`` so far [rad]."""
@@ -73,8 +73,8 @@ class DoorScene(Scene):
         return self.move(self.grip + BEFORE * self.plan.normal, facing, GAIN)
 
     def is_before_handle(self) -> bool:
-        off = np.linalg.norm(self.offset - BEFORE * self.plan.normal)
-        return bool(off < 0.02 and angle_between(self.hand.turned, self.facing()) < 0.15)
+        off = length(self.offset - BEFORE * self.plan.normal)
+        return off < 0.02 and angle_between(self.hand.turned, self.facing()) < 0.15
 
     def approach(self) -> Vector:
         return self.move(self.grip, self.facing(), GAIN)
@@ -179,7 +179,7 @@ def _rolling(hardware: Hardware, hand: Vector, facing: Vector) -> Vector:
 def _roll(hand: Vector, to: Vector) -> float:
     """Return the hand's roll from another orientation about its z axis, once that points the same way [rad]."""
     axis = np.cross(hand[:, 2], to[:, 2])
-    sine = float(np.linalg.norm(axis))
+    sine = length(axis)
     tilt = np.eye(3)
     if sine > 1e-9:
         tilt = about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))

@@ -27,13 +27,18 @@ class Pose(NamedTuple):
         return self.at + self.turned @ own
 
 
+def length(vector: Vector) -> float:
+    """Return the length of a vector, in its unit."""
+    return float(np.linalg.norm(vector))
+
+
 def rotation(columns: Vector) -> Vector:
     """Return a rotation (3, 3) from its first two columns (6,), made orthonormal again after sensor noise."""
     first = columns[:3]
     second = columns[3:]
-    x = first / np.linalg.norm(first)
+    x = first / length(first)
     y = second - (x @ second) * x
-    y /= np.linalg.norm(y)
+    y /= length(y)
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
@@ -115,7 +120,7 @@ def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float =
         gain: share of the way to its position to ask for in one step.
     """
     step = gain * (target - hand.at) / METRES
-    norm = np.linalg.norm(step)
+    norm = length(step)
     if norm > speed:
         step *= speed / norm
     turn = 0.5 * np.cross(hand.turned, turned, axis=0).sum(axis=1) / RADIANS

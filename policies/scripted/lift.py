@@ -17,7 +17,7 @@ from asm_gym.policies.scripted.base import (
     has_settled,
     over_first,
 )
-from asm_gym.policies.scripted.geometry import Pose, Vector, flattest_side, gripping
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, flattest_side, gripping, length
 
 REACH, DESCEND, GRASP, LIFT = range(4)
 QUARTER_TURN = np.pi / 2  # after which a cube looks the same [rad]
@@ -48,17 +48,17 @@ class LiftScene(Scene):
         return self._fit_sides(self.cube.at + self.plan.hover)
 
     def is_above(self) -> bool:
-        return bool(np.linalg.norm(self.offset - self.plan.hover) < 0.02)
+        return length(self.offset - self.plan.hover) < 0.02
 
     def descend(self) -> Vector:
-        target = self.cube.at - [0.0, 0.0, self.plan.depth]
+        target = self.cube.at - self.plan.depth * UP
         if self.is_careful:
             target = target + over_first(self.hand.at, self.cube.at)
         return self._fit_sides(target)
 
     def is_around(self) -> bool:
         height = self.offset[2] + self.plan.depth
-        return bool(abs(height) < 0.008 and np.linalg.norm(self.offset[:2]) < 0.015)
+        return abs(height) < 0.008 and length(self.offset[:2]) < 0.015
 
     def grasp(self) -> Vector:
         return self.move(self.state.anchor, gripping(self.hand.turned))
@@ -70,7 +70,7 @@ class LiftScene(Scene):
         return self.move(self.state.anchor + self.plan.goal, gripping(self.hand.turned))
 
     def has_lost_it(self) -> bool:
-        return bool(np.linalg.norm(self.offset) > 0.05)
+        return length(self.offset) > 0.05
 
     def _fit_sides(self, target: Vector) -> Vector:
         """Return the command (6,) of a hand whose fingers are to fit the sides of the cube."""
@@ -95,8 +95,8 @@ class LiftExpert(Expert):
         if self.is_careful:  # fingers of other arms are longer, and come down on the table
             deep = 0.0
         speed = self.draw_speed()
-        hover = np.array([0.0, 0.0, 0.07]) + self.draw_offset()
-        goal = np.array([0.0, 0.0, 0.13]) + self.draw_offset()
+        hover = 0.07 * UP + self.draw_offset()
+        goal = 0.13 * UP + self.draw_offset()
         depth = deep + 0.3 * self.style.spread * self.np_random.standard_normal()
         plan = LiftPlan(hover, goal, depth=float(np.clip(depth, 0.0, 2 * deep)))
         return State(speed, plan)

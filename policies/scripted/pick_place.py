@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
-from asm_gym.policies.scripted.geometry import Pose, Vector, about_vertical, matrix
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, about_vertical, length, matrix
 
 WALL = 0.09  # above the bins' floor, so high the fingertips keep the palm off the walls' tops [m]
 REACH_OF_PANDA = 0.8  # further from its base a hand comes down with its elbow at its stop [m]
@@ -56,7 +56,7 @@ class PickPlaceExpert(CarryExpert):
             haste = SLOWLY
         task = CarryTask(
             name=name,
-            grip=np.array([0.0, 0.0, grip]),
+            grip=grip * UP,
             closing=closing.along,
             turns=np.pi,
             clearance=0.1,
@@ -79,7 +79,7 @@ class PickPlaceExpert(CarryExpert):
                 continue
             at = self.read(observation, f"{thing.name}_pos")
             if env.not_in_bin(at, number):
-                distances[number] = np.linalg.norm(at - hand)
+                distances[number] = length(at - hand)
         return min(distances, key=lambda number: distances[number], default=None)
 
     def _closing(self, name: str, thing: Pose, half: Vector, grip: float) -> Closing:
@@ -111,11 +111,11 @@ class PickPlaceExpert(CarryExpert):
         env = self.robosuite
         place = np.array(env.target_bin_placements[number], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
-        is_far = np.linalg.norm(away) > REACH_OF_PANDA
+        is_far = length(away) > REACH_OF_PANDA
         if is_far and not self.is_careful:
             # Also away from the nearest wall, and higher: the arm reaches furthest at the height of its shoulder.
             inwards = env.bin2_pos[:2] - place[:2]
-            place[:2] += 0.08 * inwards / np.linalg.norm(inwards)
+            place[:2] += 0.08 * inwards / length(inwards)
             place[2] += 0.02
         else:
             place[:2] -= self._nearer(away, half)
@@ -128,7 +128,7 @@ class PickPlaceExpert(CarryExpert):
 
     def _nearer(self, away: Vector, half: Vector) -> Vector:
         """Return how far (2,) to come back towards the arm from a place that is ``away`` (2,) from its base [m]."""
-        distance = np.linalg.norm(away)
+        distance = length(away)
         if not self.is_careful:
             return 0.04 * away / distance
         nearer = 0.07 * away / distance
@@ -136,7 +136,7 @@ class PickPlaceExpert(CarryExpert):
             return nearer
         # Further, a tall box would stand on a wall.
         quarter = np.asarray(self.robosuite.bin_size[:2]) / 4
-        room = np.maximum(quarter - CLEAR - np.linalg.norm(half[:2]), 0.0)
+        room = np.maximum(quarter - CLEAR - length(half[:2]), 0.0)
         return np.clip(nearer, -room, room)
 
     def _half_extents(self, name: str) -> Vector:

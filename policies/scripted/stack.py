@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
-from asm_gym.policies.scripted.geometry import UP, flattest_side
+from asm_gym.policies.scripted.geometry import UP, flattest_side, length
 
 HALF_RED = 0.02  # half the edge of the cube that is carried [m]
 HALF_GREEN = 0.025  # half the edge of the cube beneath [m]
@@ -22,7 +22,7 @@ class StackExpert(CarryExpert):
         """Return the red cube, until it lies on the green one."""
         red = self.read.pose(observation, "cubeA")
         green = self.read.pose(observation, "cubeB")
-        place = green.at + np.array([0.0, 0.0, HALF_RED + HALF_GREEN])
+        place = green.at + (HALF_RED + HALF_GREEN) * UP
         side = flattest_side(red.turned)
         turns = np.pi / 2
         tolerance = 0.02  # [m]
@@ -32,7 +32,7 @@ class StackExpert(CarryExpert):
             side = min(sides, key=lambda across: abs(across @ (green.at - red.at)))
             turns = np.pi
             tolerance = 0.025
-        if np.linalg.norm(red.at - place) < tolerance:
+        if length(red.at - place) < tolerance:
             return None
         return CarryTask(
             name="cubeA",

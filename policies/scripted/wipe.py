@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.policies.scripted.base import Expert, Phase, Scene, State
-from asm_gym.policies.scripted.geometry import Vector, gripping
+from asm_gym.policies.scripted.geometry import UP, Vector, gripping, length
 
 REACH, LOWER, WIPE, REST = range(4)
 ACROSS = np.array([0.0, 1.0, 0.0])  # how the tool is held
-OVER = np.array([0.0, 0.0, 0.06])  # how high above the table the tool comes to the dirt [m]
-ABOVE = np.array([0.0, 0.0, 0.1])  # how high it rests above where the last mark was [m]
+OVER = 0.06 * UP  # how high above the table the tool comes to the dirt [m]
+ABOVE = 0.1 * UP  # how high it rests above where the last mark was [m]
 # The tool's face stands on the table's own plane and wipes under about 23 N [action units].
 PRESS = 0.2
 FAR_OFF = 0.15  # so far from a mark the tool goes through the air, not over the table [m]
@@ -42,7 +42,7 @@ class WipeScene(Scene):
     @property
     def aside(self) -> float:
         """Horizontal distance of the tool from the first mark that is left [m]."""
-        return float(np.linalg.norm((self.left[0] - self.hand.at)[:2]))
+        return length((self.left[0] - self.hand.at)[:2])
 
     @property
     def height(self) -> float:
@@ -112,7 +112,7 @@ class WipeExpert(Expert):
         bodies = [env.sim.model.body_name2id(mark.root_body) for mark in marks]
         dirt = env.sim.data.body_xpos[bodies].copy()
         order = np.arange(len(dirt))
-        if np.linalg.norm(dirt[-1] - hand) < np.linalg.norm(dirt[0] - hand):
+        if length(dirt[-1] - hand) < length(dirt[0] - hand):
             order = order[::-1]
         plan = WipePlan(press, dirt[order], order)
         return State(speed, plan, spread=self.draw_offset(), anchor=hand)
