@@ -45,14 +45,18 @@ class Hostile(StatefulPolicy):
         self, observation: Any, state: Any, deterministic: bool
     ) -> tuple[NDArray[np.float32], Any]:
         step, rng = state
-        first = self._speed * np.asarray(self._rule(self, step, rng), np.float64)
+        rule = self._rule
+        if callable(rule):
+            rule = rule(self, step, rng)
+        first = self._speed * np.asarray(rule, np.float64)
         action = np.pad(first, (0, self.size - len(first)))
         action = np.clip(action, self._space.low, self._space.high)
         return action.astype(np.float32), (step + 1, rng)
 
 
-# The first numbers of the action of a control step, (x, y, z), turns about them and grip; the others are 0.
-Rule = Callable[[Hostile, int, np.random.Generator], Floats | tuple[float, ...]]
+# The first numbers of the action, (x, y, z), turns about them and grip: of every control step, or as a function of
+# the policy, the number of the step and a generator. The others are 0.
+Rule = tuple[float, ...] | Callable[[Hostile, int, np.random.Generator], Any]
 
 
 def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
@@ -140,9 +144,9 @@ def _first_rows(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[f
 
 
 RULES: dict[str, Rule] = {
-    "down": lambda policy, step, rng: (0.0, 0.0, -1.0),
+    "down": (0.0, 0.0, -1.0),
     "aside and down": lambda policy, step, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
-    "forward": lambda policy, step, rng: (1.0, 0.0, -0.3),
+    "forward": (1.0, 0.0, -0.3),
     "bang-bang": _bang_bang,
     "uniform": lambda policy, step, rng: rng.uniform(-1.0, 1.0, policy.size),
     "ramp": lambda policy, step, rng: (0.0, 0.0, -min(1.0, step / 100)),
@@ -150,10 +154,10 @@ RULES: dict[str, Rule] = {
     "grinding": lambda policy, step, rng: (np.cos(step / 5), np.sin(step / 5), -0.5),
     "squeezing": _squeezing,
     "flinging": _flinging,
-    "to joint limits": lambda policy, step, rng: (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-    "into itself": lambda policy, step, rng: (-1.0, 0.0, -0.3),
-    "turning": lambda policy, step, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
-    "rolling": lambda policy, step, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    "to joint limits": (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    "into itself": (-1.0, 0.0, -0.3),
+    "turning": (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
+    "rolling": (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
     "waits for the hand-back": _retreating,
     "first rows": _first_rows,
 }

@@ -66,21 +66,17 @@ class NetworkPolicy(StatefulPolicy):
 
     def _check_layers(self) -> None:
         """Raise ValueError unless each layer takes what the one before gives."""
-        shapes = [W.shape for W, _ in self.layers]
-        if not shapes or len(shapes[0]) != 2:
-            raise ValueError(
-                "a network needs at least one layer, with weights in two dimensions, "
-                f"got {shapes[:1]}"
-            )
-        size = shapes[0][1]
+        if not self.layers:
+            raise ValueError("a network needs at least one layer, got none")
+        size = self.layers[0][0].shape[-1]
         for number, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
                 raise ValueError(
-                    f"layer {number} takes {size} numbers, "
-                    f"got weights {W.shape} and biases {b.shape}"
+                    f"layer {number} takes {size} numbers, with weights in two dimensions, "
+                    f"got {W.shape} and biases {b.shape}"
                 )
-            if not (np.isfinite(W).all() and np.isfinite(b).all()):
-                raise ValueError("weights and biases must be finite")
+            check_numbers("weights", W, *W.shape)
+            check_numbers("biases", b, *b.shape)
             size = len(W)
 
     def fit_to(self, env: gym.Env[Any, Any], whose: str) -> NetworkPolicy:

@@ -77,6 +77,11 @@ class CarryScene(Scene):
         return self.hand.at - self.grip
 
     @property
+    def over(self) -> Vector:
+        """Where (3,) to carry the object before it is lowered [m]."""
+        return self.plan.place + self.plan.over * UP
+
+    @property
     def aside(self) -> float:
         """Horizontal distance of the object from its place [m]."""
         return length((self.thing.at - self.plan.place)[:2])
@@ -135,7 +140,7 @@ class CarryScene(Scene):
         return has_settled(self.fingers, self.state.since, usual=7)
 
     def lift(self) -> Vector:
-        height = self.plan.place[2] + self.plan.over + 0.3 * self.state.spread[2]
+        height = self.over[2] + 0.3 * self.state.spread[2]
         target = np.array([*self.thing.at[:2], height])
         return move(self._held, target, self.down, self.state.speed)
 
@@ -144,12 +149,10 @@ class CarryScene(Scene):
         return length(self.offset) > LOST
 
     def is_lifted(self) -> bool:
-        height = self.plan.place[2] + self.plan.over - 0.03
-        return self.thing.at[2] > height or self.state.since > 60
+        return self.thing.at[2] > self.over[2] - 0.03 or self.state.since > 60
 
     def carry(self) -> Vector:
-        over = self.plan.place + self.plan.over * UP
-        return self._move_held(over, self.state.speed)
+        return self._move_held(self.over, self.state.speed)
 
     def is_over_place(self) -> bool:
         fit = self.plan.fit

@@ -39,7 +39,7 @@ class Hardware(NamedTuple):
         """Return the hand (3, 3) on the handle of the closed door, its y axis down: else a joint meets its stop."""
         y = np.array([0.0, 0.0, -1.0])
         z = -self.normal
-        return about(self.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
+        return about(self.axis, turned) @ np.column_stack([np.cross(y, z), y, z])
 
 
 @dataclass(frozen=True)

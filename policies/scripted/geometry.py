@@ -34,12 +34,11 @@ def length(vector: Vector) -> float:
 
 def rotation(columns: Vector) -> Vector:
     """Return a rotation (3, 3) from its first two columns (6,), made orthonormal again after sensor noise."""
-    first = columns[:3]
-    second = columns[3:]
-    x = first / length(first)
-    y = second - (x @ second) * x
+    x, y = columns.reshape(2, 3)
+    x = x / length(x)
+    y = y - (x @ y) * x
     y /= length(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+    return np.column_stack([x, y, np.cross(x, y)])
 
 
 def matrix(quaternion: Vector) -> Vector:
@@ -103,7 +102,7 @@ def gripping(hand: Vector, closing: Vector | None = None, turns: float = np.pi) 
         angle = heading + np.round((angle - heading) / turns) * turns
     y = np.array([np.cos(angle), np.sin(angle), 0.0])
     z = np.array([0.0, 0.0, -1.0])
-    return np.stack([np.cross(y, z), y, z], axis=1)
+    return np.column_stack([np.cross(y, z), y, z])
 
 
 def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
