@@ -95,7 +95,8 @@ def check_number(
     if isinstance(value, bool | np.bool_) or not isinstance(value, kind):
         raise _refused(name, noun, bounds, value)
     number: float = int(value) if isinstance(value, Integral) else float(value)  # type: ignore[arg-type]
-    if math.isnan(number) or not _within(number, bounds):
+    # NaN alone differs from itself; math.isnan takes no integer of thousands of digits.
+    if number != number or not _within(number, bounds):
         raise _refused(name, noun, bounds, value)
     if not infinite and abs(number) > sys.float_info.max:  # NumPy would convert a long integer
         raise ValueError(f"{name} must be finite, got {short_repr(value)}")

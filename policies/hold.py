@@ -96,16 +96,12 @@ class Hold:
         if self.explicit:
             return self._rest.copy(), state
 
-        action = self.move()
+        action = self._rest.copy()
+        if self._robot is not None:
+            self._robot.holding = True
         if state is not None:
             action[self._grip] = state[self._grip]
         return action, state
-
-    def move(self) -> NDArray[np.float32]:
-        """Return the next action (A,); its numbers for the gripper are replaced."""
-        if self._robot is not None:
-            self._robot.holding = True
-        return self._rest.copy()
 
 
 class HoldingActions:

@@ -15,6 +15,7 @@ from asm_gym.policies.registry import make_policy
 
 BANG_STEPS = 10  # control steps for which a bang-bang policy goes on in one direction
 TURNS_AT = 40  # control step in which a healthy policy turns hostile
+SPOILT = ("turns hostile", "stale actions", "flipped actions")
 LATE_STEPS = 10  # delay of stale actions [control steps]
 Floats = NDArray[np.floating[Any]]
 
@@ -79,11 +80,11 @@ class _Spoilt(StatefulPolicy):
 
     Args:
         env: an environment whose task has an expert.
-        seed: of the expert.
-        manner: ``"stale"``, ``"flipped"``, or ``"turns"``: downwards from ``TURNS_AT`` on.
+        seed: of the expert, which has a speed of its own.
+        manner: one of ``SPOILT``; one that turns hostile goes down from ``TURNS_AT`` on.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int, manner: str) -> None:
+    def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, manner: str) -> None:
         self._policy: Policy = make_policy("scripted", env, seed=seed)
         self._space: Any = env.action_space
         self._manner = manner
@@ -99,9 +100,9 @@ class _Spoilt(StatefulPolicy):
         healthy = np.array(healthy, np.float32)
         actions = (*state.actions, healthy)[-LATE_STEPS - 1 :]
         action = healthy.copy()
-        if self._manner == "stale":
+        if self._manner == "stale actions":
             action = actions[0].copy()
-        elif self._manner == "flipped":
+        elif self._manner == "flipped actions":
             action[:-1] = -action[:-1]
         elif state.step >= TURNS_AT:
             action[:] = 0.0
@@ -109,63 +110,36 @@ class _Spoilt(StatefulPolicy):
         return action, SpoiltState(state.step + 1, inner, actions)
 
 
-def _alternating(step: int, forth: int, back: int) -> float:
-    """Return 1 for ``forth`` control steps and -1 for ``back`` control steps, in turn."""
-    if step % (forth + back) < forth:
-        return 1.0
-    return -1.0
-
-
-def _squeezing(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
-    """Return an action that comes down with an open hand, and closes it."""
-    if step < 60:
-        return (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
-    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-def _flinging(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
-    """Return an action that swings aside and back, and opens the hand on the way."""
-    aside = _alternating(step, 6, 6)
-    return (0.0, aside, 0.0, 0.0, 0.0, 0.0, aside)
-
-
-def _retreating(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
-    """Return an action that presses for 24 steps, and rests for 12: a trial comes after 10."""
-    if step % 36 < 24:
-        return (0.0, 0.0, -1.0)
-    return (0.0, 0.0, 0.0)
-
-
-def _first_rows(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
-    """Return an action that moves in the first rows only."""
-    if step < 12:
-        return (1.0, 0.0, -1.0, 0.0, 1.0, 0.0)
-    return (0.0,)
-
+# Actions of rules: (x, y, z), turns about them, grip.
+REST = (0.0,)
+DOWN = (0.0, 0.0, -1.0)
+JERK = (1.0, 0.0, -1.0, 0.0, 1.0, 0.0)
+SQUEEZE_DOWN = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
+CLOSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+SWING = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 RULES: dict[str, Rule] = {
-    "down": (0.0, 0.0, -1.0),
+    "down": DOWN,
     "aside and down": lambda policy, step, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
     "forward": (1.0, 0.0, -0.3),
     "bang-bang": _bang_bang,
     "uniform": lambda policy, step, rng: rng.uniform(-1.0, 1.0, policy.size),
     "ramp": lambda policy, step, rng: (0.0, 0.0, -min(1.0, step / 100)),
-    "hammering": lambda policy, step, rng: (0.0, 0.0, -_alternating(step, 12, 8)),
+    "hammering": lambda policy, step, rng: (0.0, 0.0, -1.0 if step % 20 < 12 else 1.0),
     "grinding": lambda policy, step, rng: (np.cos(step / 5), np.sin(step / 5), -0.5),
-    "squeezing": _squeezing,
-    "flinging": _flinging,
+    "squeezing": lambda policy, step, rng: SQUEEZE_DOWN if step < 60 else CLOSE,
+    "flinging": lambda policy, step, rng: (-1.0) ** (step // 6) * SWING,
     "to joint limits": (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
     "into itself": (-1.0, 0.0, -0.3),
     "turning": (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
     "rolling": (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
-    "waits for the hand-back": _retreating,
-    "first rows": _first_rows,
+    # a trial comes after 10 quiet steps
+    "waits for the hand-back": lambda policy, step, rng: DOWN if step % 36 < 24 else REST,
+    "first rows": lambda policy, step, rng: JERK if step < 12 else REST,
 }
 
 # Hostile policies by name: made for an environment, with a seed and a share of the full speed.
 HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
     **{name: partial(Hostile, rule=rule) for name, rule in RULES.items()},
-    "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
-    "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
-    "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),
+    **{manner: partial(_Spoilt, manner=manner) for manner in SPOILT},
 }

@@ -53,13 +53,11 @@ class NetworkPolicy(StatefulPolicy):
         last, _ = self.layers[-1]
         self.observation_size = first.shape[1]
         self.action_size = last.shape[0]
-        self.mean = np.zeros(self.observation_size, np.float32)
-        self.scale = np.ones(self.observation_size, np.float32)
-        if mean is not None:
-            self.mean = check_numbers("mean", mean, self.observation_size).astype(np.float32)
-        if scale is not None:
-            positive = check_numbers("scale", scale, self.observation_size, above=0.0)
-            self.scale = positive.astype(np.float32)
+        size = self.observation_size
+        mean = check_numbers("mean", np.zeros(size) if mean is None else mean, size)
+        scale = check_numbers("scale", np.ones(size) if scale is None else scale, size, above=0.0)
+        self.mean = mean.astype(np.float32)
+        self.scale = scale.astype(np.float32)
         self.trained_in = dict(trained_in or {})
         self._high: NDArray[Any] = np.ones(self.action_size, np.float32)
         self._low: NDArray[Any] = -self._high
@@ -109,8 +107,7 @@ class NetworkPolicy(StatefulPolicy):
         """Write the agent, with what is said ``about`` it in JSON."""
         arrays = {"mean": self.mean, "scale": self.scale}
         for number, (W, b) in enumerate(self.layers):
-            arrays[f"W{number}"] = W
-            arrays[f"b{number}"] = b
+            arrays |= {f"W{number}": W, f"b{number}": b}
         write_checkpoint(path, KIND, {"trained_in": self.trained_in, "about": about} | RULE, arrays)
 
     @classmethod

@@ -68,9 +68,8 @@ class ObservationReader:
 
     def __call__(self, observation: Any, name: str) -> Vector:
         """Return the numbers of a channel."""
-        if self._is_flat:
-            return np.asarray(observation[self._columns[name]], np.float64)
-        return np.asarray(observation[name], np.float64)
+        key = self._columns[name] if self._is_flat else name
+        return np.asarray(observation[key], np.float64)
 
     def hand(self, observation: Any, prefix: str = "") -> Pose:
         """Return the pose of a hand."""
@@ -151,9 +150,7 @@ class Expert(StatefulPolicy):
         self.moves = np.setdiff1d(np.arange(self.size), inner.gripper_actions)
         # Plans have the Panda's pace; other arms drift further from their course.
         self.is_careful = set(inner.robots) != {"Panda"}
-        self.gain = 2.0
-        if self.is_careful:
-            self.gain = 3.0
+        self.gain = 3.0 if self.is_careful else 2.0
 
     def draw_speed(self) -> float:
         """Return the speed of the hand in one episode [action units]."""
@@ -214,7 +211,7 @@ def has_settled(velocity: Vector, since: int, usual: int) -> bool:
     """
     if velocity.size <= SLIDING_JOINTS:
         return since >= usual
-    is_still = float(np.abs(velocity).max()) < STILL
+    is_still = np.abs(velocity).max() < STILL
     return (since >= 2 * usual and is_still) or since >= 5 * usual
 
 

@@ -132,9 +132,8 @@ class CarryScene(Scene):
         return self.state.since > 60 or length(self.offset[:2]) > 0.06
 
     def grasp(self) -> Vector:
-        if self.is_careful:
-            return self.move(self.state.anchor, self.down, self.gain)
-        return self.move(self.state.anchor, self.down)
+        gain = self.gain if self.is_careful else 1.0
+        return self.move(self.state.anchor, self.down, gain)
 
     def has_gripped(self) -> bool:
         return has_settled(self.fingers, self.state.since, usual=7)
@@ -155,11 +154,12 @@ class CarryScene(Scene):
         return self._move_held(self.over, self.state.speed)
 
     def is_over_place(self) -> bool:
-        fit = self.plan.fit
-        if self.is_careful:
-            # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
-            fit = fit * (1 + self.state.since / 60)
-        return self.aside < fit and abs(self.turn_to_fit) < self.plan.heading_fit
+        # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
+        patience = self.state.since / 60 if self.is_careful else 0.0
+        return (
+            self.aside < self.plan.fit * (1 + patience)
+            and abs(self.turn_to_fit) < self.plan.heading_fit
+        )
 
     def lower(self) -> Vector:
         target = self.plan.place
@@ -171,10 +171,8 @@ class CarryScene(Scene):
         return self._move_held(target, 0.6 * self.state.speed)
 
     def has_slipped_aside(self) -> bool:
-        allowed = self.plan.fit
-        if self.is_careful:
-            allowed = 2.5 * allowed
-        return self.aside > allowed + 0.02
+        share = 2.5 if self.is_careful else 1.0
+        return self.aside > self.plan.fit * share + 0.02
 
     def is_down(self) -> bool:
         height = self.thing.at[2]
@@ -299,7 +297,5 @@ class CarryExpert(Expert):
 
         choices = product((task.closing, -task.closing), task.headings or (heading,))
         closing, wanted = min(choices, key=strain)
-        eased = task._replace(closing=closing, turns=2 * np.pi)
-        if task.headings:
-            return eased._replace(headings=(wanted,))
-        return eased
+        headings = (wanted,) if task.headings else ()
+        return task._replace(closing=closing, turns=2 * np.pi, headings=headings)

@@ -91,9 +91,8 @@ class LiftExpert(Expert):
     pace = 0.45
 
     def begin(self, observation: Any) -> State:
-        deep = 0.005
-        if self.is_careful:  # fingers of other arms are longer, and come down on the table
-            deep = 0.0
+        # Fingers of other arms are longer, and come down on the table.
+        deep = 0.0 if self.is_careful else 0.005
         speed = self.draw_speed()
         hover = 0.07 * UP + self.draw_offset()
         goal = 0.13 * UP + self.draw_offset()

@@ -40,9 +40,8 @@ class NutAssemblyExpert(CarryExpert):
         headings: tuple[float, ...] = (np.pi,)
         heading_fit = 0.06
         if name == "RoundNut":
-            aside = 0.5  # a Panda's elbow reaches its stop sooner than others'
-            if self.is_careful:
-                aside = np.pi / 2
+            # A Panda's elbow reaches its stop sooner than others'.
+            aside = np.pi / 2 if self.is_careful else 0.5
             headings = (np.pi - aside, np.pi, np.pi + aside)
             heading_fit = 0.2
         return CarryTask(

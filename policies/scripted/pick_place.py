@@ -51,9 +51,6 @@ class PickPlaceExpert(CarryExpert):
         grip = max(0.0, half[2] - 0.02)
         closing = self._closing(name, thing, half, grip)
         place = self._place(number, half, grip)
-        haste = 1.0
-        if closing.room < SPARE:
-            haste = SLOWLY
         task = CarryTask(
             name=name,
             grip=grip * UP,
@@ -65,7 +62,7 @@ class PickPlaceExpert(CarryExpert):
             headings=self._headings(place, closing.along),
             heading_fit=0.3,
             fit=0.03,
-            haste=haste,
+            haste=1.0 if closing.room >= SPARE else SLOWLY,
         )
         return self.at_ease(task, observation)
 
@@ -80,7 +77,7 @@ class PickPlaceExpert(CarryExpert):
             at = self.read(observation, f"{thing.name}_pos")
             if env.not_in_bin(at, number):
                 distances[number] = length(at - hand)
-        return min(distances, key=lambda number: distances[number], default=None)
+        return min(distances, key=distances.__getitem__, default=None)
 
     def _closing(self, name: str, thing: Pose, half: Vector, grip: float) -> Closing:
         """Return how to close on an object, of half this size (3,), that is held ``grip`` above its middle [m]."""

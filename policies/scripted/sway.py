@@ -31,10 +31,10 @@ class Swaying(StatefulPolicy):
         if not isinstance(space, gym.spaces.Box) or not np.isfinite([space.low, space.high]).all():
             raise ValueError(f"the policy 'sway' needs actions in a finite Box, got {space}")
         self.space = space
-        self.size = int(np.prod(space.shape))
         self.dt = control_period(env)
         self.middle = np.ravel(0.5 * (space.high + space.low)).astype(np.float64)
         self.half = np.ravel(0.5 * (space.high - space.low)).astype(np.float64)
+        self.size = self.half.size
         self.set_random_seed(seed or 0)
 
     def set_random_seed(self, seed: int) -> None:
@@ -82,7 +82,7 @@ class Arm(Swaying):
         now = self.reference(self.t)
         soon = self.reference(self.t + self.dt)
         error = now - observation[: self.size]
-        return np.asarray((soon - now) / self.dt + self.GAIN * error, np.float64)
+        return (soon - now) / self.dt + self.GAIN * error
 
     def reference(self, t: float) -> Floats:
         """Return positions (7,) along minimum-jerk moves [rad]."""
