@@ -5,6 +5,7 @@ Importing this registers the environments with Gymnasium, and little else: each 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +16,19 @@ if not hasattr(gymnasium.vector, "AutoresetMode"):  # since 1.1
         f"asm-gym needs Gymnasium 1.1 or newer, got {gymnasium.__version__}: pip install --upgrade gymnasium"
     )
 
+from asm_gym import exceptions
 from asm_gym.extras import needed_for
 from asm_gym.tasks import TASKS
 from asm_gym.version import __version__  # noqa: F401
 
 if TYPE_CHECKING:
     from asm_gym.data.episode import Episode as Episode
+    from asm_gym.exceptions import AsmGymError as AsmGymError
+    from asm_gym.exceptions import DamagedFile as DamagedFile
+    from asm_gym.exceptions import NotEnoughEpisodes as NotEnoughEpisodes
+    from asm_gym.exceptions import NotFitted as NotFitted
+    from asm_gym.exceptions import SpecMismatch as SpecMismatch
+    from asm_gym.exceptions import UnsupportedEnvironment as UnsupportedEnvironment
     from asm_gym.faults.suite import register_fault as register_fault
     from asm_gym.monitors import NeuralASM as NeuralASM
     from asm_gym.monitors import make_monitor as make_monitor
@@ -37,21 +45,22 @@ if TYPE_CHECKING:
     from asm_gym.wrappers import StreamRecorder as StreamRecorder
     from asm_gym.wrappers import VectorNeuralASMSafety as VectorNeuralASMSafety
 
-_HOME = {
-    **dict.fromkeys(("NeuralASM", "make_monitor", "register_monitor"), "monitors"),
-    **dict.fromkeys(
-        ("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"), "wrappers"
-    ),
-    **dict.fromkeys(("Channel", "StreamSpec"), "spec"),
-    "Episode": "data.episode",
-    "collect": "rollouts.run_trials",
-    "harmless": "rollouts.pretraining.healthy",
-    "make_policy": "policies",
-    "register_fault": "faults.suite",
-    "register_policy": "policies.registry",
-    "register_task": "tasks",
+_NAMES: dict[str, Iterable[str]] = {
+    "data.episode": ("Episode",),
+    "exceptions": exceptions.__all__,
+    "faults.suite": ("register_fault",),
+    "monitors": ("NeuralASM", "make_monitor", "register_monitor"),
+    "policies": ("make_policy",),
+    "policies.registry": ("register_policy",),
+    "rollouts.run_trials": ("collect",),
+    "rollouts.pretraining.healthy": ("harmless",),
+    "spec": ("Channel", "StreamSpec"),
+    "tasks": ("register_task",),
+    "wrappers": ("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"),
 }
-"""Which room a name comes from."""
+"""Public names of each module."""
+
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [*_HOME]
 
@@ -72,7 +81,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with needed_for(name):
         value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-    globals()[name] = value  # not asked for again
+    globals()[name] = value  # found without this function from now on
     return value
 
 

@@ -16,34 +16,32 @@ class _OneThread(AbstractContextManager[None]):
     """
 
     def __init__(self) -> None:
-        self._lock, self._inside = Lock(), 0
+        self._lock = Lock()
+        self._inside = 0  # how many blocks are open
         self._libraries: list[Any] = []
-        self._limited: list[tuple[Any, int]] = []
+        self._threads: list[int] = []  # of each library outside of the blocks
 
     def __enter__(self) -> None:
         with self._lock:
             if self._inside == 0:
-                # Looks through all libraries, once.
-                self._libraries = (
-                    self._libraries
-                    or ThreadpoolController().select(user_api="blas").lib_controllers
-                )
-                self._limited = [
-                    (library, n) for library in self._libraries if (n := library.num_threads) != 1
-                ]
-                self._set([(library, 1) for library, _ in self._limited])
+                if not self._libraries:  # looks through all libraries, once
+                    controller = ThreadpoolController().select(user_api="blas")
+                    self._libraries = controller.lib_controllers
+                self._threads = [library.num_threads for library in self._libraries]
+                self._set([1] * len(self._threads))
             self._inside += 1
 
     def __exit__(self, *error: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                self._set(self._limited)
+                self._set(self._threads)
 
-    @staticmethod
-    def _set(threads: list[tuple[Any, int]]) -> None:
-        for library, n in threads:
-            library.set_num_threads(n)
+    def _set(self, threads: list[int]) -> None:
+        """Give each library its number of threads, unless all of them always have one."""
+        for library, usual, wanted in zip(self._libraries, self._threads, threads, strict=True):
+            if usual != 1:
+                library.set_num_threads(wanted)
 
 
 ONE_THREAD = _OneThread()

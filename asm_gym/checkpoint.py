@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.exceptions import DamagedFile
 from asm_gym.files import regular_file, written_whole
 from asm_gym.validation import typed
 
@@ -26,23 +27,23 @@ FORMAT = "asm-gym"
 VERSION = 1
 HEADER = "header.json"
 
+# Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1.
 MOST_EXPANDED = 30
-"""Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1."""
 
+# Errors that reading a damaged zip may raise.
 DAMAGE = (
-    *(
-        zipfile.BadZipFile,
-        zlib.error,
-        ValueError,
-        KeyError,
-        EOFError,
-        OSError,
-        RuntimeError,
-        NotImplementedError,
-    ),
-    *(MemoryError, OverflowError, SyntaxError),
+    zipfile.BadZipFile,
+    zlib.error,
+    ValueError,
+    KeyError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    NotImplementedError,
+    MemoryError,
+    OverflowError,
+    SyntaxError,
 )
-"""Errors that reading a damaged zip may raise."""
 
 _npy: Any = np.lib.format
 
@@ -54,15 +55,15 @@ class Checkpoint(NamedTuple):
     arrays: dict[str, NDArray[Any]]
 
     def array(self, name: str, *shape: int) -> NDArray[Any]:
-        """Return an array. Raises ValueError unless it is there, of finite numbers and of that shape."""
+        """Return an array. Raises DamagedFile unless it is there, of finite numbers and of that shape."""
         array = self.arrays.get(name)
-        if array is None or array.shape != shape or array.dtype.kind != "f":
-            found = "none" if array is None else f"{array.dtype} {array.shape}"
-            raise ValueError(
-                f"the checkpoint is damaged: {name} should be an array of shape {shape}, found {found}"
-            )
+        if array is None:
+            raise DamagedFile("the checkpoint", f"it has no array {name} of shape {shape}")
+        if array.shape != shape or array.dtype.kind != "f":
+            got = f"{array.dtype} {array.shape}"
+            raise DamagedFile("the checkpoint", f"{name} should have shape {shape}, got {got}")
         if not np.isfinite(array).all():
-            raise ValueError(f"the checkpoint is damaged: {name} should be finite")
+            raise DamagedFile("the checkpoint", f"{name} should be finite")
         return array
 
 
@@ -70,18 +71,21 @@ class Checkpoint(NamedTuple):
 def write_checkpoint(
     path: str | Path, kind: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Write a checkpoint of a ``kind``, such as ``neural_asm``; ``header`` is JSON-serialisable.
+    """Write a checkpoint; a reader sees the old file or the new one, never half of it.
 
-    A reader sees the old file or the new one, never half of it.
+    Args:
+        path: of the file.
+        kind: what it holds, such as ``neural_asm``.
+        header: JSON-serialisable.
+        arrays: by name.
     """
-    held = {name: np.asarray(array) for name, array in arrays.items()}
-    declared = {name: [array.dtype.str, *array.shape] for name, array in held.items()}
-    about = {"format": FORMAT, "version": VERSION, "kind": kind, **header, "arrays": declared}
-    text = json.dumps(about, allow_nan=False)
+    contents = {name: np.asarray(array) for name, array in arrays.items()}
+    about = {"format": FORMAT, "version": VERSION, "kind": kind, **header}
+    text = json.dumps(about | {"arrays": _declared(contents)}, allow_nan=False)
     with written_whole(path) as file, zipfile.ZipFile(file, "w") as archive:
         # dated 1980: the same content has the same bytes at any time
         archive.writestr(zipfile.ZipInfo(HEADER), text)
-        for name, array in held.items():
+        for name, array in contents.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 _npy.write_array(member, array, allow_pickle=False)
 
@@ -92,7 +96,8 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: the file is damaged, foreign, of another kind, or of a newer format.
+        DamagedFile: the file is damaged or foreign.
+        ValueError: it is of another kind, or of a newer format.
     """
     header = read_header(path)
     if header.get("version") != VERSION:
@@ -103,21 +108,16 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     if header.get("kind") != kind:
         raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")
     with _opened(path) as file:
-        arrays = {
-            n.removesuffix(".npy"): _read(file, n) for n in sorted(file.namelist()) if n != HEADER
-        }
+        members = sorted(set(file.namelist()) - {HEADER})
+        arrays = {name.removesuffix(".npy"): _read(file, name) for name in members}
         declared = header.pop("arrays", None)  # the shipped agents declare none
-        found = {name: [array.dtype.str, *array.shape] for name, array in arrays.items()}
-        if declared is not None and found != declared:
-            wrong = sorted(
-                n for n in found.keys() | declared.keys() if found.get(n) != declared.get(n)
-            )
-            raise ValueError(f"its header declares otherwise: {', '.join(wrong)}")
+        if declared is not None:
+            _check_declared(arrays, declared)
     return Checkpoint(header, arrays)
 
 
 def read_header(path: str | Path) -> dict[str, Any]:
-    """Return the JSON values of a checkpoint. Raises FileNotFoundError, or ValueError where the file is damaged."""
+    """Return the JSON values of a checkpoint. Raises FileNotFoundError or DamagedFile."""
     with _opened(path) as file:
         header = json.loads(file.read(HEADER), parse_constant=_finite, parse_float=_finite)
         if not isinstance(header, dict) or header.get("format") != FORMAT:
@@ -127,36 +127,60 @@ def read_header(path: str | Path) -> dict[str, Any]:
 
 @typed
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an ``.npz``, by name. Raises FileNotFoundError, or ValueError where it is damaged."""
+    """Return the arrays of an ``.npz``, by name. Raises FileNotFoundError or DamagedFile."""
     with _opened(path, "is damaged", MOST_EXPANDED) as file:
-        return {n.removesuffix(".npy"): _read(file, n, kinds="biufU") for n in file.namelist()}
+        return {
+            name.removesuffix(".npy"): _read(file, name, kinds="biufU") for name in file.namelist()
+        }
+
+
+def _declared(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
+    """Return the type and shape of each array, as a header declares them."""
+    return {name: [array.dtype.str, *array.shape] for name, array in arrays.items()}
+
+
+def _check_declared(arrays: Mapping[str, NDArray[Any]], declared: Mapping[str, Any]) -> None:
+    """Raise ValueError unless the header declares these arrays."""
+    actual = _declared(arrays)
+    names = actual.keys() | declared.keys()
+    wrong = [name for name in sorted(names) if actual.get(name) != declared.get(name)]
+    if wrong:
+        raise ValueError(f"its header declares otherwise: {', '.join(wrong)}")
 
 
 @contextmanager
 def _opened(
-    path: str | Path, what: str = "is damaged or not a checkpoint of asm-gym", expanded: int = 1
+    path: str | Path,
+    verdict: str = "is damaged or not a checkpoint of asm-gym",
+    expanded: int = 1,
 ) -> Iterator[zipfile.ZipFile]:
     """Open a zip whose members are checked before anything is read; its errors become one line that names it.
 
-    Its content is at most ``expanded`` sizes of the file; at 1 nothing may be compressed.
+    Args:
+        path: of the file.
+        verdict: what the message says of a file that cannot be read.
+        expanded: most sizes of the file that its content may have; at 1 nothing may be compressed.
     """
     try:
         size = regular_file(path)
         with zipfile.ZipFile(path) as file:
-            members = file.infolist()
-            if len({m.filename for m in members}) < len(members):
-                raise ValueError("two of its members have the same name")
-            if expanded == 1 and any(m.compress_type != zipfile.ZIP_STORED for m in members):
-                raise ValueError("its members are compressed, and those of asm-gym never are")
-            if sum(m.file_size for m in members) > expanded * size:
-                raise ValueError(
-                    f"its members claim {sum(m.file_size for m in members)} bytes, in a file of {size}"
-                )
+            _check_members(file.infolist(), size, expanded)
             yield file
     except FileNotFoundError:
         raise
     except DAMAGE as error:
-        raise ValueError(f"{path} {what}: {error}") from error
+        raise DamagedFile(path, error, verdict) from error
+
+
+def _check_members(members: list[zipfile.ZipInfo], size: int, expanded: int) -> None:
+    """Raise ValueError for members of a zip that must not be read; see ``_opened``."""
+    if len({member.filename for member in members}) < len(members):
+        raise ValueError("two of its members have the same name")
+    if expanded == 1 and any(member.compress_type != zipfile.ZIP_STORED for member in members):
+        raise ValueError("its members are compressed, and those of asm-gym never are")
+    claimed = sum(member.file_size for member in members)
+    if claimed > expanded * size:
+        raise ValueError(f"its members claim {claimed} bytes, in a file of {size}")
 
 
 def _finite(text: str) -> float:

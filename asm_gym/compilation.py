@@ -42,20 +42,19 @@ def compiled(
         calls: other folders of the package that hold functions which it calls; ``"."`` for the package's own.
         nogil: let other threads run Python meanwhile.
     """
-    how: dict[str, Any] = {
+    options: dict[str, Any] = {
         "nogil": nogil,
         "fastmath": fastmath,
         "forceinline": fastmath,
         "error_model": "numpy",
     }
-    dispatcher: Any = somewhere(lambda: numba.njit(cache=True, **how)(function))
+    dispatcher: Any = somewhere(lambda: numba.njit(cache=True, **options)(function))
     cache = _cache_of(dispatcher)
     if cache is not None:
         # numba looks at the function's own file alone, and would keep code that another file's change made stale.
-        own, package = Path(function.__code__.co_filename).parent, Path(__file__).parent
-        cache._source_stamp = f"{how}" + "".join(
-            map(_digest, (own, *(package / name for name in calls)))
-        )
+        folders = [Path(function.__code__.co_filename).parent]
+        folders += [Path(__file__).parent / name for name in calls]
+        cache._source_stamp = f"{options}" + "".join(map(_digest, folders))
         cache._load_index = partial(_index_of, cache._load_index)
     return cast(F, dispatcher)
 
@@ -102,7 +101,9 @@ def must_compile(function: Any) -> bool:
 def kept_in(function: Any) -> Path | None:
     """Return the folder that holds the compiled code of a function; None where nothing keeps it."""
     cache = _cache_of(function)
-    return None if cache is None else Path(cache._cache_path)
+    if cache is None:
+        return None
+    return Path(cache._cache_path)
 
 
 def _cache_of(dispatcher: Any) -> Any:
@@ -112,17 +113,16 @@ def _cache_of(dispatcher: Any) -> Any:
 
 def inner(function: F, fastmath: bool = False, inlined: bool = False) -> F:
     """Compile ``function`` for compiled functions to call; ``inlined``, as a part of each of them."""
-    how: dict[str, Any] = {
+    options: dict[str, Any] = {
         "no_cpython_wrapper": True,
         "no_cfunc_wrapper": True,
         "error_model": "numpy",
-    }
-    how |= {
         "fastmath": fastmath,
         "forceinline": fastmath,
-        "inline": "always" if inlined else "never",
     }
-    return cast(F, numba.njit(**how)(function))
+    if inlined:
+        options["inline"] = "always"
+    return cast(F, numba.njit(**options)(function))
 
 
 @lru_cache

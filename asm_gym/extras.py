@@ -47,16 +47,17 @@ def check_simulator() -> None:
 
 def fitting(name: str) -> str:
     """Return the line that replaces MuJoCo or robosuite by a version that fits."""
-    return f"pip install {'--no-deps ' if name == 'robosuite' else ''}'{name}{TESTED[name]}'"
+    options = ""
+    if name == "robosuite":
+        options = "--no-deps "
+    return f"pip install {options}'{name}{TESTED[name]}'"
 
 
 def remedy(package: str) -> str:
     """Return the line that installs a package of an extra."""
-    return (
-        INSTALL_ROBOSUITE
-        if package == "robosuite"
-        else f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
-    )
+    if package == "robosuite":
+        return INSTALL_ROBOSUITE
+    return f"pip install 'asm-gym[{BROUGHT_BY[package]}]'"
 
 
 def require(module: str, *, what: str) -> Any:

@@ -33,10 +33,8 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{token_hex(4)}{UNFINISHED}")
     try:
-        with (
-            named(path),
-            temporary.open("xb") as file,
-        ):  # "x" follows no link; who may read it, the umask says
+        # "x" follows no link; who may read it, the umask says.
+        with named(path), temporary.open("xb") as file:
             yield file
         os.replace(temporary, path)
     except BaseException:
@@ -82,15 +80,16 @@ def regular_file(path: str | Path) -> int:
         ValueError: it is a folder, or a device or pipe, whose reading might never end; the path names no file.
     """
     try:
-        found = os.stat(_checked(path))
+        status = os.stat(_checked(path))
     except FileNotFoundError:
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path)) from None
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise ValueError(f"{path} is no regular file")
-    return found.st_size
+    return status.st_size
 
 
 def _checked(path: str | Path) -> Path:
+    """Return the path of a file. Raises ValueError where it names none."""
     if not Path(path).name or "\x00" in str(path):
         raise ValueError(f"a path must name a file, got {short_repr(str(path))}")
     return Path(path)

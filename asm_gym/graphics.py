@@ -35,14 +35,12 @@ def rendering_backend() -> str | None:
 
 def draws_a_frame(backend: str) -> bool:
     """Return whether MuJoCo draws one frame with ``MUJOCO_GL=backend``, in another process: no choice can be undone."""
-    env = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": backend}
+    env = os.environ | {"MUJOCO_GL": backend}
+    env.pop("PYOPENGL_PLATFORM", None)
     command = [sys.executable, "-c", ONE_FRAME]
-    try:  # a driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds
-        return (
-            subprocess.run(
-                command, env=env, capture_output=True, timeout=120, check=False
-            ).returncode
-            == 0
-        )
+    # A driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds.
+    try:
+        drawn = subprocess.run(command, env=env, capture_output=True, timeout=120, check=False)
     except subprocess.TimeoutExpired:
         return False
+    return drawn.returncode == 0

@@ -14,26 +14,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FEWEST, MOSTLY, NEARLY, COARSE = 10, 0.95, 0.1, 200.0
-"""A step is told from so many changes on; so large a share of them must be whole multiples of it, within so many steps;
-and most must be fewer steps apart than the last, for every number is near a multiple of a small step."""
+FEWEST_CHANGES = 10  # from which a step can be told
+MOST_CHANGES = 0.95  # so large a share of them must be whole multiples of the step
+NEARLY = 0.1  # of a step, by which a whole multiple may be missed
+LOOSEST = 0.25  # however large the rounding is
+# Most changes must be of fewer steps than this, as every number is near a multiple of a small step.
+COARSE = 200.0
 
 
 def resolution(values: NDArray[Any]) -> float:
     """Return δ of readings (T,), in their unit; 0 where no steps can be told."""
     known = values[np.isfinite(values)].astype(np.float64)
+    if len(known) < FEWEST_CHANGES:
+        return 0.0
+    rounding = float(np.spacing(np.float32(np.abs(known).max())))
     changes = np.abs(np.diff(known))
-    rounding = float(np.spacing(np.float32(np.abs(known).max()))) if len(known) else 0.0
     changes = changes[changes > 2 * rounding]
-    if len(changes) < FEWEST:
+    if len(changes) < FEWEST_CHANGES:
         return 0.0
     step = _median(changes[changes < 1.5 * changes.min()])
     ratios = changes / step
     if _median(ratios) > COARSE:
         return 0.0
-    tolerance = NEARLY + 2 * rounding / step + 1e-3 * ratios
-    near = np.abs(ratios - np.rint(ratios)) <= np.minimum(tolerance, 0.25)
-    return float(f"{step:.4g}") if np.count_nonzero(near) / len(near) >= MOSTLY else 0.0
+    tolerance = np.minimum(NEARLY + 2 * rounding / step + 1e-3 * ratios, LOOSEST)
+    is_multiple = np.abs(ratios - np.rint(ratios)) <= tolerance
+    if np.count_nonzero(is_multiple) / len(ratios) < MOST_CHANGES:
+        return 0.0
+    return float(f"{step:.4g}")
 
 
 def noise_of(values: NDArray[Any]) -> float:
@@ -45,18 +52,21 @@ def noise_of(values: NDArray[Any]) -> float:
     known = values[np.isfinite(values)].astype(np.float64)
     if len(known) < 8:
         return 0.0
-    return float(f"{_median(np.abs(np.diff(known, 3))) / 0.6745 / np.sqrt(20):.3g}")
+    spread = _median(np.abs(np.diff(known, 3))) / 0.6745 / np.sqrt(20)
+    return float(f"{spread:.3g}")
 
 
 def _median(values: NDArray[np.float64]) -> float:
     """Return the median of finite numbers; ``np.median`` takes ten times as long for so few."""
-    ordered, half = np.sort(values), len(values) // 2
-    return float(ordered[half] if len(values) % 2 else (ordered[half - 1] + ordered[half]) / 2.0)
+    ordered = np.sort(values)
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(ordered[half])
+    return float((ordered[half - 1] + ordered[half]) / 2.0)
 
 
 def spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the runs of True in ``mask`` (T,), as half-open [start, stop) steps."""
-    edges = np.diff(np.concatenate([[0], np.asarray(mask, np.int8), [0]]))  # (T + 1,)
-    return list(
-        zip(np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True)
-    )
+    padded = np.concatenate([[False], mask, [False]])  # (T + 2,)
+    edges = np.flatnonzero(padded[1:] != padded[:-1])
+    return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]

@@ -47,11 +47,12 @@ class Registry(dict[str, Row]):
 
 def added() -> Added:
     """Return the rows that were added to each registry of this process."""
-    new = {
-        at: {n: row for n, row in rows.items() if n not in rows.own}
-        for at, rows in _REGISTRIES.items()
-    }
-    return {where: rows for where, rows in new.items() if rows}
+    new: Added = {}
+    for where, registry in _REGISTRIES.items():
+        rows = {name: row for name, row in registry.items() if name not in registry.own}
+        if rows:
+            new[where] = rows
+    return new
 
 
 def knowing(rows: Added, task: Callable[[Any], Result], item: Any) -> Result:
@@ -61,16 +62,16 @@ def knowing(rows: Added, task: Callable[[Any], Result], item: Any) -> Result:
     return task(item)
 
 
-def target(found: Any) -> Any:
+def target(place: Any) -> Any:
     """Return the object that ``module:name`` names; any other object is returned as it is.
 
     Raises:
         ImportError: there is no such module; the message says what installs it.
         ValueError: the module has no such name.
     """
-    if not isinstance(found, str):
-        return found
-    module, _, name = found.partition(":")
+    if not isinstance(place, str):
+        return place
+    module, _, name = place.partition(":")
     with needed_for(name):
         home = import_module(module)
     if not hasattr(home, name):

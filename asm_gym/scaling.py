@@ -34,8 +34,8 @@ LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
 FEW_VALUES = 5  # a channel of fewer different values is a flag or a mode
 MOST_SHOWN = 10_000  # rows from which the resolution of channels is estimated
 
+# Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted from such a number.
 FARTHEST = 1e3
-"""Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted from such a number."""
 
 
 class ScaledRows(NamedTuple):
@@ -100,11 +100,12 @@ class StreamScaler:
     @cached_property
     def groups(self) -> NDArray[np.intp]:
         """(X,) the group of each change, by number; where all are of one group, every number is its own."""
-        names = [c.group for c in self.spec.channels for _ in range(c.size)]
-        found = np.unique([names[i] for i in self.spec.sensory], return_inverse=True)[1].astype(
-            np.intp
-        )
-        return found if found.any() else np.arange(len(found))
+        channels = self.spec.channels
+        names = np.repeat([c.group for c in channels], [c.size for c in channels])
+        _, groups = np.unique(names[self.spec.sensory], return_inverse=True)
+        if not groups.any():
+            return np.arange(len(groups))
+        return groups.astype(np.intp)
 
     @cached_property
     def inputs(self) -> int:
@@ -126,13 +127,33 @@ class StreamScaler:
 @inner
 def _bounded(number: float) -> float:
     """Cut off at ``FARTHEST``; a difference of two infinite numbers is 0."""
-    return 0.0 if number != number else min(max(number, -FARTHEST), FARTHEST)
+    if np.isnan(number):
+        return 0.0
+    return min(max(number, -FARTHEST), FARTHEST)
 
 
 @inner
 def _believed(number: float) -> float:
-    """Return 0 where the number would be cut off."""
-    return number if abs(number) < FARTHEST else 0.0
+    """Return 0 where the number is unknown, or would be cut off."""
+    if abs(number) < FARTHEST:
+        return number
+    return 0.0
+
+
+@inner
+def _standardised(number: float, mean: float, spread: float) -> float:
+    """Return a number in standard deviations from the mean; 0 where it is unseen."""
+    if np.isfinite(number):
+        return _bounded((number - mean) / spread)
+    return 0.0
+
+
+@inner
+def _changed(number: float, before: float, change: float) -> float:
+    """Return a change in standard deviations; 0 where either number is unseen."""
+    if np.isfinite(number) and np.isfinite(before):
+        return _bounded((number - before) / change)
+    return 0.0
 
 
 @compiled
@@ -149,40 +170,37 @@ def read_rows(
 ) -> ScaledRows:
     """Read rows (B, D), see ``StreamScaler.read``."""
     B, D = rows.shape
-    X, A, L = len(sensory), len(motor), len(slow)
-    senses, seen = np.zeros((B, X + L), np.float32), np.zeros((B, X + L), np.float32)
+    X = len(sensory)
+    L = len(slow)
+    A = len(motor)
+    senses = np.zeros((B, X + L), np.float32)
+    seen = np.zeros((B, X + L), np.float32)
     commands = np.ones((B, A + 1), np.float32)
-    inputs, changes = np.zeros((B, D + X + L + A + 1), np.float32), np.zeros((B, X), np.float32)
-    whole, finite = np.ones((B, 1), np.float32), np.zeros((B, D), np.bool_)
+    inputs = np.ones((B, D + X + L + A + 1), np.float32)
+    changes = np.zeros((B, X), np.float32)
+    whole = np.ones((B, 1), np.float32)
+    finite = np.zeros((B, D), np.bool_)
     for n in range(B):
         for i in range(D):
             finite[n, i] = np.isfinite(rows[n, i])
-            known = np.isfinite(before[n, i])
-            if not (finite[n, i] and known and np.isfinite(earlier[n, i])):
+            if not (finite[n, i] and np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])):
                 whole[n, 0] = 0.0
-            if known:
-                inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
+            inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
         for j in range(X):
             i = sensory[j]
-            if finite[n, i]:
-                senses[n, j], seen[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]), 1.0
-                if np.isfinite(before[n, i]):
-                    changes[n, j] = _bounded((rows[n, i] - before[n, i]) / change[i])
-                    inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
+            seen[n, j] = finite[n, i]
+            senses[n, j] = _standardised(rows[n, i], mean[i], spread[i])
+            changes[n, j] = _changed(rows[n, i], before[n, i], change[i])
+            inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
         for j in range(L):
             i = slow[j]
-            if finite[n, i] and np.isfinite(before[n, i]):
-                senses[n, X + j], seen[n, X + j] = (
-                    _bounded((rows[n, i] - before[n, i]) / change[i]),
-                    1.0,
-                )
-            if np.isfinite(before[n, i]) and np.isfinite(earlier[n, i]):
-                inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
+            seen[n, X + j] = finite[n, i] and np.isfinite(before[n, i])
+            senses[n, X + j] = _changed(rows[n, i], before[n, i], change[i])
+            inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
         for j in range(A):
             i = motor[j]
-            commands[n, j] = _bounded((rows[n, i] - mean[i]) / spread[i]) if finite[n, i] else 0.0
-            inputs[n, D + X + L + j] = commands[n, j] if abs(commands[n, j]) < FARTHEST else 0.0
-        inputs[n, D + X + L + A] = 1.0
+            commands[n, j] = _standardised(rows[n, i], mean[i], spread[i])
+            inputs[n, D + X + L + j] = _believed(commands[n, j])
     return ScaledRows(senses, seen, commands, inputs, changes, whole, finite)
 
 
@@ -208,9 +226,15 @@ def _least_change(
 
     Otherwise a channel that moves by one of its steps in a thousand rows would surprise at each step.
     """
-    shown = [s[:MOST_SHOWN] for s in streams[: max(1, MOST_SHOWN // max(1, len(streams[0])))]]
-    # (N, D)
-    rounded = [
-        [resolution(c) if len(np.unique(c)) >= FEW_VALUES else 0.0 for c in s.T] for s in shown
-    ]
-    return np.sqrt(2.0) * np.maximum(noise / 2, np.max(rounded, axis=0) / np.sqrt(12.0))
+    episodes = max(1, MOST_SHOWN // max(1, len(streams[0])))
+    steps = [_resolutions(stream[:MOST_SHOWN]) for stream in streams[:episodes]]
+    return np.sqrt(2.0) * np.maximum(noise / 2, np.max(steps, axis=0) / np.sqrt(12.0))
+
+
+def _resolutions(stream: NDArray[np.float32]) -> list[float]:
+    """Return the resolution of each channel (D,) of a stream (T, D); 0 for a flag or a mode."""
+    steps = [0.0] * stream.shape[1]
+    for column, values in enumerate(stream.T):
+        if len(np.unique(values)) >= FEW_VALUES:
+            steps[column] = resolution(values)
+    return steps

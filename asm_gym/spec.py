@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from asm_gym.exceptions import DamagedFile, SpecMismatch
 from asm_gym.validation import check_number, short_repr, typed
 
 MOTOR = "action"  # the group that holds the commanded action
@@ -192,10 +193,10 @@ class StreamSpec:
         return lines
 
     def require(self, other: StreamSpec, whose: str) -> None:
-        """Raise ValueError naming the channels that differ, unless ``other`` can be read with this spec."""
+        """Raise SpecMismatch naming the channels that differ, unless ``other`` can be read with this spec."""
         lines = self.difference(other)
         if lines:
-            raise ValueError(f"{whose} does not fit this stream:\n  " + "\n  ".join(lines))
+            raise SpecMismatch(whose, lines)
 
     def to_json(self) -> str:
         return json.dumps(asdict(self))
@@ -203,7 +204,7 @@ class StreamSpec:
     @classmethod
     @typed
     def from_json(cls, text: str) -> StreamSpec:
-        """Read what ``to_json`` wrote. Raises ValueError where it is something else."""
+        """Read what ``to_json`` wrote. Raises DamagedFile where it is something else."""
         try:
             raw = json.loads(text)
             channels = tuple(
@@ -218,9 +219,8 @@ class StreamSpec:
             )
             return cls(channels, raw["dt"], raw["source"], tuple(raw.get("missing", ())))
         except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(
-                f"the text of a stream's spec is damaged ({error}): {short_repr(text)}"
-            ) from error
+            reason = f"{error}, in {short_repr(text)}"
+            raise DamagedFile("the text of a stream's spec", reason) from error
 
     @classmethod
     @typed

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from asm_gym.control_period import PeriodCheck, control_period, stream_provider
 from asm_gym.control_period import layers as layers
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.spec import StreamSpec, flat
 from asm_gym.validation import as_float32
 
@@ -25,7 +26,7 @@ class StreamSource:
 
     Raises:
         TypeError: its spaces cannot be read as rows of numbers.
-        ValueError: a wrapper changes how the same sense reads over time, or repeats the steps of a
+        UnsupportedEnvironment: a wrapper changes how the same sense reads over time, or repeats the steps of a
             stream that is faster than control.
     """
 
@@ -71,12 +72,13 @@ class StreamSource:
         return self._spaces
 
     def _refuse_lost_rows(self) -> None:
-        """Raise ValueError for a wrapper that repeats steps of several rows each."""
+        """Raise UnsupportedEnvironment for a wrapper that repeats steps of several rows each."""
         rows = self.rows_per_step
         if rows > 1 and not isclose(self.spec.dt, self._stated_spec.dt):
-            raise ValueError(
+            raise UnsupportedEnvironment(
                 f"the stream has {rows} rows in each step of the robot, and a wrapper that repeats actions "
-                "hides all but those of the last: put that wrapper outside"
+                "hides all but those of the last",
+                advice="put that wrapper outside",
             )
 
     def step(self, action: Any) -> StepResult:
@@ -127,13 +129,14 @@ def stepped(env: gym.Env[Any, Any], action: Any) -> StepResult:
 
 
 def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:
-    """Raise ValueError for a wrapper, of one or many, by which the same sense reads differently the longer it runs."""
+    """Raise UnsupportedEnvironment for a wrapper by which a sense reads differently the longer it runs."""
     for layer in layers(env):
         if (
             isinstance(layer, NormalizeObservation | VectorNormalizeObservation)
             and layer.update_running_mean
         ):
-            raise ValueError(
-                "NormalizeObservation inside the guard changes its scaling over time: put it outside, as in "
-                f"NormalizeObservation({guard}(env, monitor)), or set its update_running_mean to False"
+            raise UnsupportedEnvironment(
+                "NormalizeObservation inside the guard changes its scaling over time",
+                advice=f"put it outside, as in NormalizeObservation({guard}(env, monitor)), "
+                "or set its update_running_mean to False",
             )

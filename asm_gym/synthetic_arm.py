@@ -18,7 +18,10 @@ from asm_gym.compilation import compiled
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 Floats = NDArray[np.float64]
-JOINTS, SUBSTEPS, DT = 7, 10, 0.01
+JOINTS = 7
+SUBSTEPS = 10  # of the simulation in a control step
+DT = 0.01  # control period [s]
+FASTEST = 3.0  # command [rad/s]
 MASS = np.array([2.5, 2.5, 1.5, 1.5, 0.5, 0.5, 0.2])  # [kg m²]
 GRAVITY = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]
 COUPLING = 0.15  # between neighbouring joints, as a share of the geometric mean of their masses
@@ -51,9 +54,9 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium has it)
     stream_spec = StreamSpec(
         (
-            Channel("joint_position", JOINTS, "rad", 1e-4, "position"),
-            Channel("joint_velocity", JOINTS, "rad/s", 2e-3, "velocity"),
-            Channel("joint_torque", JOINTS, "N m", 0.05, "torque"),
+            Channel("joint_position", JOINTS, "rad", noise=1e-4, group="position"),
+            Channel("joint_velocity", JOINTS, "rad/s", noise=2e-3, group="velocity"),
+            Channel("joint_torque", JOINTS, "N m", noise=0.05, group="torque"),
             Channel("command", JOINTS, "rad/s", group=MOTOR),
         ),
         dt=DT,
@@ -65,25 +68,27 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __init__(self, horizon: int = 400) -> None:
         self.horizon = horizon
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3 * JOINTS,), np.float32)
-        self.action_space = gym.spaces.Box(-3.0, 3.0, (JOINTS,), np.float32)
+        self.action_space = gym.spaces.Box(-FASTEST, FASTEST, (JOINTS,), np.float32)
         coupled = np.diag(np.full(JOINTS - 1, COUPLING), 1)
-        self._inverse = np.linalg.inv(
-            np.diag(MASS) + (coupled + coupled.T) * np.sqrt(np.outer(MASS, MASS))
-        )
+        coupling = (coupled + coupled.T) * np.sqrt(np.outer(MASS, MASS))
+        self._inverse = np.linalg.inv(np.diag(MASS) + coupling)  # of M (7, 7)
         self._noise = self.stream_spec.noise[: 3 * JOINTS]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
-        self._q, self._v, self._steps = np.zeros(JOINTS), np.zeros(JOINTS), 0
+        self._q = np.zeros(JOINTS)  # [rad]
+        self._v = np.zeros(JOINTS)  # [rad/s]
+        self._steps = 0
         self._load = 0.7 + 0.3 * self.np_random.uniform(0.5, 1.5)
         observation = self._sense(_gravity(self._q))
-        return observation, {"stream": np.concatenate([observation, np.zeros(JOINTS, np.float32)])}
+        stream = np.concatenate([observation, np.zeros(JOINTS, np.float32)])
+        return observation, {"stream": stream}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move one step by the commanded velocities [rad/s]."""
-        command = np.clip(np.asarray(action, np.float64), -3.0, 3.0)
+        command = np.clip(np.asarray(action, np.float64), -FASTEST, FASTEST)
         self._q, self._v, torque = _advance(self._q, self._v, command, self._load, self._inverse)
         self._steps += 1
         observation = self._sense(torque)
@@ -92,6 +97,5 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def _sense(self, torque: Floats) -> NDArray[np.float32]:
         exact = np.concatenate([self._q, self._v, torque])
-        return np.asarray(
-            exact + self._noise * self.np_random.standard_normal(len(exact)), np.float32
-        )
+        noise = self._noise * self.np_random.standard_normal(len(exact))
+        return np.asarray(exact + noise, np.float32)

@@ -15,14 +15,7 @@ from asm_gym.registries import Registry
 from asm_gym.validation import check_choice, check_number, check_text
 
 # arms that the tasks are tested with
-ROBOTS = (
-    "Panda",
-    "Sawyer",
-    "UR5e",
-    "Kinova3",
-    "IIWA",
-    "Jaco",
-)
+ROBOTS = ("Panda", "Sawyer", "UR5e", "Kinova3", "IIWA", "Jaco")
 
 
 @dataclass(frozen=True)
@@ -33,56 +26,59 @@ class TaskSpec:
     horizon: int  # control steps before an episode is truncated, at the default 20 Hz
     success: str  # meaning of ``info["success"]``
     arms: int = 1  # number of robots
-    draws_shapes: bool = (
-        False  # of its objects, when robosuite loads the model; see ``asm_gym.envs.shapes``
-    )
+    # of its objects, when robosuite loads the model; see ``asm_gym.envs.shapes``
+    draws_shapes: bool = False
 
     @property
     def id(self) -> str:
         return f"asm_gym/{self.name}-v0"
 
 
-_ON_PEG = "its nut is around its peg, and the hand has let go of it"
-_IN_BIN = "its object is in its bin, and the hand has left it"
+ON_PEG = "its nut is around its peg, and the hand has let go of it"
+IN_BIN = "its object is in its bin, and the hand has left it"
 
-TASKS = {
-    task.name: task
-    for task in (
-        TaskSpec("Lift", 100, "the cube is more than 4 cm above the table", draws_shapes=True),
-        TaskSpec("Stack", 200, "the red cube lies on the green one, and the hand has let go of it"),
-        TaskSpec("Door", 200, "the door stands open by more than 0.3 rad"),
-        TaskSpec("Wipe", 400, "every marker on the table is wiped off"),
-        TaskSpec("ToolHang", 700, "the frame stands in its base and the tool hangs on it"),
-        TaskSpec(
-            "NutAssembly", 700, "both nuts are around their pegs, and the hand has let go of them"
-        ),
-        *(TaskSpec(f"NutAssembly{kind}", 350, _ON_PEG) for kind in ("Single", "Square", "Round")),
-        TaskSpec(
-            "PickPlace", 1000, "all four objects are in their bins, and the hand has left them"
-        ),
-        *(
-            TaskSpec(f"PickPlace{kind}", 300, _IN_BIN)
-            for kind in ("Single", "Can", "Milk", "Bread", "Cereal")
-        ),
-        TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", 2),
-        TaskSpec("TwoArmPegInHole", 300, "the peg is in the hole and aligned with it", 2, True),
-        TaskSpec(
-            "TwoArmHandover",
-            400,
-            "the second arm alone holds the hammer by its handle, off the table",
-            2,
-            True,
-        ),
-        TaskSpec(
-            "TwoArmTransport",
-            700,
-            "the payload is in the target bin and the trash in the trash bin",
-            2,
-            True,
-        ),
-    )
-}
-"""Every task by its name."""
+TABLE = (
+    TaskSpec("Lift", 100, "the cube is more than 4 cm above the table", draws_shapes=True),
+    TaskSpec("Stack", 200, "the red cube lies on the green one, and the hand has let go of it"),
+    TaskSpec("Door", 200, "the door stands open by more than 0.3 rad"),
+    TaskSpec("Wipe", 400, "every marker on the table is wiped off"),
+    TaskSpec("ToolHang", 700, "the frame stands in its base and the tool hangs on it"),
+    TaskSpec(
+        "NutAssembly", 700, "both nuts are around their pegs, and the hand has let go of them"
+    ),
+    TaskSpec("NutAssemblySingle", 350, ON_PEG),
+    TaskSpec("NutAssemblySquare", 350, ON_PEG),
+    TaskSpec("NutAssemblyRound", 350, ON_PEG),
+    TaskSpec("PickPlace", 1000, "all four objects are in their bins, and the hand has left them"),
+    TaskSpec("PickPlaceSingle", 300, IN_BIN),
+    TaskSpec("PickPlaceCan", 300, IN_BIN),
+    TaskSpec("PickPlaceMilk", 300, IN_BIN),
+    TaskSpec("PickPlaceBread", 300, IN_BIN),
+    TaskSpec("PickPlaceCereal", 300, IN_BIN),
+    TaskSpec("TwoArmLift", 200, "the pot is more than 10 cm above the table", arms=2),
+    TaskSpec(
+        "TwoArmPegInHole",
+        300,
+        "the peg is in the hole and aligned with it",
+        arms=2,
+        draws_shapes=True,
+    ),
+    TaskSpec(
+        "TwoArmHandover",
+        400,
+        "the second arm alone holds the hammer by its handle, off the table",
+        arms=2,
+        draws_shapes=True,
+    ),
+    TaskSpec(
+        "TwoArmTransport",
+        700,
+        "the payload is in the target bin and the trash in the trash bin",
+        arms=2,
+        draws_shapes=True,
+    ),
+)
+TASKS = {task.name: task for task in TABLE}
 
 # tasks of ``register_task``, by name
 OWN: Registry[EnvSpec] = Registry("task", "asm_gym.tasks:OWN")
@@ -113,14 +109,21 @@ def register_task(
     if name in TASKS:
         raise ValueError(f"there is a task {name!r} already")
     check_number("horizon", horizon, low=1, whole=True)
-    if isinstance(make, type) and any(c.__module__.startswith("robosuite.") for c in make.__mro__):
-        make, arguments = "asm_gym.envs.user_environment:OwnRobosuite", {"make": make} | arguments
     entry: Any = make
+    if _is_of_robosuite(make):
+        entry = "asm_gym.envs.user_environment:OwnRobosuite"
+        arguments = {"make": make} | arguments
     spec = EnvSpec(
         f"asm_gym/{name}-v0", entry_point=entry, max_episode_steps=horizon, kwargs=arguments
     )
     OWN.register(name, spec)
     gym.registry[spec.id] = spec
+
+
+def _is_of_robosuite(make: object) -> bool:
+    """Return whether it is a class of robosuite, or of the user's own, derived from one."""
+    bases = getattr(make, "__mro__", ())
+    return any(base.__module__.startswith("robosuite.") for base in bases)
 
 
 def task(name: str) -> TaskSpec:

@@ -18,7 +18,16 @@ from contextlib import suppress
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import SimpleNamespace, UnionType
-from typing import Any, Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    NamedTuple,
+    ParamSpec,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +35,24 @@ from numpy.typing import ArrayLike, NDArray
 P = ParamSpec("P")
 R = TypeVar("R")
 SHOWN = 80  # characters of a refused value that a message shows
+UNCHECKED = (int, float, bool, np.ndarray, object, Any)  # by ``typed``
+
+
+class _Bound(NamedTuple):
+    """One kind of bound of a number."""
+
+    holds: Callable[[float, float], bool]
+    words: str  # of a message
+    bracket: str  # of an interval
+
+
+# The lower ones first, as an interval shows them.
+BOUNDS = {
+    "low": _Bound(operator.ge, "of at least", "["),
+    "above": _Bound(operator.gt, "above", "("),
+    "high": _Bound(operator.le, "of at most", "]"),
+    "below": _Bound(operator.lt, "below", ")"),
+}
 
 
 @typing.overload
@@ -60,23 +87,32 @@ def check_number(
     Raises:
         ValueError: it is no such number; the message begins with ``name``.
     """
-    wanted = _described("whole number" if whole else "number", **bounds)
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral if whole else Real):
-        raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
-    number: float = int(value) if isinstance(value, Integral) else float(value)
-    # NaN alone differs from itself.
-    if number != number or not _within(number, **bounds):
-        raise ValueError(f"{name} must be a {wanted}, got {short_repr(value)}")
+    kind: type = Real
+    noun = "number"
+    if whole:
+        kind = Integral
+        noun = "whole number"
+    if isinstance(value, bool | np.bool_) or not isinstance(value, kind):
+        raise _refused(name, noun, bounds, value)
+    number: float = int(value) if isinstance(value, Integral) else float(value)  # type: ignore[arg-type]
+    # NaN alone differs from itself; math.isnan takes no integer of thousands of digits.
+    if number != number or not _within(number, bounds):
+        raise _refused(name, noun, bounds, value)
     if not infinite and abs(number) > sys.float_info.max:  # NumPy would convert a long integer
         raise ValueError(f"{name} must be finite, got {short_repr(value)}")
     return number
+
+
+def _refused(name: str, noun: str, bounds: Mapping[str, float | None], value: object) -> ValueError:
+    """Return the error of a value that is no such number."""
+    return ValueError(f"{name} must be a {_described(noun, bounds)}, got {short_repr(value)}")
 
 
 def check_numbers(
     name: str, values: ArrayLike, *shape: int, **bounds: float | None
 ) -> NDArray[np.float64]:
     """Return ``values`` as float64. Raises ValueError unless they are finite, within bounds and of this shape."""
-    wanted = f"{_described('finite numbers', **bounds)} in the shape {shape}"
+    wanted = f"{_described('finite numbers', bounds)} in the shape {shape}"
     try:
         given: NDArray[Any] = np.asarray(values)
     except ValueError:  # rows of several lengths
@@ -84,18 +120,18 @@ def check_numbers(
     if given.dtype.kind not in "iuf" or given.shape != shape:
         raise ValueError(f"{name} must be {wanted}, got {short_repr(values)}")
     array = given.astype(np.float64)
-    bad = [v for v in array.ravel().tolist() if not math.isfinite(v) or not _within(v, **bounds)]
-    if bad:
-        raise ValueError(f"{name} must be {wanted}, got {short_repr(bad[0])} among them")
+    for number in array.ravel().tolist():
+        if not math.isfinite(number) or not _within(number, bounds):
+            raise ValueError(f"{name} must be {wanted}, got {short_repr(number)} among them")
     return array
 
 
 def check_shapes(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ValueError naming an array that is missing or of another shape."""
     for name, shape in shapes.items():
-        if name not in arrays or arrays[name].shape != shape:
-            found = arrays[name].shape if name in arrays else "none"
-            raise ValueError(f"{name} should be of shape {shape}, found {found}")
+        got = getattr(arrays.get(name), "shape", "none")
+        if got != shape:
+            raise ValueError(f"{name} should be of shape {shape}, found {got}")
 
 
 def check_text(name: str, value: object) -> str:
@@ -118,13 +154,12 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
     with suppress(ValueError):  # of arrays, which compare number by number
         if got in names:
             return
-    near = (
-        difflib.get_close_matches(got[:SHOWN], map(str, names), 1, 0.75)
-        if isinstance(got, str)
-        else []
-    )
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(map(str, names))}{hint}")
+    known_names = list(map(str, names))
+    hint = ""
+    if isinstance(got, str):
+        for near in difflib.get_close_matches(got[:SHOWN], known_names, 1, 0.75):
+            hint = f"; did you mean {near!r}?"
+    raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(known_names)}{hint}")
 
 
 def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
@@ -135,9 +170,8 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
         raise ValueError(f"{name} must be numbers, and some are masked: {short_repr(values)}")
     try:
         given: NDArray[Any] = np.asarray(values)
-        if (
-            given.dtype.kind not in "biufO"
-        ):  # complex numbers would lose a part, and text would pass for numbers
+        # Complex numbers would lose a part, and text would pass for numbers.
+        if given.dtype.kind not in "biufO":
             raise TypeError(given.dtype)
         with np.errstate(over="ignore"):
             return given.astype(np.float32)
@@ -147,11 +181,15 @@ def as_float32(values: ArrayLike, name: str = "values") -> NDArray[np.float32]:
 
 def short_repr(value: object) -> str:
     """Return ``value`` as a message shows it: in full where it is short."""
+    if isinstance(value, np.generic):
+        value = value.item()
     try:
-        text = repr(value.item() if isinstance(value, np.generic) else value)
+        text = repr(value)
     except ValueError:  # more digits than Python converts
-        text = "a number of thousands of digits"
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 1]}…"
+        return "a number of thousands of digits"
+    if len(text) > SHOWN:
+        return f"{text[: SHOWN - 1]}…"
+    return text
 
 
 class ArgumentTypeError(TypeError, ValueError):
@@ -177,65 +215,61 @@ def typed(call: Callable[P, R]) -> Callable[P, R]:
 @cache
 def _kinds(call: Callable[..., Any]) -> dict[str, Any]:
     """Return the annotated type of each parameter, where it is known at run time."""
-    many = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     namespace: dict[str, Any] = getattr(inspect.unwrap(call), "__globals__", {})
-    found: dict[str, Any] = {}
+    kinds: dict[str, Any] = {}
     for name, parameter in inspect.signature(call).parameters.items():
-        if parameter.kind in many or parameter.annotation is inspect.Parameter.empty:
+        if parameter.kind in several or parameter.annotation is inspect.Parameter.empty:
             continue
+        annotated = SimpleNamespace(__annotations__={name: parameter.annotation})
         with suppress(NameError):  # imported for type checkers only
-            found |= get_type_hints(
-                SimpleNamespace(__annotations__={name: parameter.annotation}), namespace
-            )
-    return found
+            kinds |= get_type_hints(annotated, namespace)
+    return kinds
 
 
 def _fits(value: Any, kind: Any) -> bool:
+    """Return whether a value is of an annotated type."""
     origin = get_origin(kind) or kind
     if origin in (typing.Union, UnionType):
         return any(_fits(value, each) for each in get_args(kind))
-    if origin in (int, float, bool, np.ndarray):
-        return True
     if origin is Sequence:
-        listed = hasattr(value, "__len__") and getattr(value, "ndim", 1) > 0
-        return (
-            listed
-            and not isinstance(value, str | bytes | dict | set)
-            and all(_fits(item, each) for each in get_args(kind) for item in value)
+        return _is_listed(value) and all(
+            _fits(item, each) for each in get_args(kind) for item in value
         )
-    if not isinstance(origin, type) or origin in (object, Any):
+    if origin in UNCHECKED or not isinstance(origin, type):
         return True
     if getattr(origin, "_is_protocol", False):
         return all(callable(getattr(value, name, None)) for name in _methods(origin))
     return isinstance(value, origin)
 
 
+def _is_listed(value: Any) -> bool:
+    """Return whether a value has items in an order, and is no text."""
+    if isinstance(value, str | bytes | dict | set):
+        return False
+    return hasattr(value, "__len__") and getattr(value, "ndim", 1) > 0
+
+
 @cache
 def _methods(protocol: type) -> list[str]:
     """Return the public methods; properties are not asked for, since asking runs them."""
-    bases = [base for base in protocol.__mro__ if getattr(base, "_is_protocol", False)]
-    return [
-        name
-        for base in bases
-        for name, m in vars(base).items()
-        if inspect.isfunction(m) and name[0] != "_"
-    ]
+    methods = inspect.getmembers_static(protocol, inspect.isfunction)
+    return [name for name, _ in methods if not name.startswith("_")]
 
 
-def _within(number: float, **bounds: float | None) -> bool:
-    compare = {"low": operator.ge, "high": operator.le, "above": operator.gt, "below": operator.lt}
-    return all(bound is None or compare[name](number, bound) for name, bound in bounds.items())
+def _within(number: float, bounds: Mapping[str, float | None]) -> bool:
+    """Return whether a number lies within its bounds."""
+    return all(bound is None or BOUNDS[name].holds(number, bound) for name, bound in bounds.items())
 
 
-def _described(what: str, **bounds: float | None) -> str:
+def _described(what: str, bounds: Mapping[str, float | None]) -> str:
     """Return for example ``whole number of at least 1``, or ``number in (0, 1]``."""
-    low, high, above, below = (bounds.get(name) for name in ("low", "high", "above", "below"))
-    least, greatest = low if above is None else above, high if below is None else below
-    if least is not None and greatest is not None:
-        brackets = ("[" if above is None else "(", "]" if below is None else ")")
-        return f"{what} in {brackets[0]}{least:g}, {greatest:g}{brackets[1]}"
-    if least is not None:
-        return f"{what} of at least {least:g}" if above is None else f"{what} above {least:g}"
-    if greatest is not None:
-        return f"{what} of at most {greatest:g}" if below is None else f"{what} below {greatest:g}"
+    given = [
+        (bound, bounds[name]) for name, bound in BOUNDS.items() if bounds.get(name) is not None
+    ]
+    if len(given) == 2:
+        (lower, least), (upper, greatest) = given
+        return f"{what} in {lower.bracket}{least:g}, {greatest:g}{upper.bracket}"
+    for bound, number in given:
+        return f"{what} {bound.words} {number:g}"
     return what

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from asm_gym.validation import check_number, typed
 
-PolicyState = Any  # what a policy carries from step to step, a value: passed in and handed back, None at the start
+# What a policy carries from step to step, a value: passed in and handed back, None at the start.
+PolicyState = Any
 
 
 @runtime_checkable
@@ -69,24 +71,29 @@ def rollout(
     resumes where it was left.
 
     Args:
+        env: the environment.
+        policy: what acts in it.
+        seed: of the environment.
         on_step: is shown every step's ``info``.
         steps: where to leave it, if it has not ended before.
     """
     if steps is not None:
         check_number("steps", steps, low=1, whole=True)
     observation, _ = env.reset(seed=seed)
-    state, success, done, taken = None, False, False, 0
-    start = np.ones(1, dtype=bool)
-    while not done:
+    state = None
+    begins = np.ones(1, dtype=bool)
+    success = False
+    for taken in itertools.count(1):
         action, next_state = policy.predict(
-            observation, state=state, episode_start=start, deterministic=False
+            observation, state=state, episode_start=begins, deterministic=False
         )
         observation, _, terminated, truncated, info = env.step(action)
         if not info.get("overridden", False):
-            state, start = next_state, np.zeros(1, dtype=bool)
-        taken += 1
-        done = bool(terminated or truncated) or taken == steps
+            state = next_state
+            begins = np.zeros(1, dtype=bool)
         success = success or bool(info.get("success", False))
         if on_step is not None:
             on_step(info)
+        if terminated or truncated or taken == steps:
+            break
     return success

@@ -23,6 +23,7 @@ from gymnasium.wrappers import ClipAction, TransformAction
 from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import DELTA, MEANINGS, TARGET, VELOCITY, ActionMeaning
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.stream_source import layers
 
 SAFE_ACTION = "use Hold(env, safe_action=...)"
@@ -51,8 +52,8 @@ class Hold:
 
     Raises:
         TypeError: the action space is no Box.
-        ValueError: ``safe_action`` does not fit the action space, or no action is known that
-            holds the robot.
+        ValueError: ``safe_action`` does not fit the action space.
+        UnsupportedEnvironment: no action is known that holds the robot.
     """
 
     def __init__(
@@ -95,16 +96,12 @@ class Hold:
         if self.explicit:
             return self._rest.copy(), state
 
-        action = self.move()
+        action = self._rest.copy()
+        if self._robot is not None:
+            self._robot.holding = True
         if state is not None:
             action[self._grip] = state[self._grip]
         return action, state
-
-    def move(self) -> NDArray[np.float32]:
-        """Return the next action (A,); its numbers for the gripper are replaced."""
-        if self._robot is not None:
-            self._robot.holding = True
-        return self._rest.copy()
 
 
 class HoldingActions:
@@ -183,7 +180,7 @@ def staying(
         recorded: what recorded episodes show of them.
 
     Raises:
-        ValueError: the meaning of an action is unknown, or it is a torque, or a wrapper changes it.
+        UnsupportedEnvironment: the meaning of an action is unknown, or it is a torque, or a wrapper changes it.
     """
     zero = nearest_to_zero(space)
     meaning = declared or recorded or ActionMeaning.unknown(space.shape)
@@ -200,7 +197,7 @@ def staying(
     changed = why_changed(env, "a reflex")
     moves_at_rest = np.any(zero.ravel()[np.array(declared.means) != TARGET])
     if changed or moves_at_rest:
-        raise ValueError(changed or _no_rest(space))
+        raise UnsupportedEnvironment(changed or _no_rest(space))
     if has_target:
         return Staying(zero, declared)
     return Staying(zero)
@@ -221,7 +218,7 @@ def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     """Return the resting action of an environment with the attribute ``action_means``.
 
     Raises:
-        ValueError: the attribute does not say that a zero action makes the robot stay.
+        UnsupportedEnvironment: the attribute does not say that a zero action makes the robot stay.
     """
     means: Any = ()
     if env.has_wrapper_attr("action_means"):
@@ -229,10 +226,10 @@ def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     if isinstance(means, str):
         means = (means,)
     if not means or not set(means) <= {DELTA, VELOCITY}:
-        raise ValueError(
+        raise UnsupportedEnvironment(
             f'{env.unwrapped} has no action_means="delta" or "velocity", '
-            f"so a zero action may not make it stay: {SAFE_ACTION}, "
-            'or on_alarm="hold" with NeuralASMSafety\'s action_means'
+            "so a zero action may not make it stay",
+            f'{SAFE_ACTION}, or on_alarm="hold" with NeuralASMSafety\'s action_means',
         )
     return resting_action(env)
 
@@ -246,7 +243,7 @@ def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     """Return (A,) the action that reaches the innermost environment as zero.
 
     Raises:
-        ValueError: none is known.
+        UnsupportedEnvironment: none is known.
     """
     space: Any = env.action_space
     bounded = np.isfinite(space.low) & np.isfinite(space.high)
@@ -254,20 +251,20 @@ def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
     for candidate in (nearest_to_zero(space), middle.astype(np.float32)):
         if not np.any(_innermost(env, candidate)):
             return candidate
-    raise ValueError(why_changed(env, "hold") or _no_rest(space))
+    raise UnsupportedEnvironment(why_changed(env, "hold") or _no_rest(space))
 
 
 def _innermost(env: gym.Env[Any, Any], action: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return what an action (A,) becomes on its way to the innermost environment.
 
     Raises:
-        ValueError: a wrapper changes it by more than a function of the action.
+        UnsupportedEnvironment: a wrapper changes it by more than a function of the action.
     """
     for wrapper in layers(env):
         if isinstance(wrapper, TransformAction):  # a function of the action alone
             action = np.asarray(wrapper.action(action))
         elif isinstance(wrapper, gym.ActionWrapper):
-            raise ValueError(_changes_actions(wrapper, "hold"))
+            raise UnsupportedEnvironment(_changes_actions(wrapper, "hold"))
     return action
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -15,17 +15,28 @@ from asm_gym.policies.registry import make_policy
 
 BANG_STEPS = 10  # control steps for which a bang-bang policy goes on in one direction
 TURNS_AT = 40  # control step in which a healthy policy turns hostile
+SPOILT = ("turns hostile", "stale actions", "flipped actions")
 LATE_STEPS = 10  # delay of stale actions [control steps]
 Floats = NDArray[np.floating[Any]]
 
 
 class Hostile(StatefulPolicy):
-    """Acts by a ``rule``, whatever it observes, at a share ``speed`` of the full change of the hand's pose."""
+    """Acts by a rule, whatever it observes.
+
+    Args:
+        env: whose actions change the pose of a hand.
+        seed: of its random draws.
+        speed: share of the full change of the hand's pose.
+        rule: the first numbers of the action of each control step.
+    """
 
     def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, rule: Rule) -> None:
-        self._space: Any = env.action_space
-        self.size = int(np.prod(env.action_space.shape or ()))
-        self._rule, self._speed, self.seed = rule, speed, seed
+        space: Any = env.action_space
+        self._space = space
+        self._rule = rule
+        self._speed = speed
+        self.seed = seed
+        self.size = int(np.prod(space.shape))
         self.held = np.zeros(self.size)  # what a rule goes on with
 
     def begin(self, observation: Any) -> tuple[int, np.random.Generator]:
@@ -35,16 +46,18 @@ class Hostile(StatefulPolicy):
         self, observation: Any, state: Any, deterministic: bool
     ) -> tuple[NDArray[np.float32], Any]:
         step, rng = state
-        first = self._speed * np.asarray(self._rule(self, step, rng), np.float64)
+        rule = self._rule
+        if callable(rule):
+            rule = rule(self, step, rng)
+        first = self._speed * np.asarray(rule, np.float64)
         action = np.pad(first, (0, self.size - len(first)))
-        return np.clip(action, self._space.low, self._space.high).astype(np.float32), (
-            step + 1,
-            rng,
-        )
+        action = np.clip(action, self._space.low, self._space.high)
+        return action.astype(np.float32), (step + 1, rng)
 
 
-Rule = Callable[[Hostile, int, np.random.Generator], Floats | tuple[float, ...]]
-"""The first numbers of the action of a control step, (x, y, z), turns about them and grip; the others are 0."""
+# The first numbers of the action, (x, y, z), turns about them and grip: of every control step, or as a function of
+# the policy, the number of the step and a generator. The others are 0.
+Rule = tuple[float, ...] | Callable[[Hostile, int, np.random.Generator], Any]
 
 
 def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
@@ -54,86 +67,79 @@ def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
     return policy.held
 
 
-class _Spoilt(StatefulPolicy):
-    """A scripted expert whose actions are spoilt on their way: ``stale``, ``flipped``, or downwards once it turns."""
+class SpoiltState(NamedTuple):
+    """Where an episode of a spoilt policy stands."""
 
-    def __init__(self, env: gym.Env[Any, Any], seed: int, how: str) -> None:
+    step: int
+    inner: Any  # state of the policy whose actions are spoilt
+    actions: tuple[NDArray[np.float32], ...]  # its newest ones, the oldest first
+
+
+class _Spoilt(StatefulPolicy):
+    """A scripted expert whose actions are spoilt on their way.
+
+    Args:
+        env: an environment whose task has an expert.
+        seed: of the expert, which has a speed of its own.
+        manner: one of ``SPOILT``; one that turns hostile goes down from ``TURNS_AT`` on.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seed: int, speed: float, manner: str) -> None:
         self._policy: Policy = make_policy("scripted", env, seed=seed)
         self._space: Any = env.action_space
-        self._how = how
+        self._manner = manner
 
-    def begin(self, observation: Any) -> tuple[int, Any, tuple[NDArray[np.float32], ...]]:
-        return 0, None, ()
+    def begin(self, observation: Any) -> SpoiltState:
+        return SpoiltState(step=0, inner=None, actions=())
 
     def act(
-        self, observation: Any, state: Any, deterministic: bool
-    ) -> tuple[NDArray[np.float32], Any]:
-        step, inner, late = state
-        action, inner = self._policy.predict(
-            observation, inner, np.array([step == 0]), deterministic
-        )
-        action = np.array(action, np.float32)
-        late = (*late, action.copy())[-LATE_STEPS - 1 :]
-        if self._how == "stale":
-            action = late[0]
-        elif self._how == "flipped":
+        self, observation: Any, state: SpoiltState, deterministic: bool
+    ) -> tuple[NDArray[np.float32], SpoiltState]:
+        begins = np.array([state.step == 0])
+        healthy, inner = self._policy.predict(observation, state.inner, begins, deterministic)
+        healthy = np.array(healthy, np.float32)
+        actions = (*state.actions, healthy)[-LATE_STEPS - 1 :]
+        action = healthy.copy()
+        if self._manner == "stale actions":
+            action = actions[0].copy()
+        elif self._manner == "flipped actions":
             action[:-1] = -action[:-1]
-        elif step >= TURNS_AT:
+        elif state.step >= TURNS_AT:
             action[:] = 0.0
             action[2] = self._space.low[2]
-        return action, (step + 1, inner, late)
+        return action, SpoiltState(state.step + 1, inner, actions)
 
+
+# Actions of rules: (x, y, z), turns about them, grip.
+REST = (0.0,)
+DOWN = (0.0, 0.0, -1.0)
+JERK = (1.0, 0.0, -1.0, 0.0, 1.0, 0.0)
+SQUEEZE_DOWN = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
+CLOSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+SWING = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 RULES: dict[str, Rule] = {
-    "down": lambda policy, t, rng: (0.0, 0.0, -1.0),
-    "aside and down": lambda policy, t, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
-    "forward": lambda policy, t, rng: (1.0, 0.0, -0.3),
+    "down": DOWN,
+    "aside and down": lambda policy, step, rng: (0.0, policy.seed % 2 * 2.0 - 1.0, -1.0),
+    "forward": (1.0, 0.0, -0.3),
     "bang-bang": _bang_bang,
-    "uniform": lambda policy, t, rng: rng.uniform(-1.0, 1.0, policy.size),
-    "ramp": lambda policy, t, rng: (0.0, 0.0, -min(1.0, t / 100)),
-    "hammering": lambda policy, t, rng: (0.0, 0.0, -1.0 if t % 20 < 12 else 1.0),
-    "grinding": lambda policy, t, rng: (np.cos(t / 5), np.sin(t / 5), -0.5),
-    "squeezing": lambda policy, t, rng: (
-        0.0,
-        0.0,
-        -1.0 * (t < 60),
-        0.0,
-        0.0,
-        0.0,
-        -1.0 if t < 60 else 1.0,
-    ),
-    "flinging": lambda policy, t, rng: (
-        0.0,
-        1.0 if t % 12 < 6 else -1.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        (-1.0) ** (t // 6),
-    ),
-    "to joint limits": lambda policy, t, rng: (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-    "into itself": lambda policy, t, rng: (-1.0, 0.0, -0.3),
-    "turning": lambda policy, t, rng: (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
-    "rolling": lambda policy, t, rng: (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
-    # a trial comes after 10
-    "waits for the hand-back": lambda policy, t, rng: (
-        0.0,
-        0.0,
-        -1.0 * (t % 36 < 24),
-    ),
-    "first rows": lambda policy, t, rng: (
-        1.0 * (t < 12),
-        0.0,
-        -1.0 * (t < 12),
-        0.0,
-        1.0 * (t < 12),
-        0.0,
-    ),
+    "uniform": lambda policy, step, rng: rng.uniform(-1.0, 1.0, policy.size),
+    "ramp": lambda policy, step, rng: (0.0, 0.0, -min(1.0, step / 100)),
+    "hammering": lambda policy, step, rng: (0.0, 0.0, -1.0 if step % 20 < 12 else 1.0),
+    "grinding": lambda policy, step, rng: (np.cos(step / 5), np.sin(step / 5), -0.5),
+    "squeezing": lambda policy, step, rng: SQUEEZE_DOWN if step < 60 else CLOSE,
+    "flinging": lambda policy, step, rng: (-1.0) ** (step // 6) * SWING,
+    "to joint limits": (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    "into itself": (-1.0, 0.0, -0.3),
+    "turning": (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
+    "rolling": (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    # a trial comes after 10 quiet steps
+    "waits for the hand-back": lambda policy, step, rng: DOWN if step % 36 < 24 else REST,
+    "first rows": lambda policy, step, rng: JERK if step < 12 else REST,
 }
+
+# Hostile policies by name: made for an environment, with a seed and a share of the full speed.
 HOSTILE: dict[str, Callable[[gym.Env[Any, Any], int, float], Policy]] = {
     **{name: partial(Hostile, rule=rule) for name, rule in RULES.items()},
-    "turns hostile": lambda env, seed, speed: _Spoilt(env, seed, "turns"),
-    "stale actions": lambda env, seed, speed: _Spoilt(env, seed, "stale"),
-    "flipped actions": lambda env, seed, speed: _Spoilt(env, seed, "flipped"),
+    **{manner: partial(_Spoilt, manner=manner) for manner in SPOILT},
 }
-"""Hostile policies by name: made for an environment, with a seed and a share of the full speed."""

@@ -7,7 +7,6 @@ The action is scaled from [-1, 1] to the action space.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
+from asm_gym.exceptions import DamagedFile
 from asm_gym.policies.base import StatefulPolicy
+from asm_gym.validation import check_numbers
 
 Array = NDArray[np.float32]
 
@@ -42,59 +43,55 @@ class NetworkPolicy(StatefulPolicy):
         self,
         layers: Sequence[tuple[Array, Array]],
         *,
-        mean: Array | None = None,
-        scale: Array | None = None,
+        mean: ArrayLike | None = None,
+        scale: ArrayLike | None = None,
         trained_in: dict[str, Any] | None = None,
     ) -> None:
         self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
-        shapes = [W.shape for W, _ in self.layers]
-        if not shapes or len(shapes[0]) != 2:
-            raise ValueError(
-                f"a network needs at least one layer, with weights in two dimensions, got {shapes[:1]}"
-            )
-        size = inputs = self.observation_size = int(shapes[0][1])
-        for n, (W, b) in enumerate(self.layers):
+        self._check_layers()
+        first, _ = self.layers[0]
+        last, _ = self.layers[-1]
+        self.observation_size = first.shape[1]
+        self.action_size = last.shape[0]
+        size = self.observation_size
+        mean = check_numbers("mean", np.zeros(size) if mean is None else mean, size)
+        scale = check_numbers("scale", np.ones(size) if scale is None else scale, size, above=0.0)
+        self.mean = mean.astype(np.float32)
+        self.scale = scale.astype(np.float32)
+        self.trained_in = dict(trained_in or {})
+        self._high: NDArray[Any] = np.ones(self.action_size, np.float32)
+        self._low: NDArray[Any] = -self._high
+
+    def _check_layers(self) -> None:
+        """Raise ValueError unless each layer takes what the one before gives."""
+        if not self.layers:
+            raise ValueError("a network needs at least one layer, got none")
+        size = self.layers[0][0].shape[-1]
+        for number, (W, b) in enumerate(self.layers):
             if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
                 raise ValueError(
-                    f"layer {n} takes {size} numbers, got weights {W.shape} and biases {b.shape}"
+                    f"layer {number} takes {size} numbers, with weights in two dimensions, "
+                    f"got {W.shape} and biases {b.shape}"
                 )
+            check_numbers("weights", W, *W.shape)
+            check_numbers("biases", b, *b.shape)
             size = len(W)
-        self.action_size = size
-        self.mean = np.asarray(np.zeros(inputs) if mean is None else mean, np.float32)
-        self.scale = np.asarray(np.ones(inputs) if scale is None else scale, np.float32)
-        if (
-            self.mean.shape != (inputs,)
-            or self.scale.shape != (inputs,)
-            or not (self.scale > 0).all()
-        ):
-            raise ValueError(f"mean and scale must be {inputs} numbers, and scale positive")
-        if not all(
-            np.isfinite(a).all() for a in (self.mean, self.scale, *itertools.chain(*self.layers))
-        ):
-            raise ValueError("weights, biases, mean and scale must be finite")
-        self.trained_in = dict(trained_in or {})
-        self._low, self._high = np.full(size, -1.0, np.float32), np.ones(size, np.float32)
 
     def fit_to(self, env: gym.Env[Any, Any], whose: str) -> NetworkPolicy:
         """Return this policy, bound to the actions of ``env``; raise ValueError where it was trained in another one."""
-        spaces_of = {"observations": env.observation_space, "actions": env.action_space}
-        for (what, space), size in zip(
-            spaces_of.items(), (self.observation_size, self.action_size), strict=True
-        ):
-            if not isinstance(space, spaces.Box) or space.shape != (size,):
-                raise ValueError(
-                    f"{whose} takes {what} of {size} numbers, {env.unwrapped} has {space}"
-                )
+        _check_size("observations", env.observation_space, self.observation_size, whose)
+        actions = _check_size("actions", env.action_space, self.action_size, whose)
         here = describe(env)
-        other = [
-            f"{n}: {v} there, {here[n]} here"
-            for n, v in self.trained_in.items()
-            if n in here and here[n] != v
-        ]
-        if other:
-            raise ValueError(f"{whose} was trained in another environment ({'; '.join(other)})")
-        assert isinstance(env.action_space, spaces.Box)
-        self._low, self._high = env.action_space.low, env.action_space.high
+        differences = []
+        for name, there in self.trained_in.items():
+            if name in here and here[name] != there:
+                differences.append(f"{name}: {there} there, {here[name]} here")
+        if differences:
+            raise ValueError(
+                f"{whose} was trained in another environment ({'; '.join(differences)})"
+            )
+        self._low = actions.low
+        self._high = actions.high
         return self
 
     def act(self, observation: Any, state: Any, deterministic: bool) -> tuple[Array, Any]:
@@ -109,37 +106,45 @@ class NetworkPolicy(StatefulPolicy):
     def save(self, path: str | Path, **about: Any) -> None:
         """Write the agent, with what is said ``about`` it in JSON."""
         arrays = {"mean": self.mean, "scale": self.scale}
-        for n, (W, b) in enumerate(self.layers):
-            arrays |= {f"W{n}": W, f"b{n}": b}
+        for number, (W, b) in enumerate(self.layers):
+            arrays |= {f"W{number}": W, f"b{number}": b}
         write_checkpoint(path, KIND, {"trained_in": self.trained_in, "about": about} | RULE, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> NetworkPolicy:
-        """Read what ``save`` wrote; raise ValueError where the file is damaged, or no agent."""
-        saved = read_checkpoint(path, KIND)
-        header, arrays = saved.header, saved.arrays
+        """Read what ``save`` wrote; raise DamagedFile where the file is damaged, or no agent."""
+        header, arrays = read_checkpoint(path, KIND)
         try:
-            count = sum(name.startswith("W") for name in arrays)
-            layers = [(arrays.pop(f"W{n}"), arrays.pop(f"b{n}")) for n in range(count)]
-            scaling = {name: arrays.pop(name) for name in ("mean", "scale")}
+            if not RULE.items() <= header.items():
+                raise ValueError(f"its network is not of {RULE}")
+            mean = arrays.pop("mean")
+            scale = arrays.pop("scale")
+            layers: list[tuple[Array, Array]] = []
+            while f"W{len(layers)}" in arrays:
+                number = len(layers)
+                layers.append((arrays.pop(f"W{number}"), arrays.pop(f"b{number}")))
             if arrays:
                 raise ValueError(f"an agent has no {', '.join(arrays)}")
-            if any(header[name] != known for name, known in RULE.items()):
-                raise ValueError(f"its network is not of {RULE}")
-            return cls(layers, trained_in=header["trained_in"], **scaling)
+            return cls(layers, mean=mean, scale=scale, trained_in=header["trained_in"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+            raise DamagedFile(path, error) from error
+
+
+def _check_size(what: str, space: gym.Space[Any], size: int, whose: str) -> spaces.Box:
+    """Return the space of an environment; raise ValueError unless it is a Box of so many numbers."""
+    if not isinstance(space, spaces.Box) or space.shape != (size,):
+        raise ValueError(f"{whose} takes {what} of {size} numbers, the environment has {space}")
+    return space
 
 
 def describe(env: gym.Env[Any, Any]) -> dict[str, Any]:
     """Return what an agent's actions depend on beside the observation, as far as ``env`` says it."""
     inner: Any = env.unwrapped
-    found: dict[str, Any] = {"env": inner.spec.id} if inner.spec is not None else {}
+    facts: dict[str, Any] = {}
+    if inner.spec is not None:
+        facts["env"] = inner.spec.id
     if hasattr(inner, "robots") and hasattr(inner, "controller"):
-        rate = int(inner.metadata["render_fps"])
-        found |= {
-            "robots": list(inner.robots),
-            "controller": inner.controller,
-            "control_freq": rate,
-        }
-    return found
+        facts["robots"] = list(inner.robots)
+        facts["controller"] = inner.controller
+        facts["control_freq"] = int(inner.metadata["render_fps"])
+    return facts

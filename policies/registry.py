@@ -11,51 +11,61 @@ import gymnasium as gym
 from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold
 from asm_gym.policies.network import NetworkPolicy
-from asm_gym.policies.scripted.carry import NutAssemblyExpert, StackExpert
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
+from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert
 from asm_gym.policies.scripted.pick_place import PickPlaceExpert
+from asm_gym.policies.scripted.stack import StackExpert
 from asm_gym.policies.scripted.sway import Arm, Swaying
 from asm_gym.policies.scripted.wipe import WipeExpert
 from asm_gym.registries import Registry, target
 from asm_gym.tasks import TaskSpec
 from asm_gym.validation import check_choice, typed
 
+# The scripted expert of each task.
 EXPERTS: dict[str, Callable[..., Policy]] = {
     "Lift": LiftExpert,
     "Stack": StackExpert,
     "Door": DoorExpert,
     "Wipe": WipeExpert,
-    **{f"NutAssembly{which}": NutAssemblyExpert for which in ("", "Single", "Square", "Round")},
-    **{
-        f"PickPlace{which}": PickPlaceExpert
-        for which in ("", "Single", "Can", "Milk", "Bread", "Cereal")
-    },
+    "NutAssembly": NutAssemblyExpert,
+    "NutAssemblySingle": NutAssemblyExpert,
+    "NutAssemblySquare": NutAssemblyExpert,
+    "NutAssemblyRound": NutAssemblyExpert,
+    "PickPlace": PickPlaceExpert,
+    "PickPlaceSingle": PickPlaceExpert,
+    "PickPlaceCan": PickPlaceExpert,
+    "PickPlaceMilk": PickPlaceExpert,
+    "PickPlaceBread": PickPlaceExpert,
+    "PickPlaceCereal": PickPlaceExpert,
 }
-"""The scripted expert of each task."""
 
 
 def scripted(env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> Policy:
     """Return the expert of an environment's task; raise ValueError where there is none."""
-    experts = {**EXPERTS, "asm_gym/SyntheticArm-v0": Arm}
+    experts = EXPERTS | {"asm_gym/SyntheticArm-v0": Arm}
     task = getattr(env.unwrapped, "task", None)
-    key = task.name if isinstance(task, TaskSpec) else env.spec.id if env.spec else ""
-    if key not in experts:
+    name = ""
+    if isinstance(task, TaskSpec):
+        name = task.name
+    elif env.spec is not None:
+        name = env.spec.id
+    if name not in experts:
         raise ValueError(
-            f"{key or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}"
+            f"{name or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}"
         )
-    return experts[key](env, seed=seed, **kwargs)
+    return experts[name](env, seed=seed, **kwargs)
 
 
+# Policies besides agents, by name.
 POLICIES: Registry[Callable[..., Policy]] = Registry(
     "policy",
     "asm_gym.policies.registry:POLICIES",
     {"scripted": scripted, "hold": lambda env, seed=None: Hold(env), "sway": Swaying},
 )
-"""Policies besides agents, by name."""
 
+# Algorithms of stable-baselines3 whose archives ``make_policy`` loads.
 ALGORITHMS = ("SAC", "TD3", "DDPG", "PPO", "A2C")
-"""Algorithms of stable-baselines3 whose archives ``make_policy`` loads."""
 
 SHIPPED = Path(__file__).resolve().parent / "agents"  # trained agents that come with the package
 
@@ -78,7 +88,7 @@ def register_policy(name: str, make: Callable[..., Policy] | str) -> None:
 
 def agents() -> tuple[str, ...]:
     """Return the names of the agents that come with the package."""
-    return tuple(sorted(f.stem for f in SHIPPED.glob("*.npz")))
+    return tuple(sorted(file.stem for file in SHIPPED.glob("*.npz")))
 
 
 def trained_in(name: str) -> str:
@@ -87,7 +97,10 @@ def trained_in(name: str) -> str:
 
 
 def _agent_file(name: str) -> Path:
-    return SHIPPED / f"{name}.npz" if name in agents() else Path(name)
+    """Return the file of an agent, by name or path."""
+    if name in agents():
+        return SHIPPED / f"{name}.npz"
+    return Path(name)
 
 
 @typed

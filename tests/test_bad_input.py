@@ -91,7 +91,7 @@ def test_one_episode_fits_and_says_what_its_threshold_lacks(name):
     assert np.isfinite(monitor.score(only).value).all()
     with pytest.raises(
         ValueError,
-        match=r"needs at least 19 nominal episodes, got 1, which can promise 0\.5 at best",
+        match=r"needs at least 19 nominal episodes, got 1: these can promise 0\.5 at best",
     ):
         monitor.calibrate(sine_episodes(1, seed=1), 0.05)
 

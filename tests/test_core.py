@@ -11,6 +11,7 @@ import zipfile
 
 import numpy as np
 
+from asm_gym import exceptions
 from asm_gym.extras import BROUGHT_BY
 from tests.wheel import LINKS, ROOT, build_wheel
 
@@ -94,6 +95,7 @@ ONE_IMPORT = {
         ("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy", "harmless"), None
     ),
     **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
+    **dict.fromkeys(exceptions.__all__, None),
     "register_fault": "register_fault needs mujoco: pip install 'asm-gym[robosuite]'",
     **dict.fromkeys(("FaultInjection", "collect"), SAID[0]),
 }

@@ -12,7 +12,13 @@ from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.registry import EXPERTS
 from asm_gym.policies.scripted.base import Style, has_settled
 from asm_gym.policies.scripted.geometry import UP, about, flattest_side, gripping
-from asm_gym.policies.scripted.pick_place import _ASKEW, _PALM, _SPARE, beside_walls
+from asm_gym.policies.scripted.pick_place import (
+    ASKEW,
+    PALM_ACROSS,
+    PALM_ALONG,
+    SPARE,
+    beside_walls,
+)
 from tests.rates import attempt, failures, room_to_the_stops, too_few
 
 QUICK = (
@@ -110,7 +116,7 @@ def chosen(x, y, heading):
     along = (turned @ closing)[:2]
     across = np.array([-along[1], along[0]])
     corners = [
-        (x, y) + a * _PALM[0] * along + b * _PALM[1] * across for a in (-1, 1) for b in (-1, 1)
+        (x, y) + a * PALM_ALONG * along + b * PALM_ACROSS * across for a in (-1, 1) for b in (-1, 1)
     ]
     return closing, room, np.array(corners)
 
@@ -120,8 +126,8 @@ def test_a_palm_in_a_bin_has_the_room_it_is_said_to_have_and_is_askew_only_for_i
     closing, room, corners = chosen(x, y, heading)
     assert -(np.abs(corners - BIN_AT) - BIN / 2).max() == pytest.approx(room, abs=1e-9)
     askew = abs(np.arctan2(closing[1], closing[0])) % (np.pi / 2)
-    assert min(askew, np.pi / 2 - askew) <= max(_ASKEW) + 1e-9
-    assert room >= _SPARE or np.abs(closing).max() > 1 - 1e-9
+    assert min(askew, np.pi / 2 - askew) <= max(ASKEW) + 1e-9
+    assert room >= SPARE or np.abs(closing).max() > 1 - 1e-9
 
 
 @pytest.mark.parametrize(
@@ -134,5 +140,5 @@ def test_a_palm_in_a_bin_has_the_room_it_is_said_to_have_and_is_askew_only_for_i
 )
 def test_in_the_middle_by_a_wall_and_in_a_corner(x, y, heading, room, square):
     closing, free, _ = chosen(x, y, heading)
-    assert (free >= _SPARE) == room
+    assert (free >= SPARE) == room
     assert (np.abs(closing).max() > 1 - 1e-9) == square

@@ -132,7 +132,8 @@ def test_importing_the_package_is_cheap() -> None:
     loaded = set(done.stdout.split())
     assert not loaded & {"robosuite", "mujoco", "torch", "stable_baselines3", "numba", "scipy"}
     assert {name for name in loaded if "." in name} <= {
-        f"asm_gym.{m}" for m in ("extras", "tasks", "files", "registries", "validation", "version")
+        f"asm_gym.{m}"
+        for m in ("exceptions", "extras", "tasks", "files", "registries", "validation", "version")
     }
 
 

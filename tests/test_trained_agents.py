@@ -109,7 +109,7 @@ def test_an_agent_is_the_same_after_saving(tmp_path):
         ([(np.zeros((3, 2)), np.zeros(3)), (np.zeros((1, 4)), np.zeros(1))], "layer 1 takes 3"),
         ([(np.zeros((3, 2)), np.zeros(2))], "layer 0"),
         ([(np.full((3, 2), np.nan), np.zeros(3))], "finite"),
-        ([(np.zeros(3), np.zeros(3))], r"two dimensions, got \[\(3,\)\]"),
+        ([(np.zeros(3), np.zeros(3))], r"two dimensions, got \(3,\)"),
     ],
 )
 def test_networks_that_do_not_hang_together_are_refused(layers, message):

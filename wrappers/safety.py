@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
 from asm_gym.guard.preview import Preview, checked_chunk
@@ -111,7 +112,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._rows_per_step = self._source.rows_per_step
         changed = why_changed(env, "a reflex within a step")
         if self._rows_per_step > 1 and changed:
-            raise ValueError(changed)
+            raise UnsupportedEnvironment(changed)
         self._watch_with(monitor)
         self._inner: Any = env.unwrapped
         self._holds_itself = isinstance(self._inner, HoldsItself)

@@ -15,6 +15,7 @@ from gymnasium.vector.utils import iterate
 from numpy.typing import NDArray
 
 from asm_gym.control_period import PeriodCheck, control_period
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
 from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
@@ -68,7 +69,7 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         refuse_running_statistics(env, "VectorNeuralASMSafety")
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:
-            raise ValueError(
+            raise UnsupportedEnvironment(
                 "VectorNeuralASMSafety needs AutoresetMode.NEXT_STEP or DISABLED, got SAME_STEP: make the environments "
                 "without it, or wrap each in NeuralASMSafety"
             )

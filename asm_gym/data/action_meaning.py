@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.validation import check_choice, short_repr
 
 DELTA = "delta"
@@ -96,14 +97,14 @@ class ActionMeaning:
             names: (A,) of the numbers of the action, if they have names.
 
         Raises:
-            ValueError: a number of the action is a torque, or its meaning is unknown.
+            UnsupportedEnvironment: a number of the action is a torque, or its meaning is unknown.
         """
         refused = []
         for number, means in enumerate(self.means):
             if means in (UNKNOWN, TORQUE):
                 refused.append(names[number] if names else f"number {number}")
         if refused:
-            raise ValueError(
+            raise UnsupportedEnvironment(
                 f"no hold is known for actions of {robot}: {', '.join(refused)} are torques, "
                 "or their meaning is unknown. Set action_means to delta, target, velocity for all "
                 "or for each; or use Hold(env, safe_action=...), another policy, "

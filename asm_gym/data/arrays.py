@@ -12,6 +12,7 @@ import numpy as np
 
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 from asm_gym.files import regular_file
 
@@ -26,7 +27,7 @@ def read_parquet(path: Path) -> Columns:
         file = parquet.ParquetFile(path)
         table = file.read()
     except OSError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        raise DamagedFile(path, error) from error
     return {name: np.asarray(table[name]) for name in table.column_names}
 
 

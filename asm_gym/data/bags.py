@@ -21,6 +21,7 @@ import numpy as np
 
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import HELD, Columns
+from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 
 Numbers = dict[str, float]
@@ -78,7 +79,7 @@ def read_bag(path: Path) -> Columns:
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
         mend = MENDS.get(path.suffix)
         hint = f"; where its recorder was killed, {mend} mends it" if mend else ""
-        raise ValueError(f"it is damaged: {error}{hint}") from error
+        raise DamagedFile("it", f"{error}{hint}") from error
 
 
 def _columns(bag: Any) -> Columns:

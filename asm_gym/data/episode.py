@@ -14,6 +14,7 @@ from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
 from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns
 from asm_gym.data.tables import laid_out
+from asm_gym.exceptions import DamagedFile
 from asm_gym.files import regular_file
 from asm_gym.readings import spans as spans
 from asm_gym.spec import StreamSpec
@@ -258,4 +259,4 @@ def load_episode(path: str | Path) -> Episode:
     except FileNotFoundError:
         raise
     except (*DAMAGE, TypeError) as error:
-        raise ValueError(f"{path} is damaged or no episode that can be read: {error}") from error
+        raise DamagedFile(path, error, "is damaged or no episode that can be read") from error

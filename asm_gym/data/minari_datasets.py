@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from asm_gym.control_period import control_period
 from asm_gym.data.arrays import check_hdf5
 from asm_gym.data.episode import Episode, check_recorded
+from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 from asm_gym.spec import StreamSpec, flat_rows
 from asm_gym.tasks import TASKS
@@ -209,7 +210,7 @@ def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
         recorded = list(dataset.iterate_episodes())
         notes = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
     except (OSError, KeyError, ValueError, AssertionError, RuntimeError, AttributeError) as error:
-        raise ValueError(f"{folder} is damaged or not a Minari dataset: {error}") from error
+        raise DamagedFile(folder, error, "is damaged or not a Minari dataset") from error
     recorded_in = getattr(dataset.env_spec, "id", None)
     if env_id is not None and recorded_in != env_id:
         raise ValueError(f"{folder} was recorded in {recorded_in}, not in {env_id!r}")

@@ -27,6 +27,7 @@ from asm_gym.data.names import TAU, TURN, TURNED, factor, is_label, label_of, sp
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import Columns, is_numeric, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
+from asm_gym.exceptions import DamagedFile
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.validation import check_choice, check_number
 
@@ -352,7 +353,7 @@ class LogSchema:
             columns = tuple(LogColumn(**column) for column in saved["columns"])
             return cls(columns, float(saved["rate"]), clock)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"the schema of the logs is damaged: {error!r}") from error
+            raise DamagedFile("the schema of the logs", repr(error)) from error
 
 
 class ColumnMatch:

@@ -31,6 +31,7 @@ from scipy.special import betaincinv
 
 from asm_gym.detection.alarm_rule import rows_of_a_minute, rows_over
 from asm_gym.detection.base import Array, Floats
+from asm_gym.exceptions import NotEnoughEpisodes
 from asm_gym.validation import check_number, short_repr
 
 EPISODE = "episode"  # units of a rate of false alarms
@@ -64,9 +65,11 @@ def conformal_threshold(maxima: Array, rate: float) -> float:
     needed = conformal_episodes(rate)
     if episodes < needed:
         possible = math.ceil(1e3 / (episodes + 1)) / 1e3
-        raise ValueError(
-            f"a false alarm rate of {rate} needs at least {needed} nominal episodes, got {episodes}, "
-            f"which can promise {possible:g} at best"
+        raise NotEnoughEpisodes(
+            f"a false alarm rate of {rate} needs",
+            needed=f"{needed} nominal episodes",
+            got=f"{episodes}",
+            advice=f"these can promise {possible:g} at best",
         )
     # (n + 1)(1 - rate) is often whole, but not in floating point.
     rank = math.ceil((episodes + 1) * (1.0 - rate) - ROUNDING)
@@ -241,9 +244,11 @@ def check_hours(rate: float, hours: float) -> None:
     unit = 10.0 ** (math.floor(math.log10(1.0 / hours)) - 2)
     possible = math.ceil(1.0 / hours / unit) * unit  # rounded up to three digits
     missing = math.ceil(100 * (1.0 / rate - hours)) / 100
-    raise ValueError(
-        f"{rate:g} false alarms an hour need at least {1.0 / rate:.4g} hours of nominal episodes, got {hours:.3g}: "
-        f"record {missing:.4g} hours more, or promise {possible:.4g}"
+    raise NotEnoughEpisodes(
+        f"{rate:g} false alarms an hour need",
+        needed=f"{1.0 / rate:.4g} hours of nominal episodes",
+        got=f"{hours:.3g}",
+        advice=f"record {missing:.4g} hours more, or promise {possible:.4g}",
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from asm_gym.control_period import whole_multiple
 from asm_gym.data.episode import CONTROLLER
+from asm_gym.exceptions import SpecMismatch
 from asm_gym.monitors import CalibratedMonitor, ExplainsItself, Monitor, NeuralASM
 from asm_gym.monitors.diagnosis import Diagnosis
 from asm_gym.spec import StreamSpec
@@ -73,17 +74,18 @@ def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -
 
 
 def _check_stream(learned: StreamSpec, watched: StreamSpec) -> None:
-    """Raise ValueError unless a monitor of the stream ``learned`` can read the stream ``watched``."""
+    """Raise SpecMismatch unless a monitor of the stream ``learned`` can read the stream ``watched``."""
     try:
         learned.require(watched, "the monitor")
-    except ValueError as error:
+    except SpecMismatch as error:
         multiple = whole_multiple(watched.dt, learned.dt)
         if multiple < 2:
             raise
-        raise ValueError(
-            f"{error}\nA control step takes {multiple} times as long. If a wrapper inside the guard repeats actions, "
+        advice = (
+            f"A control step takes {multiple} times as long. If a wrapper inside the guard repeats actions, "
             "put it outside, or fit a monitor on episodes that were recorded through it"
-        ) from error
+        )
+        raise SpecMismatch(error.whose, error.differences, advice) from error
 
 
 def _check_same(what: str, learned: str, watched: str) -> None:

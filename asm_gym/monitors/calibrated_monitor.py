@@ -19,6 +19,7 @@ from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.conformal import EPISODE, HOUR, Promise, hourly_promise
 from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
+from asm_gym.exceptions import NotFitted
 from asm_gym.monitors.calibration import (
     AlarmRate,
     apart_for_ceilings,
@@ -292,7 +293,7 @@ class CalibratedMonitor:
 
     @property
     def threshold(self) -> float:
-        """Surprise above which a row is an alarm. Raises RuntimeError before ``calibrate``."""
+        """Surprise above which a row is an alarm. Raises NotFitted before ``calibrate``."""
         if self.threshold_ is None:
             raise self._lacking("threshold")
         return self.threshold_
@@ -309,7 +310,7 @@ class CalibratedMonitor:
 
     @property
     def promise(self) -> Promise:
-        """The promised rate of alarms in nominal operation. Raises RuntimeError before ``calibrate``."""
+        """The promised rate of alarms in nominal operation. Raises NotFitted before ``calibrate``."""
         if self.maxima_ is None or self.blocks_ is None:
             raise self._lacking("calibration")
         if self.promised_ == HOUR:
@@ -420,11 +421,9 @@ class CalibratedMonitor:
     def _name(self) -> str:
         return f"{self.model.kind} monitor"
 
-    def _lacking(self, what: str) -> RuntimeError:
+    def _lacking(self, what: str) -> NotFitted:
         """Return the error of a monitor that is not calibrated."""
-        return RuntimeError(
-            f"this {self._name} has no {what} yet: call calibrate(nominal_episodes) first"
-        )
+        return NotFitted(f"this {self._name}", f"has no {what}", "calibrate(nominal_episodes)")
 
     def _copy(self) -> Self:
         """Return a copy that shares nothing that learning changes; learned arrays are never changed in place."""
@@ -436,9 +435,7 @@ class CalibratedMonitor:
 
     def _require_fitted(self) -> None:
         if not self.model.learned_ or (self.detection.arrays and not self.detection.learned_):
-            raise RuntimeError(
-                f"this {self._name} has learned nothing yet: call fit(episodes) first"
-            )
+            raise NotFitted(f"this {self._name}", "has learned nothing", "fit(episodes)")
 
     def _place_errors(self) -> None:
         """Find the columns of errors, once the model knows them."""

@@ -13,6 +13,7 @@ from asm_gym.checkpoint import Checkpoint, write_checkpoint
 from asm_gym.detection import Blocks
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.conformal import EPISODE, HOUR
+from asm_gym.exceptions import DamagedFile
 from asm_gym.monitors.weight_packing import packed, unpacked
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, check_number
@@ -119,7 +120,5 @@ def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> A
         spec = StreamSpec.from_json(saved.header["spec"])
         return make(spec, **saved.header["hyperparameters"]).restore(saved)
     except (KeyError, TypeError) as error:
-        raise ValueError(
-            f"{path} is damaged, or was written by an older version: {error}; "
-            "make it anew with asm-gym fit or asm-gym babble"
-        ) from error
+        problem = f"{error}, or it was written by an older version: make it anew with asm-gym fit"
+        raise DamagedFile(path, problem) from error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -12,21 +14,27 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from asm_gym.policies.base import StatefulPolicy
-from asm_gym.policies.scripted.geometry import Pose, Vector, matrix, rotation
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, length, matrix, move, rotation
 from asm_gym.validation import check_number
 
-OPEN, CLOSE = -1.0, 1.0
-_OVER = 0.006  # how far aside of its target a careful hand goes straight down [m]
-_STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
+# Commands of a gripper.
+OPEN = -1.0
+CLOSE = 1.0
+
+FORGETTING = 0.78  # correlation of the action noise from step to step
+SLIDING_JOINTS = 2  # of a gripper whose fingers slide; linkages have more
+STILL = 0.1  # below this a gripper's joints have come to rest [rad/s]
+
+STRAIGHT_DOWN = 0.006  # from so little aside of its target a careful hand goes straight down [m]
+HIGHEST_DETOUR = 0.06  # above its target, of a careful hand that is aside [m]
 
 
 @dataclass(frozen=True)
 class Style:
     """How an expert varies; each is drawn anew for every episode."""
 
-    noise: float = (
-        0.05  # standard deviation of the action noise [action units], correlated over about 0.2 s
-    )
+    # standard deviation of the action noise [action units], correlated over about 0.2 s
+    noise: float = 0.05
     speed: float = 1.0  # hand speed relative to the expert's usual one
     speed_spread: float = 0.08  # standard deviation of the speed between episodes
     spread: float = 0.01  # standard deviation of way-points between episodes [m]
@@ -38,58 +46,93 @@ class Style:
 
     def pace(self, usual: float, rng: np.random.Generator) -> float:
         """Return the speed of one episode, where ``usual`` is the expert's own."""
-        return (
-            usual
-            * self.speed
-            * float(np.clip(1 + self.speed_spread * rng.standard_normal(), 0.5, 1.5))
-        )
+        drawn = 1 + self.speed_spread * rng.standard_normal()
+        return usual * self.speed * float(np.clip(drawn, 0.5, 1.5))
 
-    def drifted(self, drift: Vector, rng: np.random.Generator) -> Vector:
-        """Return the next action noise after ``drift``: an AR(1) process that forgets in about 4 steps."""
-        rho = 0.78
-        return rho * drift + self.noise * np.sqrt(1 - rho**2) * rng.standard_normal(len(drift))
+    def drifted(self, drift: Vector, size: int, rng: np.random.Generator) -> Vector:
+        """Return the next action noise (size,) after ``drift``: an AR(1) process that forgets in about 4 steps."""
+        fresh = self.noise * np.sqrt(1 - FORGETTING**2) * rng.standard_normal(size)
+        return FORGETTING * drift + fresh
 
 
 class ObservationReader:
     """Named parts of an environment's flat or dict observation."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self._flat = isinstance(env.observation_space, spaces.Box)
-        sizes = env.unwrapped.observation_layout  # type: ignore[attr-defined]
-        ends = np.cumsum([*sizes.values()]).tolist()
-        self._slices = {
-            name: slice(end - sizes[name], end) for name, end in zip(sizes, ends, strict=True)
-        }
+        self._is_flat = isinstance(env.observation_space, spaces.Box)
+        self._columns: dict[str, slice] = {}
+        start = 0
+        for name, size in env.unwrapped.observation_layout.items():  # type: ignore[attr-defined]
+            self._columns[name] = slice(start, start + size)
+            start += size
 
     def __call__(self, observation: Any, name: str) -> Vector:
         """Return the numbers of a channel."""
-        part = observation[self._slices[name]] if self._flat else observation[name]
-        return np.asarray(part, dtype=np.float64)
+        key = self._columns[name] if self._is_flat else name
+        return np.asarray(observation[key], np.float64)
 
     def hand(self, observation: Any, prefix: str = "") -> Pose:
         """Return the pose of a hand."""
-        turned = rotation(self(observation, f"{prefix}hand_orientation"))
-        return Pose(self(observation, f"{prefix}hand_position"), turned)
+        return Pose(
+            at=self(observation, f"{prefix}hand_position"),
+            turned=rotation(self(observation, f"{prefix}hand_orientation")),
+        )
 
     def pose(self, observation: Any, name: str) -> Pose:
         """Return the pose of an object."""
-        return Pose(self(observation, f"{name}_pos"), matrix(self(observation, f"{name}_quat")))
+        return Pose(
+            at=self(observation, f"{name}_pos"),
+            turned=matrix(self(observation, f"{name}_quat")),
+        )
 
 
 class State(NamedTuple):
     """Where an expert stands in one episode."""
 
-    phase: int  # of its plan
-    since: int  # steps spent in the phase
-    speed: float  # action units
-    spread: Vector  # how this episode's way-points differ from the plan [m]
+    speed: float  # of the hand in this episode [action units]
     plan: Any  # what else was decided at the beginning
-    anchor: Any  # the hand, or hands, when the phase began
-    drift: Vector  # correlated action noise
+    drift: Any = 0.0  # (A,) correlated action noise
+    spread: Any = 0.0  # (3,) how this episode's way-points differ from the plan [m]
+    anchor: Any = None  # (3,) where the hand was when the phase began [m]
+    phase: int = 0  # of the plan
+    since: int = 0  # steps spent in the phase
+
+
+class Phase(NamedTuple):
+    """One phase of a plan; its functions are called with the scene."""
+
+    command: Callable[[Any], Vector]  # (6,) of the hand [action units]
+    gripper: float | None  # ``OPEN`` or ``CLOSE``; None where the hand is a tool
+    # when which phase follows; the first condition that holds counts
+    ends: Mapping[int, Callable[[Any], bool]] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What an expert observes in one step, and the table of its phases."""
+
+    phases: ClassVar[Mapping[int, Phase]]
+    state: State
+    hand: Pose
+
+    @property
+    def plan(self) -> Any:
+        """What was decided at the beginning of the episode."""
+        return self.state.plan
+
+    def move(self, target: Vector, turned: Vector, gain: float = 1.0) -> Vector:
+        """Return the hand's command (6,) towards a position (3,) and an orientation (3, 3)."""
+        return move(self.hand, target, turned, self.state.speed, gain)
 
 
 class Expert(StatefulPolicy):
-    """A scripted expert: phases of a plan, each with the command it gives and the condition that ends it."""
+    """A scripted expert: phases of a plan, each with a command and the condition that ends it.
+
+    Args:
+        env: an environment of this package.
+        seed: of the style of each episode and of the action noise.
+        style: how episodes vary.
+    """
 
     pace: ClassVar[float]  # usual hand speed [action units]
 
@@ -97,76 +140,82 @@ class Expert(StatefulPolicy):
         self, env: gym.Env[Any, Any], seed: int | None = None, style: Style | None = None
     ) -> None:
         inner: Any = env.unwrapped
-        self.inner, self.robosuite = inner, inner.robosuite_env
+        self.inner = inner
+        self.robosuite = inner.robosuite_env
         self.style = style or Style()
         self.np_random = np.random.default_rng(seed)
         self.read = ObservationReader(env)
-        size = int(np.prod(env.action_space.shape or ()))
+        self.size = int(np.prod(env.action_space.shape or ()))
         # indices of the action that move arms
-        self.moves = np.setdiff1d(np.arange(size), inner.gripper_actions)
-        self._careful = set(inner.robots) != {"Panda"}
-        """Plans have the Panda's pace; other arms drift further from their course."""
-        self._gain = 3.0 if self._careful else 2.0
+        self.moves = np.setdiff1d(np.arange(self.size), inner.gripper_actions)
+        # Plans have the Panda's pace; other arms drift further from their course.
+        self.is_careful = set(inner.robots) != {"Panda"}
+        self.gain = 3.0 if self.is_careful else 2.0
+
+    def draw_speed(self) -> float:
+        """Return the speed of the hand in one episode [action units]."""
+        return self.style.pace(self.pace, self.np_random)
+
+    def draw_offset(self) -> Vector:
+        """Return how far (3,) a way-point of one episode is from the plan's [m]."""
+        return self.style.spread * self.np_random.standard_normal(3)
 
     @abstractmethod
     def begin(self, observation: Any) -> State:
         """Draw the style of an episode, and return its first state."""
 
-    def start(
-        self, speed: float, spread: Any = 0.0, plan: Any = None, noises: int = 7, anchor: Any = None
-    ) -> State:
-        """Return a first state; ``noises`` is how many numbers of the action are noisy."""
-        return State(
-            0, 0, speed, spread, plan, np.zeros(3) if anchor is None else anchor, np.zeros(noises)
-        )
+    @abstractmethod
+    def look(self, observation: Any, state: State) -> Any:
+        """Return the ``Scene``."""
 
     def act(
         self, observation: Any, state: State, deterministic: bool
     ) -> tuple[NDArray[np.float32], State]:
         """Return the action (A,) and the next state; ``deterministic`` leaves the action noise out, not the style."""
-        state = state._replace(
-            since=state.since + 1, drift=self.style.drifted(state.drift, self.np_random)
-        )
-        scene = self.look(observation)
-        state = self.advance(state, scene)
-        command = self.command(state, scene)
-        command[self.moves] += 0.0 if deterministic else state.drift[self.moves]
+        drift = self.style.drifted(state.drift, self.size, self.np_random)
+        scene = self.look(observation, state._replace(since=state.since + 1, drift=drift))
+        state = self.advance(scene, observation)
+        if state is not scene.state:
+            scene = self.look(observation, state)
+
+        phase = scene.phases[state.phase]
+        command = phase.command(scene)
+        if phase.gripper is not None:
+            command = np.append(command, phase.gripper)
+        if not deterministic:
+            command[self.moves] += drift[self.moves]
         return np.clip(command, -1.0, 1.0).astype(np.float32), state
 
-    @abstractmethod
-    def look(self, observation: Any) -> Any:
-        """Return the scene; it has the ``hand``, or the ``hands``."""
+    def advance(self, scene: Any, observation: Any) -> State:
+        """Return the state in the phase that follows, or as it is while the phase's work is not done."""
+        for phase, is_due in scene.phases[scene.state.phase].ends.items():
+            if is_due(scene):
+                return self.entered(scene, phase)
+        return scene.state
 
-    @abstractmethod
-    def next_phase(self, state: State, scene: Any) -> int:
-        """Return the phase that follows; the present one while its work is not done."""
-
-    @abstractmethod
-    def command(self, state: State, scene: Any) -> Vector:
-        """Return the action (A,) that the phase asks for, without noise."""
-
-    def advance(self, state: State, scene: Any) -> State:
-        """Return the state in the next phase."""
-        phase = self.next_phase(state, scene)
-        return state if phase == state.phase else self.entered(state, scene, phase)
-
-    def entered(self, state: State, scene: Any, phase: int) -> State:
+    def entered(self, scene: Any, phase: int) -> State:
         """Return the state at the beginning of a phase."""
-        return state._replace(phase=phase, since=0, anchor=scene.hand.at)
+        return scene.state._replace(phase=phase, since=0, anchor=scene.hand.at)
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:
-    """Whether fingers that were told to close or open ``since`` steps ago have done so.
+    """Return whether fingers have closed or opened.
 
-    Those that slide take the ``usual`` steps. Those that turn, in linkages, take several times as long, and are waited
-    for until they stand still.
+    Those that slide take the usual number of steps. Those that turn, in linkages, take several
+    times as long, and are waited for until they stand still.
+
+    Args:
+        velocity: (J,) of the gripper's joints.
+        since: steps since they were told to.
+        usual: steps that sliding fingers take.
     """
-    if velocity.size <= 2:
+    if velocity.size <= SLIDING_JOINTS:
         return since >= usual
-    return (since >= 2 * usual and float(np.abs(velocity).max()) < _STILL) or since >= 5 * usual
+    is_still = np.abs(velocity).max() < STILL
+    return (since >= 2 * usual and is_still) or since >= 5 * usual
 
 
 def over_first(position: Vector, target: Vector) -> Vector:
     """Return how much higher (3,) than its target [m] a careful hand goes beside it, lest a finger comes down on it."""
-    astray = float(np.linalg.norm((position - target)[:2]))
-    return np.array([0.0, 0.0, np.clip(4 * (astray - _OVER), 0.0, 0.06)])
+    aside = length((position - target)[:2])
+    return np.clip(4 * (aside - STRAIGHT_DOWN), 0.0, HIGHEST_DETOUR) * UP

@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, has_settled, over_first
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    Expert,
+    Phase,
+    Scene,
+    State,
+    has_settled,
+    over_first,
+)
 from asm_gym.policies.scripted.geometry import (
     UP,
     Pose,
     Vector,
     about_vertical,
     angle_between,
-    flattest_side,
     gripping,
+    length,
     move,
     wrapped,
     yaw,
 )
 
-REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
-_AHEAD = 1.0  # how far to turn the hand at once [rad]
-_ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
-_EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
-_SMALL, _LARGE = 0.02, 0.025  # half the edges of the two cubes of Stack [m]
-_HANDLE = {"SquareNut": 0.054, "RoundNut": 0.06}  # from a nut's middle to that of its handle [m]
+REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT, IDLE = range(9)
+TURN_AT_ONCE = 1.0  # how far to turn the hand at once [rad]
+ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
+EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
+LOST = 0.05  # so far from the hand an object is not held [m]
 
 
 class CarryTask(NamedTuple):
@@ -34,8 +44,7 @@ class CarryTask(NamedTuple):
 
     name: str  # of the object, as observations call it
     grip: Vector  # (3,) where to hold it, in its own frame [m]
-    # (3,) along which of its own axes the fingers close; None where every direction does
-    closing: Vector | None
+    closing: Vector  # (3,) along which of its own axes the fingers close
     turns: float  # after how much of a turn about the vertical the grasp is the same again [rad]
     clearance: float  # how far above its grip to come from [m]
     place: Vector  # (3,) where its origin is to go [m]
@@ -47,16 +56,176 @@ class CarryTask(NamedTuple):
     haste: float = 1.0  # with which share of the usual speed the hand comes down
 
 
-class CarryScene(NamedTuple):
-    """What is observed."""
+@dataclass(frozen=True)
+class CarryScene(Scene):
+    """What is observed; its plan is the present task."""
 
-    observation: Any
-    hand: Pose
+    thing: Any  # pose of the object; None where nothing is left to carry
     fingers: Vector  # velocities of the gripper's joints
+    wrist: float  # angle of the arm's last joint [rad]
+    is_careful: bool
+    gain: float  # of the hand's commands
+
+    @property
+    def grip(self) -> Vector:
+        """Where (3,) to hold the object [m]."""
+        return self.thing.point(self.plan.grip)
+
+    @property
+    def offset(self) -> Vector:
+        """The way (3,) from the grip to the hand [m]."""
+        return self.hand.at - self.grip
+
+    @property
+    def over(self) -> Vector:
+        """Where (3,) to carry the object before it is lowered [m]."""
+        return self.plan.place + self.plan.over * UP
+
+    @property
+    def aside(self) -> float:
+        """Horizontal distance of the object from its place [m]."""
+        return length((self.thing.at - self.plan.place)[:2])
+
+    @property
+    def down(self) -> Vector:
+        """Orientation (3, 3) of a hand that points down and keeps its direction."""
+        return gripping(self.hand.turned)
+
+    @property
+    def grasping(self) -> Vector:
+        """How (3, 3) to hold the hand for grasping."""
+        closing = self.thing.turned @ self.plan.closing
+        return gripping(self.hand.turned, closing, self.plan.turns)
+
+    @property
+    def turn_to_fit(self) -> float:
+        """The smallest turn about the vertical that gives the object a heading that fits [rad]."""
+        now = yaw(self.thing.turned[:, 0])
+        turns = [wrapped(heading - now) for heading in self.plan.headings]
+        return float(min(turns, key=abs, default=0.0))
+
+    def reach(self) -> Vector:
+        above = self.plan.clearance * UP + 0.3 * self.state.spread
+        target = self.grip + above
+        # From afar, first high: the way may lead over a wall or another object.
+        if length(self.offset[:2]) > 0.1:
+            target[2] = max(target[2], min(self.hand.at[2], target[2] + 0.1))
+        return self.move(target, self._turning(self.grasping), self.gain)
+
+    def is_above(self) -> bool:
+        aside = length(self.offset[:2] - self.state.spread[:2] * 0.3)
+        is_above = aside < 0.02 and abs(self.offset[2] - self.plan.clearance) < 0.03
+        return is_above and angle_between(self.hand.turned, self.grasping) < 0.15
+
+    def descend(self) -> Vector:
+        target = self.grip
+        if self.is_careful:
+            target = target + over_first(self.hand.at, target)
+        speed = self.state.speed * self.plan.haste
+        return move(self.hand, target, self._turning(self.grasping), speed, self.gain)
+
+    def is_around(self) -> bool:
+        distance = length(self.offset)
+        return distance < 0.011 or (self.state.since > 30 and distance < 0.02)
+
+    def is_astray(self) -> bool:
+        return self.state.since > 60 or length(self.offset[:2]) > 0.06
+
+    def grasp(self) -> Vector:
+        gain = self.gain if self.is_careful else 1.0
+        return self.move(self.state.anchor, self.down, gain)
+
+    def has_gripped(self) -> bool:
+        return has_settled(self.fingers, self.state.since, usual=7)
+
+    def lift(self) -> Vector:
+        height = self.over[2] + 0.3 * self.state.spread[2]
+        target = np.array([*self.thing.at[:2], height])
+        return move(self._held, target, self.down, self.state.speed)
+
+    def has_lost_it(self) -> bool:
+        """Return whether the object fell; it may lie where it belongs."""
+        return length(self.offset) > LOST
+
+    def is_lifted(self) -> bool:
+        return self.thing.at[2] > self.over[2] - 0.03 or self.state.since > 60
+
+    def carry(self) -> Vector:
+        return self._move_held(self.over, self.state.speed)
+
+    def is_over_place(self) -> bool:
+        # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
+        patience = self.state.since / 60 if self.is_careful else 0.0
+        return (
+            self.aside < self.plan.fit * (1 + patience)
+            and abs(self.turn_to_fit) < self.plan.heading_fit
+        )
+
+    def lower(self) -> Vector:
+        target = self.plan.place
+        if self.is_careful or self.plan.fit <= EXACT:
+            # The further aside of its place an object is, the less it goes down.
+            down = 0.025 * np.clip(1.5 - 0.5 * self.aside / self.plan.fit, 0.0, 1.0)
+            height = max(target[2], self.thing.at[2] - down)
+            target = np.array([*target[:2], height])
+        return self._move_held(target, 0.6 * self.state.speed)
+
+    def has_slipped_aside(self) -> bool:
+        share = 2.5 if self.is_careful else 1.0
+        return self.aside > self.plan.fit * share + 0.02
+
+    def is_down(self) -> bool:
+        height = self.thing.at[2]
+        bottom = self.plan.place[2]
+        return height < bottom + 0.006 or (self.state.since > 50 and height < bottom + 0.03)
+
+    def release(self) -> Vector:
+        return self.move(self.state.anchor, self.down)
+
+    def has_let_go(self) -> bool:
+        return has_settled(self.fingers, self.state.since, usual=6)
+
+    def retreat(self) -> Vector:
+        return self.move(self.state.anchor + 0.12 * UP, self.down)
+
+    def idle(self) -> Vector:
+        return np.zeros(6)
+
+    @property
+    def _held(self) -> Pose:
+        """The hand as if it were where the object is that it holds."""
+        return self.hand._replace(at=self.thing.at)
+
+    def _move_held(self, target: Vector, speed: float) -> Vector:
+        """Return the command (6,) of a hand whose object is to come to ``target`` (3,) and to fit its place."""
+        fitting = about_vertical(self.turn_to_fit) @ self.down
+        return move(self._held, target, self._turning(fitting), speed, self.gain)
+
+    def _turning(self, target: Vector) -> Vector:
+        """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops."""
+        left = wrapped(yaw(target[:, 1]) - yaw(self.down[:, 1]))
+        if abs(left) <= TURN_AT_ONCE:
+            return target
+        left = self.wrist - wrapped(self.wrist - left)
+        return about_vertical(float(np.clip(left, -TURN_AT_ONCE, TURN_AT_ONCE))) @ self.down
+
+    phases: ClassVar = {
+        REACH: Phase(reach, OPEN, {DESCEND: is_above}),
+        DESCEND: Phase(descend, OPEN, {GRASP: is_around, REACH: is_astray}),
+        GRASP: Phase(grasp, CLOSE, {RAISE: has_gripped}),
+        RAISE: Phase(lift, CLOSE, {RETREAT: has_lost_it, CARRY: is_lifted}),
+        CARRY: Phase(carry, CLOSE, {RETREAT: has_lost_it, LOWER: is_over_place}),
+        LOWER: Phase(
+            lower, CLOSE, {RETREAT: has_lost_it, CARRY: has_slipped_aside, RELEASE: is_down}
+        ),
+        RELEASE: Phase(release, OPEN, {RETREAT: has_let_go}),
+        RETREAT: Phase(retreat, OPEN),  # ``advance`` goes on with the next task
+        IDLE: Phase(idle, OPEN),
+    }
 
 
 class CarryExpert(Expert):
-    """An expert that carries objects one after another; the plan of its state is the present task, None at the end."""
+    """An expert that carries objects one after another; the plan of its state is the present task."""
 
     pace = 0.55
 
@@ -65,235 +234,68 @@ class CarryExpert(Expert):
         """Return what to carry next; None where everything is done."""
 
     def begin(self, observation: Any) -> State:
-        speed = self.style.pace(self.pace, self.np_random)
-        spread = self.style.spread * self.np_random.standard_normal(3)
-        return self.start(speed, spread, self.next_task(observation))
-
-    def look(self, observation: Any) -> CarryScene:
-        return CarryScene(
-            observation, self.read.hand(observation), self.read(observation, "gripper_velocity")
-        )
-
-    def advance(self, state: State, scene: CarryScene) -> State:
-        if state.plan is None:
-            return state
-        if state.phase == RETREAT:
-            task = self.next_task(scene.observation) if state.since >= 14 else None
-            return state if task is None else self.entered(state, scene, REACH)._replace(plan=task)
-        return super().advance(state, scene)
-
-    def next_phase(self, state: State, scene: CarryScene) -> int:
-        task, phase, since = state.plan, state.phase, state.since
-        at, turned = thing = self.read.pose(scene.observation, task.name)
-        off = scene.hand.at - thing.point(task.grip)
-        far, beside = np.linalg.norm(off), np.linalg.norm(at[:2] - task.place[:2])
-        if phase == REACH:
-            aligned = (
-                angle_between(scene.hand.turned, self._grasp(task, scene.hand.turned, turned))
-                < 0.15
-            )
-            above = (
-                np.linalg.norm(off[:2] - state.spread[:2] * 0.3) < 0.02
-                and abs(off[2] - task.clearance) < 0.03
-            )
-            return DESCEND if above and aligned else REACH
-        if phase == DESCEND:
-            if far < 0.011 or (since > 30 and far < 0.02):
-                return GRASP
-            return REACH if since > 60 or np.linalg.norm(off[:2]) > 0.06 else DESCEND
-        if phase == GRASP:
-            return RAISE if has_settled(scene.fingers, since, 7) else GRASP
-        if phase in (RAISE, CARRY, LOWER) and far > 0.05:
-            return RETREAT  # and see where it falls: it may be where it belongs
-        if phase == RAISE:
-            return CARRY if at[2] > task.place[2] + task.over - 0.03 or since > 60 else RAISE
-        if phase == CARRY:
-            # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
-            fit = task.fit * (1 + since / 60) if self._careful else task.fit
-            fits = abs(_turn_to_fit(task.headings, turned)) < task.heading_fit
-            return LOWER if beside < fit and fits else CARRY
-        if phase == LOWER:
-            if beside > task.fit * (2.5 if self._careful else 1.0) + 0.02:
-                return CARRY
-            if at[2] < task.place[2] + 0.006 or (since > 50 and at[2] < task.place[2] + 0.03):
-                return RELEASE
-            return CARRY if since > 60 else LOWER  # it stands on something: up, and once more
-        return RETREAT if has_settled(scene.fingers, since, 6) else RELEASE
-
-    def command(self, state: State, scene: CarryScene) -> Vector:
-        task, phase, hand, speed = state.plan, state.phase, scene.hand, state.speed
+        speed = self.draw_speed()
+        spread = self.draw_offset()
+        task = self.next_task(observation)
         if task is None:
-            return np.append(np.zeros(6), OPEN)
-        at, turned = thing = self.read.pose(scene.observation, task.name)
-        down = gripping(hand.turned, None)
-        if phase in (REACH, DESCEND):
-            grip = thing.point(task.grip)
-            aligned = self._turning(
-                scene.observation, hand.turned, self._grasp(task, hand.turned, turned)
-            )
-            target = (
-                grip + (np.array([0.0, 0.0, task.clearance]) + 0.3 * state.spread)
-                if phase == REACH
-                else grip
-            )
-            # From afar, first high: the way may lead over a wall or another object.
-            if phase == REACH and np.linalg.norm((grip - hand.at)[:2]) > 0.1:
-                target = np.array(
-                    [target[0], target[1], max(target[2], min(hand.at[2], target[2] + 0.1))]
-                )
-            if phase == DESCEND and self._careful:
-                target = target + over_first(hand.at, grip)
-            haste = task.haste if phase == DESCEND else 1.0
-            return np.append(move(hand, target, aligned, speed * haste, self._gain), OPEN)
-        if phase == GRASP:
-            return np.append(
-                move(hand, state.anchor, down, speed, self._gain if self._careful else 1.0), CLOSE
-            )
-        # From here on the object is moved, and the hand with it.
-        held = hand._replace(at=at)
-        goal = task.place + np.array([0.0, 0.0, task.over])
-        if phase == RAISE:
-            wanted = np.array([at[0], at[1], goal[2] + 0.3 * state.spread[2]])
-            return np.append(move(held, wanted, down, speed), CLOSE)
-        if phase in (CARRY, LOWER):
-            fitting = self._turning(
-                scene.observation, hand.turned, self._held(task, hand.turned, turned)
-            )
-            if phase == LOWER:
-                goal = self._lower(task, at) if self._careful or task.fit <= _EXACT else task.place
-            share = 1.0 if phase == CARRY else 0.6
-            return np.append(move(held, goal, fitting, share * speed, self._gain), CLOSE)
-        up = state.anchor + np.array([0.0, 0.0, 0.0 if phase == RELEASE else 0.12])
-        return np.append(move(hand, up, down, speed), OPEN)
+            return State(speed, task, phase=IDLE)
+        return State(speed, task, spread=spread)
 
-    @staticmethod
-    def _lower(task: CarryTask, at: Vector) -> Vector:
-        """Return where (3,) an object is to go next on its way down: the further from over its place, the less down."""
-        astray = float(np.linalg.norm((at - task.place)[:2]))
-        down = 0.025 * float(np.clip(1.5 - 0.5 * astray / task.fit, 0.0, 1.0))
-        return np.array([*task.place[:2], max(task.place[2], at[2] - down)])
-
-    def at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
-        """Return the task with one of its two grasps and headings: those with room for the last joint, which turns back
-        with a hand that points down and onwards with the arm's bearing; of several, those that turn it least."""
-        if task.closing is None:
-            return task
-        thing = self.read.pose(observation, task.name)
-        turned = thing.turned
-        hand = self.read.hand(observation)
-        robot, model = self.robosuite.robots[0], self.inner.simulation.model
-        most = model.jnt_range[robot._ref_joint_indexes[-1], 1] - _ROOM
-        now, base = self._wrist(observation), robot.base_pos
-        along = now + yaw(hand.turned[:, 1]) - yaw(hand.at - base)
-        heading = yaw(turned[:, 0])
-
-        def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
-            """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
-            closing, wanted = choice
-            fitting = about_vertical(wanted - heading) @ turned
-            grasp = wrapped(along - yaw(turned @ closing) + yaw(thing.point(task.grip) - base))
-            place = wrapped(
-                along - yaw(fitting @ closing) + yaw(task.place + fitting @ task.grip - base)
-            )
-            return max(abs(grasp) - most, abs(place) - most, 0.0), abs(grasp - now) + abs(
-                place - grasp
-            )
-
-        choices = [
-            (c, h) for c in (task.closing, -task.closing) for h in task.headings or (heading,)
-        ]
-        closing, wanted = min(choices, key=strain)
-        return task._replace(
-            closing=closing, turns=2 * np.pi, headings=(wanted,) if task.headings else ()
+    def look(self, observation: Any, state: State) -> CarryScene:
+        thing = None
+        if state.plan is not None:
+            thing = self.read.pose(observation, state.plan.name)
+        return CarryScene(
+            state,
+            hand=self.read.hand(observation),
+            thing=thing,
+            fingers=self.read(observation, "gripper_velocity"),
+            wrist=self._wrist(observation),
+            is_careful=self.is_careful,
+            gain=self.gain,
         )
 
-    def _turning(self, observation: Any, hand: Vector, target: Vector) -> Vector:
-        """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops."""
-        down = gripping(hand, None)
-        left = wrapped(yaw(target[:, 1]) - yaw(down[:, 1]))
-        if abs(left) <= _AHEAD:
-            return target
-        wrist = self._wrist(observation)
-        left = wrist - wrapped(wrist - left)
-        return about_vertical(float(np.clip(left, -_AHEAD, _AHEAD))) @ down
+    def advance(self, scene: CarryScene, observation: Any) -> State:
+        """Return the state in the next phase; once the hand has gone up, with the next task."""
+        state = scene.state
+        if state.phase != RETREAT:
+            return super().advance(scene, observation)
+        if state.since < 14:
+            return state
+        task = self.next_task(observation)
+        if task is None:
+            return state
+        return self.entered(scene, REACH)._replace(plan=task)
 
     def _wrist(self, observation: Any) -> float:
         """Return the angle of the arm's last joint [rad]."""
         return float(self.read(observation, "joint_position")[-1])
 
-    @staticmethod
-    def _grasp(task: CarryTask, hand: Vector, turned: Vector) -> Vector:
-        """Return how (3, 3) to hold the hand for grasping."""
-        return gripping(hand, None if task.closing is None else turned @ task.closing, task.turns)
+    def at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
+        """Return the task with one of its two grasps and headings: those with room for the last joint, which turns back
+        with a hand that points down and onwards with the arm's bearing; of several, those that turn it least."""
+        thing = self.read.pose(observation, task.name)
+        hand = self.read.hand(observation)
+        robot = self.robosuite.robots[0]
+        base = robot.base_pos
+        stops = self.inner.simulation.model.jnt_range[robot._ref_joint_indexes[-1]]
+        most = stops[1] - ROOM
+        now = self._wrist(observation)
+        along = now + yaw(hand.turned[:, 1]) - yaw(hand.at - base)
+        heading = yaw(thing.turned[:, 0])
 
-    def _held(self, task: CarryTask, hand: Vector, turned: Vector) -> Vector:
-        """Return how (3, 3) to hold the hand so that the object in it comes to fit its place."""
-        return about_vertical(_turn_to_fit(task.headings, turned)) @ gripping(hand, None)
+        def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
+            """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
+            closing, wanted = choice
+            fitting = about_vertical(wanted - heading) @ thing.turned
+            picked_at = thing.point(task.grip)
+            placed_at = task.place + fitting @ task.grip
+            grasp = wrapped(along - yaw(thing.turned @ closing) + yaw(picked_at - base))
+            place = wrapped(along - yaw(fitting @ closing) + yaw(placed_at - base))
+            beyond = max(abs(grasp) - most, abs(place) - most, 0.0)
+            return beyond, abs(grasp - now) + abs(place - grasp)
 
-
-class StackExpert(CarryExpert):
-    """A scripted expert for Stack."""
-
-    pace = 0.5
-
-    def next_task(self, observation: Any) -> CarryTask | None:
-        """Return the red cube, until it lies on the green one."""
-        red, green = (self.read.pose(observation, name) for name in ("cubeA", "cubeB"))
-        place = green.at + np.array([0.0, 0.0, _SMALL + _LARGE])
-        if np.linalg.norm(red.at - place) < (0.025 if self._careful else 0.02):
-            return None
-        side, turns = flattest_side(red.turned), np.pi / 2
-        if self._careful:  # a wide gripper would stand on the green cube with one finger
-            sides = (side, np.cross(UP, side))
-            side, turns = min(sides, key=lambda s: abs(s @ (green.at - red.at))), np.pi
-        return CarryTask(
-            name="cubeA",
-            grip=np.zeros(3),
-            closing=red.turned.T @ side,
-            turns=turns,
-            clearance=0.08,
-            place=place,
-            over=0.06,
-            fit=0.006,
-        )
-
-
-class NutAssemblyExpert(CarryExpert):
-    """A scripted expert for NutAssembly, with one nut or with both."""
-
-    pace = 0.5
-
-    def next_task(self, observation: Any) -> CarryTask | None:
-        """Return a nut that is not around its peg; None where all are."""
-        env = self.robosuite
-        # a Panda's elbow reaches its stop sooner than others'
-        aside = np.pi / 2 if self._careful else 0.5
-        for i, nut in enumerate(env.nuts):
-            if env.single_object_mode and i != env.nut_id:
-                continue
-            at, _ = self.read.pose(observation, nut.name)
-            if not env.on_peg(at, i):
-                peg = env.sim.data.body_xpos[(env.peg1_body_id, env.peg2_body_id)[i]]
-                square = nut.name == "SquareNut"
-                task = CarryTask(
-                    name=nut.name,
-                    grip=np.array([_HANDLE[nut.name], 0.0, 0.0]),
-                    closing=np.array([0.0, 1.0, 0.0]),
-                    turns=np.pi,
-                    clearance=0.1,
-                    # Lower, and the palm would stand on the peg.
-                    place=np.array([peg[0], peg[1], env.table_offset[2] + 0.05]),
-                    over=0.14,
-                    # The handle points towards the robot, which could not reach further.
-                    headings=(np.pi,) if square else (np.pi - aside, np.pi, np.pi + aside),
-                    heading_fit=0.06 if square else 0.2,
-                    fit=0.005,
-                )
-                return self.at_ease(task, observation)
-        return None
-
-
-def _turn_to_fit(headings: tuple[float, ...], turned: Vector) -> float:
-    """Return the smallest turn about the vertical that gives an object one of the ``headings`` [rad]; 0 without any."""
-    left = [wrapped(h - yaw(turned[:, 0])) for h in headings]
-    return float(min(left, key=abs, default=0.0))
+        choices = product((task.closing, -task.closing), task.headings or (heading,))
+        closing, wanted = min(choices, key=strain)
+        headings = (wanted,) if task.headings else ()
+        return task._replace(closing=closing, turns=2 * np.pi, headings=headings)

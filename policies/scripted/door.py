@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State
-from asm_gym.policies.scripted.geometry import UP, Pose, Vector, about, angle_between, move
+from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Phase, Scene, State
+from asm_gym.policies.scripted.geometry import UP, Vector, about, angle_between, length
 
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
-_TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
-_PRESSED = 1.55  # how far to ask for; its spring and the hand's give take some of it [rad]
-_BEFORE = 0.09  # how far in front of the handle to come from [m]
-_ROLL = 0.8  # how far to roll the hand at once [rad]
-_OPENED = 0.36  # [rad]; the task asks for 0.3
+TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
+PRESSED = 1.55  # how far to ask for; its spring and the hand's give take some of it [rad]
+BEFORE = 0.09  # how far in front of the handle to come from [m]
+ROLL_AT_ONCE = 0.8  # how far to roll the hand at once [rad]
+OPENED = 0.36  # how far to open the door; the task asks for 0.3 [rad]
+GAIN = 2.0  # of the hand's commands
+SLIPPED = 0.07  # so far from the handle a hand does not hold it [m]
 
 
-class _Hardware(NamedTuple):
+class Hardware(NamedTuple):
     """The door as it stood closed: what the observation does not say."""
 
     hinge: Vector  # (3,) a point on the hinge's axis, which is vertical
@@ -34,14 +37,93 @@ class _Hardware(NamedTuple):
 
     def held(self, turned: float) -> Vector:
         """Return the hand (3, 3) on the handle of the closed door, its y axis down: else a joint meets its stop."""
-        z, y = -self.normal, np.array([0.0, 0.0, -1.0])
-        return about(self.axis, turned) @ np.stack([np.cross(y, z), y, z], axis=1)
+        y = np.array([0.0, 0.0, -1.0])
+        z = -self.normal
+        return about(self.axis, turned) @ np.column_stack([np.cross(y, z), y, z])
 
 
-class _Scene(NamedTuple):
-    hand: Pose
+@dataclass(frozen=True)
+class DoorScene(Scene):
+    """What is observed; its plan is the door's hardware."""
+
     turned: float  # how far the handle is pressed [rad]
     opened: float  # how far the door is open [rad]
+
+    @property
+    def grip(self) -> Vector:
+        """Where (3,) to hold the handle as it stands now [m]."""
+        return self.plan.grip_at(self.turned, self.opened)
+
+    @property
+    def offset(self) -> Vector:
+        """The way (3,) from the handle to the hand [m]."""
+        return self.hand.at - self.grip
+
+    @property
+    def distance(self) -> float:
+        """Of the hand from where to hold the handle [m]."""
+        return length(self.offset)
+
+    def facing(self, turned: float = 0.0) -> Vector:
+        """Return the hand (3, 3) before the door, fingers above and below a handle ``turned`` so far [rad]."""
+        return about(UP, self.opened) @ self.plan.held(turned)
+
+    def reach(self) -> Vector:
+        facing = _rolling(self.plan, self.hand.turned, self.facing())
+        return self.move(self.grip + BEFORE * self.plan.normal, facing, GAIN)
+
+    def is_before_handle(self) -> bool:
+        off = length(self.offset - BEFORE * self.plan.normal)
+        return off < 0.02 and angle_between(self.hand.turned, self.facing()) < 0.15
+
+    def approach(self) -> Vector:
+        return self.move(self.grip, self.facing(), GAIN)
+
+    def is_around(self) -> bool:
+        distance = self.distance
+        return distance < 0.012 or (self.state.since > 25 and distance < 0.025)
+
+    def is_late(self) -> bool:
+        return self.state.since > 60
+
+    def grasp(self) -> Vector:
+        return self.move(self.state.anchor, self.facing(), GAIN)
+
+    def has_gripped(self) -> bool:
+        return self.state.since >= 7
+
+    def turn(self) -> Vector:
+        ahead = min(self.turned + 0.4, PRESSED)
+        return self._hold(self.plan.grip_at(ahead, self.opened))
+
+    def has_slipped_off(self) -> bool:
+        return self.distance > SLIPPED
+
+    def is_unlatched(self) -> bool:
+        return self.turned > TURNED - 0.1
+
+    def pull(self) -> Vector:
+        ahead = min(self.opened + 0.12, OPENED + 0.04)
+        return self._hold(self.plan.grip_at(PRESSED, ahead))
+
+    def is_open(self) -> bool:
+        return self.opened > OPENED - 0.02
+
+    def rest(self) -> Vector:
+        return self._hold(self.state.anchor)
+
+    def _hold(self, target: Vector) -> Vector:
+        """Return the command (6,) of a hand that turns with the handle that it holds."""
+        return self.move(target, self.facing(self.turned), GAIN)
+
+    phases: ClassVar = {
+        REACH: Phase(reach, OPEN, {APPROACH: is_before_handle}),
+        APPROACH: Phase(approach, OPEN, {GRASP: is_around, REACH: is_late}),
+        GRASP: Phase(grasp, CLOSE, {TURN: has_gripped}),
+        TURN: Phase(turn, CLOSE, {REACH: has_slipped_off, PULL: is_unlatched}),
+        PULL: Phase(pull, CLOSE, {REACH: has_slipped_off, REST: is_open}),
+        REST: Phase(rest, CLOSE),
+    }
 
 
 class DoorExpert(Expert):
@@ -50,99 +132,56 @@ class DoorExpert(Expert):
     pace = 0.4
 
     def begin(self, observation: Any) -> State:
-        style, rng = self.style, self.np_random
-        speed = style.pace(self.pace, rng)
-        spread = 0.3 * style.spread * rng.standard_normal(3)
-        return self.start(speed, spread, self._hardware(spread[0]))
+        speed = self.draw_speed()
+        along = 0.3 * self.style.spread * self.np_random.standard_normal(3)[0]
+        return State(speed, self._hardware(along))
 
-    def _hardware(self, along: float) -> _Hardware:
+    def _hardware(self, along: float) -> Hardware:
         """Return the door as it stands at the beginning, closed; the grip is moved ``along`` the handle [m]."""
-        simulation = self.inner.simulation
-        model, data = simulation.model, simulation.data
-        hinge, latch = model.joint("Door_hinge").id, model.joint("Door_latch_joint").id
+        model = self.inner.simulation.model
+        data = self.inner.simulation.data
+        hinge = model.joint("Door_hinge").id
+        latch = model.joint("Door_latch_joint").id
         handle = model.geom("Door_handle").id
-        frame = data.geom_xmat[handle].reshape(3, 3)
-        middle, pivot, axis = data.geom_xpos[handle], data.xanchor[latch], data.xaxis[latch]
-        # along the handle, away from the pivot
-        outwards = frame[:, 0] * np.sign(frame[:, 0] @ (middle - pivot))
-        sign = -float(np.sign(np.cross(axis, middle - pivot)[2]))
-        grip = middle + (0.025 + along) * outwards
-        normal = frame[:, 1] * np.sign(frame[:, 1] @ (middle - pivot))
-        return _Hardware(data.xanchor[hinge].copy(), pivot.copy(), sign * axis, grip, normal, sign)
 
-    def look(self, observation: Any) -> _Scene:
-        turned, opened = (
-            float(self.read(observation, name)[0]) for name in ("handle_qpos", "hinge_qpos")
-        )
-        return _Scene(self.read.hand(observation), turned, opened)
-
-    def next_phase(self, state: State, scene: _Scene) -> int:
-        hardware, phase, since = state.plan, state.phase, state.since
-        turned, opened = hardware.sign * scene.turned, scene.opened
-        off = scene.hand.at - hardware.grip_at(turned, opened)
-        far = float(np.linalg.norm(off))
-        if phase == REACH:
-            left = angle_between(scene.hand.turned, self._facing(state, scene))
-            return (
-                APPROACH
-                if np.linalg.norm(off - _BEFORE * hardware.normal) < 0.02 and left < 0.15
-                else REACH
-            )
-        if phase == APPROACH:
-            if far < 0.012 or (since > 25 and far < 0.025):
-                return GRASP
-            return REACH if since > 60 else APPROACH
-        if phase == GRASP:
-            return TURN if since >= 7 else GRASP
-        if phase in (TURN, PULL) and far > 0.07:  # slipped off
-            return REACH
-        if phase == TURN and turned > _TURNED - 0.1:
-            return PULL
-        if phase == PULL and opened > _OPENED - 0.02:
-            return REST
-        return phase
-
-    def command(self, state: State, scene: _Scene) -> Vector:
-        hardware, phase, facing = state.plan, state.phase, self._facing(state, scene)
-        turned, opened = hardware.sign * scene.turned, scene.opened
-        if phase == REACH:
-            target = hardware.grip_at(turned, opened) + _BEFORE * hardware.normal
-            facing = self._rolling(hardware, scene.hand.turned, facing)
-        elif phase == APPROACH:
-            target = hardware.grip_at(turned, opened)
-        elif phase == TURN:
-            target = hardware.grip_at(min(turned + 0.4, _PRESSED), opened)
-        elif phase == PULL:
-            target = hardware.grip_at(_PRESSED, min(opened + 0.12, _OPENED + 0.04))
-        else:
-            target = state.anchor
-        return np.append(
-            move(scene.hand, target, facing, state.speed, gain=2.0),
-            OPEN if phase < GRASP else CLOSE,
+        pivot = data.xanchor[latch]
+        axis = data.xaxis[latch]
+        middle = data.geom_xpos[handle]
+        outwards, normal, _ = data.geom_xmat[handle].reshape(3, 3).T
+        from_pivot = middle - pivot
+        outwards = outwards * np.sign(outwards @ from_pivot)
+        sign = -float(np.sign(np.cross(axis, from_pivot)[2]))
+        return Hardware(
+            hinge=data.xanchor[hinge].copy(),
+            pivot=pivot.copy(),
+            axis=sign * axis,
+            grip=middle + (0.025 + along) * outwards,
+            normal=normal * np.sign(normal @ from_pivot),
+            sign=sign,
         )
 
-    @staticmethod
-    def _facing(state: State, scene: _Scene) -> Vector:
-        """Return the hand (3, 3) before the door, fingers above and below the handle; it turns with what it holds."""
-        held = state.plan.held(state.plan.sign * scene.turned if state.phase >= TURN else 0.0)
-        return about(UP, scene.opened) @ held
+    def look(self, observation: Any, state: State) -> DoorScene:
+        return DoorScene(
+            state,
+            hand=self.read.hand(observation),
+            turned=state.plan.sign * float(self.read(observation, "handle_qpos")[0]),
+            opened=float(self.read(observation, "hinge_qpos")[0]),
+        )
 
-    @staticmethod
-    def _rolling(hardware: _Hardware, hand: Vector, facing: Vector) -> Vector:
-        """Return where (3, 3) to turn first on the way to ``facing``, whose shortest way may lead any way round."""
-        pressed = hardware.held(_TURNED)
-        left = _roll(hand, pressed) + _roll(pressed, facing)
-        return facing @ about(UP, left - np.clip(left, -_ROLL, _ROLL))
+
+def _rolling(hardware: Hardware, hand: Vector, facing: Vector) -> Vector:
+    """Return where (3, 3) to turn first on the way to ``facing``, whose shortest way may lead any way round."""
+    pressed = hardware.held(TURNED)
+    left = _roll(hand, pressed) + _roll(pressed, facing)
+    return facing @ about(UP, left - np.clip(left, -ROLL_AT_ONCE, ROLL_AT_ONCE))
 
 
 def _roll(hand: Vector, to: Vector) -> float:
     """Return the hand's roll from another orientation about its z axis, once that points the same way [rad]."""
     axis = np.cross(hand[:, 2], to[:, 2])
-    sine = float(np.linalg.norm(axis))
-    tilt = (
-        about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))
-        if sine > 1e-9
-        else np.eye(3)
-    )
+    sine = length(axis)
+    tilt = np.eye(3)
+    if sine > 1e-9:
+        tilt = about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))
     across = to.T @ tilt @ hand[:, 1]
     return float(np.arctan2(-across[0], across[1]))

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
-# what one unit of action moves the hand's set-point by, in robosuite's OSC_POSE
-METRES, RADIANS = (
-    0.05,
-    0.5,
-)
+
+# What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE.
+METRES = 0.05  # [m]
+RADIANS = 0.5  # [rad]
+FASTEST_TURN = 0.5  # of the hand, about each axis [action units]
 
 
 class Pose(NamedTuple):
@@ -27,12 +27,18 @@ class Pose(NamedTuple):
         return self.at + self.turned @ own
 
 
+def length(vector: Vector) -> float:
+    """Return the length of a vector, in its unit."""
+    return float(np.linalg.norm(vector))
+
+
 def rotation(columns: Vector) -> Vector:
     """Return a rotation (3, 3) from its first two columns (6,), made orthonormal again after sensor noise."""
-    x = columns[:3] / np.linalg.norm(columns[:3])
-    y = columns[3:] - (x @ columns[3:]) * x
-    y /= np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
+    x, y = columns.reshape(2, 3)
+    x = x / length(x)
+    y = y - (x @ y) * x
+    y /= length(y)
+    return np.column_stack([x, y, np.cross(x, y)])
 
 
 def matrix(quaternion: Vector) -> Vector:
@@ -50,14 +56,15 @@ def matrix(quaternion: Vector) -> Vector:
 def about(axis: Any, angle: float) -> Vector:
     """Return the rotation (3, 3) about a unit ``axis`` by ``angle`` [rad] (Rodrigues)."""
     x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # K @ v is axis × v
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
 
 
 def about_vertical(angle: float) -> Vector:
     """Return the rotation (3, 3) about the vertical [rad]."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def yaw(direction: Vector) -> float:
@@ -80,28 +87,40 @@ def flattest_side(turned: Vector) -> Vector:
     return turned[:, int(np.abs(turned[2]).argmin())]
 
 
-def gripping(hand: Vector, closing: Vector | None, turns: float = np.pi) -> Vector:
-    """Return the rotation nearest ``hand`` (3, 3) whose fingers point down and close along ``closing`` (3,) or as now.
+def gripping(hand: Vector, closing: Vector | None = None, turns: float = np.pi) -> Vector:
+    """Return the orientation nearest ``hand`` (3, 3) for which the fingers point down.
 
-    After a turn by ``turns`` [rad] the direction is as good again.
+    Args:
+        hand: (3, 3) the orientation of the hand.
+        closing: (3,) along which the fingers are to close; None for as they close now.
+        turns: after a turn by this angle the direction is as good again [rad].
     """
-    angle = yaw(hand[:, 1])  # fingers move along the hand's y axis
+    # The fingers move along the hand's y axis.
+    angle = yaw(hand[:, 1])
     if closing is not None:
         heading = yaw(closing)
         angle = heading + np.round((angle - heading) / turns) * turns
     y = np.array([np.cos(angle), np.sin(angle), 0.0])
     z = np.array([0.0, 0.0, -1.0])
-    return np.stack([np.cross(y, z), y, z], axis=1)
+    return np.column_stack([np.cross(y, z), y, z])
 
 
 def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
-    """Return the hand's command (6,) towards a pose, at no more than ``speed`` (in action units).
+    """Return the hand's command (6,) towards a pose [action units].
 
-    The controller covers about a third of what it is asked for in one step, so a ``gain`` of 2 does not overshoot.
+    The controller covers about a third of what it is asked for in one step, so a gain of 2 does
+    not overshoot.
+
+    Args:
+        hand: the pose of the hand.
+        target: (3,) where it is to go [m].
+        turned: (3, 3) the orientation that it is to have.
+        speed: at most, of its position [action units].
+        gain: share of the way to its position to ask for in one step.
     """
     step = gain * (target - hand.at) / METRES
-    norm = np.linalg.norm(step)
+    norm = length(step)
     if norm > speed:
         step *= speed / norm
     turn = 0.5 * np.cross(hand.turned, turned, axis=0).sum(axis=1) / RADIANS
-    return np.concatenate([step, np.clip(turn, -0.5, 0.5)])
+    return np.concatenate([step, np.clip(turn, -FASTEST_TURN, FASTEST_TURN)])

@@ -2,26 +2,87 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, State, has_settled, over_first
-from asm_gym.policies.scripted.geometry import Pose, Vector, flattest_side, gripping, move
+from asm_gym.policies.scripted.base import (
+    CLOSE,
+    OPEN,
+    Expert,
+    Phase,
+    Scene,
+    State,
+    has_settled,
+    over_first,
+)
+from asm_gym.policies.scripted.geometry import UP, Pose, Vector, flattest_side, gripping, length
 
 REACH, DESCEND, GRASP, LIFT = range(4)
+QUARTER_TURN = np.pi / 2  # after which a cube looks the same [rad]
 
 
-class _Plan(NamedTuple):
+class LiftPlan(NamedTuple):
+    """What is drawn for an episode."""
+
     hover: Vector  # (3,) way-point above the cube, relative to it [m]
     goal: Vector  # (3,) where to carry it, relative to where it was grasped [m]
     depth: float  # how far below the cube's centre to grasp [m]
 
 
-class _Scene(NamedTuple):
-    hand: Pose
+@dataclass(frozen=True)
+class LiftScene(Scene):
+    """What is observed."""
+
     cube: Pose
     fingers: Vector  # velocities of the gripper's joints
+    is_careful: bool
+
+    @property
+    def offset(self) -> Vector:
+        """(3,) of the hand from the cube [m]."""
+        return self.hand.at - self.cube.at
+
+    def reach(self) -> Vector:
+        return self._fit_sides(self.cube.at + self.plan.hover)
+
+    def is_above(self) -> bool:
+        return length(self.offset - self.plan.hover) < 0.02
+
+    def descend(self) -> Vector:
+        target = self.cube.at - self.plan.depth * UP
+        if self.is_careful:
+            target = target + over_first(self.hand.at, self.cube.at)
+        return self._fit_sides(target)
+
+    def is_around(self) -> bool:
+        height = self.offset[2] + self.plan.depth
+        return abs(height) < 0.008 and length(self.offset[:2]) < 0.015
+
+    def grasp(self) -> Vector:
+        return self.move(self.state.anchor, gripping(self.hand.turned))
+
+    def has_gripped(self) -> bool:
+        return has_settled(self.fingers, self.state.since, usual=6)
+
+    def lift(self) -> Vector:
+        return self.move(self.state.anchor + self.plan.goal, gripping(self.hand.turned))
+
+    def has_lost_it(self) -> bool:
+        return length(self.offset) > 0.05
+
+    def _fit_sides(self, target: Vector) -> Vector:
+        """Return the command (6,) of a hand whose fingers are to fit the sides of the cube."""
+        side = flattest_side(self.cube.turned)
+        return self.move(target, gripping(self.hand.turned, side, QUARTER_TURN))
+
+    phases: ClassVar = {
+        REACH: Phase(reach, OPEN, {DESCEND: is_above}),
+        DESCEND: Phase(descend, OPEN, {GRASP: is_around}),
+        GRASP: Phase(grasp, CLOSE, {LIFT: has_gripped}),
+        LIFT: Phase(lift, CLOSE, {REACH: has_lost_it}),
+    }
 
 
 class LiftExpert(Expert):
@@ -30,55 +91,26 @@ class LiftExpert(Expert):
     pace = 0.45
 
     def begin(self, observation: Any) -> State:
-        style, rng = self.style, self.np_random
-        # fingers of other arms are longer, and come down on the table
-        deep = 0.0 if self._careful else 0.005
-        speed = style.pace(self.pace, rng)
-        plan = _Plan(
-            hover=np.array([0.0, 0.0, 0.07]) + style.spread * rng.standard_normal(3),
-            goal=np.array([0.0, 0.0, 0.13]) + style.spread * rng.standard_normal(3),
-            depth=float(np.clip(deep + 0.3 * style.spread * rng.standard_normal(), 0.0, 2 * deep)),
-        )
-        return self.start(speed, plan=plan)
+        # Fingers of other arms are longer, and come down on the table.
+        deep = 0.0 if self.is_careful else 0.005
+        speed = self.draw_speed()
+        hover = 0.07 * UP + self.draw_offset()
+        goal = 0.13 * UP + self.draw_offset()
+        depth = deep + 0.3 * self.style.spread * self.np_random.standard_normal()
+        plan = LiftPlan(hover, goal, depth=float(np.clip(depth, 0.0, 2 * deep)))
+        return State(speed, plan)
 
-    def look(self, observation: Any) -> _Scene:
-        fingers = self.read(observation, "gripper_velocity")
-        return _Scene(self.read.hand(observation), self.read.pose(observation, "cube"), fingers)
-
-    def next_phase(self, state: State, scene: _Scene) -> int:
-        phase, offset = state.phase, scene.hand.at - scene.cube.at
-        aside = np.linalg.norm(offset[:2])
-        if phase == REACH and np.linalg.norm(offset - state.plan.hover) < 0.02:
-            return DESCEND
-        if phase == DESCEND and abs(offset[2] + state.plan.depth) < 0.008 and aside < 0.015:
-            return GRASP
-        if phase == GRASP and has_settled(scene.fingers, state.since, 6):
-            return LIFT
-        if phase == LIFT and np.linalg.norm(offset) > 0.05:  # lost it
-            return REACH
-        return phase
-
-    def entered(self, state: State, scene: _Scene, phase: int) -> State:
-        # While it lifts, the anchor stays where the cube was grasped.
-        return (
-            super()
-            .entered(state, scene, phase)
-            ._replace(anchor=state.anchor if phase == LIFT else scene.hand.at)
+    def look(self, observation: Any, state: State) -> LiftScene:
+        return LiftScene(
+            state,
+            hand=self.read.hand(observation),
+            cube=self.read.pose(observation, "cube"),
+            fingers=self.read(observation, "gripper_velocity"),
+            is_careful=self.is_careful,
         )
 
-    def command(self, state: State, scene: _Scene) -> Vector:
-        phase, plan, cube = state.phase, state.plan, scene.cube
-        if phase == REACH:
-            target = cube.at + plan.hover
-        elif phase == DESCEND:
-            target = cube.at - [0.0, 0.0, plan.depth]
-            if self._careful:
-                target = target + over_first(scene.hand.at, cube.at)
-        else:
-            target = state.anchor + (plan.goal if phase == LIFT else 0.0)
-        # a cube looks the same every quarter turn
-        side = flattest_side(cube.turned) if phase <= DESCEND else None
-        aligned = gripping(scene.hand.turned, side, np.pi / 2)
-        return np.append(
-            move(scene.hand, target, aligned, state.speed), OPEN if phase <= DESCEND else CLOSE
-        )
+    def entered(self, scene: LiftScene, phase: int) -> State:
+        entered = super().entered(scene, phase)
+        if phase == LIFT:  # the anchor stays where the cube was grasped
+            return entered._replace(anchor=scene.state.anchor)
+        return entered

@@ -15,24 +15,33 @@ Floats = NDArray[np.float64]
 
 
 class Swaying(StatefulPolicy):
-    """Sways smoothly in a finite Box of actions: each number a sine of its own, and coloured noise."""
+    """Sways smoothly in a finite Box of actions: each number a sine of its own, and coloured noise.
 
-    WIDTH, NOISE, COLOUR = 0.4, 0.05, 0.7
-    """Shares of half the range of an action; how much of the noise stays from step to step."""
+    Raises:
+        ValueError: the actions are in no finite Box.
+    """
+
+    # Shares of half the range of an action.
+    WIDTH = 0.4
+    NOISE = 0.05
+    COLOUR = 0.7  # how much of the noise stays from step to step
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None) -> None:
         space = env.action_space
         if not isinstance(space, gym.spaces.Box) or not np.isfinite([space.low, space.high]).all():
             raise ValueError(f"the policy 'sway' needs actions in a finite Box, got {space}")
-        self.space, self.dt, self.size = space, control_period(env), int(np.prod(space.shape))
+        self.space = space
+        self.dt = control_period(env)
         self.middle = np.ravel(0.5 * (space.high + space.low)).astype(np.float64)
         self.half = np.ravel(0.5 * (space.high - space.low)).astype(np.float64)
-        self.set_random_seed(0 if seed is None else seed)
+        self.size = self.half.size
+        self.set_random_seed(seed or 0)
 
     def set_random_seed(self, seed: int) -> None:
         """Begin an episode of this seed."""
         self.rng = np.random.default_rng([seed, 3])
-        self.t, self.noise = 0.0, np.zeros(self.size)
+        self.t = 0.0  # [s]
+        self.noise = np.zeros(self.size)
         self.draw()
 
     def draw(self) -> None:
@@ -50,9 +59,8 @@ class Swaying(StatefulPolicy):
         self, observation: Any, state: Any, deterministic: bool
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action and the state as it was."""
-        self.noise = self.COLOUR * self.noise + self.NOISE * self.half * self.rng.standard_normal(
-            self.size
-        )
+        fresh = self.NOISE * self.half * self.rng.standard_normal(self.size)
+        self.noise = self.COLOUR * self.noise + fresh
         chosen = (self.intended(observation) + self.noise).reshape(self.space.shape)
         self.t += self.dt
         return np.clip(chosen, self.space.low, self.space.high).astype(np.float32), state
@@ -62,23 +70,25 @@ class Arm(Swaying):
     """The synthetic arm goes through four poses, a second each, and sways a little on the way."""
 
     NOISE = 0.0
+    GAIN = 4.0  # of the position error [1/s]
 
     def draw(self) -> None:
-        self.poses = 0.7 * np.cumsum(
-            np.vstack([np.zeros(7), self.rng.uniform(-0.6, 0.6, (4, 7))]), axis=0
-        )
-        self.width = self.rng.uniform(0.02, 0.08, 7)
+        turns = self.rng.uniform(-0.6, 0.6, (4, self.size))
+        self.poses = 0.7 * np.cumsum(np.vstack([np.zeros(self.size), turns]), axis=0)  # [rad]
+        self.width = self.rng.uniform(0.02, 0.08, self.size)  # [rad]
+        self.frequency = np.linspace(0.5, 1.5, self.size)  # [Hz]
 
     def intended(self, observation: Any) -> Floats:
-        now, soon = self.reference(self.t), self.reference(self.t + self.dt)
-        return np.asarray((soon - now) / self.dt + 4.0 * (now - observation[:7]), np.float64)
+        now = self.reference(self.t)
+        soon = self.reference(self.t + self.dt)
+        error = now - observation[: self.size]
+        return (soon - now) / self.dt + self.GAIN * error
 
     def reference(self, t: float) -> Floats:
         """Return positions (7,) along minimum-jerk moves [rad]."""
-        k = min(int(t), len(self.poses) - 2)
-        s = min(t - k, 1.0)
-        there = 10 * s**3 - 15 * s**4 + 6 * s**5
-        sway: Floats = self.width * np.sin(2 * np.pi * np.linspace(0.5, 1.5, 7) * t)
-        return np.asarray(
-            self.poses[k] + there * (self.poses[k + 1] - self.poses[k]) + sway, np.float64
-        )
+        move = min(int(t), len(self.poses) - 2)
+        s = min(t - move, 1.0)
+        share = 10 * s**3 - 15 * s**4 + 6 * s**5
+        start = self.poses[move]
+        sway = self.width * np.sin(2 * np.pi * self.frequency * t)
+        return start + share * (self.poses[move + 1] - start) + sway

@@ -2,28 +2,98 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import Expert, State
-from asm_gym.policies.scripted.geometry import Pose, Vector, gripping, move
+from asm_gym.policies.scripted.base import Expert, Phase, Scene, State
+from asm_gym.policies.scripted.geometry import UP, Vector, gripping, length
 
 REACH, LOWER, WIPE, REST = range(4)
-_OVER = 0.06  # how high above the table the tool comes to the dirt [m]
-_PRESS = 0.2  # where the tool's face stands on the table's own plane and wipes, under about 23 N [action units]
+ACROSS = np.array([0.0, 1.0, 0.0])  # how the tool is held
+OVER = 0.06 * UP  # how high above the table the tool comes to the dirt [m]
+ABOVE = 0.1 * UP  # how high it rests above where the last mark was [m]
+# The tool's face stands on the table's own plane and wipes under about 23 N [action units].
+PRESS = 0.2
+FAR_OFF = 0.15  # so far from a mark the tool goes through the air, not over the table [m]
 
 
-class _Plan(NamedTuple):
+class WipePlan(NamedTuple):
+    """What is decided at the beginning of an episode."""
+
     press: float  # action units
     dirt: Vector  # (N, 3) the marks in the order of the trace, from the end that is nearer [m]
     order: NDArray[np.intp]  # (N,) which of the task's marks they are
 
 
-class _Scene(NamedTuple):
-    hand: Pose
-    dirty: NDArray[np.bool_]  # which of the task's marks are still on the table
+@dataclass(frozen=True)
+class WipeScene(Scene):
+    """What is observed."""
+
+    left: Vector  # (M, 3) the marks still on the table, in the order of the trace [m]
+
+    @property
+    def level(self) -> Vector:
+        """Orientation (3, 3) in which the tool lies flat on the table."""
+        return gripping(self.hand.turned, ACROSS)
+
+    @property
+    def aside(self) -> float:
+        """Horizontal distance of the tool from the first mark that is left [m]."""
+        return length((self.left[0] - self.hand.at)[:2])
+
+    @property
+    def height(self) -> float:
+        """Height of the tool above the first mark that is left [m]."""
+        return float(self.hand.at[2] - self.left[0][2])
+
+    def is_clean(self) -> bool:
+        return not len(self.left)
+
+    def reach(self) -> Vector:
+        return self.move(self.left[0] + OVER + 0.3 * self.state.spread, self.level)
+
+    def is_over_dirt(self) -> bool:
+        return self.aside < 0.03
+
+    def lower(self) -> Vector:
+        return self._follow(-0.06 - 5.0 * self.height)
+
+    def is_down(self) -> bool:
+        return self.height < 0.003
+
+    def is_far_off(self) -> bool:
+        """Return whether the tool was thrown off the trace, or missed something far back."""
+        return self.aside > FAR_OFF
+
+    def wipe(self) -> Vector:
+        # Gently at first: a tool that comes down with all of it hits the table three times as hard as it presses.
+        return self._follow(-self.plan.press * min(1.0, 0.3 + self.state.since / 15))
+
+    def is_lifted_off(self) -> bool:
+        return self.height > 0.02
+
+    def rest(self) -> Vector:
+        return self.move(self.state.anchor + ABOVE + self.state.spread, self.level)
+
+    def _follow(self, down: float) -> Vector:
+        """Return the command (6,) towards the first mark that is left, which leads the tool along the trace.
+
+        ``down`` replaces the vertical part [action units].
+        """
+        target = np.array([*self.left[0][:2], self.hand.at[2]])
+        command = self.move(target, self.level, gain=2.0)
+        command[2] = down
+        return command
+
+    phases: ClassVar = {
+        REACH: Phase(reach, None, {REST: is_clean, LOWER: is_over_dirt}),
+        LOWER: Phase(lower, None, {REST: is_clean, WIPE: is_down, REACH: is_far_off}),
+        WIPE: Phase(wipe, None, {REST: is_clean, REACH: is_far_off, LOWER: is_lifted_off}),
+        REST: Phase(rest, None),
+    }
 
 
 class WipeExpert(Expert):
@@ -32,68 +102,27 @@ class WipeExpert(Expert):
     pace = 1.0
 
     def begin(self, observation: Any) -> State:
-        hand_at = self.read(observation, "hand_position")
-        style, rng = self.style, self.np_random
-        pace = style.pace(self.pace, rng)
-        press = _PRESS * float(np.clip(1 + style.speed_spread * rng.standard_normal(), 0.8, 1.2))
+        speed = 0.5 * self.draw_speed()
+        stronger = 1 + self.style.speed_spread * self.np_random.standard_normal()
+        press = PRESS * float(np.clip(stronger, 0.8, 1.2))
+
+        hand = self.read(observation, "hand_position")
         env = self.robosuite
-        bodies = [
-            env.sim.model.body_name2id(mark.root_body) for mark in env.model.mujoco_arena.markers
-        ]
+        marks = env.model.mujoco_arena.markers
+        bodies = [env.sim.model.body_name2id(mark.root_body) for mark in marks]
         dirt = env.sim.data.body_xpos[bodies].copy()
         order = np.arange(len(dirt))
-        if np.linalg.norm(dirt[-1] - hand_at) < np.linalg.norm(dirt[0] - hand_at):
+        if length(dirt[-1] - hand) < length(dirt[0] - hand):
             order = order[::-1]
-        spread = style.spread * rng.standard_normal(3)
-        return self.start(
-            0.5 * pace, spread, _Plan(press, dirt[order], order), noises=6, anchor=hand_at
-        )
+        plan = WipePlan(press, dirt[order], order)
+        return State(speed, plan, spread=self.draw_offset(), anchor=hand)
 
-    def look(self, observation: Any) -> _Scene:
+    def look(self, observation: Any, state: State) -> WipeScene:
+        marks = self.robosuite.model.mujoco_arena.markers
         wiped = set(self.robosuite.wiped_markers)
-        dirty = np.array([mark not in wiped for mark in self.robosuite.model.mujoco_arena.markers])
-        return _Scene(self.read.hand(observation), dirty)
-
-    def next_phase(self, state: State, scene: _Scene) -> int:
-        phase, left = state.phase, _left(state, scene)
-        if not len(left):
-            return REST
-        far = float(np.linalg.norm((left[0] - scene.hand.at)[:2]))
-        height = float(scene.hand.at[2] - left[0][2])
-        if phase == REACH and far < 0.03:
-            return LOWER
-        if phase == LOWER and height < 0.003:
-            return WIPE
-        # Thrown off the trace, or at its end with something missed far back: through the air, not over the table.
-        if phase in (LOWER, WIPE) and far > 0.15:
-            return REACH
-        if phase == WIPE and height > 0.02:  # lifted off
-            return LOWER
-        return phase
-
-    def command(self, state: State, scene: _Scene) -> Vector:
-        hand, left = scene.hand, _left(state, scene)
-        level = gripping(hand.turned, np.array([0.0, 1.0, 0.0]))
-        if state.phase == REST:
-            return move(
-                hand, state.anchor + np.array([0.0, 0.0, 0.1]) + state.spread, level, state.speed
-            )
-        if state.phase == REACH:
-            return move(
-                hand, left[0] + np.array([0.0, 0.0, _OVER]) + 0.3 * state.spread, level, state.speed
-            )
-        # The nearest mark of the trace that is left leads the tool along it.
-        command = move(
-            hand, np.array([left[0][0], left[0][1], hand.at[2]]), level, state.speed, gain=2.0
+        is_dirty = np.array([mark not in wiped for mark in marks])
+        return WipeScene(
+            state,
+            hand=self.read.hand(observation),
+            left=state.plan.dirt[is_dirty[state.plan.order]],
         )
-        if state.phase == WIPE:
-            # Gently at first: a tool that comes down with all of it hits the table three times as hard as it presses.
-            command[2] = -state.plan.press * min(1.0, 0.3 + state.since / 15)
-        else:
-            command[2] = -0.06 - 5.0 * (hand.at[2] - left[0][2])
-        return command
-
-
-def _left(state: State, scene: _Scene) -> Vector:
-    """Return the marks (M, 3) that are still on the table, in the order of the trace [m]."""
-    return state.plan.dirt[scene.dirty[state.plan.order]]
