@@ -8,7 +8,7 @@ time of day   seconds since midnight, and a day more after each midnight
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -72,6 +72,10 @@ class LogClock:
         """The names of ``units``, such as ``ms``."""
         names = {seconds: name for name, seconds in reversed(LONGER.items())}
         return [names.get(unit, f"{unit:g} s") for unit in self.units]
+
+    def is_in(self, names: Container[str]) -> bool:
+        """Return whether its columns are among those of a table."""
+        return all(column in names for column in self.columns)
 
     def times(self, table: Mapping[str, NDArray[Any]]) -> Times:
         """Return the times of the rows of a table.

@@ -19,9 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.live_clock import LEAP_S, ClockWentBack, LiveClock, Pace
+from asm_gym.data.column_match import ColumnMatch
+from asm_gym.data.live_clock import LONGEST_STEP_S, ClockWentBack, LiveClock, Pace
 from asm_gym.data.names import element_name, is_clock, split_unit
-from asm_gym.data.schema import ColumnMatch, LogSchema
+from asm_gym.data.schema import LogSchema
 from asm_gym.data.tables import Named, is_key, named_columns, named_row
 from asm_gym.data.text import DOUBLED, Dialect, check_cells, flat_row, header_of
 
@@ -193,7 +194,7 @@ class RowReader:
             lost = self._pace.lost(stamp)
         except ClockWentBack as error:
             problem = str(error)
-            if aside is None or not 0 < stamp - aside <= LEAP_S:
+            if aside is None or not 0 < stamp - aside <= LONGEST_STEP_S:
                 self._aside = stamp
                 problem += ": the row is left out (--clock NAME chooses)"
                 return Row(numbers=numbers, read=False, stamp=stamp, problem=problem)

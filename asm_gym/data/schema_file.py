@@ -9,9 +9,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
-from asm_gym.data.clock import KINDS, LogClock
+from asm_gym.data.clock import KINDS, NUMBER, LogClock
+from asm_gym.data.log_column import ROLES, LogColumn
 from asm_gym.data.names import LONGER
-from asm_gym.data.schema import ROLES, LogColumn, LogSchema
+from asm_gym.data.schema import LogSchema
 from asm_gym.files import write_text
 from asm_gym.validation import check_choice, check_number
 
@@ -21,24 +22,29 @@ HEAD = f"""\
 # Further keys of a column: unit, wrap (turn of an angle that turns over), missing (number for
 # missing data), scale (its numbers are multiplied by it), varies = true (logs may differ in range).
 """
+NO_RATE = "# rate = 100.0  # rows a second [Hz]: no clock tells it"
+NO_CLOCK = "# clock = { columns = [...], units = ['s'], kind = 'number' }  # there is none"
 DEFAULTS = LogColumn(name="")
+NOT_IN_COMMENTS = r"[\x00-\x1f\x7f]"
 KEYS = [each.name for each in fields(LogColumn) if each.name not in ("name", "reason")]
 
 
 def write_schema(path: Path, schema: LogSchema) -> None:
     """Write a schema to a file."""
-    clock = "# clock = { columns = [...], units = ['s'], kind = 'number' }  # there is none\n"
+    rate = NO_RATE
+    if schema.rate:
+        rate = f"rate = {schema.rate!r}  # rows a second [Hz]"
+    clock = NO_CLOCK
     if schema.clock is not None:
         table = {
-            "columns": list(schema.clock.columns),
+            "columns": schema.clock.columns,
             "units": schema.clock.unit_names,
             "kind": schema.clock.kind,
         }
-        clock = f"clock = {_inline(table)}  # {schema.clock.reason}\n"
-    rate = f"rate = {schema.rate!r}  # rows a second [Hz]\n"
-    if not schema.rate:
-        rate = "# rate = 100.0  # rows a second [Hz]: no clock tells it\n"
-    write_text(path, "".join([HEAD, rate, clock, "\n[columns]\n", *map(_line, schema.columns)]))
+        clock = f"clock = {_inline(table)}  # {schema.clock.reason}"
+    lines = [HEAD + rate, clock, "", "[columns]"]
+    lines += [_line(column) for column in schema.columns]
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _line(column: LogColumn) -> str:
@@ -46,25 +52,23 @@ def _line(column: LogColumn) -> str:
     table = {"role": column.role}
     for key in KEYS:
         value = getattr(column, key)
-        if value != getattr(DEFAULTS, key) and key != "role":
+        if value != getattr(DEFAULTS, key):
             table[key] = value
     if column.channel == column.name:
         del table["channel"]
-    reason = column.reason or "read as it is"
-    return (
-        f"{json.dumps(column.name, ensure_ascii=False)} = {_inline(table)}  # {_one_line(reason)}\n"
-    )
-
-
-def _one_line(text: str) -> str:
-    """Return text without the characters that a comment may not hold."""
-    return re.sub(r"[\x00-\x1f\x7f]", " ", text)
+    reason = re.sub(NOT_IN_COMMENTS, " ", column.reason or "read as it is")
+    return f"{_json(column.name)} = {_inline(table)}  # {reason}"
 
 
 def _inline(table: dict[str, Any]) -> str:
     """Return an inline table of TOML, whose strings and numbers are those of JSON."""
-    cells = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
+    cells = [f"{key} = {_json(value)}" for key, value in table.items()]
     return f"{{ {', '.join(cells)} }}"
+
+
+def _json(value: Any) -> str:
+    """Return a string, a number or a list of them as JSON, which is TOML too."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def read_schema(path: Path) -> LogSchema:
@@ -101,11 +105,13 @@ class _Parser:
 
     def refuse(self, key: str, problem: object) -> NoReturn:
         """Raise ValueError with the line of a key."""
-        quoted = {key, json.dumps(key, ensure_ascii=False), f"'{key}'"}
+        written = {key, _json(key), f"'{key}'", f"[{key}]"}
+        place = str(self._path)
         for number, line in enumerate(self._lines, 1):
-            if line.partition("=")[0].strip() in quoted or line.strip() == f"[{key}]":
-                raise ValueError(f"{self._path}, line {number}: {key}: {problem}")
-        raise ValueError(f"{self._path}: {key}: {problem}")
+            if line.partition("=")[0].strip() in written:
+                place += f", line {number}"
+                break
+        raise ValueError(f"{place}: {key}: {problem}")
 
     def rate(self, saved: dict[str, Any]) -> float:
         """Return the rate; 0 if the file says none."""
@@ -120,17 +126,16 @@ class _Parser:
         if table is None:
             return None
         try:
-            units = [LONGER[unit] for unit in table["units"]]
-            kind = table.get("kind", KINDS[0])
+            columns = tuple(str(name) for name in table["columns"])
+            units = tuple(LONGER[unit] for unit in table["units"])
+            kind = table.get("kind", NUMBER)
             check_choice("kind", kind, KINDS)
-            columns = tuple(map(str, table["columns"]))
         except (KeyError, TypeError, ValueError) as error:
-            self.refuse(
-                "clock", f"needs columns, units of {', '.join(LONGER)}, and a kind: {error}"
-            )
+            known = ", ".join(LONGER)
+            self.refuse("clock", f"needs columns, units of {known}, and a kind: {error}")
         if len(columns) != len(units):
             self.refuse("clock", f"{len(columns)} columns need as many units, got {len(units)}")
-        return LogClock(columns, tuple(units), kind, "by the schema")
+        return LogClock(columns, units, kind, "by the schema")
 
     def column(self, name: str, table: Any) -> LogColumn:
         """Return a column."""
