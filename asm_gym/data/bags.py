@@ -76,9 +76,10 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = MENDS.get(path.suffix)
-        hint = f"; where its recorder was killed, {mend} mends it" if mend else ""
-        raise ValueError(f"it is damaged: {error}{hint}") from error
+        message = f"it is damaged: {error}"
+        if path.suffix in MENDS:
+            message += f"; where its recorder was killed, {MENDS[path.suffix]} mends it"
+        raise ValueError(message) from error
 
 
 def _columns(bag: Any) -> Columns:

@@ -85,14 +85,14 @@ class LogClock:
         """
         first = self.columns[0]
         if self.kind == DATE:
-            return _since_first(_nanoseconds(first, table[first]), 1e-9)
+            return _since_first(_nanoseconds(first, table[first]), 1e-9, -math.inf)
         if self.kind == TIME_OF_DAY:
             return Times(0.0, _seconds_of_day(table[first]))
 
         parts = []
         for column, unit in zip(self.columns, self.units, strict=True):
             numbers = numbers_of(column, table[column])
-            parts.append(_times_of_numbers(numbers, unit))
+            parts.append(_since_first(numbers, unit, SINCE_1970))
         origin = sum(part.origin for part in parts)
         return Times(origin, np.sum([part.seconds for part in parts], axis=0))
 
@@ -181,19 +181,17 @@ def _refuse_words(column: str, text: Any, numbers: Any) -> None:
         )
 
 
-def _times_of_numbers(numbers: NDArray[Any], unit: float) -> Times:
-    """Return the times of numbers of a unit [s]; those since 1970 have an origin."""
-    known = numbers[np.isfinite(numbers)]
-    if len(known) and float(known[0]) * unit >= SINCE_1970:
-        return _since_first(numbers, unit)
-    return Times(0.0, numbers * unit)
+def _since_first(numbers: NDArray[Any], unit: float, least: float) -> Times:
+    """Return times since the first number: numbers since 1970 have more digits than a float.
 
-
-def _since_first(numbers: NDArray[Any], unit: float) -> Times:
-    """Return times since the first number: numbers since 1970 have more digits than a float."""
+    Args:
+        numbers: (T,).
+        unit: seconds in one.
+        least: first time from which on it is the origin [s]; that of others is 0.
+    """
     known = numbers[np.isfinite(numbers)]
-    if not len(known):
-        return Times(0.0, np.asarray(numbers, np.float64))
+    if not len(known) or float(known[0]) * unit < least:
+        return Times(0.0, numbers * unit)
     first = known[0]
     if numbers.dtype.kind in "biu":
         numbers = numbers.astype(np.int64)

@@ -132,8 +132,7 @@ def missing_value_sentinel(values: NDArray[Any]) -> float:
     numbers = finite(values)
     if not len(numbers):
         return math.nan
-    ends = [float(numbers.min()), float(numbers.max())]
-    for sentinel in ends:
+    for sentinel in (numbers.min(), numbers.max()):
         others = numbers[numbers != sentinel]
         count = len(numbers) - len(others)
         if not 2 <= count <= MOST_SENTINELS * len(values):
@@ -143,7 +142,7 @@ def missing_value_sentinel(values: NDArray[Any]) -> float:
         if spread == 0 or distance <= SENTINEL_APART * spread:
             continue
         if abs(sentinel) >= LEAST_SENTINEL or _stands_alone(values == sentinel):
-            return sentinel
+            return float(sentinel)
     return math.nan
 
 

@@ -101,7 +101,11 @@ def classify_columns(
     """
     columns = _named_columns(tables[0])
     named_as_read = (*hints.channels, *hints.action)
-    _check_patterns(named_as_read, columns, clock)
+    own_stamps: Sequence[str] = ()  # columns of the clock
+    if clock is not None:
+        own_stamps = clock.columns
+    others = [column for header, column in columns.items() if header not in own_stamps]
+    _check_patterns(named_as_read, others)
 
     stamps: set[str] = set()  # columns that are called clocks
     if not hints.channels:
@@ -133,16 +137,11 @@ def _numbers_by_header(tables: Sequence[Columns]) -> dict[str, list[NDArray[Any]
     return numbers
 
 
-def _check_patterns(
-    patterns: Iterable[str], columns: dict[str, LogColumn], clock: LogClock | None
-) -> None:
-    """Raise ValueError if a pattern names no column but the clock."""
-    candidates = list(columns.values())
-    if clock is not None:
-        candidates = [column for header, column in columns.items() if header not in clock.columns]
+def _check_patterns(patterns: Iterable[str], columns: Sequence[LogColumn]) -> None:
+    """Raise ValueError if a pattern names no column."""
     for pattern in patterns:
-        if not any(column.matches([pattern]) for column in candidates):
-            names = ", ".join(column.name for column in candidates) or "none"
+        if not any(column.matches([pattern]) for column in columns):
+            names = ", ".join(column.name for column in columns) or "none"
             raise ValueError(
                 f"no column of these channels is called {pattern!r}; there are: {names}"
             )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_column import LogColumn
+from asm_gym.data.reader_notes import listed
 from asm_gym.data.schema import LOG_SCHEMA, LogSchema
 
 Floats = NDArray[np.float64]
@@ -26,7 +27,6 @@ KNOWN_FACTORS = {
     "degrees beside radians": 180 / np.pi,
     "units beside thousandths": 1000.0,
 }
-SHOWN_LOGS = 6  # that a message names
 
 
 class _OtherScale(NamedTuple):
@@ -61,8 +61,7 @@ def _refuse_copies(episodes: Sequence[Episode], names: Sequence[str]) -> None:
     """Raise ValueError if two logs hold the same rows."""
     first_with: dict[bytes, str] = {}
     for episode, name in zip(episodes, names, strict=True):
-        rows = episode.stream.tobytes()
-        original = first_with.setdefault(rows, name)
+        original = first_with.setdefault(episode.stream.tobytes(), name)
         if original != name:
             raise ValueError(
                 f"{name} is a copy of {original}: a threshold from rows that were learned from "
@@ -78,12 +77,9 @@ def _refuse_other_scales(episodes: Sequence[Episode], names: Sequence[str]) -> N
         return
     column = unlike[0].column.name
     differences = ", ".join(str(other) for other in unlike)
-    logs = [names[k] for k in unlike[0].logs]
-    shown = ", ".join(logs[:SHOWN_LOGS])
-    if len(logs) > SHOWN_LOGS:
-        shown += f" and {len(logs) - SHOWN_LOGS} others"
+    logs = listed([names[k] for k in unlike[0].logs])
     raise ValueError(
-        f"columns without a unit differ in scale between logs: {differences}, in {shown}. "
+        f"columns without a unit differ in scale between logs: {differences}, in {logs}. "
         f"Say the units in their headers, such as '{column} [deg]', or leave these logs out; "
         f"if they are right, write varies = true in the line of {column} of a schema "
         "(asm-gym inspect --schema FILE)"

@@ -135,8 +135,9 @@ class LogSchema:
             if count > 1:
                 raise ValueError(f"columns must have different names, got {name!r} twice")
         if not names:
-            reasons = "; ".join(f"{column.name} {column.reason}" for column in self.columns)[:300]
-            raise ValueError(f"a log must hold columns of numbers, got {reasons or 'nothing'}")
+            reasons = "; ".join(f"{column.name} {column.reason}" for column in self.columns)
+            got = reasons[:300] or "nothing"
+            raise ValueError(f"a log must hold columns of numbers, got {got}")
         if not self.rate:
             raise ValueError(NO_RATE)
 
@@ -228,16 +229,13 @@ class LogSchema:
             ValueError: it is something else.
         """
         try:
-            clock = saved["clock"]
-            if clock is not None:
-                clock = LogClock(
-                    columns=tuple(clock["columns"]),
-                    units=tuple(clock["units"]),
-                    kind=clock["kind"],
-                    reason=clock["reason"],
-                )
             columns = tuple(LogColumn(**column) for column in saved["columns"])
-            return cls(columns, float(saved["rate"]), clock)
+            schema = cls(columns, float(saved["rate"]))
+            clock = saved["clock"]
+            if clock is None:
+                return schema
+            lists = {key: tuple(clock[key]) for key in ("columns", "units")}
+            return replace(schema, clock=LogClock(**clock | lists))
         except (KeyError, TypeError) as error:
             raise ValueError(f"the schema of the logs is damaged: {error!r}") from error
 

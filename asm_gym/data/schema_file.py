@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from asm_gym.data.clock import KINDS, NUMBER, LogClock
 from asm_gym.data.log_column import ROLES, LogColumn
@@ -83,12 +85,22 @@ def read_schema(path: Path) -> LogSchema:
         saved = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path} is no schema: {error}") from error
-    parser = _Parser(path, text)
-    unknown = set(saved) - {"rate", "clock", "columns"}
-    if unknown:
-        parser.refuse(min(unknown), "unknown key; known: rate, clock, columns")
-    columns = tuple(parser.column(name, table) for name, table in saved.get("columns", {}).items())
-    schema = LogSchema(columns, parser.rate(saved), parser.clock(saved))
+    clock = None
+    rate = 0.0
+    columns = []
+    lines = _Lines(path, text)
+    for key, value in saved.items():
+        with lines.named(key):
+            if key == "rate":
+                rate = float(check_number("rate", value, low=0.0))
+            elif key == "clock":
+                clock = _clock(value)
+            elif key != "columns":
+                raise ValueError("unknown key; known: rate, clock, columns")
+    for name, table in saved.get("columns", {}).items():
+        with lines.named(name):
+            columns.append(_column(name, table))
+    schema = LogSchema(tuple(columns), rate, clock)
     try:
         schema.check()
     except ValueError as error:
@@ -96,52 +108,45 @@ def read_schema(path: Path) -> LogSchema:
     return schema
 
 
-class _Parser:
-    """Check the values of a schema's file, and name the line of one that is wrong."""
+class _Lines:
+    """The lines of a schema's file, which name what is wrong."""
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
         self._lines = text.splitlines()
 
-    def refuse(self, key: str, problem: object) -> NoReturn:
-        """Raise ValueError with the line of a key."""
-        written = {key, _json(key), f"'{key}'", f"[{key}]"}
-        place = str(self._path)
-        for number, line in enumerate(self._lines, 1):
-            if line.partition("=")[0].strip() in written:
-                place += f", line {number}"
-                break
-        raise ValueError(f"{place}: {key}: {problem}")
-
-    def rate(self, saved: dict[str, Any]) -> float:
-        """Return the rate; 0 if the file says none."""
+    @contextmanager
+    def named(self, key: str) -> Iterator[None]:
+        """Raise a ValueError of the block with the line of a key."""
         try:
-            return float(check_number("rate", saved.get("rate", 0.0), low=0.0))
-        except (TypeError, ValueError) as error:
-            self.refuse("rate", error)
-
-    def clock(self, saved: dict[str, Any]) -> LogClock | None:
-        """Return the clock; None if the file says none."""
-        table = saved.get("clock")
-        if table is None:
-            return None
-        try:
-            columns = tuple(str(name) for name in table["columns"])
-            units = tuple(LONGER[unit] for unit in table["units"])
-            kind = table.get("kind", NUMBER)
-            check_choice("kind", kind, KINDS)
+            yield
         except (KeyError, TypeError, ValueError) as error:
-            known = ", ".join(LONGER)
-            self.refuse("clock", f"needs columns, units of {known}, and a kind: {error}")
-        if len(columns) != len(units):
-            self.refuse("clock", f"{len(columns)} columns need as many units, got {len(units)}")
-        return LogClock(columns, units, kind, "by the schema")
+            place = str(self._path)
+            written = {key, _json(key), f"'{key}'", f"[{key}]"}
+            for number, line in enumerate(self._lines, 1):
+                if line.partition("=")[0].strip() in written:
+                    place += f", line {number}"
+                    break
+            raise ValueError(f"{place}: {key}: {error}") from error
 
-    def column(self, name: str, table: Any) -> LogColumn:
-        """Return a column."""
-        if not isinstance(table, dict) or set(table) - set(KEYS):
-            self.refuse(name, f"must be a table of {', '.join(KEYS)}, got {table!r}")
-        try:
-            return LogColumn(name=name, reason="by the schema", **{"channel": name, **table})
-        except (TypeError, ValueError) as error:
-            self.refuse(name, error)
+
+def _clock(table: Any) -> LogClock:
+    """Return the clock of an inline table."""
+    try:
+        columns = tuple(str(name) for name in table["columns"])
+        units = tuple(LONGER[unit] for unit in table["units"])
+        kind = table.get("kind", NUMBER)
+        check_choice("kind", kind, KINDS)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        known = ", ".join(LONGER)
+        raise ValueError(f"needs columns, units of {known}, and a kind: {error}") from error
+    if len(columns) != len(units):
+        raise ValueError(f"{len(columns)} columns need as many units, got {len(units)}")
+    return LogClock(columns, units, kind, "by the schema")
+
+
+def _column(name: str, table: Any) -> LogColumn:
+    """Return a column of an inline table."""
+    if not isinstance(table, dict) or set(table) - set(KEYS):
+        raise ValueError(f"must be a table of {', '.join(KEYS)}, got {table!r}")
+    return LogColumn(name=name, reason="by the schema", **{"channel": name, **table})

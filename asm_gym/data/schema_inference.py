@@ -26,7 +26,7 @@ from asm_gym.data.column_roles import (
     classify_columns,
 )
 from asm_gym.data.log_column import CLOCK, IGNORED, LABEL, LogColumn
-from asm_gym.data.reader_notes import note
+from asm_gym.data.reader_notes import listed, note
 from asm_gym.data.schema import RATE_TOLERANCE, LogSchema, can_resample
 from asm_gym.data.tables import Columns
 from asm_gym.data.timing import recordings, timing_of
@@ -34,7 +34,6 @@ from asm_gym.readings import noise_of
 from asm_gym.validation import check_number
 
 SLOWEST_HZ = 1e-6  # the least rate of a log [Hz]: a row in eleven days
-SHOWN = 6  # columns that a note names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,10 +157,7 @@ def note_columns(schema: LogSchema) -> None:
         elif column.role != CLOCK and column.reason not in (BY_IGNORE, NOT_CHOSEN):
             left_out.setdefault(column.reason, []).append(column.name)
     for reason, names in left_out.items():
-        shown = ", ".join(names[:SHOWN])
-        if len(names) > SHOWN:
-            shown += f" and {len(names) - SHOWN} others"
-        note(f"left out: {shown}: {reason}")
+        note(f"left out: {listed(names)}: {reason}")
 
 
 def _with_noise(schema: LogSchema, tables: Sequence[Columns]) -> LogSchema:

@@ -67,7 +67,7 @@ def _unmarked_parts(episode: Episode) -> list[Episode]:
 
 def complete_parts(episode: Episode) -> list[Episode]:
     """Return the parts of an episode between lost numbers, but for those under half a second."""
-    is_complete = np.isfinite(episode.stream).all(axis=1)
+    is_complete = np.asarray(np.isfinite(episode.stream).all(axis=1))
     if is_complete.all():
         return [episode]
     return _parts(episode, is_complete)
