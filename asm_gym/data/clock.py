@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.names import LONGER
+from asm_gym.data.tables import is_numeric
 
 Floats = NDArray[np.float64]
 
@@ -132,10 +133,9 @@ def numbers_of(column: str, values: NDArray[Any]) -> NDArray[Any]:
     import pandas as pd
 
     if values.ndim != 1 or not len(values):
-        raise ValueError(
-            f"the clock {column!r} must hold a number a row, got the shape {values.shape}"
-        )
-    if values.dtype.kind in "biuf":
+        shape = values.shape
+        raise ValueError(f"the clock {column!r} must hold a number a row, got the shape {shape}")
+    if is_numeric(values):
         return values
     text = _text(values)
     numbers = pd.to_numeric(text, errors="coerce")
@@ -153,7 +153,7 @@ def kind_of(column: str, values: NDArray[Any]) -> str:
 
     if values.dtype.kind == "M":
         return DATE
-    if values.dtype.kind in "biuf":
+    if is_numeric(values):
         return NUMBER
     text = _text(values)
     if (pd.to_numeric(text, errors="coerce").notna() | text.isna()).all():

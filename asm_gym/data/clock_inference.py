@@ -20,6 +20,7 @@ from asm_gym.data.clock import DATE, DAY_S, NUMBER, LogClock, kind_of, numbers_o
 from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.names import CLOCK, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
+from asm_gym.data.tables import is_numeric
 
 Floats = NDArray[np.float64]
 Table = Mapping[str, NDArray[Any]]
@@ -27,11 +28,11 @@ Table = Mapping[str, NDArray[Any]]
 MOST_REPEATED = 0.02  # share of rows that may have the stamp of the row before: written twice
 DISAGREE = 0.01  # share by which two clocks may differ before the user is told
 ALIKE = 0.2  # share by which a clock may differ from the memory that tells its unit
-SLOWEST_HZ = 1.0  # plausible rates of rows, which tell a unit,
-FASTEST_HZ = 1000.0  # from this to that
+SHORTEST_S = 1e-3  # plausible times from row to row, which tell a unit,
+LONGEST_S = 1.0  # from this to that [s]
 LEAST_DATE = 3e4  # Excel and MATLAB count days, from 1982 on so many
 LEAST_STAMP = 1e14  # microseconds since 1970, in March 1973: few other numbers are as large
-LONGEST_STEP_OF_DATES = 1 / (DAY_S * SLOWEST_HZ)  # from row to row [days]
+RISES = "rises from row to row"
 UNNAMED_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 _FRACTION = re.compile(
@@ -198,8 +199,9 @@ def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
     if step <= 0:
         return 1.0
 
-    name, unit = plausible_unit(step, dt, are_whole(known))
-    if known[0] > LEAST_DATE and step < LONGEST_STEP_OF_DATES:
+    name = plausible_unit(step, dt, are_whole(known))
+    unit = UNNAMED_UNITS[name]
+    if known[0] > LEAST_DATE and step * DAY_S < LONGEST_S:
         name = "days"
         unit = DAY_S
     if unit != 1.0:
@@ -211,22 +213,23 @@ def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
     return unit
 
 
-def plausible_unit(step: float, dt: float | None, is_whole: bool) -> tuple[str, float]:
-    """Return the name of the likeliest unit in which a clock counts, and the seconds in one.
+def plausible_unit(step: float, dt: float | None, is_whole: bool) -> str:
+    """Return the likeliest of ``UNNAMED_UNITS`` in which a clock counts.
 
     Args:
         step: by how much it goes on from row to row.
         dt: period of the memory that reads it; None without one [s].
         is_whole: all its numbers are whole.
     """
-    units = list(UNNAMED_UNITS.items())
+    shortest = SHORTEST_S
+    longest = LONGEST_S
     if dt is not None:
-        plausible = [each for each in units if abs(step * each[1] / dt - 1) < ALIKE]
-    else:
-        plausible = [each for each in units if SLOWEST_HZ <= 1 / (step * each[1]) <= FASTEST_HZ]
-        if is_whole:
-            plausible.reverse()  # 0, 1, 2, … is a controller's count of ms, and no log of seconds
-    return (plausible or units)[0]
+        shortest = dt * (1 - ALIKE)
+        longest = dt * (1 + ALIKE)
+    plausible = [name for name, unit in UNNAMED_UNITS.items() if shortest <= step * unit <= longest]
+    if dt is None and is_whole:
+        plausible.reverse()  # 0, 1, 2, … is a controller's count of ms, and no log of seconds
+    return next(iter(plausible), "s")
 
 
 def _candidate(named: NamedClock, table: Table, dt: float | None) -> _Candidate:
@@ -272,22 +275,20 @@ def _rising(table: Table, coarse: list[LogClock]) -> LogClock | None:
     """Return a column that is not called a clock and is one: it rises, and its unit is known."""
     stamps = {column for clock in coarse for column in clock.columns}
     for name, values in table.items():
-        kind = NUMBER
-        unit = None
-        if values.dtype.kind not in "biuf":
-            kind = DATE
-            if _is_index_of_dates(name, values):
-                unit = 1.0
-        elif _rises(values):
+        if name in stamps:
+            continue
+        if _is_index_of_dates(name, values):
+            return LogClock((name,), kind=DATE, reason=RISES)
+        if _rises(values):
             unit = _unit_of_rising(name, values)
-        if unit is not None and name not in stamps:
-            return LogClock((name,), (unit,), kind, "rises from row to row")
+            if unit is not None:
+                return LogClock((name,), (unit,), reason=RISES)
     return None
 
 
 def _is_index_of_dates(name: str, values: NDArray[Any]) -> bool:
     """Return whether a column is called as an index is, and holds dates that rise."""
-    if not _is_index(name) or not len(values):
+    if is_numeric(values) or not _is_index(name) or not len(values):
         return False
     with suppress(ValueError):
         dates = LogClock((name,), kind=kind_of(name, values))
@@ -303,7 +304,7 @@ def _is_index(name: str) -> bool:
 
 def _rises(values: NDArray[Any]) -> bool:
     """Return whether numbers (T,) rise in nearly all rows."""
-    if values.ndim != 1 or len(values) < 3 or not np.isfinite(values).all():
+    if not is_numeric(values) or len(values) < 3 or not np.isfinite(values).all():
         return False
     return bool(np.mean(np.diff(values) > 0) > 1 - MOST_REPEATED)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -94,23 +94,21 @@ def inspect_log(name: str, table: Columns, schema: LogSchema, trouble: str = "")
     """
     columns = {header: _column_of(header, schema) for header in table}
     rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
+    unread = Inspection(name=name, table=table, columns=columns, times=rows)
     try:
         if trouble:
             raise ValueError(trouble)
         schema.read(table)
         clock = schema.clock_in(table)
     except ValueError as error:
-        return Inspection(name=name, table=table, columns=columns, times=rows, trouble=str(error))
+        return replace(unread, trouble=str(error))
     if clock is None:
-        times = rows / schema.rate
-        return Inspection(name=name, table=table, columns=columns, times=times, rate=schema.rate)
+        return replace(unread, times=rows / schema.rate, rate=schema.rate)
 
     timing = timing_of(table, clock)
     dt = timing.dt or 1.0 / schema.rate
-    return Inspection(
-        name=name,
-        table=table,
-        columns=columns,
+    return replace(
+        unread,
         times=clock.times(table).seconds,
         rate=1 / dt,
         clock=clock.name,

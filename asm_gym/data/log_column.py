@@ -63,9 +63,8 @@ class LogColumn:
             text = getattr(self, what)
             if not isinstance(text, str):
                 raise ValueError(f"{what} of {self.name!r} must be text, got {text!r}")
-        check_number(f"scale of {self.name!r}", self.scale)
-        check_number(f"wrap of {self.name!r}", self.wrap, low=0.0)
-        check_number(f"noise of {self.name!r}", self.noise, low=0.0)
+        for what, low in (("scale", None), ("wrap", 0.0), ("noise", 0.0)):
+            check_number(f"{what} of {self.name!r}", getattr(self, what), low=low)
 
     @property
     def is_read(self) -> bool:

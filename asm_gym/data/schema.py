@@ -36,6 +36,8 @@ NO_RATE = (
     "how many rows come a second? Say the rate [Hz] (--rate), or name or add a column of times "
     "(--clock)"
 )
+TURN_UNITS = {TAU: "rad", 360.0: "deg"}
+"""The unit of an angle by its turn."""
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
 
 
@@ -260,9 +262,7 @@ def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
     if group == MOTOR:
         noise = 0.0
     if first.wrap:
-        unit = "deg"
-        if first.wrap == TAU:
-            unit = "rad"
+        unit = TURN_UNITS.get(first.wrap, "deg")
         return Channel(name, 2, unit, noise, group, TURNED)
 
     elements = tuple(column.element for column in columns)
