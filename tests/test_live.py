@@ -18,7 +18,8 @@ from asm_gym.data import live
 from asm_gym.data.live import SourceDied, live_source, record
 from asm_gym.data.live_clock import NEWEST, Pace
 from asm_gym.data.logs import read_logs
-from asm_gym.data.rows import Publishers, RowReader
+from asm_gym.data.publishers import Publishers
+from asm_gym.data.rows import RowReader
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason

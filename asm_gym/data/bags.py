@@ -77,9 +77,10 @@ def read_bag(path: Path) -> Columns:
     except (ValueError, ImportError):
         raise
     except Exception as error:  # rosbags, SQLite, struct: whichever meets the damage first
-        mend = MENDS.get(path.suffix)
-        hint = f"; where its recorder was killed, {mend} mends it" if mend else ""
-        raise DamagedFile("it", f"{error}{hint}") from error
+        problem = str(error)
+        if path.suffix in MENDS:
+            problem += f"; where its recorder was killed, {MENDS[path.suffix]} mends it"
+        raise DamagedFile("it", problem) from error
 
 
 def _columns(bag: Any) -> Columns:

@@ -7,7 +7,8 @@ time of day   seconds since midnight, and a day more after each midnight
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Container, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.names import LONGER
+from asm_gym.data.tables import is_numeric
 
 Floats = NDArray[np.float64]
 
@@ -26,17 +28,22 @@ TIME_OF_DAY = "time of day"
 KINDS = (NUMBER, DATE, TIME_OF_DAY)
 
 SINCE_1970 = 1e8  # a number of seconds from which on it counts from 1970: March 1973
+UNITS_SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (SINCE_1970, 1.0))
+"""The unit [s] of a number since 1970, by the least such number."""
 LATEST_DATE = 1e11  # stamps up to the year 5138 are dates [s]
 DAY_S = 86400.0
+
+# Orders in which pandas reads a date.
+ISO = {"format": "ISO8601"}
+DAY_FIRST = {"format": "mixed", "dayfirst": True}
+MONTH_FIRST = {"format": "mixed", "dayfirst": False}
 _TIME_OF_DAY = r"\d{1,2}:\d\d:\d\d([.,]\d+)?"
 
 
 class Times(NamedTuple):
     """When the rows of a log were sensed."""
 
-    origin: (
-        float  # what is to be added: the first stamp of a clock that counts from 1970, else 0 [s]
-    )
+    origin: float  # to be added: the first stamp of a clock that counts from 1970, else 0 [s]
     seconds: Floats  # (T,) [s]
 
 
@@ -67,24 +74,26 @@ class LogClock:
         names = {seconds: name for name, seconds in reversed(LONGER.items())}
         return [names.get(unit, f"{unit:g} s") for unit in self.units]
 
+    def is_in(self, names: Container[str]) -> bool:
+        """Return whether its columns are among those of a table."""
+        return all(column in names for column in self.columns)
+
     def times(self, table: Mapping[str, NDArray[Any]]) -> Times:
         """Return the times of the rows of a table.
 
         Raises:
             ValueError: a cell is no time.
         """
+        first = self.columns[0]
         if self.kind == DATE:
-            return _since_first(_nanoseconds(self.columns[0], table[self.columns[0]]), 1e-9)
+            return _since_first(_nanoseconds(first, table[first]), 1e-9, -math.inf)
         if self.kind == TIME_OF_DAY:
-            return Times(0.0, _seconds_of_day(table[self.columns[0]]))
+            return Times(0.0, _seconds_of_day(table[first]))
 
         parts = []
         for column, unit in zip(self.columns, self.units, strict=True):
             numbers = numbers_of(column, table[column])
-            part = Times(0.0, numbers * unit)
-            if _first(numbers) * unit >= SINCE_1970:
-                part = _since_first(numbers, unit)
-            parts.append(part)
+            parts.append(_since_first(numbers, unit, SINCE_1970))
         origin = sum(part.origin for part in parts)
         return Times(origin, np.sum([part.seconds for part in parts], axis=0))
 
@@ -94,13 +103,25 @@ class LogClock:
         Raises:
             ValueError: a cell is no time.
         """
-        cells: list[Any] = [row.get(column) for column in self.columns]
-        if any(cell is None for cell in cells):
-            return None
-        if self.kind != NUMBER:
-            return _moment(self.kind, self.columns[0], str(cells[0]).strip())
-        parts = [float("nan" if cell == "" else cell) for cell in cells]
-        return sum(part * unit for part, unit in zip(parts, self.units, strict=True))
+        seconds = 0.0
+        for column, unit in zip(self.columns, self.units, strict=True):
+            cell = row.get(column)
+            if cell is None:
+                return None
+            if self.kind != NUMBER:
+                return self._moment_of_text(str(cell).strip())
+            if cell == "":
+                cell = math.nan
+            seconds += float(cell) * unit
+        return seconds
+
+    def _moment_of_text(self, cell: str) -> float:
+        """Return the time of a date or of a time of day [s]."""
+        with suppress(ValueError):
+            date = datetime.fromisoformat(cell)
+            return date.replace(tzinfo=date.tzinfo or UTC).timestamp()
+        times = self.times({self.columns[0]: np.array([cell], object)})
+        return times.origin + float(times.seconds[0])
 
 
 def numbers_of(column: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -112,10 +133,9 @@ def numbers_of(column: str, values: NDArray[Any]) -> NDArray[Any]:
     import pandas as pd
 
     if values.ndim != 1 or not len(values):
-        raise ValueError(
-            f"the clock {column!r} must hold a number a row, got the shape {values.shape}"
-        )
-    if values.dtype.kind in "biuf":
+        shape = values.shape
+        raise ValueError(f"the clock {column!r} must hold a number a row, got the shape {shape}")
+    if is_numeric(values):
         return values
     text = _text(values)
     numbers = pd.to_numeric(text, errors="coerce")
@@ -133,7 +153,7 @@ def kind_of(column: str, values: NDArray[Any]) -> str:
 
     if values.dtype.kind == "M":
         return DATE
-    if values.dtype.kind in "biuf":
+    if is_numeric(values):
         return NUMBER
     text = _text(values)
     if (pd.to_numeric(text, errors="coerce").notna() | text.isna()).all():
@@ -161,19 +181,17 @@ def _refuse_words(column: str, text: Any, numbers: Any) -> None:
         )
 
 
-def _first(numbers: NDArray[Any]) -> float:
-    """Return the first finite number, 0 if there is none."""
-    known = numbers[np.isfinite(numbers)]
-    if len(known):
-        return float(known[0])
-    return 0.0
+def _since_first(numbers: NDArray[Any], unit: float, least: float) -> Times:
+    """Return times since the first number: numbers since 1970 have more digits than a float.
 
-
-def _since_first(numbers: NDArray[Any], unit: float) -> Times:
-    """Return times since the first number: numbers since 1970 have more digits than a float."""
+    Args:
+        numbers: (T,).
+        unit: seconds in one.
+        least: first time from which on it is the origin [s]; that of others is 0.
+    """
     known = numbers[np.isfinite(numbers)]
-    if not len(known):
-        return Times(0.0, np.asarray(numbers, np.float64))
+    if not len(known) or float(known[0]) * unit < least:
+        return Times(0.0, numbers * unit)
     first = known[0]
     if numbers.dtype.kind in "biu":
         numbers = numbers.astype(np.int64)
@@ -205,12 +223,10 @@ def _nanoseconds(column: str, values: NDArray[Any]) -> NDArray[Any]:
         return values.astype("M8[ns]").astype(np.int64)
     text = _text(values)
     ends = text.dropna().iloc[[0, -1]]
-    orders: list[dict[str, Any]] = [
-        {"format": "mixed", "dayfirst": first} for first in (True, False)
-    ]
+    orders: list[dict[str, Any]] = [DAY_FIRST, MONTH_FIRST]
     if len(text) > 1:
         orders.sort(key=lambda order: _span(ends, order))
-    for order in ({"format": "ISO8601"}, *orders):
+    for order in (ISO, *orders):
         with suppress(ValueError, TypeError):
             dates = pd.to_datetime(text, utc=True, **order).dt.as_unit("ns")
             since = dates.astype(np.int64)
@@ -232,19 +248,9 @@ def _span(ends: Any, order: dict[str, Any]) -> float:
     return np.inf
 
 
-def _moment(kind: str, column: str, cell: str) -> float:
-    """Return the time of one cell, a date or a time of day [s]."""
-    if kind == TIME_OF_DAY:
-        return float(_seconds_of_day(np.array([cell], object))[0])
-    with suppress(ValueError):
-        date = datetime.fromisoformat(cell)
-        return date.replace(tzinfo=date.tzinfo or UTC).timestamp()
-    return 1e-9 * float(_nanoseconds(column, np.array([cell], object))[0])
-
-
 def unit_by_size(number: float) -> float | None:
     """Return the seconds in one number since 1970, by its size; None if it counts from elsewhere."""
-    for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (SINCE_1970, 1.0)):
+    for least, unit in UNITS_SINCE_1970:
         if number >= least:
             return unit
     return None

@@ -9,15 +9,18 @@ unit       by the name, by the size of numbers since 1970, else by the rate of r
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.clock import DATE, DAY_S, NUMBER, LogClock, kind_of, numbers_of, unit_by_size
+from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.names import CLOCK, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
+from asm_gym.data.tables import is_numeric
 
 Floats = NDArray[np.float64]
 Table = Mapping[str, NDArray[Any]]
@@ -25,8 +28,11 @@ Table = Mapping[str, NDArray[Any]]
 MOST_REPEATED = 0.02  # share of rows that may have the stamp of the row before: written twice
 DISAGREE = 0.01  # share by which two clocks may differ before the user is told
 ALIKE = 0.2  # share by which a clock may differ from the memory that tells its unit
-SLOWEST_HZ, FASTEST_HZ = 1.0, 1000.0  # plausible rates of rows, which tell a unit
+SHORTEST_S = 1e-3  # plausible times from row to row, which tell a unit,
+LONGEST_S = 1.0  # from this to that [s]
 LEAST_DATE = 3e4  # Excel and MATLAB count days, from 1982 on so many
+LEAST_STAMP = 1e14  # microseconds since 1970, in March 1973: few other numbers are as large
+RISES = "rises from row to row"
 UNNAMED_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 _FRACTION = re.compile(
@@ -42,21 +48,32 @@ class NamedClock(NamedTuple):
     units: tuple[float | None, ...] = (None,)
 
 
+class _Candidate(NamedTuple):
+    """A clock that a table may have, and how evenly it goes on."""
+
+    clock: LogClock
+    times: Floats  # (T,) [s]
+    repeated: float = 1.0  # share of rows with the stamp of the row before
+    jitter: float = 1.0  # median difference of a step from the median, as a share of that
+
+
 def clocks_among(names: Iterable[str]) -> list[NamedClock]:
     """Return the clocks among columns by their names; seconds and a fraction of them are one."""
     names = list(names)
     pairs = _pairs(names)
     fractions = {pair.columns[1] for pair in pairs.values()}
-    clocks = []
-    for name in names:
-        if name in pairs:
-            clocks.append(pairs[name])
-        elif is_clock(name) and name not in fractions:
-            clocks.append(NamedClock((name,), (unit_by_name(name),)))
-    return clocks
+    single = {name for name in names if is_clock(name)} - fractions
+    return [_clock_of(name, pairs) for name in names if name in single.union(pairs)]
 
 
-def _pairs(names: list[str]) -> dict[str, NamedClock]:
+def _clock_of(name: str, pairs: Mapping[str, NamedClock]) -> NamedClock:
+    """Return the pair that a column begins, or the clock that it is alone."""
+    if name in pairs:
+        return pairs[name]
+    return NamedClock((name,), (unit_by_name(name),))
+
+
+def _pairs(names: Sequence[str]) -> dict[str, NamedClock]:
     """Return the pairs of seconds and a fraction, by the column of seconds."""
     by_lower_name = {name.lower(): name for name in reversed(names)}
     pairs: dict[str, NamedClock] = {}
@@ -64,12 +81,15 @@ def _pairs(names: list[str]) -> dict[str, NamedClock]:
         match = _FRACTION.fullmatch(name)
         if match is None:
             continue
-        start, end = match.span("unit")
-        unit = 1e-9 if match["unit"].lower().startswith("n") else 1e-6
+        unit = 1e-6
+        if match["unit"].lower().startswith("n"):
+            unit = 1e-9
+        before = name[: match.start("unit")]
+        behind = name[match.end("unit") :]
         for word in _SECONDS:
-            seconds = by_lower_name.get(f"{name[:start]}{word}{name[end:]}".lower())
-            if seconds is not None and seconds != name and seconds not in pairs:
-                pairs[seconds] = NamedClock((seconds, name), (1.0, unit))
+            seconds = by_lower_name.get(f"{before}{word}{behind}".lower(), name)
+            if seconds != name:
+                pairs.setdefault(seconds, NamedClock((seconds, name), (1.0, unit)))
     return pairs
 
 
@@ -80,8 +100,9 @@ def unit_by_name(name: str) -> float | None:
     match = CLOCK.fullmatch(name.strip())
     if match is not None and match["unit"]:
         return SECONDS[match["unit"].lower()]
-    unit = LONGER.get(split_unit(name)[1].lower())
-    return unit or SECONDS.get(name.lower().rpartition("_")[2])
+    in_brackets = split_unit(name)[1].lower()
+    behind = name.lower().rpartition("_")[2]
+    return LONGER.get(in_brackets) or SECONDS.get(behind)
 
 
 def infer_clock(table: Table, wanted: str = "", dt: float | None = None) -> LogClock | None:
@@ -98,26 +119,20 @@ def infer_clock(table: Table, wanted: str = "", dt: float | None = None) -> LogC
     if wanted:
         return resolve(clock_called(wanted, table), table, dt, "chosen by --clock")
 
-    trouble = ""
-    steady: list[tuple[float, LogClock]] = []
-    coarse: list[LogClock] = []
+    candidates = []
+    problems = []
     for named in clocks_among(table):
         try:
-            clock = resolve(named, table, dt, "called as a clock is")
-            repeated, jitter = _unsteadiness(clock.times(table).seconds)
+            candidates.append(_candidate(named, table, dt))
         except ValueError as error:
-            trouble = trouble or str(error)
-            continue
-        if repeated <= MOST_REPEATED:
-            steady.append((jitter, clock))
-        else:
-            coarse.append(clock)
+            problems.append(error)
+    steady = [candidate for candidate in candidates if candidate.repeated <= MOST_REPEATED]
     if steady:
-        steady.sort(key=lambda each: each[0])
-        clocks = [clock for _, clock in steady]
-        _note_disagreement(table, clocks)
-        return clocks[0]
+        steady.sort(key=lambda candidate: candidate.jitter)
+        _note_disagreement(steady)
+        return steady[0].clock
 
+    coarse = [candidate.clock for candidate in candidates]
     rising = _rising(table, coarse)
     if rising is not None:
         if coarse:
@@ -126,9 +141,9 @@ def infer_clock(table: Table, wanted: str = "", dt: float | None = None) -> LogC
                 f"{rising.name!r}, which rises with them"
             )
         return rising
-    if trouble:
-        raise ValueError(trouble)
-    return coarse[0] if coarse else None
+    if problems:
+        raise problems[0]
+    return next(iter(coarse), None)
 
 
 def clock_called(wanted: str, names: Collection[str]) -> NamedClock:
@@ -139,12 +154,12 @@ def clock_called(wanted: str, names: Collection[str]) -> NamedClock:
     """
     bare, unit = split_unit(wanted)
     headers = {split_unit(name)[0]: name for name in names}
-    header = wanted if wanted in names else headers.get(wanted) or headers.get(bare)
+    headers |= {name: name for name in names}
+    header = headers.get(wanted) or headers.get(bare)
     if header is None:
         raise ValueError(f"no column is called {wanted!r}; there are: {', '.join(names)[:300]}")
-    if wanted in names or not unit:
-        pair = _pairs(list(names)).get(header)
-        return pair or NamedClock((header,), (unit_by_name(header),))
+    if header == wanted or not unit:
+        return _clock_of(header, _pairs(list(names)))
     if unit.lower() not in LONGER:
         raise ValueError(f"a clock counts in one of {', '.join(LONGER)}, got {wanted!r}")
     return NamedClock((header,), (LONGER[unit.lower()],))
@@ -159,25 +174,22 @@ def resolve(named: NamedClock, table: Table, dt: float | None, reason: str) -> L
     column = named.columns[0]
     kind = kind_of(column, table[column])
     if kind != NUMBER:
-        return LogClock((column,), (1.0,), kind, reason)
+        return LogClock((column,), kind=kind, reason=reason)
 
-    if len(named.columns) == 2:
-        seconds_unit, fraction_unit = named.units
-        assert seconds_unit is not None
-        assert fraction_unit is not None
-        fraction = numbers_of(named.columns[1], table[named.columns[1]])
-        if np.nanmax(fraction, initial=0.0) * fraction_unit < 1.0:
-            return LogClock(named.columns, (seconds_unit, fraction_unit), NUMBER, reason)
-
-    unit = named.units[0]
-    if unit is None:
-        unit = _unit_of(column, numbers_of(column, table[column]), dt)
-    return LogClock((column,), (unit,), NUMBER, reason)
+    units: list[float] = []
+    for name, unit in zip(named.columns, named.units, strict=True):
+        numbers = numbers_of(name, table[name])
+        if unit is None:
+            unit = _unit_of(name, numbers, dt)
+        if units and np.nanmax(numbers, initial=0.0) * unit >= 1.0:
+            break  # no fraction of a second
+        units.append(unit)
+    return LogClock(named.columns[: len(units)], tuple(units), reason=reason)
 
 
 def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
     """Return the seconds in a number of a clock that says no unit, and tell the user."""
-    known = np.asarray(numbers[np.isfinite(numbers)], np.float64)
+    known = finite(numbers)
     if not len(known):
         return 1.0
     by_size = unit_by_size(known[0])
@@ -186,11 +198,12 @@ def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
     step = float(np.median(np.diff(known)))
     if step <= 0:
         return 1.0
-    if known[0] > LEAST_DATE and step * DAY_S < 1 / SLOWEST_HZ and step < 1e-4:
-        units = {"days": DAY_S}
-    else:
-        units = plausible_units(step, dt, bool((known == np.rint(known)).all()))
-    name, unit = next(iter(units.items()))
+
+    name = plausible_unit(step, dt, are_whole(known))
+    unit = UNNAMED_UNITS[name]
+    if known[0] > LEAST_DATE and step * DAY_S < LONGEST_S:
+        name = "days"
+        unit = DAY_S
     if unit != 1.0:
         note(
             f"{column!r} goes on by {step:g} from row to row and says no unit: read in {name}, "
@@ -200,49 +213,60 @@ def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
     return unit
 
 
-def plausible_units(step: float, dt: float | None, is_whole: bool) -> dict[str, float]:
-    """Return the units [s] by name in which a clock may count, the likeliest first.
+def plausible_unit(step: float, dt: float | None, is_whole: bool) -> str:
+    """Return the likeliest of ``UNNAMED_UNITS`` in which a clock counts.
 
     Args:
         step: by how much it goes on from row to row.
         dt: period of the memory that reads it; None without one [s].
         is_whole: all its numbers are whole.
     """
-    rates = {name: 1 / (step * unit) for name, unit in UNNAMED_UNITS.items()}
+    shortest = SHORTEST_S
+    longest = LONGEST_S
     if dt is not None:
-        alike = [name for name, rate in rates.items() if abs(1 / (rate * dt) - 1) < ALIKE]
-    else:
-        alike = [name for name, rate in rates.items() if SLOWEST_HZ <= rate <= FASTEST_HZ]
-        if is_whole:
-            alike.reverse()  # 0, 1, 2, … is a controller's count of ms, and no log of seconds
-    return {name: UNNAMED_UNITS[name] for name in alike} | UNNAMED_UNITS
+        shortest = dt * (1 - ALIKE)
+        longest = dt * (1 + ALIKE)
+    plausible = [name for name, unit in UNNAMED_UNITS.items() if shortest <= step * unit <= longest]
+    if dt is None and is_whole:
+        plausible.reverse()  # 0, 1, 2, … is a controller's count of ms, and no log of seconds
+    return next(iter(plausible), "s")
 
 
-def _unsteadiness(times: Floats) -> tuple[float, float]:
-    """Return the share of rows with the stamp of the row before, and how much steps differ."""
+def _candidate(named: NamedClock, table: Table, dt: float | None) -> _Candidate:
+    """Return a clock, and how evenly it goes on.
+
+    Raises:
+        ValueError: its columns hold no times.
+    """
+    clock = resolve(named, table, dt, "called as a clock is")
+    times = clock.times(table).seconds
     steps = np.diff(times)
     if not len(steps) or not np.isfinite(times).all():
-        return 1.0, 1.0
-    median = float(np.median(steps))
+        return _Candidate(clock, times)
+    median = np.median(steps)
     if median < 0:
-        return 1.0, 1.0
+        return _Candidate(clock, times)
+
     repeated = float(np.mean(steps == 0.0))
     if median == 0:
-        return repeated, 1.0
-    return repeated, round(float(np.median(np.abs(steps / median - 1))), 2)
+        return _Candidate(clock, times, repeated)
+    jitter = float(np.median(np.abs(steps / median - 1)))
+    return _Candidate(clock, times, repeated, round(jitter, 2))
 
 
-def _note_disagreement(table: Table, clocks: list[LogClock]) -> None:
+def _note_disagreement(candidates: list[_Candidate]) -> None:
     """Tell the user of clocks whose rates differ from that of the first."""
-    periods = [float(np.ptp(clock.times(table).seconds)) for clock in clocks]
-    rows = len(table[clocks[0].columns[0]])
-    if rows < 3 or not periods[0] > 0:
+    first, *others = candidates
+    steps = len(first.times) - 1
+    span = float(np.ptp(first.times))
+    if steps < 2 or not span > 0:
         return
-    for clock, period in zip(clocks[1:], periods[1:], strict=True):
-        if period > 0 and abs(period / periods[0] - 1) > DISAGREE:
-            rates = f"{(rows - 1) / periods[0]:.4g} and {(rows - 1) / period:.4g} rows a second"
+    for other in others:
+        other_span = float(np.ptp(other.times))
+        if other_span > 0 and abs(other_span / span - 1) > DISAGREE:
             note(
-                f"{clocks[0].name!r} and {clock.name!r} disagree, {rates}: the former is read; "
+                f"{first.clock.name!r} and {other.clock.name!r} disagree, {steps / span:.4g} and "
+                f"{steps / other_span:.4g} rows a second: the former is read; "
                 "--clock NAME chooses"
             )
 
@@ -251,32 +275,45 @@ def _rising(table: Table, coarse: list[LogClock]) -> LogClock | None:
     """Return a column that is not called a clock and is one: it rises, and its unit is known."""
     stamps = {column for clock in coarse for column in clock.columns}
     for name, values in table.items():
-        unit = _unit_of_rising(name, values)
-        if unit is not None and name not in stamps:
-            kind = NUMBER if values.dtype.kind in "biuf" else DATE
-            return LogClock((name,), (unit,), kind, "rises from row to row")
+        if name in stamps:
+            continue
+        if _is_index_of_dates(name, values):
+            return LogClock((name,), kind=DATE, reason=RISES)
+        if _rises(values):
+            unit = _unit_of_rising(name, values)
+            if unit is not None:
+                return LogClock((name,), (unit,), reason=RISES)
     return None
 
 
-def _unit_of_rising(name: str, values: NDArray[Any]) -> float | None:
-    """Return the seconds in a number of a column that rises; None if it does not, or says no unit."""
-    is_index = name.strip().lower() in COUNTERS
-    if values.dtype.kind in "OM" and is_index and len(values):
-        try:
-            is_clock_of_dates = kind_of(name, values) == DATE
-        except ValueError:
-            return None
-        dates = LogClock((name,), kind=DATE).times(table={name: values}).seconds
-        return 1.0 if is_clock_of_dates and bool((np.diff(dates) > 0).all()) else None
+def _is_index_of_dates(name: str, values: NDArray[Any]) -> bool:
+    """Return whether a column is called as an index is, and holds dates that rise."""
+    if is_numeric(values) or not _is_index(name) or not len(values):
+        return False
+    with suppress(ValueError):
+        dates = LogClock((name,), kind=kind_of(name, values))
+        steps = np.diff(dates.times({name: values}).seconds)
+        return dates.kind == DATE and bool((steps > 0).all())
+    return False
 
-    is_numeric = values.dtype.kind in "biuf" and values.ndim == 1 and len(values) >= 3
-    if not is_numeric or not np.isfinite(values).all():
-        return None
-    if np.mean(np.diff(values) > 0) <= 1 - MOST_REPEATED:
-        return None
-    if is_index and (values != np.rint(values)).any():
+
+def _is_index(name: str) -> bool:
+    """Return whether a column is called as one that counts rows."""
+    return name.strip().lower() in COUNTERS
+
+
+def _rises(values: NDArray[Any]) -> bool:
+    """Return whether numbers (T,) rise in nearly all rows."""
+    if not is_numeric(values) or len(values) < 3 or not np.isfinite(values).all():
+        return False
+    return bool(np.mean(np.diff(values) > 0) > 1 - MOST_REPEATED)
+
+
+def _unit_of_rising(name: str, values: NDArray[Any]) -> float | None:
+    """Return the seconds in a number of a column that rises; None if nothing tells."""
+    if _is_index(name) and not are_whole(values):
         return 1.0  # an index of seconds
     unit = unit_by_name(name)
-    if unit is None and float(values[0]) >= 1e14:
+    if unit is None and float(values[0]) >= LEAST_STAMP:
         unit = unit_by_size(float(values[0]))
     return unit

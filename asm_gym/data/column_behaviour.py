@@ -10,6 +10,7 @@ sentinel        an end of the range that repeats, SENTINEL_APART ranges away fro
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -33,10 +34,15 @@ def finite(values: NDArray[Any]) -> Floats:
     return np.asarray(values[np.isfinite(values)], np.float64)
 
 
+def are_whole(numbers: NDArray[Any]) -> bool:
+    """Return whether all numbers are whole."""
+    return bool((numbers == np.rint(numbers)).all())
+
+
 def is_constant(values: NDArray[Any]) -> bool:
     """Return whether a column (T,) holds numbers and never moves."""
     numbers = finite(values)
-    return len(numbers) > 0 and bool((numbers == numbers[0]).all())
+    return len(numbers) > 0 and bool(np.ptp(numbers) == 0.0)
 
 
 def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
@@ -46,59 +52,76 @@ def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
     after several rows.
     """
     numbers = finite(values)
-    if len(numbers) < max(fewest, len(values)) or (numbers != np.rint(numbers)).any():
+    if len(numbers) < max(fewest, len(values)) or not are_whole(numbers):
         return False
 
     steps = np.diff(numbers)
     changes = steps[steps != 0]
-    if 1 < len(changes) < len(steps) and changes[0] > 0 and (changes == changes[0]).all():
+    rests = 1 < len(changes) < len(steps)
+    if rests and changes[0] > 0 and is_constant(changes):
         return len(np.unique(numbers)) > 2
 
-    usual = float(np.median(steps))
-    if usual <= 0 or np.mean(steps == usual) < STEADY:
+    usual = np.median(steps)
+    is_steady = np.mean(steps == usual) >= STEADY
+    if usual <= 0 or not is_steady:
         return False
-    begins_anew = np.flatnonzero(steps < 0) + 1
-    near_least = numbers[begins_anew] <= numbers.min() + usual * (FEWEST + 1)
-    return bool((steps[steps > 0] % usual == 0).all() and near_least.all())
+
+    rises = steps[steps > 0]
+    is_multiple = rises % usual == 0
+    starts = numbers[1:][steps < 0]
+    highest_start = numbers.min() + usual * (FEWEST + 1)
+    return bool(is_multiple.all() and (starts <= highest_start).all())
 
 
 def is_second_clock(values: NDArray[Any], times: Floats) -> bool:
     """Return whether a column (T,) goes on as ``times`` (T,) do."""
-    if len(values) < FEWEST or not np.isfinite(values).all() or not np.isfinite(times).all():
+    is_known = np.isfinite(values) & np.isfinite(times)
+    if len(values) < FEWEST or not is_known.all():
         return False
+
     since = values.astype(np.float64) - float(values[0])
-    span = float(np.ptp(since))
-    if span == 0 or (np.diff(since) < 0).any():
+    span = np.ptp(since)
+    falls = np.diff(since) < 0
+    if span == 0 or falls.any():
         return False
+
     centred = times - times.mean()
     slope, offset = np.polyfit(centred, since, 1)
-    return float(np.abs(since - offset - slope * centred).max()) <= STRAIGHT * span
+    off_line = since - offset - slope * centred
+    return bool(np.abs(off_line).max() <= STRAIGHT * span)
 
 
 def wrap_period(values: NDArray[Any], unit: str) -> float:
     """Return the turn of a column (T,) that holds an angle which turns over, 360 or 2π; else 0."""
-    turns = [360.0, TAU]
+    turns: Iterable[float] = (360.0, TAU)
     if unit:
-        turns = [TURN[unit]] if unit in TURN else []
+        turns = (TURN.get(unit, 0.0),)
+    angle = finite(values)
     for turn in turns:
-        if _turns_over(finite(values), turn):
+        if _turns_over(angle, turn):
             return turn
     return 0.0
 
 
 def _turns_over(angle: Floats, turn: float) -> bool:
     """Return whether an angle (T,) jumps by a turn from one end of it to the other."""
-    if len(angle) < FEWEST or np.ptp(angle) > 1.01 * turn or len(np.unique(angle)) <= FEWEST:
+    if len(np.unique(angle)) <= FEWEST:
         return False
+    lowest = angle.min()
+    highest = angle.max()
+    start = 0.0
+    if lowest < -0.05 * turn:
+        start = -turn / 2
+    end = start + turn
+    reaches_ends = lowest - start < 0.1 * turn and end - highest < 0.1 * turn
+    if not reaches_ends or highest - lowest > 1.01 * turn:
+        return False
+
     steps = np.diff(angle)
-    if not (np.abs(steps) > 0.6 * turn).any():
-        return False
-    low = 0.0
-    if angle.min() < -0.05 * turn:
-        low = -turn / 2
-    reaches_ends = angle.min() - low < 0.1 * turn and low + turn - angle.max() < 0.1 * turn
+    jumps = np.abs(steps) > 0.6 * turn
     between_turns = np.abs(steps - turn * np.rint(steps / turn))
-    return bool(reaches_ends and (between_turns < 0.25 * turn).all())
+    is_smooth = between_turns < 0.25 * turn
+    return bool(jumps.any() and is_smooth.all())
 
 
 def missing_value_sentinel(values: NDArray[Any]) -> float:
@@ -109,15 +132,21 @@ def missing_value_sentinel(values: NDArray[Any]) -> float:
     numbers = finite(values)
     if not len(numbers):
         return math.nan
-    for sentinel in (float(numbers.min()), float(numbers.max())):
+    for sentinel in (numbers.min(), numbers.max()):
         others = numbers[numbers != sentinel]
         count = len(numbers) - len(others)
         if not 2 <= count <= MOST_SENTINELS * len(values):
             continue
-        spread = float(np.ptp(others))
-        if spread == 0 or np.abs(others - sentinel).min() <= SENTINEL_APART * spread:
+        spread = np.ptp(others)
+        distance = np.abs(others - sentinel).min()
+        if spread == 0 or distance <= SENTINEL_APART * spread:
             continue
-        alone = np.mean(np.diff(np.flatnonzero(values == sentinel)) > 1) >= SINGLE
-        if abs(sentinel) >= LEAST_SENTINEL or (count >= FEWEST and alone):
-            return sentinel
+        if abs(sentinel) >= LEAST_SENTINEL or _stands_alone(values == sentinel):
+            return float(sentinel)
     return math.nan
+
+
+def _stands_alone(is_sentinel: NDArray[np.bool_]) -> bool:
+    """Return whether a sentinel stands often, and mostly in single rows."""
+    rows = np.flatnonzero(is_sentinel)
+    return len(rows) >= FEWEST and bool(np.mean(np.diff(rows) > 1) >= SINGLE)

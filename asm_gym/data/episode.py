@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,11 +103,16 @@ class Episode:
 
     def __repr__(self) -> str:
         """Return length, source and outcome in a line."""
-        seconds, seed = len(self) * self.spec.dt, "" if self.seed is None else f", seed {self.seed}"
-        faults = f", {int(self.faults.sum())} rows with a fault" if self.faults.any() else ""
-        ended = "success" if self.success else "no success"
-        rows = f"{len(self)} rows of {self.spec.size}, {seconds:g} s"
-        return f"<Episode of {self.spec.source or 'a stream'}: {rows}, {ended}{seed}{faults}>"
+        parts = [f"{len(self)} rows of {self.spec.size}", f"{len(self) * self.spec.dt:g} s"]
+        if self.success:
+            parts.append("success")
+        else:
+            parts.append("no success")
+        if self.seed is not None:
+            parts.append(f"seed {self.seed}")
+        if self.faults.any():
+            parts.append(f"{self.faults.sum()} rows with a fault")
+        return f"<Episode of {self.spec.source or 'a stream'}: {', '.join(parts)}>"
 
     @property
     def labelled(self) -> EpisodeLabel:
@@ -162,17 +167,14 @@ class Episode:
             ValueError: bad columns; the rate is unknown or differs from the spec's; time runs
                 backwards; logs differ in scale or are copies of each other.
         """
-        chosen = () if isinstance(channels, LogSchema | StreamSpec | None) else tuple(channels)
-        hints = SchemaHints(
-            rate=rate, clock=clock, channels=chosen, action=action, labels=labels, ignore=ignore
-        )
+        hints = SchemaHints(rate=rate, clock=clock, action=action, labels=labels, ignore=ignore)
         tables = [laid_out(frame) for frame in frames]
+        if isinstance(channels, StreamSpec):
+            channels = LogSchema.of_spec(channels)
         if isinstance(channels, LogSchema):
             schema = hints.apply(channels)
-        elif isinstance(channels, StreamSpec):
-            schema = hints.apply(LogSchema.of_spec(channels))
         else:
-            schema = infer_schema(tables, hints)
+            schema = infer_schema(tables, replace(hints, channels=tuple(channels or ())))
         note_columns(schema)
         return [cls.read(table, schema, **fields) for table in tables]
 
@@ -193,17 +195,17 @@ class Episode:
 
 def check_recorded(episode: Episode) -> None:
     """Raise ValueError unless the arrays of an episode are of one length, and its rewards are numbers."""
-    rows, steps = len(episode), len(episode.actions)
-    for name, length in (("observations", steps + 1), ("rewards", steps), ("contact_force", steps)):
-        if steps and len(getattr(episode, name)) not in (0, length):
-            raise ValueError(
-                f"{steps} actions need {length} {name}, got {len(getattr(episode, name))}"
-            )
+    rows = len(episode)
+    steps = len(episode.actions)
+    lengths = {"observations": steps + 1, "rewards": steps, "contact_force": steps}
+    for name, length in lengths.items():
+        size = len(getattr(episode, name))
+        if steps and size not in (0, length):
+            raise ValueError(f"{steps} actions need {length} {name}, got {size}")
     for name in ("rewards", "faults", "contact_force"):
-        if getattr(episode, name).ndim != 1:
-            raise ValueError(
-                f"{name} must have one dimension, got the shape {getattr(episode, name).shape}"
-            )
+        shape = getattr(episode, name).shape
+        if len(shape) != 1:
+            raise ValueError(f"{name} must have one dimension, got the shape {shape}")
     if len(episode.faults) not in (0, rows):
         raise ValueError(f"{rows} rows of a stream need {rows} faults, got {len(episode.faults)}")
     if steps and rows % steps:
@@ -219,8 +221,9 @@ def check_recorded(episode: Episode) -> None:
 def save_episode(path: str | Path, episode: Episode) -> Path:
     """Write one episode to a file of its own, which appears only when it is complete; return its path."""
     check_recorded(episode)
-    label = None if episode.label is None else asdict(episode.label)
-    if label is not None:
+    label = None
+    if episode.label is not None:
+        label = asdict(episode.label)
         label["affected_channels"] = sorted(label["affected_channels"])
     header = {
         "spec": episode.spec.to_json(),
@@ -239,21 +242,24 @@ def load_episode(path: str | Path) -> Episode:
     regular_file(path)
     try:
         saved = read_checkpoint(Path(path), KIND)
-        header, label = saved.header, saved.header["label"]
-        if label is not None:
-            label = EpisodeLabel(
-                **{**label, "affected_channels": frozenset(label["affected_channels"])}
-            )
-        kept: dict[str, Any] = {
-            **saved.arrays,
-            "label": label,
-            "spec": StreamSpec.from_json(header["spec"]),
-        }
-        kept |= {name: header[name] for name in ("success", "seed", "info")}
+        header = saved.header
         for name, kinds in ARRAYS.items():
-            if name in kept and kept[name].dtype.kind not in kinds:
-                raise ValueError(f"{name} cannot be of {kept[name].dtype}")
-        episode = Episode(**kept)
+            array = saved.arrays.get(name)
+            if array is not None and array.dtype.kind not in kinds:
+                raise ValueError(f"{name} cannot be of {array.dtype}")
+        label = header["label"]
+        if label is not None:
+            label["affected_channels"] = frozenset(label["affected_channels"])
+            label = EpisodeLabel(**label)
+        arrays: dict[str, Any] = saved.arrays
+        episode = Episode(
+            spec=StreamSpec.from_json(header["spec"]),
+            success=header["success"],
+            seed=header["seed"],
+            label=label,
+            info=header["info"],
+            **arrays,
+        )
         check_recorded(episode)
         return episode
     except FileNotFoundError:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.log_column import COMMAND, IGNORED, SENSE, LogColumn
 from asm_gym.data.names import split_unit
-from asm_gym.data.schema import COMMAND, IGNORED, SENSE, LogColumn, LogSchema
+from asm_gym.data.schema import LogSchema
 from asm_gym.data.tables import Columns, is_numeric
 from asm_gym.data.timing import BRIDGED_ROWS, FAR, Timing, evenly, timing_of
 from asm_gym.readings import noise_of, resolution, spans
@@ -46,14 +47,16 @@ class Inspection:
 
     def caption(self) -> str:
         """Say in a line how long it is, and at which rate it comes."""
-        rate = "no rate"
-        seconds = 0.0
-        if self.rate:
-            by = f" by {self.clock!r}" if self.clock else ""
-            rate = f"{self.rate:.6g} Hz{by}, jitter {100 * self.jitter:.1f} %"
-            seconds = float(np.ptp(self.times)) if len(self.times) else 0.0
-        rows = f"{len(self.times)} rows, {seconds:.5g} s"
-        return f"{self.name}: {rows}, {rate}, {len(self.gaps)} gaps"
+        size = len(self.times)
+        if not self.rate:
+            return f"{self.name}: {size} rows, 0 s, no rate, {len(self.gaps)} gaps"
+        clock = ""
+        if self.clock:
+            clock = f" by {self.clock!r}"
+        return (
+            f"{self.name}: {size} rows, {np.ptp(self.times):.5g} s, {self.rate:.6g} Hz{clock}, "
+            f"jitter {100 * self.jitter:.1f} %, {len(self.gaps)} gaps"
+        )
 
     def remarks(self) -> list[str]:
         """List what a user should know of the whole, a line each."""
@@ -91,23 +94,21 @@ def inspect_log(name: str, table: Columns, schema: LogSchema, trouble: str = "")
     """
     columns = {header: _column_of(header, schema) for header in table}
     rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
+    unread = Inspection(name=name, table=table, columns=columns, times=rows)
     try:
         if trouble:
             raise ValueError(trouble)
         schema.read(table)
         clock = schema.clock_in(table)
     except ValueError as error:
-        return Inspection(name=name, table=table, columns=columns, times=rows, trouble=str(error))
+        return replace(unread, trouble=str(error))
     if clock is None:
-        times = rows / schema.rate
-        return Inspection(name=name, table=table, columns=columns, times=times, rate=schema.rate)
+        return replace(unread, times=rows / schema.rate, rate=schema.rate)
 
     timing = timing_of(table, clock)
     dt = timing.dt or 1.0 / schema.rate
-    return Inspection(
-        name=name,
-        table=table,
-        columns=columns,
+    return replace(
+        unread,
         times=clock.times(table).seconds,
         rate=1 / dt,
         clock=clock.name,
@@ -130,8 +131,9 @@ def _jitter(timing: Timing, dt: float) -> float:
     steps = np.diff(timing.times.seconds) / dt
     if not len(steps):
         return 0.0
-    longest = FAR * max(1.0, float(np.quantile(steps, 0.9)))
-    return float(steps[steps <= longest].std())
+    nine_in_ten = float(np.quantile(steps, 0.9))
+    is_gap = steps > FAR * max(1.0, nine_in_ten)
+    return float(steps[~is_gap].std())
 
 
 def _gaps(timing: Timing, dt: float) -> NDArray[np.float64]:
@@ -147,23 +149,34 @@ def _facts(column: LogColumn, values: NDArray[Any]) -> dict[str, Any]:
     if not is_numeric(values):
         values = np.zeros(0)
     known = values[np.isfinite(values) & (values != column.missing)]
-    different = len(np.unique(known))
     missing = len(values) - len(known)
-
-    remarks = [column.reason] if column.reason else []
-    if column.role == SENSE and 1 < different < FEW_VALUES:
-        remarks.append(f"hardly moves: {different} values; its spread has a floor")
-    if column.role == SENSE and missing:
-        remarks.append("missing numbers: bridged, or cut there")
+    ends = [np.nan, np.nan]
+    if len(known):
+        ends = [float(known.min()), float(known.max())]
+    repeats = 0.0
+    if len(values) > 1:
+        repeats = float(np.mean(values[1:] == values[:-1]))
     return {
         "channel": column.name,
         "unit": column.unit,
         "is": column.role,
-        "from": float(known.min()) if len(known) else np.nan,
-        "to": float(known.max()) if len(known) else np.nan,
+        "from": ends[0],
+        "to": ends[1],
         "noise": noise_of(values),
         "resolution": resolution(values),
-        "repeats": float(np.mean(values[1:] == values[:-1])) if len(values) > 1 else 0.0,
+        "repeats": repeats,
         "missing": missing,
-        "what is done": "; ".join(remarks) or "read as it is",
+        "what is done": _what_is_done(column, len(np.unique(known)), missing),
     }
+
+
+def _what_is_done(column: LogColumn, different: int, missing: int) -> str:
+    """Say what is done with a column of so many different and missing numbers, and why."""
+    remarks = []
+    if column.reason:
+        remarks.append(column.reason)
+    if column.role == SENSE and 1 < different < FEW_VALUES:
+        remarks.append(f"hardly moves: {different} values; its spread has a floor")
+    if column.role == SENSE and missing:
+        remarks.append("missing numbers: bridged, or cut there")
+    return "; ".join(remarks) or "read as it is"

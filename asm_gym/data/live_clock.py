@@ -17,10 +17,10 @@ import numpy as np
 
 from asm_gym.data.clock import NUMBER, SINCE_1970, LogClock
 from asm_gym.data.clock_inference import UNNAMED_UNITS, clock_called, clocks_among, resolve
-from asm_gym.data.schema import RESAMPLED, LogSchema
+from asm_gym.data.schema import LogSchema, can_resample
 
 NEWEST = 32  # rows that tell the rate, and after which it is told again
-LEAP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
+LONGEST_STEP_S = 3600.0  # a clock that goes on by more between two rows was set anew [s]
 
 
 class ClockWentBack(ValueError):  # noqa: N818 (what happened, and no fault of ours)
@@ -48,7 +48,7 @@ class Pace:
 
         Raises:
             ValueError: the stamp is not finite.
-            ClockWentBack: it is not later than the last one, or more than ``LEAP_S`` later.
+            ClockWentBack: it is not later than the last one, or more than ``LONGEST_STEP_S`` later.
         """
         if not math.isfinite(stamp):
             raise ValueError(f"its time is {stamp}")
@@ -57,9 +57,11 @@ class Pace:
         step = self.dt
         if before is not None:
             step = stamp - before
-        if not 0 < step <= LEAP_S:
-            what = "leapt" if step > 0 else "must increase"
-            raise ClockWentBack(f"time {what}, got {stamp:g} s after {before:g} s")
+        if not 0 < step <= LONGEST_STEP_S:
+            problem = "must increase"
+            if step > 0:
+                problem = "leapt"
+            raise ClockWentBack(f"time {problem}, got {stamp:g} s after {before:g} s")
         self._before = stamp
         self._rows += 1
         if before is None:
@@ -75,11 +77,15 @@ class Pace:
     def _check_rate(self) -> None:
         """Compare the newest steps with the memory's."""
         own = median(self._steps)
-        right = self.dt / RESAMPLED <= own <= self.dt * RESAMPLED
-        if right != self.right:
-            self.change = f"rows come at {1 / own:.4g} a second"
-            self.change += " again" if right else f", and the memory reads {1 / self.dt:.4g}"
+        right = can_resample(own / self.dt)
+        if right == self.right:
+            return
         self.right = right
+        self.change = f"rows come at {1 / own:.4g} a second"
+        if right:
+            self.change += " again"
+        else:
+            self.change += f", and the memory reads {1 / self.dt:.4g}"
 
 
 class LiveClock:
@@ -103,15 +109,15 @@ class LiveClock:
             ValueError: the one that is asked for is not there.
         """
         self._first = None
-        own = self._schema.clock
-        if own is not None and not self._wanted and set(own.columns) <= set(row):
-            self._clock = own
-            return
-
-        candidates = clocks_among(row)
+        self._clock = None
         if self._wanted:
             candidates = [clock_called(self._wanted, list(row))]
-        self._clock = None
+        elif self._schema.clock is not None and self._schema.clock.is_in(row):
+            self._clock = self._schema.clock
+            return
+        else:
+            candidates = clocks_among(row)
+
         for named in candidates:
             if set(read).isdisjoint(named.columns):
                 cells = {name: np.array([row[name]], object) for name in named.columns}
@@ -142,8 +148,8 @@ class LiveClock:
         step = stamp - first
         if step < 1.0 or stamp >= SINCE_1970:
             return None
-        dt = 1.0 / self._schema.rate
-        unit = min(UNNAMED_UNITS.values(), key=lambda unit: abs(math.log(step * unit / dt)))
+        rate = self._schema.rate
+        unit = min(UNNAMED_UNITS.values(), key=lambda unit: abs(math.log(step * unit * rate)))
         if unit == 1.0:
             return None
         self._clock = LogClock(self._clock.columns, (unit,))

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
-from asm_gym.data.schema import LOG_SCHEMA, LogColumn, LogSchema
+from asm_gym.data.log_column import LogColumn
+from asm_gym.data.reader_notes import listed
+from asm_gym.data.schema import LOG_SCHEMA, LogSchema
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +27,6 @@ KNOWN_FACTORS = {
     "degrees beside radians": 180 / np.pi,
     "units beside thousandths": 1000.0,
 }
-SHOWN_LOGS = 6
 
 
 class _OtherScale(NamedTuple):
@@ -34,6 +35,14 @@ class _OtherScale(NamedTuple):
     column: LogColumn
     factor: float
     logs: list[int]
+
+    def __str__(self) -> str:
+        """Return its name, how many times larger it is in some logs, and what that may be."""
+        difference = f"{self.column.name} {self.factor:.2g} times"
+        for guess, factor in KNOWN_FACTORS.items():
+            if 0.6 < self.factor / factor < 1.6:
+                difference += f" ({guess}?)"
+        return difference
 
 
 def refuse_unlike(episodes: Sequence[Episode], names: Sequence[str]) -> None:
@@ -52,8 +61,7 @@ def _refuse_copies(episodes: Sequence[Episode], names: Sequence[str]) -> None:
     """Raise ValueError if two logs hold the same rows."""
     first_with: dict[bytes, str] = {}
     for episode, name in zip(episodes, names, strict=True):
-        rows = episode.stream.tobytes()
-        original = first_with.setdefault(rows, name)
+        original = first_with.setdefault(episode.stream.tobytes(), name)
         if original != name:
             raise ValueError(
                 f"{name} is a copy of {original}: a threshold from rows that were learned from "
@@ -67,22 +75,14 @@ def _refuse_other_scales(episodes: Sequence[Episode], names: Sequence[str]) -> N
     unlike = _other_scales(episodes, schema)
     if not unlike:
         return
-    found = []
-    for other in unlike:
-        guess = [
-            f" ({said}?)"
-            for said, factor in KNOWN_FACTORS.items()
-            if 0.6 < other.factor / factor < 1.6
-        ]
-        found.append(f"{other.column.name} {other.factor:.2g} times{''.join(guess)}")
-    logs = [names[k] for k in unlike[0].logs]
-    more = f" and {len(logs) - SHOWN_LOGS} others" if len(logs) > SHOWN_LOGS else ""
     column = unlike[0].column.name
+    differences = ", ".join(str(other) for other in unlike)
+    logs = listed([names[k] for k in unlike[0].logs])
     raise ValueError(
-        f"columns without a unit differ in scale between logs: {', '.join(found)}, in "
-        f"{', '.join(logs[:SHOWN_LOGS])}{more}. Say the units in their headers, such as "
-        f"'{column} [deg]', or leave these logs out; if they are right, write varies = true in the "
-        f"line of {column} of a schema (asm-gym inspect --schema FILE)"
+        f"columns without a unit differ in scale between logs: {differences}, in {logs}. "
+        f"Say the units in their headers, such as '{column} [deg]', or leave these logs out; "
+        f"if they are right, write varies = true in the line of {column} of a schema "
+        "(asm-gym inspect --schema FILE)"
     )
 
 
@@ -106,7 +106,8 @@ def _other_scales(episodes: Sequence[Episode], schema: LogSchema) -> list[_Other
 
 def _scale(numbers: NDArray[np.float32], noise: float) -> tuple[float, float]:
     """Return spread and range of the numbers (T, k) of a channel; NaN if it stands."""
-    known = np.asarray(numbers[np.isfinite(numbers).all(axis=1)], np.float64)
+    is_known = np.isfinite(numbers).all(axis=1)
+    known = np.asarray(numbers[is_known], np.float64)
     if len(known) < 2:
         return np.nan, np.nan
     spread = float(known.std(axis=0).max())
@@ -125,12 +126,13 @@ def _split_by_scale(scales: Floats) -> tuple[float, list[int]] | None:
     if len(moving) < 2:
         return None
     order = moving[np.argsort(scales[moving, 0])]
-    steps = np.diff(np.log(scales[order, 0]))
-    split = int(np.argmax(steps)) + 1
-    small = order[:split]
-    large = order[split:]
-    factors = np.median(scales[large], axis=0) / np.median(scales[small], axis=0)
+    ordered = scales[order]  # (M, 2) by their spread
+    split = int(np.argmax(np.diff(np.log(ordered[:, 0])))) + 1
+    small = np.median(ordered[:split], axis=0)
+    factors = np.median(ordered[split:], axis=0) / small
     if factors.min() < FACTOR:
         return None
-    odd = large if len(large) <= len(small) else small
+    odd = order[split:]
+    if len(odd) > split:
+        odd = order[:split]
     return float(factors[0]), sorted(odd.tolist())

@@ -124,7 +124,7 @@ def _note_unknown(table: Columns, schema: LogSchema) -> None:
     """Tell the user of columns that the schema of the first logs does not have."""
     if schema.memory_spec is not None:
         return
-    known = {name for column in schema.columns for name in (column.name, column.label)}
+    known = schema.names
     unknown = [name for name in table if not is_label(name) and split_unit(name)[0] not in known]
     if unknown:
         note(f"not read, as the schema of the first logs lacks it: {', '.join(unknown)[:120]}")

@@ -41,21 +41,9 @@ LONGER = (
 )
 """Those that stand in brackets: an ``angle_min`` holds no minutes."""
 
-# Names of columns that count rows.
-COUNTERS = {
-    "",
-    "index",
-    "idx",
-    "num",
-    "no",
-    "no.",
-    "row",
-    "seq",
-    "frame",
-    "frame_index",
-    "unnamed: 0",
-}
-COUNTERS |= {"__index_level_0__"}  # of pandas in Parquet
+COUNTERS = {"", "index", "idx", "num", "no", "no.", "row", "seq", "frame", "frame_index"}
+COUNTERS |= {"unnamed: 0", "__index_level_0__"}  # of pandas, the latter in Parquet
+"""Names of columns that count rows."""
 
 TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fromkeys(
     ("rad", "radian", "radians"), TAU
@@ -86,7 +74,8 @@ LABEL = _word(
 COMMAND = _word("target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?")
 _SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
 _PLACES = "pos|position|positions|angles?|q|qpos|joint_pos"
-SPEED, POSITION = _word(_SPEEDS), _word(_PLACES)
+SPEED = _word(_SPEEDS)
+POSITION = _word(_PLACES)
 
 SENSE_NAME = _word(
     f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|temperatures?|voltages?|pressures?"
@@ -112,65 +101,86 @@ class Element(NamedTuple):
 @cache
 def element_of(name: str) -> Element | None:
     """Return the channel and the element that a name says; None where it says none."""
-    found = _ELEMENT.fullmatch(name)
-    if found is None:
+    match = _ELEMENT.fullmatch(name)
+    if match is None:
         return None
-    named = found["named"] is not None
-    return Element(
-        found["of"] if named else found["stem"], found["named"] if named else found["number"], named
-    )
+    if match["named"] is None:
+        return Element(match["stem"], match["number"], named=False)
+    return Element(match["of"], match["named"], named=True)
 
 
 @cache
 def split_unit(column: str) -> tuple[str, str]:
-    """Return a column's name and unit: ``joint_0`` and ``rad`` of ``joint_0 [rad]``; the unit may be empty.
+    """Return a column's name and unit: ``joint_0`` and ``rad`` of ``joint_0 [rad]``.
 
-    ``q1(deg)`` and ``q1_deg`` say it too; ``yaw_deg``, which is no element of a channel, keeps its name.
+    The unit may be empty. ``q1(deg)`` and ``q1_deg`` say it too; ``yaw_deg``, which is no element
+    of a channel, keeps its name.
     """
-    if found := _WITH_UNIT.fullmatch(column):
-        return found["name"], found["unit"]
-    if (found := _UNIT_AT_ONCE.fullmatch(column)) and (
-        found["unit"] in UNITS or found["unit"] in SECONDS
-    ):
-        return found["name"], found["unit"]
-    if found := _UNIT_BEHIND.fullmatch(column):
-        return found["name"] if element_of(found["name"]) else column, found["unit"]
-    return column, ""
+    if match := _WITH_UNIT.fullmatch(column):
+        return match["name"], match["unit"]
+    match = _UNIT_AT_ONCE.fullmatch(column)
+    if match and (match["unit"] in UNITS or match["unit"] in SECONDS):
+        return match["name"], match["unit"]
+    match = _UNIT_BEHIND.fullmatch(column)
+    if match is None:
+        return column, ""
+    if element_of(match["name"]) is None:
+        return column, match["unit"]
+    return match["name"], match["unit"]
 
 
 def element_name(column: str, element: object) -> str:
     """Return the name of an element of a column: ``q[2] [rad]`` of ``q [rad]``."""
     name, unit = split_unit(column)
-    return f"{name}[{element}]" + (f" [{unit}]" if unit else "")
+    if unit:
+        unit = f" [{unit}]"
+    return f"{name}[{element}]{unit}"
 
 
 def ratio(unit: str, other: str) -> float | None:
-    """Return how many of ``other`` are in one ``unit``; None where the two do not measure the same."""
+    """Return how many of ``other`` are in one ``unit``; None if they measure something else."""
     if unit == other:
         return 1.0
-    if unit not in UNITS or other not in UNITS or UNITS[unit][0] != UNITS[other][0]:
+    if unit not in UNITS or other not in UNITS:
         return None
-    return UNITS[unit][1] / UNITS[other][1]
+    base, size = UNITS[unit]
+    other_base, other_size = UNITS[other]
+    if base != other_base:
+        return None
+    return size / other_size
 
 
 def factor(name: str, own: str, unit: str) -> float:
-    """Return how many of ``unit`` are in a column's ``own`` one; 1 where either is unknown, ValueError if unlike."""
-    found = 1.0 if not own or unit == "1" else ratio(own, unit)
-    if found is None:
+    """Return how many of ``unit`` are in a column's ``own`` one; 1 if either is unknown.
+
+    Raises:
+        ValueError: they measure something else.
+    """
+    if not own or unit == "1":
+        return 1.0
+    units = ratio(own, unit)
+    if units is None:
         raise ValueError(f"{name} is in {own}, and the memory reads {unit}")
-    return found
+    return units
 
 
 def label_of(name: str) -> str:
     """Return what a stream calls the number of a column: ``joint[0]`` of ``joint_0``."""
-    found = element_of(name)
-    return f"{found.channel}[{found.name}]" if found else name
+    element = element_of(name)
+    if element is None:
+        return name
+    return f"{element.channel}[{element.name}]"
 
 
 def is_clock(name: str) -> bool:
     """Tell whether a column holds times. A bare ``T`` is a temperature."""
-    bare, unit = split_unit(name.strip())
-    return bare != "T" and CLOCK.fullmatch(bare if unit in LONGER else name.strip()) is not None
+    name = name.strip()
+    bare, unit = split_unit(name)
+    if bare == "T":
+        return False
+    if unit in LONGER:
+        name = bare
+    return CLOCK.fullmatch(name) is not None
 
 
 def is_label(name: str) -> bool:

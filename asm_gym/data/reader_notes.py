@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 UNREAD = "left out, for it cannot be read: "  # begins a note on a file
+SHOWN = 6  # names that a message lists
 
 
 class LogWarning(UserWarning):
@@ -18,6 +19,14 @@ def note(message: str) -> None:
     warnings.warn(message, LogWarning, stacklevel=2)
 
 
+def listed(names: Sequence[str]) -> str:
+    """Return the first names of a list, and how many others there are."""
+    text = ", ".join(names[:SHOWN])
+    if len(names) > SHOWN:
+        text += f" and {len(names) - SHOWN} others"
+    return text
+
+
 @contextmanager
 def noted() -> Iterator[list[str]]:
     """Collect the notes of this block, each once, in order; other warnings pass."""
@@ -26,9 +35,10 @@ def noted() -> Iterator[list[str]]:
         warnings.simplefilter("always", LogWarning)
         yield notes
     for warning in caught:
-        if issubclass(warning.category, LogWarning):
-            notes += [str(warning.message)] if str(warning.message) not in notes else []
-        else:
+        message = str(warning.message)
+        if not issubclass(warning.category, LogWarning):
             warnings.warn_explicit(
                 warning.message, warning.category, warning.filename, warning.lineno
             )
+        elif message not in notes:
+            notes.append(message)

@@ -12,20 +12,21 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.live_clock import LEAP_S, ClockWentBack, LiveClock, Pace
-from asm_gym.data.names import element_name, is_clock, split_unit
-from asm_gym.data.schema import ColumnMatch, LogSchema
-from asm_gym.data.tables import MOST_COLUMNS, Named, is_key, named_columns, named_row
-from asm_gym.data.text import DOUBLED, Dialect, check_cells, flat_row, header_of
-
-NO_DIALECT = Dialect(",", comma=False)
+from asm_gym.data.column_match import ColumnMatch
+from asm_gym.data.csv_lines import CsvLines
+from asm_gym.data.joint_rows import JointRows
+from asm_gym.data.live_clock import LONGEST_STEP_S, ClockWentBack, LiveClock, Pace
+from asm_gym.data.publishers import Publishers
+from asm_gym.data.schema import LogSchema
+from asm_gym.data.tables import MOST_COLUMNS
+from asm_gym.data.text import flat_row
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
@@ -53,50 +54,11 @@ class Row:
     problem: str = ""
 
 
-class Publishers:
-    """Join messages that hold different numbers.
+class _Reading(NamedTuple):
+    """What a line holds."""
 
-    A row is a message of most numbers, with the newest of the others.
-
-    Args:
-        silence: after which the numbers of a publisher are missing [s].
-    """
-
-    def __init__(self, silence: float) -> None:
-        self.silence = silence
-        # Arrival, whether it may make a row, and the newest message, by its numbers.
-        self._newest: dict[frozenset[str], tuple[float, bool, Mapping[str, Any]]] = {}
-
-    def row(
-        self, message: Mapping[str, Any], numbers: Iterable[str], now: float, leads: bool = True
-    ) -> dict[str, Any] | None:
-        """Return the row that a message makes, or None.
-
-        A message with some of the numbers of another one is of the same publisher, and lacks the
-        others.
-
-        Args:
-            message: values by name.
-            numbers: the names that are read.
-            now: when it came [s].
-            leads: it may make a row.
-        """
-        own = frozenset(numbers)
-        for others in self._newest:
-            if others & own:
-                own |= others
-        kept = {names: newest for names, newest in self._newest.items() if not names & own}
-        kept[own] = (now, leads, message)
-        self._newest = {
-            names: newest for names, newest in kept.items() if now - newest[0] <= self.silence
-        }
-        leaders = [names for names, newest in self._newest.items() if newest[1]]
-        if own != max(leaders, key=len, default=None):
-            return None
-        row: dict[str, Any] = {}
-        for _, _, values in self._newest.values():
-            row |= values
-        return row | dict(message)
+    numbers: NDArray[np.float64]  # (D,)
+    stamp: float | None  # by the robot's own clock; None without one [s]
 
 
 class RowReader:
@@ -114,20 +76,11 @@ class RowReader:
         self._spec = schema.spec
         self._clock = LiveClock(schema, clock)
         self._pace = Pace(self._spec.dt)
+        self._joints = JointRows(schema)
         self._publishers = Publishers(silence)
+        self._csv: CsvLines | None = None
         self._match: ColumnMatch | None = None  # of rows by name
         self._is_known = False  # a row was read
-
-        # The header of CSV, as in a file: a name that comes again has a number.
-        self._dialect = NO_DIALECT
-        self._header: list[str] | None = None
-        self._header_line = ""
-        self._doubled: dict[str, str] = {}  # names without the number, by those with it
-        self._named: Named = {}  # columns that name others
-
-        # A row of each joint.
-        self._joint = ""  # the column that says whose numbers a row holds
-        self._gathered: dict[str, Any] = {}  # of the joints that came
 
         self._now = 0.0  # when the newest line came
         self._lacks_since = math.inf  # when the first line came that lacks columns
@@ -172,12 +125,14 @@ class RowReader:
         try:
             return self._row_of(line)
         except Exception as error:  # anybody may have sent it: deep, huge or broken
+            if self._begins_anew(line):
+                return None
             return self._problem(error)
 
     def _problem(self, error: Exception) -> Row:
         """Return a line that is no row."""
         kind = "no row of numbers"
-        if self._header is None and not self._is_known:
+        if self._csv is None and not self._is_known:
             kind += ", and no header"
         missing = np.full(self._spec.size, np.nan)
         return Row(numbers=missing, read=False, problem=f"line {self.line} is {kind}: {error}")
@@ -190,18 +145,17 @@ class RowReader:
         """
         if self._is_header(line):
             return None
-        given = self._numbers_and_stamp(line)
-        if given is None:
+        reading = self._reading(line)
+        if reading is None:
             return None
-        numbers, stamp = given
-        if numbers.shape != (self._spec.size,):
-            raise ValueError(
-                f"it must hold {self._spec.size} numbers, got the shape {numbers.shape}"
-            )
+        size = self._spec.size
+        shape = reading.numbers.shape
+        if shape != (size,):
+            raise ValueError(f"it must hold {size} numbers, got the shape {shape}")
         self._is_known = True
-        if stamp is None:
-            return Row(numbers=numbers)
-        return self._stamped(numbers, stamp)
+        if reading.stamp is None:
+            return Row(numbers=reading.numbers)
+        return self._stamped(reading.numbers, reading.stamp)
 
     def _stamped(self, numbers: NDArray[np.float64], stamp: float) -> Row:
         """Return a row at its place in time; one that came late is left out."""
@@ -212,7 +166,7 @@ class RowReader:
             lost = self._pace.lost(stamp)
         except ClockWentBack as error:
             problem = str(error)
-            if aside is None or not 0 < stamp - aside <= LEAP_S:
+            if aside is None or not 0 < stamp - aside <= LONGEST_STEP_S:
                 self._aside = stamp
                 problem += ": the row is left out (--clock NAME chooses)"
                 return Row(numbers=numbers, read=False, stamp=stamp, problem=problem)
@@ -229,54 +183,42 @@ class RowReader:
 
     def _is_header(self, line: str) -> bool:
         """Return whether a line is the header of CSV, and take it up if it is the first."""
-        if line.strip() == self._header_line:
-            return True
-        if line.lstrip()[0] in "[{":
+        if self._csv is not None:
+            return line.strip() == self._csv.header
+        if self._is_known or _is_json(line):
             return False
-        if (self._header is not None or self._is_known) and not self._fits_schema(line):
-            return False
+        csv = CsvLines(line)
+        if csv.names_all_columns:
+            ColumnMatch(self._schema, csv.names)  # refuses a header that lacks columns at once
+        self._csv = csv
+        return True
 
-        dialect = Dialect.of(line)
-        names = header_of(dialect.cells(line))
-        header: list[str] = []
-        self._doubled = {}
-        for place, name in enumerate(names):
-            unique = name
-            if name in header:
-                unique = f"{name}{DOUBLED}{names[:place].count(name) + 1}"
-                self._doubled[unique] = name
-            header.append(unique)
-        named = named_columns(header)
-        if not named and not any(map(is_key, header)):
-            ColumnMatch(self._schema, header)  # refuses a header that lacks columns at once
-        self._header = header
-        self._header_line = line.strip()
-        self._dialect = dialect
-        self._named = named
+    def _begins_anew(self, line: str) -> bool:
+        """Return whether a line is another header with all columns of the schema, and take it up."""
+        if _is_json(line) or line.count(",") > MOST_COLUMNS:
+            return False
+        try:
+            csv = CsvLines(line)
+            ColumnMatch(self._schema, csv.names)
+        except ValueError:
+            return False
+        self._csv = csv
         self._match = None
         return True
 
-    def _fits_schema(self, line: str) -> bool:
-        """Return whether a line is a header with all columns of the schema: another logger began."""
-        dialect = Dialect.of(line)
-        cells = dialect.cells(line)
-        if any(dialect.is_number(cell) for cell in cells if cell.strip()):
-            return False
-        try:
-            ColumnMatch(self._schema, header_of(cells))
-        except ValueError:
-            return False
-        return True
-
-    def _numbers_and_stamp(self, line: str) -> tuple[NDArray[np.float64], float | None] | None:
-        """Return the numbers of a row (D,) and its stamp [s], None without one; or None: more is to come."""
+    def _reading(self, line: str) -> _Reading | None:
+        """Return the numbers and the stamp of a row; None if more of it is to come."""
         if line.count(",") > MOST_COLUMNS:
             raise ValueError(f"it holds more than {MOST_COLUMNS} values")
-        if line.lstrip()[0] not in "[{" and self._header is not None:
-            return self._read_cells(self._cells_of_csv(line), self._dialect.number)
+        if self._csv is not None and not _is_json(line):
+            read: Sequence[str] = ()
+            if self._match is not None:
+                read = self._match.headers
+            return self._read_cells(self._csv.cells(line, read), self._csv.dialect.number)
+
         row: Any = json.loads(line)
         if isinstance(row, list):
-            return np.asarray(row, np.float64), None
+            return _Reading(np.asarray(row, np.float64), None)
         cells = flat_row(row)
         for channel in self._spec.channels:
             part = row.get(channel.name)
@@ -287,23 +229,13 @@ class RowReader:
                 )
         return self._read_cells(cells, _number)
 
-    def _cells_of_csv(self, line: str) -> dict[str, str]:
-        """Return the cells of a line by the names of the header."""
-        assert self._header is not None
-        cells = self._dialect.cells(line)
-        check_cells(cells, len(self._header), "it has")
-        given = dict(zip(self._header, map(self._dialect.plain, cells), strict=False))
-        for name, first in self._doubled.items():
-            is_read = self._match is not None and name in self._match.headers
-            if given[name] != given[first] and not is_read:
-                raise ValueError(f"its columns of the same name differ: {first!r}")
-        return given
-
     def _read_cells(
         self, cells: Mapping[str, Any], number: Callable[[Any], float]
-    ) -> tuple[NDArray[np.float64], float | None] | None:
+    ) -> _Reading | None:
         """Return the numbers and the stamp of a row by name; a number that it lacks is NaN."""
-        message = self._all_joints(named_row(cells, self._named) if self._named else cells)
+        if self._match is None:
+            self._joints.find(cells)
+        message = self._joints.whole(cells)
         if message is None:
             return None
         match = self._match or ColumnMatch(self._schema, message, whole=False)
@@ -315,14 +247,19 @@ class RowReader:
             return None
         assert self._match is not None
         numbers = {name: number(row[name]) for name in self._match.headers if name in row}
+        return _Reading(self._match.row(numbers), self._stamp(row))
+
+    def _stamp(self, row: Mapping[str, Any]) -> float | None:
+        """Return the stamp of a row [s], by a unit that it may be the first to tell."""
         stamp = self._clock.stamp(row)
-        if stamp is not None:
-            first = self._clock.told_unit(stamp)
-            if first is not None:
-                self.begin()
-                self._pace.lost(first)
-                stamp = self._clock.stamp(row)
-        return self._match.row(numbers), stamp
+        if stamp is None:
+            return None
+        first = self._clock.told_unit(stamp)
+        if first is None:
+            return stamp
+        self.begin()
+        self._pace.lost(first)
+        return self._clock.stamp(row)
 
     def _is_whole(self, row: Mapping[str, Any], has_numbers: bool) -> bool:
         """Return whether all columns of the schema are there; another publisher may add some.
@@ -345,45 +282,10 @@ class RowReader:
         self._lacking = None
         return True
 
-    def _all_joints(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
-        """Return the row of all joints, if rows are of one joint each; None while more are to come."""
-        if self._match is None:
-            labels = self._spec.labels
-            joints = {label.partition("[")[2].rstrip("]") for label in labels if "[" in label}
-            keys = [name for name in row if is_key(name) and str(row[name]).strip() in joints]
-            self._joint = keys[0] if keys else ""
-        if not self._joint:
-            return row
-        return self._gather(row)
 
-    def _gather(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
-        """Return the row of all joints once it is complete, or one of a later moment comes."""
-        joint = str(row[self._joint]).strip()
-        own = {}
-        for name, value in row.items():
-            if name != self._joint:
-                own[name if is_clock(name) else element_name(name, joint)] = value
-
-        before = self._gathered
-        has_joint = any(name in before and not is_clock(name) for name in own)
-        if has_joint or self._is_later(before, row):
-            self._gathered = own
-            return before
-        self._gathered = own | before  # the time is that of the first
-        if not set(self._spec.labels) <= {split_unit(name)[0] for name in self._gathered}:
-            return None
-        whole = self._gathered
-        self._gathered = {}
-        return whole
-
-    def _is_later(self, before: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
-        """Return whether a row is of a later moment than the joints before it."""
-        clock = LiveClock(self._schema, "")
-        clock.find(row, ())
-        stamps = [clock.stamp(before), clock.stamp(row)]
-        if stamps[0] is None or stamps[1] is None:
-            return False
-        return stamps[1] - stamps[0] > 0.5 * self._spec.dt
+def _is_json(line: str) -> bool:
+    """Return whether a line begins as an object or a list does."""
+    return line.lstrip()[0] in "[{"
 
 
 def _number(value: Any) -> float:

@@ -3,17 +3,13 @@
 tables ► LogSchema.infer ► schema.read(table) ► rows of a stream, and which of them a label marks
               ▲
            logs.toml, which the user edits (``asm_gym.data.schema_file``)
-
-number of a stream   x = scale · ratio(unit of the header, unit) · cell, NaN if the cell is ``missing``
-wrapped angle        sin(2π x / wrap) and cos(2π x / wrap)
 """
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -23,25 +19,15 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import LogClock
 from asm_gym.data.clock_inference import infer_clock
-from asm_gym.data.names import TAU, TURN, TURNED, factor, is_label, label_of, split_unit
+from asm_gym.data.column_behaviour import are_whole, finite
+from asm_gym.data.column_match import ColumnMatch
+from asm_gym.data.log_column import COMMAND, LABEL, SENSE, UNCLEAR, LogColumn
+from asm_gym.data.names import TAU, TURN, TURNED, is_label, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import Columns, is_numeric, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
 from asm_gym.exceptions import DamagedFile
 from asm_gym.spec import MOTOR, Channel, StreamSpec
-from asm_gym.validation import check_choice, check_number
-
-SENSE = "sense"
-COMMAND = "command"
-LABEL = "label"
-CLOCK = "clock"
-CONSTANT = "constant"
-COPY = "copy"
-COUNTER = "counter"
-IGNORED = "ignored"
-UNCLEAR = "unclear"
-ROLES = (SENSE, COMMAND, LABEL, CLOCK, CONSTANT, COPY, COUNTER, IGNORED, UNCLEAR)
-READ = (SENSE, COMMAND)
 
 LOG_SCHEMA = "log_schema"  # where an episode and a memory keep the schema that they were read with
 ORIGIN = "origin"  # where an episode keeps the stamp of its first row [s]
@@ -51,72 +37,9 @@ NO_RATE = (
     "how many rows come a second? Say the rate [Hz] (--rate), or name or add a column of times "
     "(--clock)"
 )
+TURN_UNITS = {TAU: "rad", 360.0: "deg"}
+"""The unit of an angle by its turn."""
 NORMAL = ("", "0", "false", "no", "none", "normal", "nominal", "ok", "good", "healthy", "nan")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LogColumn:
-    """What a column of a log is.
-
-    Args:
-        name: in the log, without the unit behind it.
-        role: one of ``ROLES``; senses and commands are read.
-        unit: of its numbers after ``scale``; empty if the log does not say.
-        channel: to which its numbers belong; by default its name.
-        element: which of several numbers of the channel it is.
-        wrap: turn of an angle that turns over [unit]; 0 of other numbers.
-        missing: the number that stands for missing data; None without one.
-        scale: its numbers are multiplied by this.
-        noise: standard deviation of its white noise [unit].
-        varies: logs may differ in its range.
-        reason: why it has this role.
-    """
-
-    name: str
-    role: str = SENSE
-    unit: str = ""
-    channel: str = ""
-    element: str = ""
-    wrap: float = 0.0
-    missing: float | None = None
-    scale: float = 1.0
-    noise: float = 0.0
-    varies: bool = False
-    reason: str = field(default="", compare=False)
-
-    def __post_init__(self) -> None:
-        check_choice(f"role of {self.name!r}", self.role, ROLES)
-        for what in ("unit", "channel", "element"):
-            if not isinstance(getattr(self, what), str):
-                raise ValueError(f"{what} of {self.name!r} must be text, got {self.unit!r}")
-        check_number(f"scale of {self.name!r}", self.scale)
-        check_number(f"wrap of {self.name!r}", self.wrap, low=0.0)
-        check_number(f"noise of {self.name!r}", self.noise, low=0.0)
-
-    @property
-    def is_read(self) -> bool:
-        """Whether it is part of the stream."""
-        return self.role in READ
-
-    @property
-    def stream_channel(self) -> str:
-        """The channel of the stream: an angle that turns over has one of its own."""
-        if self.wrap or not self.channel:
-            return self.name
-        return self.channel
-
-    @property
-    def label(self) -> str:
-        """What the stream calls its number."""
-        if self.element:
-            return f"{self.channel}[{self.element}]"
-        return self.channel or self.name
-
-    def matches(self, pattern: str) -> bool:
-        """Return whether it or its channel is called so."""
-        return pattern in (self.name, self.channel) or (
-            fnmatchcase(self.name, pattern) or fnmatchcase(self.channel, pattern)
-        )
 
 
 class Recorded(NamedTuple):
@@ -166,26 +89,7 @@ class LogSchema:
     @classmethod
     def of_spec(cls, spec: StreamSpec) -> Self:
         """Return the schema of a stream whose columns are called as its labels are."""
-        columns = []
-        for channel in spec.channels:
-            role = COMMAND if channel.group == MOTOR else SENSE
-            if channel.elements == TURNED:
-                turn = TURN[channel.unit]
-                columns.append(
-                    LogColumn(name=channel.name, role=role, unit=channel.unit, wrap=turn)
-                )
-                continue
-            elements: Iterable[Any] = channel.elements or range(channel.size)
-            for label, element in zip(channel.labels, elements, strict=True):
-                columns.append(
-                    LogColumn(
-                        name=label,
-                        role=role,
-                        unit=channel.unit,
-                        channel=channel.name,
-                        element="" if label == channel.name else str(element),
-                    )
-                )
+        columns = [column for channel in spec.channels for column in _columns_of(channel)]
         return cls(tuple(columns), 1.0 / spec.dt, find_clock="", memory_spec=spec)
 
     @classmethod
@@ -194,6 +98,11 @@ class LogSchema:
         if LOG_SCHEMA in about:
             return cls.from_json(about[LOG_SCHEMA])
         return cls.of_spec(spec)
+
+    @property
+    def names(self) -> set[str]:
+        """What its columns are called in logs and in the stream."""
+        return {name for column in self.columns for name in (column.name, column.label)}
 
     @cached_property
     def read_columns(self) -> list[LogColumn]:
@@ -216,11 +125,8 @@ class LogSchema:
         channels: dict[str, list[LogColumn]] = {}
         for column in self.read_columns:
             channels.setdefault(column.stream_channel, []).append(column)
-        return StreamSpec(
-            tuple(_channel(name, columns) for name, columns in channels.items()),
-            1.0 / self.rate,
-            "table",
-        )
+        described = [_channel(name, columns) for name, columns in channels.items()]
+        return StreamSpec(tuple(described), 1.0 / self.rate, "table")
 
     def check(self) -> None:
         """Raise ValueError if logs cannot be read so, and say what to change."""
@@ -232,8 +138,9 @@ class LogSchema:
             if count > 1:
                 raise ValueError(f"columns must have different names, got {name!r} twice")
         if not names:
-            reasons = "; ".join(f"{column.name} {column.reason}" for column in self.columns)[:300]
-            raise ValueError(f"a log must hold columns of numbers, got {reasons or 'nothing'}")
+            reasons = "; ".join(f"{column.name} {column.reason}" for column in self.columns)
+            got = reasons[:300] or "nothing"
+            raise ValueError(f"a log must hold columns of numbers, got {got}")
         if not self.rate:
             raise ValueError(NO_RATE)
 
@@ -249,22 +156,20 @@ class LogSchema:
         table = laid_out(table)
         spec = self.spec
         match = ColumnMatch(self, table)
-        rows = match.rows(table)
-        faults = self._marked_rows(table, match)
+        rows = np.column_stack([match.rows(table), *self._marks(table, match.headers)])
+        origin = None
         clock = self.clock_in(table)
-        if clock is None:
-            return Recorded(rows.astype(np.float32), spec, faults, None)
+        if clock is not None:
+            timing = timing_of(table, clock)
+            self._check_rate(timing)
+            rows = evenly(rows[timing.kept], timing.times.seconds, spec.dt)
+            origin = timing.times.origin + float(timing.times.seconds[0])
 
-        timing = timing_of(table, clock)
-        self._check_rate(timing)
-        if len(faults):
-            rows = np.column_stack([rows, faults])
-        rows = evenly(rows[timing.kept], timing.times.seconds, spec.dt)
-        if len(faults):
-            faults = np.nan_to_num(rows[:, -1]) > 0
-            rows = rows[:, :-1]
-        origin = timing.times.origin + float(timing.times.seconds[0])
-        return Recorded(rows.astype(np.float32), spec, faults, origin)
+        faults: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        marks = rows[:, spec.size :]
+        if marks.size:
+            faults = np.asarray(np.nan_to_num(marks).any(axis=1))
+        return Recorded(rows[:, : spec.size].astype(np.float32), spec, faults, origin)
 
     def clock_in(self, table: Columns) -> LogClock | None:
         """Return the clock of a table; None if its rows come at ``rate``.
@@ -272,67 +177,52 @@ class LogSchema:
         Raises:
             ValueError: it has no clock, and must have one.
         """
-        dt = 1.0 / self.rate
-        if self.find_clock is not None:
-            return _found(infer_clock(table, self.find_clock, dt))
-        if self.clock is None or set(self.clock.columns) <= set(table):
-            return self.clock
-        found = _found(infer_clock(table, dt=dt))
-        note(f"the clock {self.clock.name!r} is not there: {found.name!r} is read")
-        return found
+        own = self.clock
+        wanted = self.find_clock
+        if wanted is None and (own is None or own.is_in(table)):
+            return own
+        clock = infer_clock(table, wanted or "", 1.0 / self.rate)
+        if clock is None:
+            raise ValueError(NO_RATE)
+        if wanted is None and own is not None:
+            note(f"the clock {own.name!r} is not there: {clock.name!r} is read")
+        return clock
 
     def _check_rate(self, timing: Timing) -> None:
         """Raise ValueError if rows come at another rate, and tell the user if they are resampled."""
         if timing.dt is None:
             return
         ratio = timing.dt * self.rate
-        if not 1 / RESAMPLED <= ratio <= RESAMPLED:
+        own = 1 / timing.dt
+        if not can_resample(ratio):
             raise ValueError(
-                f"the memory reads {self.rate:.4g} rows a second, these come at {1 / timing.dt:.4g}"
+                f"the memory reads {self.rate:.4g} rows a second, these come at {own:.4g}"
             )
         if abs(ratio - 1) > RATE_TOLERANCE:
             note(
-                f"rows that come at {1 / timing.dt:.4g} a second are read at {self.rate:.4g}, "
-                "by their clock"
+                f"rows that come at {own:.4g} a second are read at {self.rate:.4g}, by their clock"
             )
 
-    def _marked_rows(self, table: Columns, match: ColumnMatch) -> NDArray[np.bool_]:
-        """Return the rows (T,) that a label marks as faulty; (0,) without a label."""
-        marks = []
+    def _marks(self, table: Columns, read: Sequence[str]) -> Iterator[NDArray[np.bool_]]:
+        """Yield which rows (T,) each label that is not ``read`` as a number marks as faulty."""
         for header, values in table.items():
-            if header not in match.headers and self._is_label(split_unit(header)[0], values):
-                marks.append(_is_marked(values))
-        if not marks:
-            return np.zeros(0, np.bool_)
-        return np.asarray(np.logical_or.reduce(marks))
+            if header not in read and self._is_label(split_unit(header)[0], values):
+                yield _is_marked(values)
 
     def _is_label(self, name: str, values: NDArray[Any]) -> bool:
         """Return whether a column labels faults: by the schema, or if that has no such column."""
         for column in self.columns:
             if column.name == name or fnmatchcase(name, column.name):
                 return column.role == LABEL
-        return is_label(name) and are_whole(values)
-
-    def with_column(self, name: str, **changes: Any) -> LogSchema:
-        """Return the schema with one column changed, or added at the front.
-
-        Args:
-            name: of the column; an added one may be a pattern such as ``state*``.
-            changes: fields of ``LogColumn``.
-        """
-        if all(column.name != name for column in self.columns):
-            return replace(self, columns=(LogColumn(name=name, **changes), *self.columns))
-        columns = tuple(
-            replace(column, **changes) if column.name == name else column for column in self.columns
-        )
-        return replace(self, columns=columns)
+        return is_called_label(name, values)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON values."""
-        saved = asdict(replace(self, memory_spec=None))
-        del saved["memory_spec"]
-        del saved["find_clock"]
-        return saved
+        clock = None
+        if self.clock is not None:
+            clock = asdict(self.clock)
+        columns = [asdict(column) for column in self.columns]
+        return {"columns": columns, "rate": self.rate, "clock": clock}
 
     @classmethod
     def from_json(cls, saved: Mapping[str, Any]) -> LogSchema:
@@ -342,135 +232,20 @@ class LogSchema:
             ValueError: it is something else.
         """
         try:
-            clock = saved["clock"]
-            if clock is not None:
-                clock = LogClock(
-                    columns=tuple(clock["columns"]),
-                    units=tuple(clock["units"]),
-                    kind=clock["kind"],
-                    reason=clock["reason"],
-                )
             columns = tuple(LogColumn(**column) for column in saved["columns"])
-            return cls(columns, float(saved["rate"]), clock)
+            schema = cls(columns, float(saved["rate"]))
+            clock = saved["clock"]
+            if clock is None:
+                return schema
+            lists = {key: tuple(clock[key]) for key in ("columns", "units")}
+            return replace(schema, clock=LogClock(**clock | lists))
         except (KeyError, TypeError) as error:
             raise DamagedFile("the schema of the logs", repr(error)) from error
 
 
-class ColumnMatch:
-    """Find the numbers of a stream's row among the columns of a table or the names of a line.
-
-    A column is found by its name, by the stream's label, or by its place in a list of its channel.
-
-    Args:
-        schema: how logs are read.
-        names: of the columns that are there, perhaps with units.
-        whole: all columns of the schema must be there.
-
-    Attributes:
-        headers: names of the columns that were found.
-
-    Raises:
-        ValueError: columns are missing, or of another unit.
-    """
-
-    def __init__(self, schema: LogSchema, names: Iterable[str], whole: bool = True) -> None:
-        by_name = _headers_by_name(names)
-        self.headers: list[str] = []
-        self._columns: list[LogColumn] = []
-        self._scales: list[float] = []
-        missing = []
-        for column, place in _with_places(schema.read_columns, by_name):
-            candidates = (column.name, column.label, place)
-            header = next((by_name[name] for name in candidates if name in by_name), None)
-            if header is None:
-                missing.append(column.label)
-                continue
-            self.headers.append(header)
-            self._columns.append(column)
-            own_name, own_unit = split_unit(header)
-            self._scales.append(column.scale * factor(own_name, own_unit, column.unit or "1"))
-        if missing and whole:
-            raise ValueError(_what_is_missing(missing, schema, by_name))
-        self._scale = np.array(self._scales)
-        self._missing = np.array(
-            [math.nan if c.missing is None else c.missing for c in self._columns]
-        )
-        self._wrapped = any(column.wrap for column in self._columns)
-
-    def row(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
-        """Return the numbers (D,) of a line, by the names of its columns; NaN of those it lacks."""
-        cells = [values.get(header) for header in self.headers]
-        return self._numbers(
-            np.array([math.nan if cell is None else cell for cell in cells], np.float64)
-        )
-
-    def rows(self, table: Columns) -> NDArray[np.float64]:
-        """Return the rows (T, D) of a table.
-
-        Raises:
-            ValueError: a column holds words.
-        """
-        for header in self.headers:
-            if not is_numeric(table[header]):
-                raise ValueError(
-                    f"{header} must hold numbers, as its schema says, got {table[header][0]!r}"
-                )
-        return self._numbers(
-            np.column_stack([table[header] for header in self.headers]).astype(np.float64)
-        )
-
-    def _numbers(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the numbers (..., D) of a stream of those of its columns (..., C)."""
-        numbers = np.where(cells == self._missing, np.nan, cells) * self._scale
-        if not self._wrapped:
-            return numbers
-        parts = []
-        for k, column in enumerate(self._columns):
-            if column.wrap:
-                angle = numbers[..., k] * TAU / column.wrap
-                parts += [np.sin(angle), np.cos(angle)]
-            else:
-                parts.append(numbers[..., k])
-        return np.stack(parts, axis=-1)
-
-
-def _found(clock: LogClock | None) -> LogClock:
-    """Return a clock that was looked for; raise ValueError if there is none."""
-    if clock is None:
-        raise ValueError(NO_RATE)
-    return clock
-
-
-def _headers_by_name(names: Iterable[str]) -> dict[str, str]:
-    """Return the headers by their names without a unit, and by the labels that these stand for."""
-    bare = {name: split_unit(name)[0] for name in names}
-    headers = {label_of(short): name for name, short in bare.items()}
-    return headers | {short: name for name, short in bare.items()}
-
-
-def _with_places(
-    columns: Iterable[LogColumn], by_name: Mapping[str, str]
-) -> list[tuple[LogColumn, str]]:
-    """Return each column, and its place in a list of its channel, ``q[1]``, if no name is there."""
-    columns = list(columns)
-    named = {c.channel for c in columns if c.name in by_name or c.label in by_name}
-    count = Counter[str]()
-    placed = []
-    for column in columns:
-        place = "" if column.channel in named else f"{column.channel}[{count[column.channel]}]"
-        count[column.channel] += 1
-        placed.append((column, place))
-    return placed
-
-
-def _what_is_missing(missing: list[str], schema: LogSchema, by_name: Mapping[str, str]) -> str:
-    """Say which columns of a schema are not there, and which are there that it does not know."""
-    message = f"the memory reads channels that are not there: {', '.join(missing)}"
-    known = {name for column in schema.columns for name in (column.name, column.label)}
-    extra = sorted({by_name[name] for name in by_name} - {by_name.get(name) for name in known})
-    if extra:
-        message += f"; there are, and its schema lacks them: {', '.join(extra)[:120]}"
-    return message
+def can_resample(ratio: float) -> bool:
+    """Return whether logs of so many times the rate, or the period, of a memory can be read."""
+    return 1 / RESAMPLED <= ratio <= RESAMPLED
 
 
 def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
@@ -479,38 +254,60 @@ def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
     Raises:
         ValueError: they are of several units, or only some of them are commands.
     """
-    names = ", ".join(sorted(column.name for column in columns))
+    first = columns[0]
+    unit = _common_unit(name, columns)
+    noise = float(np.median([column.noise for column in columns]))
+    group = first.channel or name
+    if first.role == COMMAND:
+        group = MOTOR
+    if group == MOTOR:
+        noise = 0.0
+    if first.wrap:
+        unit = TURN_UNITS.get(first.wrap, "deg")
+        return Channel(name, 2, unit, noise, group, TURNED)
+
+    elements = tuple(column.element for column in columns)
+    if not any(elements):
+        elements = ()
+    return Channel(name, len(columns), unit, noise, group, elements)
+
+
+def _common_unit(name: str, columns: Sequence[LogColumn]) -> str:
+    """Return the unit of a channel's columns, 1 without one.
+
+    Raises:
+        ValueError: they are of several units, or only some of them are commands.
+    """
     if len({column.role for column in columns}) > 1:
+        names = ", ".join(sorted(column.name for column in columns))
         raise ValueError(f"channel {name!r} is commanded in part: {names}")
     units = sorted({column.unit for column in columns if column.unit})
     if len(units) > 1:
         raise ValueError(f"channel {name!r} is of several units: {', '.join(units)}")
-    group = columns[0].channel or name
-    if columns[0].role == COMMAND:
-        group = MOTOR
-    noise = float(np.median([column.noise for column in columns]))
-    if group == MOTOR:
-        noise = 0.0
-    if columns[0].wrap:
-        unit = "rad" if columns[0].wrap == TAU else "deg"
-        return Channel(name, 2, unit, noise, group, TURNED)
-    elements = tuple(column.element for column in columns)
-    return Channel(
-        name=name,
-        size=len(columns),
-        unit=units[0] if units else "1",
-        noise=noise,
-        group=group,
-        elements=elements if any(elements) else (),
-    )
+    return next(iter(units), "1")
 
 
-def are_whole(values: NDArray[Any]) -> bool:
-    """Return whether a column holds whole numbers, or words."""
-    if not is_numeric(values):
-        return True
-    known = values[np.isfinite(values)]
-    return bool((known == np.rint(known)).all())
+def _columns_of(channel: Channel) -> Iterator[LogColumn]:
+    """Yield the columns of a channel, called as its labels are."""
+    role = SENSE
+    if channel.group == MOTOR:
+        role = COMMAND
+    if channel.elements == TURNED:
+        turn = TURN[channel.unit]
+        yield LogColumn(name=channel.name, role=role, unit=channel.unit, wrap=turn)
+        return
+
+    elements: Iterable[Any] = channel.elements or range(channel.size)
+    for label, element in zip(channel.labels, elements, strict=True):
+        column = LogColumn(name=label, role=role, unit=channel.unit, channel=channel.name)
+        if label != channel.name:
+            column = replace(column, element=str(element))
+        yield column
+
+
+def is_called_label(name: str, values: NDArray[Any]) -> bool:
+    """Return whether a column is called as a label is, and holds whole numbers, or words."""
+    return is_label(name) and (not is_numeric(values) or are_whole(finite(values)))
 
 
 def _is_marked(values: NDArray[Any]) -> NDArray[np.bool_]:

@@ -16,7 +16,10 @@ from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.readings import spans
 
 SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
-AROUND_S = 5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is no normal motion
+AROUND_S = (
+    5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is not normal
+)
+ROUNDING = 1e-9  # share of an episode that is rounding error
 
 
 def normal_episodes(
@@ -26,53 +29,59 @@ def normal_episodes(
 ) -> tuple[list[Episode], Counter[str]]:
     """Return the normal episodes among logs, and how many others were left out, by why.
 
-    ``progress`` is called with the number of logs so far. A table with marked rows is left out, or with
-    ``between_marks`` learned from where none of them is near.
+    Args:
+        logs: in their order.
+        between_marks: a table with marked rows is not left out, but learned from where no marked
+            row is near.
+        progress: is called with the number of logs so far.
 
     Raises:
         ValueError: logs are copies of each other, or of different scale.
     """
-    kept: list[Episode] = []
-    names: list[str] = []
+    kept: list[Log] = []
     left_out = Counter[str]()
-    for n, (name, episode) in enumerate(logs, 1):
+    for n, log in enumerate(logs, 1):
         progress(n, n)  # how many there are is known at the end
-        role = ""
-        if episode.label is not None:
-            role = episode.label.role
-        if between_marks and episode.spec.source == "table" and episode.faults.any():
-            near = round(AROUND_S / episode.spec.dt)
-            close = np.convolve(episode.faults, np.ones(2 * near + 1), "same") > 0.5
-            parts = _parts(episode, ~close)
-            kept += parts
-            names += [f"{name} part {part}" for part in range(len(parts))]
-        elif episode.faults.any() or role == "faulty":
+        episode = log.episode
+        is_marked = bool(episode.faults.any())
+        if between_marks and is_marked and episode.spec.source == "table":
+            for number, part in enumerate(_unmarked_parts(episode)):
+                kept.append(Log(f"{log.name} part {number}", part))
+        elif is_marked or (episode.label is not None and episode.label.role == "faulty"):
             left_out["with a fault"] += 1
         elif not episode.success:
             left_out["failed"] += 1
         else:
-            kept.append(episode)
-            names.append(name)
-    refuse_unlike(kept, names)
-    return kept, left_out
+            kept.append(log)
+    episodes = [log.episode for log in kept]
+    refuse_unlike(episodes, [log.name for log in kept])
+    return episodes, left_out
+
+
+def _unmarked_parts(episode: Episode) -> list[Episode]:
+    """Return the parts of an episode with no marked row near."""
+    near = round(AROUND_S / episode.spec.dt)
+    marked_rows = np.convolve(episode.faults, np.ones(2 * near + 1), "same")
+    return _parts(episode, marked_rows <= 0.5)
 
 
 def complete_parts(episode: Episode) -> list[Episode]:
-    """Return the parts of an episode between lost numbers; those under half a second are left out."""
-    known = np.asarray(np.isfinite(episode.stream).all(axis=1))
-    return [episode] if known.all() else _parts(episode, known)
+    """Return the parts of an episode between lost numbers, but for those under half a second."""
+    is_complete = np.asarray(np.isfinite(episode.stream).all(axis=1))
+    if is_complete.all():
+        return [episode]
+    return _parts(episode, is_complete)
 
 
 def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
-    """The stretches of rows that are wanted (T,), but for short ones."""
+    """Return the stretches of rows that are wanted (T,), but for short ones."""
     least = max(2, round(SHORTEST_S / episode.spec.dt))
-    return [
-        _stretch(episode, start, stop) for start, stop in spans(wanted) if stop - start >= least
-    ]
+    stretches = [_stretch(episode, start, stop) for start, stop in spans(wanted)]
+    return [stretch for stretch in stretches if len(stretch) >= least]
 
 
 def _stretch(episode: Episode, start: int, stop: int) -> Episode:
-    """Return some rows of a log as an episode of their own."""
+    """Return some rows of an episode as one of their own, with the schema of their log."""
     info = {key: value for key, value in episode.info.items() if key == LOG_SCHEMA}
     return Episode.from_stream(episode.stream[start:stop], episode.spec, success=True, info=info)
 
@@ -87,19 +96,26 @@ def pieces(episode: Episode, seconds: float) -> list[Episode]:
 def split_in_time(
     logs: list[list[Episode]], calibration_share: float
 ) -> tuple[list[Episode], list[Episode]]:
-    """Split the pieces of long logs into heads to learn from and tails to calibrate on, a piece between left out.
+    """Split the pieces of long logs into heads to learn from, and tails to calibrate on.
 
-    Shuffled, pieces that follow each other would promise too much. Raises ValueError where no log is long enough.
+    A piece between them is left out, but for that of a single log of two. Shuffled, pieces that
+    follow each other would promise too much.
+
+    Raises:
+        ValueError: no log is long enough.
     """
-    fitting, calibration = list[Episode](), list[Episode]()
+    fitting: list[Episode] = []
+    calibration: list[Episode] = []
     for parts in logs:
         head = math.ceil(len(parts) * (1 - calibration_share))
+        tail = head + 1
+        if len(logs) == 1 and len(parts) <= 2:
+            tail = head
         fitting += parts[:head]
-        calibration += parts[head + 1 :] if len(logs) > 1 or len(parts) > 2 else parts[head:]
+        calibration += parts[tail:]
     if not fitting or not calibration:
-        raise ValueError(
-            f"{len(fitting) + len(calibration)} pieces are too few to learn from and to calibrate on"
-        )
+        count = len(fitting) + len(calibration)
+        raise ValueError(f"{count} pieces are too few to learn from and to calibrate on")
     return fitting, calibration
 
 
@@ -108,15 +124,18 @@ def split_at_random(
 ) -> tuple[list[Episode], list[Episode]]:
     """Split episodes by a seed into those to learn from, and a share (0, 1) to calibrate on.
 
-    Raises ValueError where fewer than ``needed`` would be left to calibrate on.
+    Raises:
+        ValueError: fewer than ``needed`` would be left to calibrate on.
     """
-    n = len(episodes)
-    order = np.random.default_rng(seed).permutation(n)
-    calibration = math.floor(n * calibration_share + 1e-9)
-    if calibration < needed or calibration == n:
-        least = max(2, math.ceil(needed / calibration_share - 1e-9))
+    size = len(episodes)
+    calibration_size = math.floor(size * calibration_share + ROUNDING)
+    if calibration_size < needed or calibration_size == size:
+        least = max(2, math.ceil(needed / calibration_share - ROUNDING))
         raise ValueError(
             f"this false-alarm rate needs {least} normal episodes, {needed} of them to "
-            f"calibrate on, got {n}: record more, take a higher --false-alarm-rate, or --split long logs"
+            f"calibrate on, got {size}: record more, take a higher --false-alarm-rate, or "
+            "--split long logs"
         )
-    return [episodes[i] for i in order[calibration:]], [episodes[i] for i in order[:calibration]]
+    order = np.random.default_rng(seed).permutation(size)
+    shuffled = [episodes[k] for k in order]
+    return shuffled[calibration_size:], shuffled[:calibration_size]

@@ -59,26 +59,33 @@ def timing_of(table: Mapping[str, NDArray[Any]], clock: LogClock) -> Timing:
         ValueError: its clock cannot be read.
     """
     times = clock.times(table)
-    repeats = np.concatenate([[False], np.diff(times.seconds) == 0.0])
-    kept = np.arange(len(repeats))
-    if repeats.any() and repeats.mean() <= MOST_REPEATED:
-        count = int(repeats.sum())
-        note(f"{count} rows have the same time as the one before, and are left out")
-        kept = np.flatnonzero(~repeats)
+    repeats = np.diff(times.seconds, prepend=np.nan) == 0.0
+    if np.mean(repeats) > MOST_REPEATED:
+        repeats[:] = False
+    elif repeats.any():
+        note(f"{repeats.sum()} rows have the same time as the one before, and are left out")
+    kept = np.flatnonzero(~repeats)
     times = times._replace(seconds=times.seconds[kept])
     return Timing(times, kept, period(times.seconds))
 
 
 def recordings(times: Floats) -> list[tuple[int, int]]:
     """Return the stretches of rows, half-open, between which time (T,) goes back or leaps."""
+    size = len(times)
+    whole = [(0, size)]
+    if size < 2:
+        return whole
     steps = np.diff(times)
-    if not len(steps) or not np.median(steps) > 0:
-        return [(0, len(times))]
-    longest = MOST_LOST * len(times) * float(np.median(steps)) + LEAP_S
-    cuts = np.flatnonzero((steps < 0) | (steps > longest)) + 1
-    if not len(cuts) or len(cuts) > max(1, MOST_CUTS * len(times)):
-        return [(0, len(times))]
-    ends = pairwise([0, *cuts.tolist(), len(times)])
+    median = float(np.median(steps))
+    if not median > 0:
+        return whole
+
+    longest = MOST_LOST * size * median + LEAP_S
+    is_cut = (steps < 0) | (steps > longest)
+    cuts = np.flatnonzero(is_cut) + 1
+    if not len(cuts) or len(cuts) > max(1, MOST_CUTS * size):
+        return whole
+    ends = pairwise([0, *cuts.tolist(), size])
     return [(start, stop) for start, stop in ends if stop - start > 1]
 
 
@@ -94,28 +101,30 @@ def period(times: Floats) -> float | None:
     steps = np.diff(times)
     median = float(np.median(steps))
     counts = np.rint(steps / median)
-    near = counts >= 1
-    if np.mean(near & (np.abs(steps / median - counts) <= NEARLY)) >= MOSTLY:
-        mean = float(steps[near].sum() / counts[near].sum())
+    is_whole = np.abs(steps / median - counts) <= NEARLY
+    is_counted = counts >= 1
+    if np.mean(is_counted & is_whole) >= MOSTLY:
+        mean = steps[is_counted].sum() / counts[is_counted].sum()
     else:
-        mean = float(steps[steps <= FAR * median].mean())
+        mean = steps[steps <= FAR * median].mean()
     return float(f"{mean:.6g}")  # rates that differ by rounding would be two rates
 
 
 def _check_increasing(times: Floats) -> None:
     """Raise ValueError unless times are finite and increase."""
-    if not np.isfinite(times).all():
-        row = int(np.argmin(np.isfinite(times)))
+    is_finite = np.isfinite(times)
+    if not is_finite.all():
+        row = int(np.argmin(is_finite))
         raise ValueError(
             f"time must be a number in every row, got {times[row]} in row {row}: --rate HZ goes "
             "without"
         )
-    steps = np.diff(times)
-    if not np.all(steps > 0):
-        row = int(np.argmin(steps > 0)) + 1
+    rises = np.diff(times) > 0
+    if not rises.all():
+        row = int(np.argmin(rises))
         raise ValueError(
-            f"time must increase from row to row, got {times[row - 1]:g} s before "
-            f"{times[row]:g} s: cut the log there, choose another clock with --clock NAME, or say "
+            f"time must increase from row to row, got {times[row]:g} s before "
+            f"{times[row + 1]:g} s: cut the log there, choose another clock with --clock NAME, or say "
             "--rate HZ"
         )
 
@@ -139,27 +148,34 @@ def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
             f"time jumps by {steps[gap] * dt:g} s after {times[gap]:g} s: cut the log there"
         )
     counts = np.rint(steps)
-    drift = float(steps.sum() / max(counts.sum(), 1)) - 1
-    if abs(drift) <= DRIFT and np.all(counts >= 1) and np.all(np.abs(steps - counts) <= JITTER):
-        return _placed(rows, np.concatenate([[0], np.cumsum(counts)]).astype(np.intp))
-    return _interpolated(rows, times, times[0] + dt * np.arange(size), dt)
+    drift = steps.sum() / max(counts.sum(), 1) - 1
+    is_near = (counts >= 1) & (np.abs(steps - counts) <= JITTER)
+    if abs(drift) <= DRIFT and is_near.all():
+        places = np.cumsum(counts, dtype=np.intp)
+        return _placed(rows, np.concatenate([[0], places]))
+    due = times[0] + dt * np.arange(size)
+    return _interpolated(rows, times, due, dt)
 
 
 def _placed(rows: Floats, places: NDArray[np.intp]) -> Floats:
     """Return rows (T, D) at their places (T,), NaN between them."""
-    if len(places) == places[-1] + 1:
+    size = places[-1] + 1
+    if len(places) == size:
         return rows
-    placed = np.full((places[-1] + 1, rows.shape[1]), np.nan)
+    placed = np.full((size, rows.shape[1]), np.nan)
     placed[places] = rows
     return placed
 
 
 def _interpolated(rows: Floats, times: Floats, due: Floats, dt: float) -> Floats:
     """Return rows (N, D) at the times (N,) at which they are due, NaN within gaps."""
-    longest = FAR * max(dt, float(np.quantile(np.diff(times), 0.9)))
+    nine_in_ten = float(np.quantile(np.diff(times), 0.9))
+    longest = FAR * max(dt, nine_in_ten)
     after = np.clip(np.searchsorted(times, due), 1, len(times) - 1)
-    in_gap = times[after] - times[after - 1] > longest
-    at_stamp = (times[after] == due) | (times[after - 1] == due)
+    next_stamp = times[after]
+    last_stamp = times[after - 1]
+    in_gap = next_stamp - last_stamp > longest
+    at_stamp = (next_stamp == due) | (last_stamp == due)
     interpolated = np.column_stack([np.interp(due, times, column) for column in rows.T])
     interpolated[in_gap & ~at_stamp] = np.nan
     return interpolated
@@ -188,9 +204,11 @@ class Bridge:
 
     def over(self, missing: NDArray[np.bool_]) -> bool:
         """Return whether the next row lacks numbers (D,), and none for longer than it may."""
-        paid = np.maximum(self._spent - PAID_BACK * self.dt, 0.0)
-        self._spent = np.where(missing, self._spent + self.dt, paid)
-        return bool(missing.any() and (self._spent[missing] <= self.seconds * (1 + 1e-9)).all())
+        spent = self._spent + self.dt
+        paid_back = np.maximum(self._spent - PAID_BACK * self.dt, 0.0)
+        self._spent = np.where(missing, spent, paid_back)
+        is_short = self._spent[missing] <= self.seconds * (1 + 1e-9)
+        return bool(missing.any() and is_short.all())
 
 
 def bridged(stream: Rows, dt: float, seconds: float) -> NDArray[np.bool_]:
@@ -205,9 +223,10 @@ def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np
     result = stream.copy()
     for column in result.T:
         for start, stop in spans(np.isnan(column)):
-            if start and stop < len(column) and stop - start <= longest:
+            is_inside = start > 0 and stop < len(column)
+            if is_inside and stop - start <= longest:
                 ends = [start - 1, stop]
-                column[start:stop] = np.interp(np.arange(start, stop), ends, column[ends])
+                column[start:stop] = np.interp(range(start, stop), ends, column[ends])
     return result
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from asm_gym.data.column_behaviour import is_constant
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
-from asm_gym.data.schema import LogColumn
+from asm_gym.data.log_column import LogColumn
 from asm_gym.data.tables import is_numeric
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.statistics import Floats

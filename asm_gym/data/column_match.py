@@ -1,0 +1,130 @@
+"""Find the columns of a schema in a table or a line, and make the numbers of a stream of their cells.
+
+number of a stream   x = scale · ratio(unit of the header, unit) · cell, NaN if the cell is ``missing``
+wrapped angle        sin(2π x / wrap) and cos(2π x / wrap)
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asm_gym.data.log_column import LogColumn
+from asm_gym.data.names import TAU, factor, label_of, split_unit
+from asm_gym.data.tables import Columns, is_numeric
+
+if TYPE_CHECKING:
+    from asm_gym.data.schema import LogSchema
+
+
+class ColumnMatch:
+    """Find the numbers of a stream's row among the columns of a table or the names of a line.
+
+    A column is found by its name, by the stream's label, or by its place in a list of its channel.
+
+    Args:
+        schema: how logs are read.
+        names: of the columns that are there, perhaps with units.
+        whole: all columns of the schema must be there.
+
+    Attributes:
+        headers: names of the columns that were found.
+
+    Raises:
+        ValueError: columns are missing, or of another unit.
+    """
+
+    def __init__(self, schema: LogSchema, names: Iterable[str], whole: bool = True) -> None:
+        by_name = _headers_by_name(names)
+        self.headers: list[str] = []
+        self._columns: list[LogColumn] = []
+        scales = []
+        sentinels = []
+        lacking = []
+        for column, place in _with_places(schema.read_columns, by_name):
+            candidates = (column.name, column.label, place)
+            header = next((by_name[name] for name in candidates if name in by_name), None)
+            if header is None:
+                lacking.append(column.label)
+                continue
+            own_name, own_unit = split_unit(header)
+            self.headers.append(header)
+            self._columns.append(column)
+            scales.append(column.scale * factor(own_name, own_unit, column.unit or "1"))
+            sentinels.append(column.missing)
+        if lacking and whole:
+            raise ValueError(_what_is_missing(lacking, schema, by_name))
+        self._scales = np.array(scales)
+        self._sentinels = np.array(sentinels, np.float64)  # None becomes NaN
+        self._wraps = any(column.wrap for column in self._columns)
+
+    def row(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
+        """Return the numbers (D,) of a line, by the names of its columns; NaN of those it lacks."""
+        cells = [values.get(header) for header in self.headers]
+        return self._numbers(np.array(cells, np.float64))
+
+    def rows(self, table: Columns) -> NDArray[np.float64]:
+        """Return the rows (T, D) of a table.
+
+        Raises:
+            ValueError: a column holds words.
+        """
+        cells = []
+        for header in self.headers:
+            values = table[header]
+            if not is_numeric(values):
+                raise ValueError(
+                    f"{header} must hold numbers, as its schema says, got {values[0]!r}"
+                )
+            cells.append(values)
+        return self._numbers(np.column_stack(cells).astype(np.float64))
+
+    def _numbers(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the numbers (..., D) of a stream of those of its columns (..., C)."""
+        numbers = np.where(cells == self._sentinels, np.nan, cells) * self._scales
+        if not self._wraps:
+            return numbers
+        parts = []
+        for k, column in enumerate(self._columns):
+            if column.wrap:
+                angle = numbers[..., k] * TAU / column.wrap
+                parts += [np.sin(angle), np.cos(angle)]
+            else:
+                parts.append(numbers[..., k])
+        return np.stack(parts, axis=-1)
+
+
+def _headers_by_name(names: Iterable[str]) -> dict[str, str]:
+    """Return the headers by their names without a unit, and by the labels that these stand for."""
+    bare = {split_unit(header)[0]: header for header in names}
+    labels = {label_of(name): header for name, header in bare.items()}
+    return labels | bare
+
+
+def _with_places(
+    columns: Iterable[LogColumn], by_name: Mapping[str, str]
+) -> Iterator[tuple[LogColumn, str]]:
+    """Yield each column, and its place in a list of its channel, ``q[1]``, if no name is there."""
+    columns = list(columns)
+    named = {c.channel for c in columns if c.name in by_name or c.label in by_name}
+    count = Counter[str]()
+    for column in columns:
+        place = ""
+        if column.channel not in named:
+            place = f"{column.channel}[{count[column.channel]}]"
+        count[column.channel] += 1
+        yield column, place
+
+
+def _what_is_missing(lacking: list[str], schema: LogSchema, by_name: Mapping[str, str]) -> str:
+    """Say which columns of a schema are not there, and which are there that it does not know."""
+    message = f"the memory reads channels that are not there: {', '.join(lacking)}"
+    known = {by_name.get(name) for name in schema.names}
+    unknown = sorted(set(by_name.values()).difference(known))
+    if unknown:
+        message += f"; there are, and its schema lacks them: {', '.join(unknown)[:120]}"
+    return message
