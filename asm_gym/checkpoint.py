@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -26,6 +27,8 @@ from asm_gym.validation import typed
 FORMAT = "asm-gym"
 VERSION = 1
 HEADER = "header.json"
+END = b"PK\x05\x06"  # begins the record at the end of a zip,
+END_BYTES = 22  # which is so long without a comment
 
 # Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1.
 MOST_EXPANDED = 30
@@ -165,11 +168,20 @@ def _opened(
         size = regular_file(path)
         with zipfile.ZipFile(path) as file:
             _check_members(file.infolist(), size, expanded)
+            _check_end(Path(path))
             yield file
     except FileNotFoundError:
         raise
     except DAMAGE as error:
         raise DamagedFile(path, error, verdict) from error
+
+
+def _check_end(path: Path) -> None:
+    """Raise ValueError if bytes follow the end of a zip without a comment, as ours are."""
+    with path.open("rb") as file:
+        file.seek(-END_BYTES, os.SEEK_END)
+        if file.read(len(END)) != END:
+            raise ValueError("other bytes follow its end")
 
 
 def _check_members(members: list[zipfile.ZipInfo], size: int, expanded: int) -> None:

@@ -225,7 +225,7 @@ def settings(args: Args) -> dict[str, Any]:
 
 def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
     """Yield notes on which columns of a log are commands."""
-    if spec.source != "table":
+    if spec.source != "table" or args.schema is not None:
         return
     names = ", ".join(channel.name for channel in spec.channels if channel.group == MOTOR)
     if not names:
@@ -290,6 +290,9 @@ def fit(args: Args, console: Console) -> int:
     logs = [[part] for part in parts]
     if args.split is not None:
         logs = [pieces(part, args.split) for part in parts]
+    logs, repeats = selection.without_repeats(logs)
+    if repeats:
+        of_gaps.append(f"Left out: {repeats} parts whose rows are those of another one.")
     fitting, calibration = divide(args, logs, live)
 
     spec = fitting[0].spec

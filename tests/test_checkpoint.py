@@ -144,3 +144,11 @@ def test_a_pipe_is_no_checkpoint_and_nobody_waits_for_it(read, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="is no regular file"):
         read(tmp_path / "pipe")
+
+
+def test_bytes_behind_the_end_of_a_checkpoint_are_refused(tmp_path):
+    path = tmp_path / "x.asm"
+    write_checkpoint(path, "test", {}, {"a": np.zeros(2)})
+    path.write_bytes(path.read_bytes() + b"garbage" * 15)
+    with pytest.raises(ValueError, match=r"x\.asm is damaged.*follow its end"):
+        read_checkpoint(path, "test")

@@ -21,7 +21,7 @@ from asm_gym.data.clock import LogClock
 from asm_gym.data.clock_inference import infer_clock
 from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.column_match import ColumnMatch
-from asm_gym.data.log_column import COMMAND, LABEL, SENSE, UNCLEAR, LogColumn
+from asm_gym.data.log_column import COMMAND, COUNTER, LABEL, SENSE, UNCLEAR, LogColumn
 from asm_gym.data.names import TAU, TURN, TURNED, is_label, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.tables import Columns, is_numeric, laid_out
@@ -142,7 +142,11 @@ class LogSchema:
             got = reasons[:300] or "nothing"
             raise ValueError(f"a log must hold columns of numbers, got {got}")
         if not self.rate:
-            raise ValueError(NO_RATE)
+            counters = [column.name for column in self.columns if column.role == COUNTER]
+            message = NO_RATE
+            if counters:
+                message += f"; {counters[0]!r} counts: --clock '{counters[0]} [ms]'?"
+            raise ValueError(message)
 
     def read(self, table: Any) -> Recorded:
         """Return the rows of a log.

@@ -167,7 +167,7 @@ def _with_noise(schema: LogSchema, tables: Sequence[Columns]) -> LogSchema:
         noise = [0.0]
         if column.is_read:
             noise = [_noise_in(table, column) for table in tables]
-        columns.append(replace(column, noise=float(np.median(noise))))
+        columns.append(replace(column, noise=float(f"{np.median(noise):.3g}")))
     return replace(schema, columns=tuple(columns))
 
 

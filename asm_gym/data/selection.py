@@ -93,6 +93,25 @@ def pieces(episode: Episode, seconds: float) -> list[Episode]:
     return [_stretch(episode, end - rows, end) for end in ends]
 
 
+def without_repeats(logs: list[list[Episode]]) -> tuple[list[list[Episode]], int]:
+    """Return the parts of logs without those whose rows are those of another, and how many these are.
+
+    A quantised arm at rest says the same in many of them, which are no evidence of their own.
+    """
+    known: set[bytes] = set()
+    kept = []
+    for parts in logs:
+        own = []
+        for part in parts:
+            rows = part.stream.tobytes()
+            if rows not in known:
+                known.add(rows)
+                own.append(part)
+        kept.append(own)
+    repeats = sum(map(len, logs)) - sum(map(len, kept))
+    return [own for own in kept if own], repeats
+
+
 def split_in_time(
     logs: list[list[Episode]], calibration_share: float
 ) -> tuple[list[Episode], list[Episode]]:
