@@ -111,9 +111,7 @@ class MemoryModel(ScaledModel):
         completion = Completion.fit(senses, streams)
         if completion is not None:
             learned |= completion.named()
-        return self.restore(
-            {**learned, **network.weights._asdict(), **network.association.named()}
-        )
+        return self.restore({**learned, **network.weights._asdict(), **network.association.named()})
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
         """Go on from what it knows: association learns what these episodes have of their own, all else stays.
