@@ -5,15 +5,15 @@ long             time, joint, position          a row a joint: position[elbow], 
 several rates    empty cells between            the rows of the fastest columns; a slower one keeps its newest value
 publishers       a row of one of them each      the rows of the one of most columns; others keep their newest value
 lists            (T, k)                         q[0], …, q[k-1]
+pictures         (T, h, w), or many bytes       left out
 """
 
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,41 +23,77 @@ from asm_gym.data.reader_notes import note
 from asm_gym.validation import short_repr
 
 Columns = dict[str, NDArray[Any]]
-Named = dict[str, dict[str, str]]  # values by their kind, by the column that names them
+Mask = NDArray[np.bool_]
 
-_NAMES = re.compile(r"(?P<of>.*?)(?:joint_?)?names?[_.]?\[?(?P<place>\d+)\]?", re.I)
-_KEYS = "joint|motor|axis|servo|actuator|name|channel|signal|sensor|topic|field|variable"  # whose row it is
-_KEY = re.compile(rf"(.*[^a-z])?({_KEYS})s?([^a-z].*)?", re.I)
+# A column whose cells name those of its number: field.name0, joint_name[0]
+_NAMES = re.compile(
+    r"""
+    (?P<of> .*?)
+    (?: joint_? )? names? [_.]?
+    \[? (?P<place> \d+) \]?
+    """,
+    re.IGNORECASE | re.VERBOSE,
+)
+# A column that says whose row it is
+_KEY = re.compile(
+    r"""
+    (.*[^a-z])?
+    (joint|motor|axis|servo|actuator|name|channel|signal|sensor|topic|field|variable) s?
+    ([^a-z].*)?
+    """,
+    re.IGNORECASE | re.VERBOSE,
+)
+LISTS = (list, tuple, np.ndarray)  # types of a cell that holds several numbers
 MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
+MOST_BYTES = 512  # of a row of an array of bytes; more are a picture
 MOST_KEYS = 64  # joints of a long table
 MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
 SPARSE = 0.55  # share of filled rows up to which a column comes at a lower rate: at most at every other row
 HELD = 3.0  # for so many of its own periods a slower column keeps its newest value
+FEWEST = 5  # filled rows that show a rate
+
+
+class NamedBy(NamedTuple):
+    """What names a column: ``name0`` names ``position0``, which is of the kind ``position``."""
+
+    column: str
+    kind: str
+
+
+Named = dict[str, NamedBy]  # by the column that is named
 
 
 def table_of(frame: Any) -> Columns:
     """Return the columns (T,) of a dictionary, a frame of pandas or Polars, or an Arrow table by name."""
-    names = (
-        frame
-        if isinstance(frame, Mapping)
-        else getattr(frame, "column_names", getattr(frame, "columns", None))
-    )
-    if names is None or callable(names):
+    names = getattr(frame, "column_names", getattr(frame, "columns", None))
+    if isinstance(frame, Mapping):
+        names = frame
+    if names is None:
         raise TypeError(
             f"a table must be a dictionary of columns, or a frame of them, got {short_repr(frame)}"
         )
-    if len({str(name) for name in names}) < len(list(names)):
-        raise ValueError(f"columns must have different names, got {', '.join(map(str, names))}")
-    made: Columns = {}
+    words = list(map(str, names))
+    if len(set(words)) < len(words):
+        raise ValueError(f"columns must have different names, got {', '.join(words)}")
+    table: Columns = {}
     for name in names:
         values = as_array(frame[name])
-        if values.ndim > 2:
-            note(f"{name}: of {values.ndim} dimensions, left out")
+        if _are_pictures(values):
+            note(f"{name}: left out, taken for pictures by its type and size")
         elif values.ndim == 2:
-            made |= {element_name(str(name), k): v for k, v in enumerate(values.T)}
+            for place, column in enumerate(values.T):
+                table[element_name(str(name), place)] = column
         else:
-            made[str(name)] = values
-    return made
+            table[str(name)] = values
+    return table
+
+
+def _are_pictures(values: NDArray[Any]) -> bool:
+    """Whether a row of an array is of two dimensions, or of many bytes."""
+    is_bytes = values.dtype.name in ("uint8", "int8")
+    if is_bytes and values.ndim == 2:
+        return values.shape[1] > MOST_BYTES
+    return values.ndim > 2
 
 
 def check_width(size: int) -> None:
@@ -69,15 +105,16 @@ def check_width(size: int) -> None:
 def as_array(column: Any) -> NDArray[Any]:
     """Return an array (T,), None being NaN, or, of lists of one length, (T, k)."""
     array = np.asarray(column)
-    if array.dtype == object and all(cell is None or isinstance(cell, Real) for cell in array):
-        return np.array([np.nan if cell is None else cell for cell in array], np.float64)
-    if (
-        array.dtype == object
-        and len(array)
-        and all(isinstance(row, list | tuple | np.ndarray) for row in array)
-    ):
-        return np.array(array.tolist()) if len({len(row) for row in array}) == 1 else array
-    return array
+    if array.dtype != object:
+        return array
+    if all(isinstance(cell, Real | None) for cell in array):
+        return array.astype(np.float64)
+    if not all(isinstance(cell, LISTS) for cell in array):
+        return array
+    lengths = set(map(len, array))
+    if len(lengths) > 1:
+        return array
+    return np.array(array.tolist())
 
 
 def is_numeric(values: NDArray[Any]) -> bool:
@@ -86,48 +123,50 @@ def is_numeric(values: NDArray[Any]) -> bool:
 
 
 def named_columns(names: Iterable[str]) -> Named:
-    """Return the columns whose cells name others, and these by their kind: ``position`` of ``position0``."""
+    """Return the columns that the cells of others name: ``position0`` by those of ``name0``."""
     names = list(names)
-    found: Named = {}
-    for name in names:
-        if match := _NAMES.fullmatch(name):
-            kind = re.compile(rf"({re.escape(match['of'])}.*?[^\W\d])[_.]?\[?{match['place']}\]?")
-            others = {
-                other: kind.fullmatch(other)
-                for other in names
-                if other != name and not _NAMES.fullmatch(other)
-            }
-            found[name] = {hit[1].rstrip("_.["): other for other, hit in others.items() if hit}
-    return {name: kinds for name, kinds in found.items() if kinds}
+    named: Named = {}
+    matches = map(_NAMES.fullmatch, names)
+    for match in filter(None, matches):
+        of = re.escape(match["of"])
+        pattern = rf"({of}.*?[^\W\d])[_.]?\[?{match['place']}\]?"
+        for other in names:
+            kind = re.fullmatch(pattern, other)
+            if kind and not _NAMES.fullmatch(other):
+                named[other] = NamedBy(
+                    column=match[0],
+                    kind=kind[1].rstrip("_.["),
+                )
+    return named
 
 
 def named_row(row: Mapping[str, Any], named: Named) -> dict[str, Any]:
     """Return a row whose cells name its values, by those names: ``position[elbow]``."""
     made = dict(row)
-    for name, kinds in named.items():
-        for kind, column in kinds.items():
-            if column in made and str(row.get(name) or "").strip():
-                made[f"{kind}[{str(row[name]).strip()}]"] = made.pop(column)
+    for column, by in named.items():
+        word = str(row.get(by.column, "")).strip()
+        if word and column in made:
+            made[f"{by.kind}[{word}]"] = made.pop(column)
     return made
 
 
 def _with_names(table: Columns) -> Columns:
     """The table with the columns that cells name: a message may name other joints, or the same in another order."""
-    named = {
-        name: kinds for name, kinds in named_columns(table).items() if not is_numeric(table[name])
-    }
-    made = {
-        name: values
-        for name, values in table.items()
-        if all(name not in k.values() for k in named.values())
-    }
-    for name, kinds in named.items():
-        words = np.array([str(cell).strip() for cell in made.pop(name)])
+    made = dict(table)
+    for column, by in named_columns(table).items():
+        names = table[by.column]
+        values = table[column]
+        if is_numeric(names) or not is_numeric(values):
+            continue
+        made.pop(column)
+        made.pop(by.column, None)
+        words = np.array([str(name).strip() for name in names])
         for word in dict.fromkeys(words.tolist()):
-            at = words == word
-            for kind, column in kinds.items() if word else ():
-                values = made.setdefault(f"{kind}[{word}]", np.full(len(words), np.nan))
-                values[at] = table[column][at]
+            rows = words == word
+            empty = np.full(len(words), np.nan)
+            if word:
+                named = made.setdefault(f"{by.kind}[{word}]", empty)
+                named[rows] = values[rows]
     return made
 
 
@@ -135,97 +174,125 @@ def _pivoted(table: Columns) -> Columns:
     """A long table as a wide one; others as they are."""
     import pandas as pd
 
-    key = next((name for name in table if is_key(name) and _goes_round(table[name])), None)
-    values = [
-        name for name in table if name != key and is_numeric(table[name]) and not is_clock(name)
-    ]
-    if key is None or not values:
+    keys = []
+    clocks = []
+    senses = []
+    for name, values in table.items():
+        if is_clock(name):
+            clocks.append(name)
+        elif is_key(name) and _goes_round(values):
+            keys.append(name)
+        elif is_numeric(values):
+            senses.append(name)
+    if not keys or not senses:
         return table
-    clock = next(filter(is_clock, table), None)
+    key = keys[0]
     frame = pd.DataFrame(table)
-    round_of = frame.groupby(key, sort=False).cumcount()
-    if clock is not None and frame[clock].duplicated().any():  # joints of a moment share a stamp
-        round_of = (frame[clock] != frame[clock].shift()).cumsum()
-    wide = frame.assign(_round=round_of).pivot_table(
-        values, "_round", key, aggfunc="last", sort=False
+    moments = frame.groupby(key).cumcount()
+    times = frame[clocks[:1]]
+    if times.duplicated().any():  # joints of a moment share a stamp
+        is_new = times != times.shift()
+        moments = is_new.any(axis=1).cumsum()
+    wide = frame.pivot_table(
+        senses,
+        index=moments,
+        columns=key,
+        aggfunc="last",
+        sort=False,
     )
-    made: Columns = (
-        {}
-        if clock is None
-        else {clock: frame.groupby(round_of.to_numpy())[clock].first().to_numpy()}
-    )
-    made |= {element_name(name, word): wide[name, word].to_numpy() for name, word in wide.columns}
-    note(
-        f"a row a joint: put side by side by {key!r}, as {next(reversed(made))} and {len(made) - 1} others"
-    )
+    made: Columns = {}
+    for clock in times:
+        made[clock] = times[clock].groupby(moments).first().to_numpy()
+    for name, word in wide:
+        made[element_name(name, word)] = wide[name, word].to_numpy()
+    names = ", ".join(made)
+    note(f"a row a joint: put side by side by {key!r}, as {names[:120]}")
     return made
 
 
 def is_key(name: str) -> bool:
     """Tell whether a column is called as if it said whose row it is."""
-    return _KEY.fullmatch(name) is not None and _NAMES.fullmatch(name) is None
+    if _NAMES.fullmatch(name):
+        return False
+    return _KEY.fullmatch(name) is not None
 
 
 def _goes_round(values: NDArray[Any]) -> bool:
     """Whether a column goes round the same few words or numbers."""
     import pandas as pd
 
-    if len(values) < 4 or values.dtype.kind == "f":
+    if values.dtype.kind == "f":
         return False
-    words = pd.factorize(values)[0]
-    size = int(words.max()) + 1
-    if not 2 <= size <= min(MOST_KEYS, len(words) // 2) or (words[:size] != np.arange(size)).any():
+    codes, words = pd.factorize(values)
+    size = len(words)
+    most = min(MOST_KEYS, len(codes) / 2)
+    if not 2 <= size <= most:
         return False
-    changes, again = np.mean(words[1:] != words[:-1]), np.mean(words[size:] == words[:-size])
-    return bool(changes >= MOSTLY and again >= MOSTLY)
+    changes = np.mean(codes[1:] != codes[:-1])
+    repeats = np.mean(codes[size:] == codes[:-size])
+    return bool(min(changes, repeats) >= MOSTLY)
 
 
 def _joined(table: Columns) -> Columns:
     """A table whose columns come at several rates, at the rate of the fastest ones."""
     import pandas as pd
 
-    filled = {
-        n: np.isfinite(v)
-        for n, v in table.items()
-        if is_numeric(v) and v.dtype.kind == "f" and not is_clock(n)
-    }
-    masks = {mask.tobytes(): mask for mask in filled.values() if mask.any()}
-    rows, most = np.ones(len(next(iter(table.values()), ())), np.bool_), SPARSE
-    if (
-        len(masks) > 1 and np.mean(np.sum(list(masks.values()), axis=0) == 1) > MOSTLY
-    ):  # a row has one of them
-        # as live: rows are those of the most numbers
-        columns = Counter(mask.tobytes() for mask in filled.values())
-        rows, most = (
-            max(masks.values(), key=lambda mask: (columns[mask.tobytes()], np.count_nonzero(mask))),
-            1.0,
-        )
-    slower = {
-        n: m
-        for n, m in filled.items()
-        if not np.array_equal(m, rows) and m.mean() <= most and _regular(m)
-    }
+    filled = {}
+    for name, values in table.items():
+        if values.dtype.kind == "f" and not is_clock(name):
+            mask = np.isfinite(values)
+            if mask.any():
+                filled[name] = mask
+    rows = _leading_rows(list(filled.values()))
+    slower = {}
+    for name, mask in filled.items():
+        share = mask.mean()
+        is_fast = rows.all() and share > SPARSE
+        if is_fast or np.array_equal(mask, rows) or not _is_steady(mask):
+            continue
+        column = pd.Series(table[name])
+        limit = round(HELD / share)
+        slower[name] = column.ffill(limit=limit)
     if not slower:
         return table
-    note(f"columns come at several rates: {', '.join(slower)[:120]} keep their newest value")
-    held = pd.DataFrame(
-        {n: pd.Series(table[n]).ffill(limit=round(HELD / m.mean())) for n, m in slower.items()}
-    )[rows]
-    # before that the slower ones said nothing
-    start = int(held.notna().to_numpy().argmax(axis=0).max())
-    return {
-        n: (held[n].to_numpy() if n in slower else values[rows])[start:]
-        for n, values in table.items()
-    }
+    names = ", ".join(slower)
+    note(f"columns come at several rates: {names[:120]} keep their newest value")
+    is_known = pd.DataFrame(slower)[rows].notna()
+    start = is_known.all(axis=1).argmax()  # before, a slower column has no value yet
+    joined: Columns = {}
+    for name, values in table.items():
+        column = np.asarray(slower.get(name, values))
+        joined[name] = column[rows][start:]
+    return joined
 
 
-def _regular(mask: NDArray[np.bool_]) -> bool:
+def _leading_rows(filled: Sequence[Mask]) -> Mask:
+    """The rows (T,) of the publisher of most columns where publishers take turns; else all rows."""
+    publishers: dict[bytes, list[Mask]] = {}
+    for mask in filled:
+        columns = publishers.setdefault(mask.tobytes(), [])
+        columns.append(mask)
+    rows = [columns[0] for columns in publishers.values()]
+    is_of_one = np.sum(rows, axis=0) == 1
+    if len(rows) < 2 or is_of_one.mean() <= MOSTLY:
+        return np.ones_like(is_of_one)
+    leader = max(publishers.values(), key=len)
+    return leader[0]
+
+
+def _is_steady(filled: Mask) -> bool:
     """Whether filled cells (T,) come at a steady rate all the time, and not in a stretch of their own."""
-    filled = np.flatnonzero(mask)
-    if len(filled) < 5 or filled[-1] - filled[0] < MOSTLY * (len(mask) - 2 / mask.mean()):
+    places = np.flatnonzero(filled)
+    if len(places) < FEWEST:
         return False
-    steps = np.diff(filled)
-    return bool(np.quantile(steps, 0.9) <= 2.5 * max(float(np.median(steps)), 1 / mask.mean()))
+    period = len(filled) / len(places)  # [rows]
+    stretch = len(filled) - 2 * period
+    if np.ptp(places) < MOSTLY * stretch:
+        return False
+    steps = np.diff(places)
+    usual = max(period, np.median(steps))
+    long = np.quantile(steps, 0.9)
+    return bool(long <= 2.5 * usual)
 
 
 def laid_out(frame: Any) -> Columns:
@@ -235,13 +302,13 @@ def laid_out(frame: Any) -> Columns:
     """
     table = table_of(frame)
     check_width(len(table))
-    lengths = {name: len(values) for name, values in table.items()}
-    if not any(lengths.values()):
-        raise ValueError(
-            f"a table must hold a row of numbers, got none of {', '.join(table)[:200] or 'any column'}"
-        )
-    if len(set(lengths.values())) > 1:
-        raise ValueError(
-            f"columns must have one length, got {', '.join(f'{n}: {k}' for n, k in lengths.items())}"
-        )
-    return _joined(_pivoted(_with_names(table)))
+    lengths = set(map(len, table.values()))
+    if lengths <= {0}:
+        names = ", ".join(table)
+        raise ValueError(f"a table must hold a row of numbers, got none of {names[:200]}")
+    if len(lengths) > 1:
+        sizes = [f"{name}: {len(values)}" for name, values in table.items()]
+        raise ValueError(f"columns must have one length, got {', '.join(sizes)}")
+    table = _with_names(table)
+    table = _pivoted(table)
+    return _joined(table)
