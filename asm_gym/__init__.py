@@ -13,7 +13,8 @@ import gymnasium
 
 if not hasattr(gymnasium.vector, "AutoresetMode"):  # since 1.1
     raise ImportError(
-        f"asm-gym needs Gymnasium 1.1 or newer, got {gymnasium.__version__}: pip install --upgrade gymnasium"
+        f"asm-gym needs Gymnasium 1.1 or newer, got {gymnasium.__version__}: "
+        "pip install --upgrade gymnasium"
     )
 
 from asm_gym import exceptions
@@ -65,7 +66,7 @@ _HOME = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = [*_HOME]
 
 for _task in TASKS.values():
-    # Without max_episode_steps: the environment truncates itself, so that `horizon` is an argument like any other.
+    # No max_episode_steps: the environment truncates itself, so `horizon` is an ordinary argument.
     gymnasium.register(
         _task.id,
         f"asm_gym.envs:{_task.name}",

@@ -30,7 +30,7 @@ HEADER = "header.json"
 END = b"PK\x05\x06"  # begins the record at the end of a zip,
 END_BYTES = 22  # which is so long without a comment
 
-# Largest size of the content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1.
+# Largest content of a compressed ``.npz``, in sizes of the file; real streams shrink by 1.1.
 MOST_EXPANDED = 30
 
 # Errors that reading a damaged zip may raise.
@@ -105,8 +105,8 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
     header = read_header(path)
     if header.get("version") != VERSION:
         raise ValueError(
-            f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads {VERSION}; "
-            "a newer asm-gym may have written it"
+            f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads "
+            f"{VERSION}; a newer asm-gym may have written it"
         )
     if header.get("kind") != kind:
         raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")

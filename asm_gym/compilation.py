@@ -37,9 +37,11 @@ def compiled(
 
     Args:
         function: to be compiled.
-        fastmath: let loops use vector registers; inputs must then be finite. Callees are compiled into their callers,
-            as the linker would take one of two copies that differ in the order of sums.
-        calls: other folders of the package that hold functions which it calls; ``"."`` for the package's own.
+        fastmath: let loops use vector registers; inputs must then be finite. Callees are
+            compiled into their callers, as the linker would take one of two copies that differ in
+            the order of sums.
+        calls: other folders of the package that hold functions which it calls; ``"."`` for the
+            package's own.
         nogil: let other threads run Python meanwhile.
     """
     options: dict[str, Any] = {
@@ -51,7 +53,8 @@ def compiled(
     dispatcher: Any = somewhere(lambda: numba.njit(cache=True, **options)(function))
     cache = _cache_of(dispatcher)
     if cache is not None:
-        # numba looks at the function's own file alone, and would keep code that another file's change made stale.
+        # numba looks at the function's own file alone, and would keep code that a change of another
+        # file made stale.
         folders = [Path(function.__code__.co_filename).parent]
         folders += [Path(__file__).parent / name for name in calls]
         cache._source_stamp = f"{options}" + "".join(map(_digest, folders))
@@ -60,9 +63,10 @@ def compiled(
 
 
 def somewhere(make: Callable[[], T]) -> T:
-    """Return what ``make`` returns, which keeps compiled code: in a temporary folder where no other can be written to.
+    """Return what ``make`` returns, which keeps compiled code.
 
-    From then on all code of this process is kept there, robosuite's too.
+    Where no other folder can be written to, the code is kept in a temporary one. From then on all
+    code of this process is kept there, robosuite's too.
     """
     try:
         return make()
@@ -73,8 +77,8 @@ def somewhere(make: Callable[[], T]) -> T:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     reload_config()  # type: ignore[no-untyped-call]
     print(
-        "asm-gym: neither the install nor HOME is writable, so that compiled code is lost when this process ends: "
-        "name a folder that is, export NUMBA_CACHE_DIR=FOLDER",
+        "asm-gym: neither the install nor HOME is writable, so that compiled code is lost when "
+        "this process ends: name a folder that is, export NUMBA_CACHE_DIR=FOLDER",
         file=sys.stderr,
     )
     return make()

@@ -16,7 +16,10 @@ GET_RENDERING = "apt-get install libegl1 libgl1 libgl1-mesa-dri (or libosmesa6)"
 # A lit white ball on black: a driver that draws nothing returns a frame of one colour.
 ONE_FRAME = """
 import mujoco
-ball = "<mujoco><worldbody><light pos='0 0 3'/><geom size='.1' rgba='1 1 1 1'/></worldbody></mujoco>"
+ball = (
+    "<mujoco><worldbody><light pos='0 0 3'/>"
+    "<geom size='.1' rgba='1 1 1 1'/></worldbody></mujoco>"
+)
 model = mujoco.MjModel.from_xml_string(ball)
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
@@ -34,11 +37,14 @@ def rendering_backend() -> str | None:
 
 
 def draws_a_frame(backend: str) -> bool:
-    """Return whether MuJoCo draws one frame with ``MUJOCO_GL=backend``, in another process: no choice can be undone."""
+    """Return whether MuJoCo draws one frame with ``MUJOCO_GL=backend``.
+
+    It draws in another process, as no choice can be undone.
+    """
     env = os.environ | {"MUJOCO_GL": backend}
     env.pop("PYOPENGL_PLATFORM", None)
     command = [sys.executable, "-c", ONE_FRAME]
-    # A driver may wait for a device for ever; importing mujoco on a busy machine takes tens of seconds.
+    # A driver may wait for a device for ever; a busy machine imports mujoco in tens of seconds.
     try:
         drawn = subprocess.run(command, env=env, capture_output=True, timeout=120, check=False)
     except subprocess.TimeoutExpired:

@@ -34,7 +34,8 @@ LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
 FEW_VALUES = 5  # a channel of fewer different values is a flag or a mode
 MOST_SHOWN = 10_000  # rows from which the resolution of channels is estimated
 
-# Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted from such a number.
+# Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted
+# from such a number.
 FARTHEST = 1e3
 
 

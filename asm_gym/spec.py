@@ -172,7 +172,8 @@ class StreamSpec:
         """Raise ValueError unless the last axis of ``stream`` is D long."""
         if stream.ndim < 1 or stream.shape[-1] != self.size:
             raise ValueError(
-                f"a stream of this spec has {self.size} numbers a step ({', '.join(c.name for c in self.channels)}), "
+                f"a stream of this spec has {self.size} numbers a step "
+                f"({', '.join(c.name for c in self.channels)}), "
                 f"got an array of shape {stream.shape}"
             )
 

@@ -76,8 +76,8 @@ class StreamSource:
         rows = self.rows_per_step
         if rows > 1 and not isclose(self.spec.dt, self._stated_spec.dt):
             raise UnsupportedEnvironment(
-                f"the stream has {rows} rows in each step of the robot, and a wrapper that repeats actions "
-                "hides all but those of the last",
+                f"the stream has {rows} rows in each step of the robot, and a wrapper that repeats "
+                "actions hides all but those of the last",
                 advice="put that wrapper outside",
             )
 
@@ -116,14 +116,20 @@ class StreamSource:
 
 
 def stepped(env: gym.Env[Any, Any], action: Any) -> StepResult:
-    """Return what a step of an environment returns. Raises TypeError unless it is the five values of Gymnasium."""
+    """Return what a step of an environment returns.
+
+    Raises TypeError unless it is the five values of Gymnasium.
+    """
     found: Any = env.step(action)
     if not isinstance(found, tuple) or len(found) != 5:
         size = len(found) if isinstance(found, tuple) else 1
-        cost = "; of Safety-Gymnasium, safety_gymnasium.wrappers.SafetyGymnasium2Gymnasium(env) makes them"
+        cost = (
+            "; of Safety-Gymnasium, "
+            "safety_gymnasium.wrappers.SafetyGymnasium2Gymnasium(env) makes them"
+        )
         raise TypeError(
-            f"step of {type(env.unwrapped).__name__} returns {size} values, and Gymnasium's returns observation, "
-            f"reward, terminated, truncated, info{cost if size == 6 else ''}"
+            f"step of {type(env.unwrapped).__name__} returns {size} values, and Gymnasium's "
+            f"returns observation, reward, terminated, truncated, info{cost if size == 6 else ''}"
         )
     return found
 

@@ -80,9 +80,10 @@ def check_number(
 def check_number(
     name: str, value: object, *, whole: bool = False, infinite: bool = False, **bounds: float | None
 ) -> float:
-    """Return ``value`` as a Python number, a ``whole`` one, or perhaps an ``infinite`` one, within ``bounds``.
+    """Return ``value`` as a Python number within ``bounds``.
 
-    ``low`` and ``high`` are allowed, ``above`` and ``below`` are not.
+    It must be ``whole``, or may be ``infinite``, where that is said. ``low`` and ``high`` are
+    allowed, ``above`` and ``below`` are not.
 
     Raises:
         ValueError: it is no such number; the message begins with ``name``.
@@ -94,7 +95,8 @@ def check_number(
         noun = "whole number"
     if isinstance(value, bool | np.bool_) or not isinstance(value, kind):
         raise _refused(name, noun, bounds, value)
-    number: float = int(value) if isinstance(value, Integral) else float(value)  # type: ignore[arg-type]
+    convert: Any = int if isinstance(value, Integral) else float
+    number: float = convert(value)
     # NaN alone differs from itself; math.isnan takes no integer of thousands of digits.
     if number != number or not _within(number, bounds):
         raise _refused(name, noun, bounds, value)

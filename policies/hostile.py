@@ -55,8 +55,8 @@ class Hostile(StatefulPolicy):
         return action.astype(np.float32), (step + 1, rng)
 
 
-# The first numbers of the action, (x, y, z), turns about them and grip: of every control step, or as a function of
-# the policy, the number of the step and a generator. The others are 0.
+# The first numbers of the action, (x, y, z), turns about them and grip: of every control step, or
+# as a function of the policy, the number of the step and a generator. The others are 0.
 Rule = tuple[float, ...] | Callable[[Hostile, int, np.random.Generator], Any]
 
 

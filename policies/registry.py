@@ -52,7 +52,8 @@ def scripted(env: gym.Env[Any, Any], seed: int | None = None, **kwargs: Any) -> 
         name = env.spec.id
     if name not in experts:
         raise ValueError(
-            f"{name or env} has no scripted expert, use 'sway'; these have one: {', '.join(experts)}"
+            f"{name or env} has no scripted expert, use 'sway'; these have one: "
+            f"{', '.join(experts)}"
         )
     return experts[name](env, seed=seed, **kwargs)
 

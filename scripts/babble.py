@@ -229,7 +229,8 @@ def babble(args: Args, console: Console) -> None:
         if args.exam_episodes:
             publish(args, memory, evaluate(args, memory, console), console)
     console.print(
-        f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, NeuralASM.load(...)) watches with it"
+        f"Wrote {args.out}/{memory.about['name']}.asm: NeuralASMSafety(env, "
+        "NeuralASM.load(...)) watches with it"
     )
 
 

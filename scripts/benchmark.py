@@ -263,7 +263,10 @@ def physics_alone(
 
 
 def measure_env(args: Args, console: Console) -> Table:
-    """Compare vectors with MuJoCo's own threads, which simulate the same motion alone, and with robosuite's step."""
+    """Compare vectors with MuJoCo's own threads and with robosuite's step.
+
+    MuJoCo's threads only simulate the same motion.
+    """
     rows = []
     turns = max(1, args.steps // SECOND)
     envs = [_made(args.task) for _ in range(max(args.members))]
@@ -283,7 +286,7 @@ def measure_env(args: Args, console: Console) -> Table:
     )
     for n, ours in vectors_of(envs, args.members).items():
         rng = np.random.default_rng(args.seed)
-        # Each action is held for a second, as a policy's are: noise alone would keep the arm in place.
+        # Each action is held for a second, as a policy's are: noise alone keeps the arm in place.
         held = rng.uniform(-0.3, 0.3, (turns + 1, *(ours.action_space.shape or ())))
         actions = np.repeat(held, SECOND, axis=0).astype(np.float32)
         ours.reset(seed=args.seed)

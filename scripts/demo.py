@@ -139,8 +139,9 @@ def demonstrate(args: Args, console: Console) -> None:
     console.print("", table, "")
     low, high = map(int, binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE))
     result = (
-        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of {args.nominal_episodes} "
-        f"nominal episodes raise an alarm by chance (95 %). The expert succeeded in {expert.k} of {expert.n} episodes."
+        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of "
+        f"{args.nominal_episodes} nominal episodes raise an alarm by chance (95 %). The expert "
+        f"succeeded in {expert.k} of {expert.n} episodes."
     )
     console.print(result)
     figure = figures.surprise_figure([typical(condition.watched) for condition in rows])
@@ -149,8 +150,8 @@ def demonstrate(args: Args, console: Console) -> None:
         report,
         title=f"asm-gym demo: {args.task}",
         intro=(
-            f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes feel like and then "
-            f"watched others, some of them faulty. {result}"
+            f"A Neural Associative Skill Memory learned what {args.fit_episodes} nominal episodes "
+            f"feel like and then watched others, some of them faulty. {result}"
         ),
         tables=[table],
         drawn={"Surprise over time in a typical episode of each condition": figure},

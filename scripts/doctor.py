@@ -1,6 +1,6 @@
 """Check this machine, and print what it lacks and what installs it. Exit code 1: asm-gym cannot run here."""
 
-# Nothing that is checked here is imported here: the doctor must work where `import robosuite` does not.
+# Nothing that is checked is imported here: the doctor must work where `import robosuite` fails.
 
 from __future__ import annotations
 

@@ -95,7 +95,8 @@ class Args(Options):
         if self.elsewhere:
             if len(self.tasks) > 1:
                 raise ValueError(
-                    f"one memory has one stream: name one environment at a time, got {', '.join(self.tasks)}"
+                    "one memory has one stream: name one environment at a time, "
+                    f"got {', '.join(self.tasks)}"
                 )
             for name in self.faults:
                 check_choice("kind of fault", name, anywhere.KINDS)
@@ -105,14 +106,15 @@ class Args(Options):
             kinds_of(self.faults)
         if self.faulty_episodes > self.nominal_episodes:
             raise ValueError(
-                f"every faulty episode is the twin of a nominal one: faulty_episodes must be at most "
-                f"{self.nominal_episodes}, got {self.faulty_episodes}"
+                "every faulty episode is the twin of a nominal one: faulty_episodes must be at "
+                f"most {self.nominal_episodes}, got {self.faulty_episodes}"
             )
         needed = conformal_episodes(self.false_alarm_rate)
         if self.calibration_episodes * len(self.tasks) < needed and not self.quick:
             raise ValueError(
-                f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration episodes in all, got "
-                f"{self.calibration_episodes} for each of {len(self.tasks)} tasks"
+                f"a false-alarm rate of {self.false_alarm_rate:g} needs {needed} calibration "
+                f"episodes in all, got {self.calibration_episodes} "
+                f"for each of {len(self.tasks)} tasks"
             )
 
     @property

@@ -127,14 +127,18 @@ def record_live(args: Args, say: Callable[[str], None]) -> Args:
 def divide(
     args: Args, logs: list[list[Episode]], in_time: bool
 ) -> tuple[list[Episode], list[Episode]]:
-    """Return episodes to learn from, and to calibrate on. Raises ValueError where they are too few for the promise."""
+    """Return episodes to learn from, and to calibrate on.
+
+    Raises ValueError where they are too few for the promise.
+    """
     by_episode = args.promise.per == EPISODE
     if in_time or (args.split is not None and not by_episode):
         fitting, calibration = selection.split_in_time(logs, CALIBRATION_SHARE)
         if len(calibration) < args.needed:
             raise ValueError(
-                f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to calibrate on, got "
-                f"{len(calibration)} of {args.split:g} s: record for longer, or take a higher --false-alarm-rate"
+                f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to "
+                f"calibrate on, got {len(calibration)} of {args.split:g} s: record for longer, or "
+                "take a higher --false-alarm-rate"
             )
     else:
         episodes = flat(logs)
@@ -229,7 +233,10 @@ def notes_on_columns(args: Args, spec: StreamSpec) -> Iterator[str]:
         return
     names = ", ".join(channel.name for channel in spec.channels if channel.group == MOTOR)
     if not names:
-        yield "no command is recorded, so faults are found later; --action names the columns of commands"
+        yield (
+            "no command is recorded, so faults are found later; "
+            "--action names the columns of commands"
+        )
     elif not args.action:
         yield f"read as commands, by name: {names}; the output of a controller would hide pushes"
 
@@ -243,9 +250,15 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         model = monitor.values_.monitor.model
     if not isinstance(model, ValueAssociation):
         return
-    left = f"with it the squared error of held-out torques is {model.left_by_body:.2f} of that without it"
+    left = (
+        f"with it the squared error of held-out torques is {model.left_by_body:.2f} "
+        "of that without it"
+    )
     if model.links is None:
-        yield f"{args.urdf} is not used: {left}; check its masses, and that it names joints as the log does"
+        yield (
+            f"{args.urdf} is not used: {left}; "
+            "check its masses, and that it names joints as the log does"
+        )
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
     assigned = "by the best fit to the torques, as no column names a joint"
@@ -307,7 +320,8 @@ def fit(args: Args, console: Console) -> int:
         say(f"Note: {note}.")
     rows = sum(map(len, fitting))
     say(
-        f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, {1 / spec.dt:g} a second."
+        f"Learned from {len(fitting)} episodes: {rows} rows of {spec.size} numbers, "
+        f"{1 / spec.dt:g} a second."
     )
     if left_out:
         say(f"Left out: {left_out}.")
@@ -319,7 +333,10 @@ def fit(args: Args, console: Console) -> int:
 
 
 def summary_of_threshold(args: Args, monitor: Any, calibration: int) -> Iterator[str]:
-    """Yield the threshold and its promise, and the false alarms to expect, after so many episodes of calibration."""
+    """Yield the threshold and its promise, and the false alarms to expect.
+
+    It was set from ``calibration`` episodes, less those that set ceilings.
+    """
     hours = monitor.blocks_.total
     used = len(monitor.maxima_)
     promise = f"at most {args.promise.rate:g} alarms an hour, from {hours:.3g} normal hours"
@@ -333,8 +350,8 @@ def summary_of_threshold(args: Args, monitor: Any, calibration: int) -> Iterator
 
     expected, most = monitor.promise.hourly(hours)
     line = (
-        f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an hour, at most "
-        f"{most:.3g} with 95 % confidence; other motion raises more."
+        f"Expected false alarms for motion as in these {60 * hours:.2g} minutes: {expected:.3g} an "
+        f"hour, at most {most:.3g} with 95 % confidence; other motion raises more."
     )
     if expected > 1.0:
         line += f" A promise of 1 an hour takes {1 / CALIBRATION_SHARE:g} hours of recordings."

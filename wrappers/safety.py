@@ -101,7 +101,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         if self._box is None and not (
             isinstance(on_alarm, str) and on_alarm in ("monitor", "terminate")
         ):
-            needs = f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, got {env.action_space}"
+            needs = (
+                f"on_alarm={short_repr(on_alarm)} needs a Box action space to act in, "
+                f"got {env.action_space}"
+            )
             raise TypeError(
                 f'{needs}: others can only be watched, on_alarm="monitor", or ended, "terminate"'
             )

@@ -70,8 +70,8 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         if mode == AutoresetMode.SAME_STEP:
             raise UnsupportedEnvironment(
-                "VectorNeuralASMSafety needs AutoresetMode.NEXT_STEP or DISABLED, got SAME_STEP: make the environments "
-                "without it, or wrap each in NeuralASMSafety"
+                "VectorNeuralASMSafety needs AutoresetMode.NEXT_STEP or DISABLED, got SAME_STEP: "
+                "make the environments without it, or wrap each in NeuralASMSafety"
             )
         self._resets_itself = mode == AutoresetMode.NEXT_STEP
         self._members = askable(env)
@@ -109,8 +109,9 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         env = self.env
         if not isinstance(env.single_observation_space, gym.spaces.Box):
             raise TypeError(
-                f"environments without a stream must have Box observations to be watched in a vector, got "
-                f"{env.single_observation_space}: wrap each in NeuralASMSafety, or in FlattenObservation"
+                "environments without a stream must have Box observations to be watched in a "
+                f"vector, got {env.single_observation_space}: wrap each in NeuralASMSafety, or in "
+                "FlattenObservation"
             )
         return StreamSpec.from_spaces(
             env.single_observation_space, env.single_action_space, self._period

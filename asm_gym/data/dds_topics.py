@@ -35,7 +35,9 @@ FIELDS = {
     ),
     "geometry_msgs/msg/Vector3": "float64 x, float64 y, float64 z",
     "geometry_msgs/msg/Wrench": "geometry_msgs/msg/Vector3 force, geometry_msgs/msg/Vector3 torque",
-    "geometry_msgs/msg/WrenchStamped": "std_msgs/msg/Header header, geometry_msgs/msg/Wrench wrench",
+    "geometry_msgs/msg/WrenchStamped": (
+        "std_msgs/msg/Header header, geometry_msgs/msg/Wrench wrench"
+    ),
     "std_msgs/msg/String": "string data",
     "std_msgs/msg/MultiArrayDimension": "string label, uint32 size, uint32 stride",
     "std_msgs/msg/MultiArrayLayout": "std_msgs/msg/MultiArrayDimension[] dim, uint32 data_offset",

@@ -119,7 +119,8 @@ class Episode:
         """The label. Raises ValueError without one."""
         if self.label is None:
             raise ValueError(
-                "this episode has no label, which holds the task and the role that it was recorded for"
+                "this episode has no label, which holds the task and "
+                "the role that it was recorded for"
             )
         return self.label
 

@@ -52,13 +52,14 @@ TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fro
 TURNED = ("sin", "cos")  # elements of a channel that stands for an angle which turns over
 
 _OF = (
-    r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|recording|record|recv|"
-    r"receive|received|publish|device|sim|wall)"
+    r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|"
+    r"recording|record|recv|receive|received|publish|device|sim|wall)"
 )
 _WHAT = r"(?:time[ _]?stamps?|time|stamp|date[ _]?time|date|zeit(?:stempel)?|uhrzeit)"
 _UNIT = "|".join(sorted(map(re.escape, SECONDS), key=len, reverse=True))
 CLOCK = re.compile(
-    rf"[%_#\s]*(?:(?:.*[./])?(?:header[._])?(?:{_OF}[ _]?)?{_WHAT}|t)(?:[ _.]*[\[(]?\s*(?P<unit>{_UNIT})\s*[\])]?)?",
+    rf"[%_#\s]*(?:(?:.*[./])?(?:header[._])?(?:{_OF}[ _]?)?{_WHAT}|t)"
+    rf"(?:[ _.]*[\[(]?\s*(?P<unit>{_UNIT})\s*[\])]?)?",
     re.I,
 )
 
@@ -69,7 +70,8 @@ def _word(words: str) -> re.Pattern[str]:
 
 
 LABEL = _word(
-    "labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|grip_?lost|y_true|ground_?truth|outliers?"
+    "labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|"
+    "grip_?lost|y_true|ground_?truth|outliers?"
 )
 COMMAND = _word("target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?")
 _SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
@@ -78,7 +80,8 @@ SPEED = _word(_SPEEDS)
 POSITION = _word(_PLACES)
 
 SENSE_NAME = _word(
-    f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|temperatures?|voltages?|pressures?"
+    f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|"
+    "temperatures?|voltages?|pressures?"
 )
 
 _ELEMENT = re.compile(

@@ -48,7 +48,7 @@ MOST_COLUMNS = 8192  # every number is weighed against every other later on: see
 MOST_BYTES = 512  # of a row of an array of bytes; more are a picture
 MOST_KEYS = 64  # joints of a long table
 MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
-SPARSE = 0.55  # share of filled rows up to which a column comes at a lower rate: at most at every other row
+SPARSE = 0.55  # largest share of filled rows of a column at a lower rate: at most every other row
 HELD = 3.0  # for so many of its own periods a slower column keeps its newest value
 FEWEST = 5  # filled rows that show a rate
 

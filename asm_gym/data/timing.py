@@ -124,8 +124,8 @@ def _check_increasing(times: Floats) -> None:
         row = int(np.argmin(rises))
         raise ValueError(
             f"time must increase from row to row, got {times[row]:g} s before "
-            f"{times[row + 1]:g} s: cut the log there, choose another clock with --clock NAME, or say "
-            "--rate HZ"
+            f"{times[row + 1]:g} s: cut the log there, choose another clock with --clock NAME, or "
+            "say --rate HZ"
         )
 
 

@@ -30,7 +30,8 @@ KNOCKING = 50.0  # force at the wrist, on an axis [N]
 KNOCKED_S = 1.0  # duration of its excuse [s]
 NEAR_STOP = 0.03  # a joint is at its stop from so far before it [rad]
 PAST_STOP = 0.1  # to so far past it [rad]
-FASTEST = 5.0  # largest joint speed [rad/s]: a joint farther from its stop in the row before is not at it now
+# Largest joint speed [rad/s]: a joint farther from its stop in the row before is not at it now.
+FASTEST = 5.0
 MOVING = 0.01  # speed of a sliding finger [m/s]
 MOVED_S = 0.1  # duration of its excuse [s]
 EXCUSED = 10.0  # divisor of surprise at a knock or a stop

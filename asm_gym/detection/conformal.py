@@ -45,7 +45,9 @@ ROUNDING = 1e-9
 ENOUGH = 5.0  # maxima that may exceed a threshold, from which on they are counted
 FEWEST_IN_TAIL = 50  # maxima that a model of their tail takes
 TAIL_SHARE = 10  # one in so many maxima is in the tail
-SURER = 0.6  # standard errors added to its index: with these a Pareto law keeps a rate of 1 % from 100 maxima on
+# Standard errors added to its index: with these a Pareto law keeps a rate of 1 % from 100 maxima
+# on.
+SURER = 0.6
 
 
 def conformal_episodes(rate: float) -> int:
@@ -134,15 +136,18 @@ def episode_threshold(maxima: Array, rate: float) -> float:
 class Promise(NamedTuple):
     """The promise of a threshold set on nominal episodes, or blocks by the hour.
 
-    If k of n maxima exceed it, the share of fresh ones that do is Beta(k + 1, n - k)-distributed (Vovk 2012).
+    If k of n maxima exceed it, the share of fresh ones that do is Beta(k + 1, n - k)-distributed
+    (Vovk 2012).
     """
 
     episodes: int  # that it was set on
-    rate: float  # of alarms, mean over calibrations: (k + 1)/(n + 1) an episode, or (k + 1)/hours an hour
+    # Mean rate of alarms over calibrations: (k + 1)/(n + 1) an episode, or (k + 1)/hours an hour.
+    rate: float
     at_most: float  # upper bound of the rate in 95 % of calibrations
     per: str = EPISODE  # or ``HOUR``
     hours: float = 0.0  # of the blocks; 0 by the episode
-    modelled: bool = False  # the rate is that of the maxima's ``Tail``, as too few were above the threshold to count
+    # The rate is that of the maxima's ``Tail``, as too few were above the threshold to count.
+    modelled: bool = False
 
     @classmethod
     def of(

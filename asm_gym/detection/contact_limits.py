@@ -71,7 +71,10 @@ class ContactLimits:
         check_flag("stays", self.stays)
 
     def most(self, felt: Sequence[Channel]) -> Floats:
-        """Return (N,) the limit of each number that is felt. Raises ValueError where ``healthy`` is of another arm."""
+        """Return (N,) the limit of each number that is felt.
+
+        Raises ValueError where ``healthy`` is of another arm.
+        """
         limits: list[float] = []
         for channel in felt:
             limit = self.external_torque
@@ -83,7 +86,8 @@ class ContactLimits:
 
         if len(self.healthy) != len(limits):
             raise ValueError(
-                f"healthy must say {len(limits)} numbers, one for each that is felt, got {len(self.healthy)}"
+                f"healthy must say {len(limits)} numbers, one for each that is felt, "
+                f"got {len(self.healthy)}"
             )
         return np.maximum(limits, self.healthy)
 

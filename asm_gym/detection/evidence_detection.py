@@ -154,7 +154,8 @@ class EvidenceDetection:
         shape = (3, len(self.spec.sensory))
         if counted.shape != shape or not ((counted >= 0.0) & np.isfinite(counted)).all():
             raise ValueError(
-                f"the repetition of evidence should be {shape} numbers of at least 0, found {short_repr(counted)}"
+                f"the repetition of evidence should be {shape} numbers of at least 0, "
+                f"found {short_repr(counted)}"
             )
         offset = counted[2] + RARER
         return RepetitionWeights(

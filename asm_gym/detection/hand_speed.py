@@ -24,7 +24,8 @@ CELL_SIZE = np.array([0.04, 0.04, 0.02])  # edges of a cell of the map along x, 
 AXES = 6  # of a twist
 DOWN = 8  # of the 12 directions, along each axis and then against each: against z
 
-ABOVE_HEALTHY = 1.25  # a hand may be commanded so many times as fast as healthy ones: about 0.8 of it is reached
+# A hand may be commanded so many times as fast as healthy ones: about 0.8 of it is reached.
+ABOVE_HEALTHY = 1.25
 ABOVE_HEALTHY_DOWN = 1.05  # the same downwards
 SLACK = np.array([0.03, 0.03, 0.03, 0.15, 0.15, 0.15])  # and by so much faster [m/s], [rad/s]
 DOWN_SLACK = 0.03  # downwards as fast as this, whatever healthy hands did [m/s]

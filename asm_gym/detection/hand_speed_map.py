@@ -62,7 +62,8 @@ class HandSpeedMap:
     ) -> None:
         if not _are_cells(cells):
             raise ValueError(
-                f"pace must be rows of {FASTEST.stop} numbers, places within {FARTHEST_CELL} cells, got {cells.shape}"
+                f"pace must be rows of {FASTEST.stop} numbers, "
+                f"places within {FARTHEST_CELL} cells, got {cells.shape}"
             )
         self.cells = cells
         self.momentum = momentum
@@ -75,7 +76,7 @@ class HandSpeedMap:
         at = tuple(offsets.T)
         np.maximum.at(grid, at, cells[:, FASTEST])
 
-        # A hand may go as fast as others beside its cell; downwards, only as those at the same height.
+        # A hand may go as fast as others beside its cell; downwards, only as others at its height.
         downward = grid[..., DOWN]
         self.grid = maximum_filter(grid, (1, 3, 3, 3, 1))
         self.grid[..., DOWN] = maximum_filter(downward, (1, 3, 3, 1))

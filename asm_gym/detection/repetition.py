@@ -33,7 +33,8 @@ RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal epi
 MOST_BEYOND = 24.0  # largest n - n_0
 UNMOVED = 0.5  # noise below this many steps of the resolution leaves a reading where it is
 RESTS = 0.5  # a sense that repeats itself this often after a repetition is at rest now and then
-RESTLESS = 5.0  # a repetition is assumed no rarer than one in this many times the number of nominal episodes
+# A repetition is assumed no rarer than one in this many times the number of nominal episodes.
+RESTLESS = 5.0
 MOST_READ = 20_000  # largest number of rows from which noise and resolution are estimated
 
 Stream = NDArray[np.floating[Any]]

@@ -68,10 +68,14 @@ class Actions:
         return action
 
     def turning(self, turns: Floats) -> Action:
-        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad], as nearly as one step can."""
+        """Return the action (A,) that turns the arms' joints by ``turns`` (J,) [rad].
+
+        It does so as nearly as one step can.
+        """
         if self._controller not in CHANGES:
             raise ValueError(
-                f"actions of {' and '.join(CHANGES)} are changes, those of {self._controller} are not"
+                f"actions of {' and '.join(CHANGES)} are changes, "
+                f"those of {self._controller} are not"
             )
         action = np.zeros(self.size, np.float32)
         first = 0

@@ -72,7 +72,10 @@ def describe(parts: list[Part], model: mujoco.MjModel) -> Any:
 
 
 def describe_inputs(arm: Arm, model: mujoco.MjModel, controller: Any, part: slice) -> None:
-    """Write what the inputs of an arm are, where they tell how fast its hand will go; ``part`` of an action."""
+    """Write what the inputs of an arm are, where they tell how fast its hand will go.
+
+    They are ``part`` of an action.
+    """
     size = part.stop - part.start
     if controller.name not in SLOWED or size > JOINTS:
         return
@@ -82,7 +85,7 @@ def describe_inputs(arm: Arm, model: mujoco.MjModel, controller: Any, part: slic
     if controller.input_type != "delta":
         return
 
-    # A controller that is asked for a change again and again comes to the velocity Kp/Kd times the change.
+    # A controller asked for a change again and again reaches a velocity of Kp/Kd times the change.
     gains = controller.kp / controller.kd
     arm.speeds[:size] = gains[:size] * unit_change(controller)
     if controller.name == "JOINT_POSITION":

@@ -26,7 +26,7 @@ from asm_gym.validation import check_choice, check_text
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
 
-# Tasks that choose one of several objects for each episode: attributes with the objects and with the choice.
+# Tasks that choose one of several objects an episode: attributes with the objects and the choice.
 _CHOSEN = {"PickPlaceSingle": ("objects", "object_id"), "NutAssemblySingle": ("nuts", "nut_id")}
 
 
@@ -83,13 +83,17 @@ def _compile_less() -> None:
 
 
 def row_substeps(rate: int, control_freq: int) -> int:
-    """Return the physics substeps between two rows at ``rate`` [Hz]; raise ValueError, listing those that fit."""
+    """Return the physics substeps between two rows at ``rate`` [Hz].
+
+    Raises ValueError, listing the rates that fit.
+    """
     rates = range(control_freq, PHYSICS_FREQ + 1, control_freq)
     possible = [f for f in rates if PHYSICS_FREQ % f == 0]
     if rate not in possible:
         raise ValueError(
-            f"stream_freq must divide the physics rate of {PHYSICS_FREQ} Hz and be a multiple of the control rate of "
-            f"{control_freq} Hz, one of {', '.join(map(str, possible))}, got {rate}"
+            f"stream_freq must divide the physics rate of {PHYSICS_FREQ} Hz and be a multiple of "
+            f"the control rate of {control_freq} Hz, one of {', '.join(map(str, possible))}, "
+            f"got {rate}"
         )
     return PHYSICS_FREQ // rate
 

@@ -61,7 +61,8 @@ class OffscreenRenderer:
         self.close()
         self._gl = _gl_context(self.width, self.height)
         _live.add(self)
-        # Before OpenGL is cleaned up: the last to be registered is the first to run, and OpenGL has registered its own.
+        # Before OpenGL is cleaned up: the last function that is registered runs first, and OpenGL
+        # has registered its own.
         atexit.unregister(_close_all)
         atexit.register(_close_all)
         self._gl.make_current()
@@ -91,13 +92,18 @@ def _close_all() -> None:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """Return an OpenGL context that needs no display; raise RuntimeError where this machine has none."""
-    # PyTorch's CUDA builds bring triton, whose LLVM ends the process when it is loaded after Mesa's; before it is fine.
+    """Return an OpenGL context that needs no display.
+
+    Raises RuntimeError where this machine has none.
+    """
+    # PyTorch's CUDA builds bring triton, whose LLVM ends the process when it is loaded after
+    # Mesa's; before it is fine.
     if find_spec("triton") is not None:
         with suppress(ImportError):
             import_module("triton")
     try:
-        # mujoco.Renderer would take GLFW here, which needs a display, unless MUJOCO_GL was set before MuJoCo's import.
+        # mujoco.Renderer would take GLFW here, which needs a display, unless MUJOCO_GL was set
+        # before MuJoCo's import.
         if sys.platform == "darwin":
             from mujoco.cgl import GLContext
         elif os.environ.get("MUJOCO_GL", "").lower() == "osmesa":
@@ -107,5 +113,6 @@ def _gl_context(width: int, height: int) -> Any:
         return GLContext(width, height)
     except (ImportError, RuntimeError, AttributeError, OSError) as error:
         raise RuntimeError(
-            f"no OpenGL for rendering: {error}. `asm-gym doctor` says which library is missing and how to get it."
+            f"no OpenGL for rendering: {error}. `asm-gym doctor` says which "
+            "library is missing and how to get it."
         ) from error

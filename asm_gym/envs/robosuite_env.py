@@ -265,7 +265,7 @@ class RobosuiteEnv(SteppedEnv):
         is_finite = self._finite and self._reading.row_finite
         unstable = not is_finite or self._divergences() != self._diverged
         if unstable:
-            # The simulation then holds MuJoCo's initial state as a rule, which no sensor of the robot could read.
+            # The simulation then usually holds MuJoCo's initial state, which no sensor could read.
             self._reading.row[:] = np.nan
             self._reading.stream[:] = np.nan
             self._reading.seen[:] = 0.0

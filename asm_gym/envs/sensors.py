@@ -44,7 +44,7 @@ class _Sensor(NamedTuple):
     resolution: float = 0.0
 
 
-# 15 bits of a turn; the link-side encoders of DLR's light-weight arm, from which the iiwa descends [rad].
+# 15 bits of a turn [rad]: the link-side encoders of DLR's light-weight arm, the iiwa's ancestor.
 _COUNT = np.deg2rad(0.01)
 
 _FORCE = slice(kernels.WRENCH.start, kernels.WRENCH.start + 3)
@@ -52,10 +52,11 @@ _TORQUE = slice(kernels.WRENCH.start + 3, kernels.WRENCH.stop)
 _LINEAR = slice(kernels.VELOCITY.start, kernels.VELOCITY.start + 3)
 _ANGULAR = slice(kernels.VELOCITY.start + 3, kernels.VELOCITY.stop)
 
-# About what a research arm's own sensors have. Resolutions: DLR, "Joint sensors of the light-weight robot" (0.01°);
-# Franka Emika, Panda data sheet (0.02 N m, 13 bits of ±87 N m); ATI Industrial Automation, Gamma SI-130-10 (±130 N in
-# steps of 1/20 N, ±10 N m in steps of 1/800 N m). A velocity is the difference of two counts, 50 ms apart. Mean and
-# peak come out of the sensor's own filter, in its steps. The rest is computed in floating point from several of these.
+# About what a research arm's own sensors have. Resolutions: DLR, "Joint sensors of the light-weight
+# robot" (0.01°); Franka Emika, Panda data sheet (0.02 N m, 13 bits of ±87 N m); ATI Industrial
+# Automation, Gamma SI-130-10 (±130 N in steps of 1/20 N, ±10 N m in steps of 1/800 N m). A velocity
+# is the difference of two counts, 50 ms apart. Mean and peak come out of the sensor's own filter,
+# in its steps. The rest is computed in floating point from several of these.
 _SENSORS = (
     _Sensor("joint_position", "joint", "rad", "qpos", "joints", noise=2e-4, resolution=_COUNT),
     _Sensor(
@@ -127,7 +128,8 @@ def _places(part: Part) -> dict[str, Any]:
         "dofs": robot._ref_joint_vel_indexes,
         "motors": robot._ref_actuators_indexes_dict[arm],
         "hand": 3 * robot.eef_site_id[arm] + np.arange(3),
-        # The first two columns of the rotation: six numbers that turn smoothly, where a quaternion flips its sign.
+        # The first two columns of the rotation: six numbers that turn smoothly; a quaternion flips
+        # its sign.
         "turn": 9 * model.body(robot.robot_model.eef_name[arm]).id + np.array([0, 3, 6, 1, 4, 7]),
         "fingers": (),
         "finger_dofs": (),

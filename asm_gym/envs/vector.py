@@ -102,7 +102,8 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
             seeds = list(seed)
         if len(seeds) != n or begun.dtype != bool or begun.shape != (n,):
             raise ValueError(
-                f"seed and reset_mask must have {n} entries (one an environment), got {seed} and {begun}"
+                f"seed and reset_mask must have {n} entries (one an environment), "
+                f"got {seed} and {begun}"
             )
         if any(seen is None and not now for seen, now in zip(self._env_obs, begun, strict=True)):
             raise gym.error.ResetNeeded("the first reset() must reset all environments")
@@ -121,7 +122,8 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
         given = list(iterate(self.action_space, actions))
         if len(given) != self.num_envs:
             raise ValueError(
-                f"actions must have {self.num_envs} rows, one for each environment, got {len(given)}"
+                f"actions must have {self.num_envs} rows, one for each environment, "
+                f"got {len(given)}"
             )
         outcomes = self._of_each(lambda i: self._outcome(i, given[i]))
         observations, rewards, terminated, truncated, infos = zip(*outcomes, strict=True)

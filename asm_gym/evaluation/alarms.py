@@ -24,7 +24,8 @@ class Alarm(NamedTuple):
     log: str
     start: float  # [s] at the end of its first row
     end: float  # [s]
-    channel: str  # the most surprising number when the alarm was raised; empty where a whole row was missing
+    # The most surprising number when the alarm was raised; empty where a whole row was missing.
+    channel: str
     why: str  # surprise, missing data, or not finite
     excess: float  # surprise of the worst row, in thresholds
     stamp: float | None = None  # of its first row, by the robot's own clock [s]

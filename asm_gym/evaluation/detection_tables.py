@@ -124,11 +124,12 @@ def monitors_table(result: BenchmarkResult) -> Table:
     """Return the monitors side by side, the ideal observer on top."""
     failed, crashed = result.left_out
     caption = (
-        f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds and severities of fault that an "
-        f"ideal observer can detect; thresholds from separate nominal episodes, delays and alarms at a false-alarm "
-        f"rate of {100 * result.rate:g} % of episodes; in brackets 95 % intervals over resampled scenes and "
-        f"calibration episodes. AUROC: against nominal episodes over the same steps. Needs: calibration episodes for "
-        f"that rate, where there were fewer. Left out: nominal episodes in which the policy failed ({failed}) or "
+        f"Detection within {1e3 * result.window_s:.0f} ms of the onset, over kinds and severities "
+        "of fault that an ideal observer can detect; thresholds from separate nominal episodes, "
+        f"delays and alarms at a false-alarm rate of {100 * result.rate:g} % of episodes; in "
+        "brackets 95 % intervals over resampled scenes and calibration episodes. AUROC: against "
+        "nominal episodes over the same steps. Needs: calibration episodes for that rate, where "
+        f"there were fewer. Left out: nominal episodes in which the policy failed ({failed}) or "
         f"crashed ({crashed}), and faults in such scenes."
     )
     hidden = [_in_words(kind) for kind, is_visible in result.visible.items() if not is_visible]
@@ -167,8 +168,8 @@ def kinds_table(result: BenchmarkResult) -> Table:
         cells = [f"{o.auroc:.2f} / {percent(o.found.get(result.promise))}" for o in observers]
         rows.append((name, *cells))
     return Table(
-        f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no observer could "
-        "detect it.",
+        f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no "
+        "observer could detect it.",
         ("Fault", IDEAL, *result.monitors),
         rows,
     )
@@ -179,11 +180,14 @@ def _in_words(kind: Kind) -> str:
 
 
 def lead_table(result: BenchmarkResult) -> Table:
-    """Return how far the first monitor is ahead of each other, on the same scenes and calibration episodes."""
+    """Return how far the first monitor is ahead of each other.
+
+    All are compared on the same scenes and calibration episodes.
+    """
     first, *others = result.on_visible
     caption = (
-        f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired difference, which decide "
-        "between ahead, behind and within chance."
+        f"How far {first.name} is ahead of each other monitor; 95 % intervals of the paired "
+        "difference, which decide between ahead, behind and within chance."
     )
     by_hour = [promise for promise in first.calibration.thresholds if promise.per == HOUR]
     columns: dict[str, Callable[[DetectionMetrics], str]] = {
@@ -232,9 +236,10 @@ def kept_table(result: BenchmarkResult) -> Table:
     hours = sum(len(trace) * trace.dt for trace in nominal) / 3600
     unsafe = Share.of([trace.outcome.unsafe for trace in nominal if trace.outcome.success])
     caption = (
-        f"False alarms in {len(nominal)} nominal test episodes of {hours:.2f} hours, by the promise of the "
-        "threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in 40 (beta-binomial); by the hour, "
-        f"the interval lies above the promise. {count(unsafe)} solved ones pressed with more than {TRANSIENT:g} N."
+        f"False alarms in {len(nominal)} nominal test episodes of {hours:.2f} hours, by the "
+        "promise of the threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in "
+        f"40 (beta-binomial); by the hour, the interval lies above the promise. {count(unsafe)} "
+        f"solved ones pressed with more than {TRANSIENT:g} N."
     )
     return _by_promise(caption, [*by_episode, *by_hour], _kept, monitors)
 
@@ -288,10 +293,14 @@ def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str
 
 
 def splits_table(result: BenchmarkResult) -> Table:
-    """Return what each promise comes to over random halves of the nominal episodes: set on one, kept on the other."""
+    """Return what each promise comes to over random halves of the nominal episodes.
+
+    It is set on one half, and kept on the other.
+    """
     caption = (
-        f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where {SPLITS} random halves "
-        "of the nominal episodes for calibration and test set the threshold and the other halves count: mean ± SD."
+        f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where "
+        f"{SPLITS} random halves of the nominal episodes for calibration and test set the "
+        "threshold and the other halves count: mean ± SD."
     )
     promises = list(result.on_visible[0].calibration.thresholds)
     return _by_promise(caption, promises, _over_own_splits, result.on_visible)

@@ -98,8 +98,9 @@ def publish(folder: Path, result: BenchmarkResult, details: Mapping[str, Any]) -
         tables.insert(1, lead_table(result))
     write_text(folder / "results.md", "\n\n".join(map(markdown, tables)) + "\n")
     intro = (
-        f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal observer knows the "
-        "healthy twin of every faulty episode and the sensors' noise: no monitor can do better than its row."
+        f"{len(result.detectability)} faulty episodes, {len(result.monitors)} monitors. The ideal "
+        "observer knows the healthy twin of every faulty episode and the sensors' noise: no "
+        "monitor can do better than its row."
     )
     write_report(folder / "report.html", "Who notices what", intro, tables, {}, details=details)
 

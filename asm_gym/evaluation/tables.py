@@ -26,7 +26,8 @@ class Table:
         for row in self.rows:
             if len(row) != len(self.headings):
                 raise ValueError(
-                    f"the table has {len(self.headings)} columns, but a row of {len(row)}: {list(row)}"
+                    f"the table has {len(self.headings)} columns, but a row of {len(row)}: "
+                    f"{list(row)}"
                 )
 
     def __rich__(self) -> RichTable:

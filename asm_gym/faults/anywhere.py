@@ -56,7 +56,8 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             sensed = np.asarray(info["stream"])[self._source.spec.sensory]
             if not np.allclose(sensed, flat(self.observation_space, observation), equal_nan=True):
                 raise ValueError(
-                    "this environment's stream does not hold its observation: a fault cannot be in both"
+                    "this environment's stream does not hold its observation: "
+                    "a fault cannot be in both"
                 )
         return self._sensed(observation, info), info
 
@@ -126,7 +127,7 @@ KINDS: dict[str, Callable[[Target, int], Fault]] = {
 }
 """The fault of each kind for an episode, at severity 0 to 2."""
 
-# Of these kinds, every channel has the fault: lost rows keep the last value of every sensor meanwhile.
+# Of these kinds, every channel has the fault: lost rows keep the last value of every sensor.
 _OF_EVERY_CHANNEL = ("late_rows", "lost_rows")
 
 

@@ -73,7 +73,10 @@ ALARM_TERMS: Registry[AlarmTerm] = Registry(
         OUT_OF_RANGE: AlarmTerm(
             lambda robots: robots.records["out_of_range"],
             priority=60.0,
-            help="the policy's action is far out of the range of healthy commands, and is not executed",
+            help=(
+                "the policy's action is far out of the range of healthy commands, "
+                "and is not executed"
+            ),
             response="hold",
         ),
     },
@@ -166,10 +169,13 @@ class AlarmTerms:
         return mask
 
     def __str__(self) -> str:
-        """Return a line for each term: priority, name, rows in which it held, response, where it holds."""
+        """Return a line for each term.
+
+        It has the priority, the name, the rows in which the term held, the response, and where it
+        holds.
+        """
         lines = ["priority  term           rows  response  holds where"]
         for name, term in self.terms.items():
-            lines.append(
-                f"{term.priority:8g}  {name:13}  {self.held_rows[name]:4}  {term.response:8}  {term.help}"
-            )
+            rows = self.held_rows[name]
+            lines.append(f"{term.priority:8g}  {name:13}  {rows:4}  {term.response:8}  {term.help}")
         return "\n".join(lines)

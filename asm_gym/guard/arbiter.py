@@ -29,9 +29,10 @@ MOST_DOUBLINGS = 16  # of the time that a contact must have been gone for
 MOSTLY_AFTER = 200  # rows under the policy after which it is said that most of them alarm
 
 MOSTLY = (
-    "{} of the first {} rows under this policy alarm: something is wrong all the time, or the memory does not know "
-    'this policy, task or set-up. Look with on_alarm="monitor" which channels info["asm"]["attribution"] names; if all '
-    "is well, record episodes of it, and monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
+    "{} of the first {} rows under this policy alarm: something is wrong all the time, or the "
+    'memory does not know this policy, task or set-up. Look with on_alarm="monitor" which channels '
+    'info["asm"]["attribution"] names; if all is well, record episodes of it, and '
+    "monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
 )
 
 Mask = NDArray[np.bool_]
@@ -59,7 +60,8 @@ class Situation(NamedTuple):
 class Transition(NamedTuple):
     """A row of the table: in one of the states ``within``, where ``when`` holds, ``to`` is next."""
 
-    name: str  # as ``info["asm"]["transition"]`` says it; empty for none, "*" for the response's own name
+    # As ``info["asm"]["transition"]`` says it; empty for none, "*" for the response's own name.
+    name: str
     within: tuple[int, ...]
     to: int | None  # None: the state stays
     when: Callable[[Situation], bool]

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.memory.completion import Completion
 
-PRESSED = 2.5  # standard deviations of its completion that the external torque of a pressed joint is off, at least
+# The external torque of a pressed joint is off by at least so many standard deviations of its
+# completion.
+PRESSED = 2.5
 STILL = 0.02  # a joint that turns by no more than this does not [rad/s]
 
 Rows = NDArray[np.floating[Any]]

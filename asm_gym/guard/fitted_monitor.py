@@ -74,7 +74,7 @@ def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -
 
 
 def _check_stream(learned: StreamSpec, watched: StreamSpec) -> None:
-    """Raise SpecMismatch unless a monitor of the stream ``learned`` can read the stream ``watched``."""
+    """Raise SpecMismatch unless a monitor of the stream ``learned`` can read ``watched``."""
     try:
         learned.require(watched, "the monitor")
     except SpecMismatch as error:
@@ -82,17 +82,21 @@ def _check_stream(learned: StreamSpec, watched: StreamSpec) -> None:
         if multiple < 2:
             raise
         advice = (
-            f"A control step takes {multiple} times as long. If a wrapper inside the guard repeats actions, "
-            "put it outside, or fit a monitor on episodes that were recorded through it"
+            f"A control step takes {multiple} times as long. If a wrapper inside the guard repeats "
+            "actions, put it outside, or fit a monitor on episodes that were recorded through it"
         )
         raise SpecMismatch(error.whose, error.differences, advice) from error
 
 
 def _check_same(what: str, learned: str, watched: str) -> None:
-    """Raise ValueError where a monitor was fitted for something else than it is to watch, as far as both are named."""
+    """Raise ValueError where a monitor was fitted for something else than it is to watch.
+
+    Only what both name is compared.
+    """
     if learned != watched and not {learned, watched} & UNNAMED:
         raise ValueError(
-            f"the monitor was fitted for the {what} {learned}, got {watched}: give a monitor for {watched}"
+            f"the monitor was fitted for the {what} {learned}, got {watched}: "
+            f"give a monitor for {watched}"
         )
 
 

@@ -33,8 +33,9 @@ AVERAGED_S = 0.2  # time over which the running mean is taken [s]
 ONE_ROW = 2.0  # no single row takes the mean further than so many times the limit, lest it last
 WINDOW = 10  # rows by which the sensor at fault is distinguished from others
 EXPLAINED = 30.0  # most of |z|², nine numbers, that is left where the sensor at fault is left out
-SURER_BY = 10.0  # how much more of |z|², in all of these rows, the next best sensor leaves; else a moment is waited for
-SAME_SPEED = 0.2  # the speed that is sensed of a joint is that of its angle where they differ by less [rad/s]
+# How much more of |z|², in all of these rows, the next best sensor leaves; else wait a moment.
+SURER_BY = 10.0
+SAME_SPEED = 0.2  # a joint's sensed speed is that of its angle where they differ by less [rad/s]
 DIFFERENCE = 1e-6  # of an angle, by which slopes are taken [rad]
 LONGEST_STEP = 0.5  # that an angle makes in an iteration [rad]
 ITERATIONS = 8
@@ -206,7 +207,10 @@ class HandCheck:
         robot: int,
         missing: Mask,
     ) -> Contradiction | None:
-        """Return what is wrong with a robot whose last row contradicts itself, beside what is ``missing`` (D,)."""
+        """Return what is wrong with a robot whose last row contradicts itself.
+
+        What is ``missing`` (D,) is left aside.
+        """
         case = self._cases.setdefault(robot, _OpenCase(np.zeros_like(missing)))
         wrong = (missing | case.accused)[self._suspects]
         if wrong.any():
@@ -214,7 +218,7 @@ class HandCheck:
             bounded = min(unexplained, ONE_ROW * EXPLAINED / self._gain)
             case.unexplained += self._gain * (bounded - case.unexplained)
             if case.unexplained <= EXPLAINED:
-                # What was named explains it still; where nothing completes that sensor, it is named again.
+                # What was named still explains it; if nothing completes that sensor, name it again.
                 return case.named if (case.accused & ~missing).any() else None
         named = self._name_sensor(robot, case, wrong)
         if named is not None:

@@ -160,8 +160,8 @@ class Observer:
         wanted = (self._count,), (self._count, self._size)
         if (value.shape, shares.shape) != wanted:
             raise ValueError(
-                f"a surprise must have values of shape {wanted[0]} and attributions of shape {wanted[1]}, "
-                f"got {value.shape} and {shares.shape}"
+                f"a surprise must have values of shape {wanted[0]} and attributions of shape "
+                f"{wanted[1]}, got {value.shape} and {shares.shape}"
             )
         judged["surprise"] = value
         judged["raw_surprise"] = value

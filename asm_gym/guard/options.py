@@ -32,13 +32,17 @@ IMPULSE = 20.0  # or presses with more than this, beyond healthy motion [N s]
 
 @dataclass(frozen=True)
 class ReleaseRule:
-    """When control is handed back, and when the episode ends, counted in rows; infinite for never."""
+    """When control is handed back, and when the episode ends.
+
+    Counted in rows; infinite for never.
+    """
 
     release_after: int = 10  # calm rows after which control is handed back
     # rows of a reflex, those before a hand-back after which the alarm was soon back too
     max_override: float = math.inf
     try_after: float = math.inf  # rows until a trial; after each trial that fails, twice as many
-    free_after: int = 5  # rows without contact after which it is over; after each that was too early, twice as many
+    # rows without contact after which it is over; after each that was too early, twice as many
+    free_after: int = 5
     # how often the policy may pass a contact limit before the episode ends
     strikes: float = math.inf
     # how much the arm may press in an episode, beyond healthy motion [N s]
@@ -68,7 +72,8 @@ class GuardOptions:
     def __post_init__(self) -> None:
         if isinstance(self.on_alarm, str) and self.on_alarm not in ON_ALARM:
             raise ValueError(
-                f"unknown on_alarm {short_repr(self.on_alarm)}; known: {', '.join(ON_ALARM)}, or any policy"
+                f"unknown on_alarm {short_repr(self.on_alarm)}; known: {', '.join(ON_ALARM)}, "
+                "or any policy"
             )
         check_number("release_after", self.release_after, low=1, whole=True)
         for name in ("max_override", "try_after"):

@@ -41,7 +41,8 @@ def checked_chunk(actions: Any, shape: tuple[int, ...]) -> Floats32:
     chunk = np.array(as_float32(actions, "a chunk of actions"))
     if chunk.shape[1:] != shape or not len(chunk):
         raise ValueError(
-            f"a chunk must have the shape {shape} and at least one action, got the shape {chunk.shape}"
+            f"a chunk must have the shape {shape} and at least one action, "
+            f"got the shape {chunk.shape}"
         )
     return chunk
 

@@ -194,7 +194,9 @@ def motion_arrays(motion: FeltMotion | None, facts: RobotFacts) -> MotionArrays:
 
 @compiled
 def record_motion(robots: Any, rows: Any, executed: Any, motion: Any) -> None:
-    """Take rows (n, D) that end a step into external torques, and what policies executed (n, A) into their paths.
+    """Take rows into external torques, and executed actions into the policies' paths.
+
+    The rows (n, D) end a step; the actions (n, A) are what policies executed.
 
     Args:
         robots: (n,) records of ``ROBOT``.
@@ -206,7 +208,7 @@ def record_motion(robots: Any, rows: Any, executed: Any, motion: Any) -> None:
             continue
         for j in range(len(motion.torque_columns)):
             if not robot.overridden:
-                # What is carried weighs on the joints as well; only what has come since is yielded to.
+                # What is carried weighs on the joints as well; only what came since is yielded to.
                 motion.usual_torque[n, j] += USUAL_GAIN * (
                     motion.torque[n, j] - motion.usual_torque[n, j]
                 )

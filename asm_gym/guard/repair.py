@@ -27,7 +27,8 @@ TRUST_S = (
     1.0  # how long a sense that no other sense tells of is completed, by its last good value [s]
 )
 LONGEST_S = 20.0  # no sense is completed for longer than this [s]
-MOST_MISSING = 0.5  # where more than this share of the senses is missing, what is left tells too little of them
+# Where more than this share of the senses is missing, what is left tells too little of them.
+MOST_MISSING = 0.5
 FARTHEST = 6.0  # no completed number goes further than so many of its spreads from its mean
 
 
@@ -48,7 +49,7 @@ class Repair:
     robot: int  # which of those that ``hands`` know
     before: Floats | None  # (D,) the row before, repaired; None where there is none
     read: Mask  # (D,) which columns the policy reads, of whose completion something depends
-    # Tell of missing angles better than the memory, and which senses are not to be believed again yet.
+    # Tell of missing angles better than the memory, and which senses not to believe again yet.
     hands: Sequence[HandCheck]
     # Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault.
     settling: int = 0

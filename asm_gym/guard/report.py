@@ -193,7 +193,9 @@ def side_by_side(row: RowReport, spec: StreamSpec, **step: Any) -> dict[str, Any
     """
     each = [asm_info([row], robot, spec) for robot in range(len(row.robots))]
     numbers = [severity_info(record) for record in row.robots]
-    info: dict[str, Any] = {name: _stacked([said[name] for said in each]) for name in each[0]}  # type: ignore[literal-required]
+    info: dict[str, Any] = {}
+    for name in each[0]:
+        info[name] = _stacked([said[name] for said in each])  # type: ignore[literal-required]
     info["severity"] = {
         name: np.array([severity[name] for severity in numbers]) for name in numbers[0]
     }

@@ -49,7 +49,8 @@ it presses with no more than 40 N; else the robot holds."""
 class Response(NamedTuple):
     """What is to be done about a row of one robot."""
 
-    name: str  # one of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked
+    # One of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked.
+    name: str
     cause: dict[str, Any]  # as ``info["asm"]["cause"]`` says it
     touched: bool | None = (
         None  # the contact is still there; None: not known, or so long that it may never end

@@ -64,7 +64,8 @@ class RowValidator:
                 "complete", "it is not known where they stand in the observation"
             )
             warnings.warn(
-                f"a faulty sensor cannot be estimated from the others, so the robot holds: {reason}",
+                "a faulty sensor cannot be estimated from the others, so the robot holds: "
+                f"{reason}",
                 stacklevel=5,
             )
         self._completion = completion
@@ -190,7 +191,7 @@ def _next(
     try:
         row = repair.next(row)
     except Exception as error:
-        # Nobody knows what the row should say: what is not finite is an alarm, and nothing explains it.
+        # Nobody knows what the row should say: what is not finite is an alarm without explanation.
         warnings.warn(f"completion: {error!r}; the row counts as lost", stacklevel=2)
         return np.full_like(row, np.nan)
     if silent := ", ".join(name for name in repair.names if name not in known):

@@ -67,7 +67,10 @@ class ChangeLayout(NamedTuple):
 
 
 class Association(NamedTuple):
-    """The synapses of I inputs, M hidden units and X changes; float32, 0 where there is no synapse."""
+    """The synapses of I inputs, M hidden units and X changes.
+
+    All are float32, and 0 where there is no synapse.
+    """
 
     V: Array  # (M, I)
     U: Array  # (X, M)
@@ -77,8 +80,9 @@ class Association(NamedTuple):
     span_S: Array  # noqa: N815 (2, X) limits of log σ²
     remainder: Array  # (X,) s
     R: Array  # (I, I) lower triangle, or (0, I) where leverage is not known; the changes come last
-    Q: Array  # (X, X) rows Q_g: an orthonormal basis of what Δ_g adds to z_Δ, the changes' part of z
-    leverage_scale: Array  # (3, X) of g²: value at leverage 0, slope, and the leverage above which it is constant
+    Q: Array  # (X, X) rows Q_g: orthonormal basis of what Δ_g adds to z_Δ, the changes' part of z
+    # (3, X) of g²: value at leverage 0, slope, and the leverage above which it is constant
+    leverage_scale: Array
 
     @classmethod
     def from_named(cls, arrays: dict[str, NDArray[Any]]) -> Self:

@@ -55,7 +55,8 @@ class Completion:
     products: NDArray[np.intp]  # (P, 2) columns that are multiplied
     covariance: Floats  # (Y, Y) C of centred y
     centre: Floats  # (Y,) mean of y
-    error: Floats  # (D,) standard deviation of a column's error when its sensor is completed, in spreads; 1 for actions
+    # (D,) standard deviation of a column's error when its sensor is completed [spread]; 1: actions
+    error: Floats
 
     @classmethod
     def fit(cls, senses: StreamScaler, streams: Sequence[NDArray[np.floating[Any]]]) -> Self | None:

@@ -16,7 +16,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import scipy.linalg.cython_blas  # noqa: F401  (the BLAS of the kernels; loaded here, so that its threads can be limited)
+
+# The BLAS of the kernels; loaded here, so that its threads can be limited.
+import scipy.linalg.cython_blas  # noqa: F401
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner

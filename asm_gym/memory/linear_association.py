@@ -41,7 +41,8 @@ FEW_PENALTY = 1e-4  # λ where rows are too few to choose it
 # λ of leverage: inputs that are constant, or copies of others, have no endless one
 LEAST_VARIANCE = 1e-4
 HELD_OUT = 5  # the last one in so many rows is held out
-LARGEST_ERROR = 3.0  # standard deviations to which errors are clipped when penalties of ``specialise`` are compared
+# Standard deviations to which errors are clipped when penalties of ``specialise`` are compared.
+LARGEST_ERROR = 3.0
 
 
 class Moments(NamedTuple):
@@ -88,8 +89,8 @@ def check_inputs(count: int) -> None:
     """Refuse more inputs than can be weighed against each other. Raises ValueError."""
     if count > MOST_INPUTS:
         raise ValueError(
-            f"a memory takes at most {MOST_INPUTS} inputs (values, changes, actions, rows), but this stream makes "
-            f"{count}: leave channels out, or reduce them first"
+            f"a memory takes at most {MOST_INPUTS} inputs (values, changes, actions, rows), but "
+            f"this stream makes {count}: leave channels out, or reduce them first"
         )
 
 
@@ -162,7 +163,8 @@ def specialise(known: Association, a: Array, layout: ChangeLayout) -> Associatio
         far = leverage(a, known.R, known.Q, layout.groups, layout.changes_last)
         steady, slope, most = known.leverage_scale
         error /= np.sqrt(steady + slope * np.minimum(far, most))
-    # The body's memory knows how errors differ between contexts; the policy's rows tell how large they are overall.
+    # The body's memory knows how errors differ between contexts; the policy's rows tell how large
+    # they are overall.
     expected = log_variance(f, known.W_S, known.b_S, known.span_S)
     ratio = np.mean(error**2 * np.exp(-expected), axis=0)
     larger = np.log(np.maximum(ratio, 1e-6)).astype(np.float32)

@@ -214,7 +214,8 @@ def learn_settling(
     tick: Tick,
 ) -> Trained:
     """Learn the synapses through time; see ``temporal.Learn``."""
-    # A network that runs on alone must keep its state; one that reads hundreds of rows would drift if it kept all.
+    # A network that runs on alone must keep its state; one that reads hundreds of rows would drift
+    # if it kept all.
     least = LEAST
     if schedule.free_running_probability > 0:
         least = 1.0

@@ -77,11 +77,14 @@ def fit_gains(episodes: Sequence[Array]) -> NDArray[np.float32]:
 
 
 class Weights(NamedTuple):
-    """The synapses of H hidden units, S senses, A motor and I = K (S + A + 1) traces; all float32."""
+    """The synapses of H hidden units, S senses, A motor and I = K (S + A + 1) traces.
+
+    All are float32.
+    """
 
     W_C: Array  # (H, I) from the traces to the state
     W_F: Array  # (S + A, H) from the state to senses and action
-    W_D: Array  # (S + A, I + A + 1) from the traces, the action and a constant 1 to senses and action
+    W_D: Array  # (S + A, I + A + 1) from traces, action and a constant 1 to senses and action
     gains: Array  # (K,) of the traces; not learned
 
 

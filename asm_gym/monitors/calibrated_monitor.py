@@ -226,30 +226,34 @@ class CalibratedMonitor:
     ) -> Self:
         """Set the threshold from nominal episodes that ``fit`` has not seen, and return the monitor.
 
-        Give one rate; ``threshold_at`` returns the threshold of any other rate. If fewer than five of the episodes'
-        maxima may exceed the threshold, their tail is modelled, and ``promise.modelled`` is true.
+        Give one rate; ``threshold_at`` returns the threshold of any other rate. If fewer than five of
+        the episodes' maxima may exceed the threshold, their tail is modelled, and
+        ``promise.modelled`` is true.
 
-        Of 300 episodes or more, one in three (or ten) says how far each sense goes at its worst, where the detection is
-        that of evidence and the others suffice for the rate; they alone set the threshold. Without that fewer faults
-        are found.
+        Of 300 episodes or more, one in three (or ten) says how far each sense goes at its worst,
+        where the detection is that of evidence and the others suffice for the rate; they alone set
+        the threshold. Without that fewer faults are found.
 
         Args:
-            episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an hour.
+            episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an
+                hour.
             false_alarm_rate: largest probability of an alarm in a nominal episode, in (0, 1).
-            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. An alarm that persists,
-                or returns within a minute of the same episode, counts once.
+            false_alarms_per_hour: largest mean number of alarms in an hour of nominal episodes. An
+                alarm that persists, or returns within a minute of the same episode, counts once.
             each: task or policy of each episode, to keep the promise in each of them.
 
         Raises:
-            ValueError: too few episodes or hours for this rate (the message names the rate that they can promise), bad
-                episodes, not exactly one rate, an episode that was given to ``fit``, or one that is given twice.
+            ValueError: too few episodes or hours for this rate (the message names the rate that they can
+                promise), bad episodes, not exactly one rate, an episode that was given to ``fit``,
+                or one that is given twice.
         """
         self._require_fitted()
         asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         check_nominal(episodes, self.spec, self.model.shortest)
         if each and len(each) != len(episodes):
             raise ValueError(
-                f"each must name a group for each episode, got {len(each)} for {len(episodes)} episodes"
+                "each must name a group for each episode, "
+                f"got {len(each)} for {len(episodes)} episodes"
             )
         asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
         apart: set[int] = set()

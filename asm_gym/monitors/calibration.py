@@ -37,7 +37,8 @@ ONE_IN = (
     3,
     10,
 )  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
-AT_ONCE = 400  # episodes that ceilings are learned from at once: arrays of all rows of many hours would fill the memory
+# Episodes that ceilings are learned from at once: all rows of many hours would fill the memory.
+AT_ONCE = 400
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 
 
@@ -49,8 +50,14 @@ class AlarmRate(NamedTuple):
 
     @classmethod
     def of(cls, false_alarm_rate: float | None, false_alarms_per_hour: float | None) -> Self:
-        """Return the one of two that is given. Raises ValueError unless exactly one is, and is a rate."""
-        rule = "give either false_alarm_rate (such as 0.01, of episodes) or false_alarms_per_hour (such as 1.0)"
+        """Return the one of two that is given.
+
+        Raises ValueError unless exactly one is, and is a rate.
+        """
+        rule = (
+            "give either false_alarm_rate (such as 0.01, of episodes) "
+            "or false_alarms_per_hour (such as 1.0)"
+        )
         if false_alarm_rate is None:
             if false_alarms_per_hour is None:
                 raise ValueError(f"{rule}, got neither")
@@ -134,9 +141,10 @@ def require_sight(
 def apart_for_ceilings(
     episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()
 ) -> set[int]:
-    """Return which nominal episodes are to set ceilings, and not the threshold: one in so many of each group.
+    """Return which nominal episodes are to set ceilings, and not the threshold.
 
-    None are where they would be fewer than ``FEWEST_EPISODES``, or the others too few for the rate that is asked for.
+    One in so many of each group is. None are where they would be fewer than ``FEWEST_EPISODES``, or
+    the others too few for the rate that is asked for.
     """
     groups: defaultdict[str, list[int]] = defaultdict(list)
     for n, name in enumerate(each or [""] * len(episodes)):
@@ -148,8 +156,8 @@ def apart_for_ceilings(
             return chosen
     if len(episodes) >= ONE_IN[0] * FEWEST_EPISODES:
         LOG.warning(
-            "the rate that is asked for takes all %d episodes, so that none say how far each sense goes at its worst, "
-            "and fewer faults are found: record more, or ask for a higher rate",
+            "the rate that is asked for takes all %d episodes, so that none say how far each sense "
+            "goes at its worst, and fewer faults are found: record more, or ask for a higher rate",
             len(episodes),
         )
     return set()

@@ -133,7 +133,8 @@ class MemoryModel(ScaledModel):
         kept = dynamics_of(learned)
         if kept != self.dynamics:
             raise ValueError(
-                f"this is a memory of dynamics={kept!r}, which cannot be loaded as {self.dynamics!r}"
+                f"this is a memory of dynamics={kept!r}, "
+                f"which cannot be loaded as {self.dynamics!r}"
             )
         dynamics = DYNAMICS[self.dynamics]
         temporal = dynamics.shapes(self.hidden_size, senses.size, A)

@@ -110,7 +110,8 @@ class NeuralASMPolicy(StatefulPolicy):
             theirs = inner.measured_spec
             if memory.spec.dt != dt:
                 raise ValueError(
-                    f"the memory reads a row every {memory.spec.dt} s, and is asked to act every {dt} s"
+                    f"the memory reads a row every {memory.spec.dt} s, "
+                    f"and is asked to act every {dt} s"
                 )
         else:
             theirs = StreamSpec.from_spaces(env.observation_space, env.action_space, dt)

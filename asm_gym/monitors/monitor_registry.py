@@ -16,7 +16,8 @@ from asm_gym.registries import Registry, target
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
-EVIDENCE = "+evidence"  # end of the name of a monitor whose errors are judged by the detection of the Neural ASM
+# End of the name of a monitor whose errors are judged by the detection of the Neural ASM.
+EVIDENCE = "+evidence"
 
 DETECTIONS: dict[str, Any] = {
     "evidence": EvidenceDetection,
@@ -32,8 +33,10 @@ DETECTIONS: dict[str, Any] = {
 class MonitorKind:
     """How the monitors of one name are made and loaded."""
 
-    model: Any  # class of its model, or of the whole monitor; or ``module:class``, imported when it is needed
-    own: str = "evidence"  # detection that its authors judged it by; always fitted, so that one fit serves both
+    # Class of its model, or of the whole monitor; or ``module:class``, imported when it is needed.
+    model: Any
+    # Detection that its authors judged it by; always fitted, so that one fit serves both.
+    own: str = "evidence"
     detection: str = "evidence"  # the one in use
 
     @property
@@ -115,7 +118,9 @@ as those of the Neural ASM are. ``+`` and the name of any other detection will d
 
 @typed
 def register_monitor(name: str, model: type[Any] | str, detection: str = "evidence") -> None:
-    """Register a model, in this process and its workers, for ``make_monitor(name)`` and ``name+evidence``.
+    """Register a model for ``make_monitor(name)`` and ``name+evidence``.
+
+    It is known in this process and its workers.
 
     Args:
         name: the ``kind`` of the model, which its files contain too.
@@ -123,7 +128,8 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
         detection: its default detection, a name in ``DETECTIONS``.
 
     Raises:
-        ValueError: the name is taken or is not that of the model's ``kind``, or there is no such detection.
+        ValueError: the name is taken or is not that of the model's ``kind``, or there is no such
+            detection.
 
     Example:
         >>> from asm_gym import NeuralASM, register_monitor
@@ -134,7 +140,8 @@ def register_monitor(name: str, model: type[Any] | str, detection: str = "eviden
     check_choice("detection", detection, DETECTIONS)
     if not isinstance(model, str) and getattr(model, "kind", None) != name:
         raise ValueError(
-            f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, got the name {name!r}"
+            f"{model.__name__} is of the kind {getattr(model, 'kind', None)!r}, "
+            f"got the name {name!r}"
         )
     row = MonitorKind(model, detection, detection)
     MONITORS.register(name, row)

@@ -206,11 +206,14 @@ def state_of(arrays: Any) -> MonitorState:
 
 @partial(compiled, calls=("memory", "detection", "."))
 def bind_states(learned: Bound, *arrays: Any) -> Bound:
-    """Return what was learned, a state, and a state that is to be written; ``arrays`` are those of both.
+    """Return what was learned, a state, and a state that is to be written.
 
-    Numba takes longer to look through nested named tuples that Python hands over than through arrays.
+    ``arrays`` are those of both states. Numba takes longer to look through nested named tuples that
+    Python hands over than through arrays.
     """
-    return Bound((learned, state_of(arrays[:14]), state_of(arrays[14:])))  # type: ignore[no-untyped-call]
+    state = state_of(arrays[:14])
+    written = state_of(arrays[14:])
+    return Bound((learned, state, written))  # type: ignore[no-untyped-call]
 
 
 def unwritten(state: Any) -> Any:

@@ -59,8 +59,9 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         lines.append(f"  {name}: {'; '.join(misfits)}")
     if spec.source == "spaces":
         raise ValueError(
-            "shipped memories know only robosuite's arms in environments of asm_gym: fit a monitor on healthy episodes "
-            "of this environment, recorded by StreamRecorder(env), and pass it as monitor"
+            "shipped memories know only robosuite's arms in environments of asm_gym: fit a monitor "
+            "on healthy episodes of this environment, recorded by StreamRecorder(env), "
+            "and pass it as monitor"
         )
     rate = round(1.0 / spec.dt)
     command = f"asm-gym babble --robot {spec.source or 'ROBOT'}"
@@ -72,5 +73,6 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
     listed = "\n".join(lines)
     raise ValueError(
         f"no shipped memory fits this stream of {body}. There are:\n{listed}\nFit your own: "
-        f"{command} for an arm of robosuite, asm-gym fit DATA for recordings, and pass it as monitor"
+        f"{command} for an arm of robosuite, asm-gym fit DATA for recordings, "
+        "and pass it as monitor"
     )

@@ -24,14 +24,16 @@ AT_ONCE = 64  # episodes run side by side; with more the arrays no longer fit th
 
 
 class StreamModel:
-    """Base class of models: predicts each row of a stream, and returns its errors; a detection makes surprise of them.
+    """Base class of models: predicts each row of a stream, and returns its errors.
 
-    Arguments of ``__init__`` beside the stream's spec are hyperparameters, kept under their own names.
+    A detection makes surprise of them. Arguments of ``__init__`` beside the stream's spec are
+    hyperparameters, kept under their own names.
     """
 
     kind: str  # its name, in ``make_monitor`` and in checkpoints
     shortest: int = 2  # fewest steps of an episode to learn from
-    held_out: int = 5  # one in so many episodes is not learned, but shows how large errors usually are; 0 for none
+    # One in so many episodes is not learned, but shows how large errors usually are; 0 for none.
+    held_out: int = 5
 
     def __init__(self, spec: StreamSpec) -> None:
         self.spec = spec
@@ -91,11 +93,15 @@ class ScaledModel(StreamModel):
 
 
 def require_arrays(learned: Arrays, names: Iterable[str]) -> None:
-    """Raise ValueError unless a file, perhaps of an earlier release, holds all arrays of these names."""
+    """Raise ValueError unless a file holds all arrays of these names.
+
+    The file may be of an earlier release.
+    """
     missing = [name for name in names if name not in learned]
     if missing:
         raise ValueError(
-            f"this memory has no {', '.join(missing)}: make it anew, by asm-gym fit or asm-gym babble"
+            f"this memory has no {', '.join(missing)}: make it anew, "
+            "by asm-gym fit or asm-gym babble"
         )
 
 

@@ -40,7 +40,9 @@ class Surprise(NamedTuple):
         """Return one line: number of rows, last and largest value."""
         if not len(self.value):
             return "<Surprise of no row>"
-        return f"<Surprise of {len(self.value)}: last {self.value[-1]:.4g}, largest {self.value.max():.4g}>"
+        last = self.value[-1]
+        largest = self.value.max()
+        return f"<Surprise of {len(self.value)}: last {last:.4g}, largest {largest:.4g}>"
 
     def of(self, stream: int) -> Surprise:
         """Return the surprise of one stream, as a batch of one."""

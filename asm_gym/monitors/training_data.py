@@ -48,7 +48,10 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
 
 
 def _check_proportions(episodes: Sequence[Episode], spec: StreamSpec) -> None:
-    """Raise ValueError for a number out of all proportion, beside which its channel would look constant."""
+    """Raise ValueError for a number out of all proportion.
+
+    Beside it, its channel would look constant.
+    """
     rows = np.concatenate([episode.stream for episode in episodes]).astype(np.float64)
     low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
     reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
@@ -56,8 +59,8 @@ def _check_proportions(episodes: Sequence[Episode], spec: StreamSpec) -> None:
         for step, column in np.argwhere(np.abs(episode.stream - middle) > reach):
             value = episode.stream[step, column]
             raise ValueError(
-                f"episode {n}, step {step}, {spec.labels[column]} is {value:g}, where 98 % of all lie between "
-                f"{low[column]:g} and {high[column]:g}: leave the episode out"
+                f"episode {n}, step {step}, {spec.labels[column]} is {value:g}, where 98 % of all "
+                f"lie between {low[column]:g} and {high[column]:g}: leave the episode out"
             )
 
 
@@ -124,8 +127,9 @@ def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
         stale = np.flatnonzero(np.isin(hashes, known))
         if len(stale):
             raise ValueError(
-                "calibrate() needs episodes that were not learned from, as the surprise of others is "
-                f"too low to set a threshold: leave out episodes {shortened(stale)}, or replace them"
+                "calibrate() needs episodes that were not learned from, as the surprise of others "
+                f"is too low to set a threshold: leave out episodes {shortened(stale)}, "
+                "or replace them"
             )
     _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
     original = first[group]  # (N,) number of the first episode with the same rows

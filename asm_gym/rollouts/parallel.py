@@ -81,8 +81,8 @@ def _pickled(task: Callable[[Any], Any]) -> bytes:
         return cloudpickle.dumps(task)
     except Exception as error:  # whatever a foreign __reduce__ raises
         raise TypeError(
-            f"the work cannot be sent to another process ({type(error).__name__}: {error}): make what it needs in the "
-            "worker, by a name, a path or a factory, or set workers to 1"
+            f"the work cannot be sent to another process ({type(error).__name__}: {error}): make "
+            "what it needs in the worker, by a name, a path or a factory, or set workers to 1"
         ) from error
 
 

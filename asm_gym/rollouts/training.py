@@ -30,7 +30,9 @@ from asm_gym.policies.network import NetworkPolicy, describe
 from asm_gym.rollouts.parallel import Progress
 
 ACTOR_SHARE = 0.05  # the actor's learning rate, as a share of the critic's
-ENTROPY = -3.0  # target entropy per number of the action: a third of the usual spread, or learned grasps are shaken off
+# Target entropy per number of the action: a third of the usual spread, or learned grasps are
+# shaken off.
+ENTROPY = -3.0
 CRITIC_UPDATES = 2000  # of critics alone, between cloning and learning
 BATCH = 256  # steps of an update of cloning
 LOG_STD = -3.5  # the actor's log standard deviation before tanh, after cloning
@@ -186,7 +188,8 @@ def check_sizes(env: gym.Env[Any, Any], demonstrations: Sequence[Episode]) -> No
             size = getattr(episode, name).shape[1]
             if size != space.shape[0]:
                 raise ValueError(
-                    f"demonstration {n} has {name} of {size} numbers, the environment {space.shape[0]}"
+                    f"demonstration {n} has {name} of {size} numbers, "
+                    f"the environment {space.shape[0]}"
                 )
 
 

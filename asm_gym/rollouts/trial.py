@@ -52,7 +52,8 @@ class Trial:
 
     env_id: str
     seed: int  # of the environment and of the policy: trials that share it are twins
-    kind: str = NOMINAL  # else ``"passing_push"``, a fault of the suite of this ``severity``; with ``faults``, a name
+    # or ``"passing_push"``, or a fault of the suite of this ``severity``; with ``faults``, a name
+    kind: str = NOMINAL
     severity: str = ""
     # [steps]; by default drawn from the seed, in the first half of the episode
     onset: int | None = None

@@ -34,7 +34,8 @@ for step in range(100):
     picture = ImageOps.expand(Image.fromarray(env.render()).resize((320, 320)), 8, colour)
     fault, doing = ", ".join(info["fault"]) or "no fault", asm["response"] or asm["state"]
     doing = " ".join([doing, *asm["completed"], "is completed"]) if asm["completed"] else doing
-    said = f"{step / 20:.1f} s: {fault}\nsurprise {asm['surprise'] / asm['threshold']:.1f} thresholds\n{doing}"
+    surprise = asm["surprise"] / asm["threshold"]
+    said = f"{step / 20:.1f} s: {fault}\nsurprise {surprise:.1f} thresholds\n{doing}"
     ImageDraw.Draw(picture).text((16, 14), said, "white")
     pictures.append(picture.quantize(64))
 pictures[0].save(

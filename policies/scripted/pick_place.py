@@ -104,13 +104,16 @@ class PickPlaceExpert(CarryExpert):
         return (across, across + np.pi)
 
     def _place(self, number: int, half: Vector, grip: float) -> Vector:
-        """Return where (3,) to let go: nearer to the arm, because it is stretched out at the far side of the bins."""
+        """Return where (3,) to let go.
+
+        It is nearer to the arm, because it is stretched out at the far side of the bins.
+        """
         env = self.robosuite
         place = np.array(env.target_bin_placements[number], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
         is_far = length(away) > REACH_OF_PANDA
         if is_far and not self.is_careful:
-            # Also away from the nearest wall, and higher: the arm reaches furthest at the height of its shoulder.
+            # Away from the nearest wall, and higher: the arm reaches furthest at shoulder height.
             inwards = env.bin2_pos[:2] - place[:2]
             place[:2] += 0.08 * inwards / length(inwards)
             place[2] += 0.02

@@ -69,7 +69,8 @@ class WipeScene(Scene):
         return self.aside > FAR_OFF
 
     def wipe(self) -> Vector:
-        # Gently at first: a tool that comes down with all of it hits the table three times as hard as it presses.
+        # Gently at first: a tool that comes down with all of it hits the table three times as hard
+        # as it presses.
         return self._follow(-self.plan.press * min(1.0, 0.3 + self.state.since / 15))
 
     def is_lifted_off(self) -> bool:

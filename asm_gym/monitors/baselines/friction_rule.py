@@ -56,7 +56,8 @@ class FrictionRule(StreamModel):
         joints = min(len(torques), len(speeds))
         if not joints:
             raise ValueError(
-                f"a rule of friction needs a torque and a speed of each joint; there are: {spec.slices}"
+                "a rule of friction needs a torque and a speed of each joint; there are: "
+                f"{spec.slices}"
             )
         self._torques = torques[:joints]
         self._speeds = speeds[:joints]

@@ -55,7 +55,8 @@ LOG_VARIANCE = (-12.0, 8.0)  # limits of what the GRU predicts
 LAYERS = 3  # hidden ones of the flow
 ROWS = 256  # of a batch of the flow
 STAGES = 10  # steps of the flow
-FARTHEST = 30.0  # where standardised numbers are cut off: networks of this kind diverge far from what they have seen
+# Where standardised numbers are cut off: such networks diverge far from what they have seen.
+FARTHEST = 30.0
 
 
 class TorchModel(ScaledModel):

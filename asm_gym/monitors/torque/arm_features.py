@@ -29,7 +29,8 @@ COMMANDED = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
 
 WIDTHS = (0.01, 0.1, 1.0)  # w, shares of a speed's spread
 MOST_ANGLES = 12  # of more angles no sines are taken: their products would be too many
-CHAIN = 3  # angles from the second on that are summed: shoulder, elbow and wrist often turn about parallel axes
+# Angles from the second on that are summed: shoulder, elbow and wrist often have parallel axes.
+CHAIN = 3
 
 
 class SensedRows(NamedTuple):
@@ -159,8 +160,9 @@ def _check_joints(angles: int, speeds: int) -> None:
     """Raise ValueError unless each joint has an angle and a speed."""
     if not speeds == angles > 0:
         raise ValueError(
-            f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; by their names "
-            f"{angles} numbers are angles and {speeds} are speeds; leave out others, as --ignore '*finger*' does"
+            f"a body model needs an angle and a speed of each joint, among {MOST_ANGLES} at most; "
+            f"by their names {angles} numbers are angles and {speeds} are speeds; leave out "
+            "others, as --ignore '*finger*' does"
         )
 
 

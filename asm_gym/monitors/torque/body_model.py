@@ -174,13 +174,16 @@ def _words(name: str) -> set[str]:
 
 
 def _columns_by_chain(model: Any, count: int) -> dict[str, int]:
-    """Return the place of each of the first joints of the longest chain. Raises ValueError where they are too few."""
+    """Return the place of each of the first joints of the longest chain.
+
+    Raises ValueError where they are too few.
+    """
     chain = _longest_chain(model)[:count]
     names = _joint_names(model)
     if len(chain) < count:
         raise ValueError(
-            f"{count} joints are sensed, and the body's longest chain has {len(chain)} that move: name "
-            f"the columns as its joints are named ({', '.join(names) or 'it has none'})"
+            f"{count} joints are sensed, and the body's longest chain has {len(chain)} that move: "
+            f"name the columns as its joints are named ({', '.join(names) or 'it has none'})"
         )
     return {names[joint]: place for place, joint in enumerate(chain)}
 

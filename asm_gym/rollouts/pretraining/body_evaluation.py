@@ -173,11 +173,12 @@ def scores_table(scores: Sequence[Scores], memory: CalibratedMonitor, window: fl
     about = memory.about
     per_hour = about["false_alarms_per_hour"]
     caption = (
-        f"{about['name']}: learned from {about['lessons']} lessons of {', '.join(about['tasks'])}; threshold "
-        f"{memory.threshold:.3g} for {per_hour:g} false alarms per hour, from "
-        f"{about['hours']:.2f} other hours. Alarms per hour of solved healthy episodes, with 95 % Poisson intervals; "
-        "failed episodes with an alarm; visible faults of medium and strong severity, found within "
-        f"{window:g} s. Adaptive: under a threshold that follows each policy, and for faults at its last value."
+        f"{about['name']}: learned from {about['lessons']} lessons of {', '.join(about['tasks'])}; "
+        f"threshold {memory.threshold:.3g} for {per_hour:g} false alarms per hour, from "
+        f"{about['hours']:.2f} other hours. Alarms per hour of solved healthy episodes, with 95 % "
+        "Poisson intervals; failed episodes with an alarm; visible faults of medium and strong "
+        f"severity, found within {window:g} s. Adaptive: under a threshold that follows each "
+        "policy, and for faults at its last value."
     )
     own = tabulate(caption, COLUMNS, scores)
     adaptive_columns = {f"{name}, adaptive": COLUMNS[name] for name in ("faults/h", "found")}
@@ -198,7 +199,10 @@ def all_episodes(
 def promises_table(
     scores: Sequence[Scores], thresholds: Mapping[float, float], window: float
 ) -> Table:
-    """Return a row for each promise: its threshold, the false alarms, and faults found within ``window`` [s]."""
+    """Return a row for each promise.
+
+    It has the threshold, the false alarms, and the faults found within ``window`` [s].
+    """
     healthy, faulty = all_episodes(scores)
     severities = {f"{' and '.join(SEVERITIES)} found": SEVERITIES, "mild found": ("mild",)}
     present = {trace.severity for trace in faulty}
@@ -215,8 +219,8 @@ def promises_table(
     hours = hourly_alarms(healthy).hours
     caption = (
         f"By promise: alarms per hour in the {hours:.2f} healthy hours of these exams, with 95 % "
-        "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the promise. Found: "
-        f"faults that an ideal observer could see, within {window:g} s."
+        "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the "
+        f"promise. Found: faults that an ideal observer could see, within {window:g} s."
     )
     headings = ("promised", "threshold", "false alarms", "knocks", "stops", *severities)
     return Table(caption, headings, rows)
@@ -230,6 +234,6 @@ def summary(scores: Sequence[Scores]) -> str:
     stop = hourly_alarms(healthy, STOP)
     found = Share.total([each.metrics.detected for each in scores])
     return (
-        f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops an hour in {fault.hours:.2f} healthy "
-        f"hours, {count(found)} faults found."
+        f"In all: {fault.text} faults, {knock.text} knocks, {stop.text} stops an hour in "
+        f"{fault.hours:.2f} healthy hours, {count(found)} faults found."
     )

@@ -34,7 +34,8 @@ class Gentle(NamedTuple):
     """Limits of harmless contact."""
 
     force: float  # external, on an arm as a whole [N]
-    torque: float  # external, on a joint [N m]; it shows what cancels in the force, such as an arm that hits itself
+    # External, on a joint [N m]; shows what cancels in the force, such as an arm that hits itself.
+    torque: float
 
     def times(self, factor: float) -> Gentle:
         """Return limits so many times as high."""
@@ -95,7 +96,8 @@ def usual_contact(recordings: Sequence[Episode]) -> dict[str, Gentle]:
     missing = {episode.labelled.task for episode in recordings} - set(peaks)
     if missing:
         raise ValueError(
-            f"no undisturbed motion of {', '.join(sorted(missing))} was solved by the expert, to say what is usual"
+            f"no undisturbed motion of {', '.join(sorted(missing))} was solved by the expert, "
+            "to say what is usual"
         )
     usual = {}
     for task, own in peaks.items():
