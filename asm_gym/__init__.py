@@ -24,6 +24,7 @@ from asm_gym.version import __version__  # noqa: F401
 
 if TYPE_CHECKING:
     from asm_gym.data.episode import Episode as Episode
+    from asm_gym.data.schema import LogSchema as LogSchema
     from asm_gym.exceptions import AsmGymError as AsmGymError
     from asm_gym.exceptions import DamagedFile as DamagedFile
     from asm_gym.exceptions import NotEnoughEpisodes as NotEnoughEpisodes
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 
 _NAMES: dict[str, Iterable[str]] = {
     "data.episode": ("Episode",),
+    "data.schema": ("LogSchema",),
     "exceptions": exceptions.__all__,
     "faults.suite": ("register_fault",),
     "monitors": ("NeuralASM", "make_monitor", "register_monitor"),

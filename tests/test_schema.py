@@ -223,6 +223,15 @@ def test_logs_of_another_scale_are_named_until_the_schema_says_otherwise(tmp_pat
     assert main(["fit", str(folder), *out, "--schema", str(schema_file)]) == 0
 
 
+def test_python_refuses_logs_of_another_scale_too():
+    from asm_gym.monitors import make_monitor
+
+    logs = [in_degrees(arm_table(n), False) if n % 4 == 3 else arm_table(n) for n in range(12)]
+    episodes = Episode.from_tables(logs)
+    with pytest.raises(ValueError, match=r"degrees.*episode 3"):
+        make_monitor("kalman", episodes[0].spec).fit(episodes)
+
+
 def test_logs_with_units_are_converted_and_no_note_says_otherwise(tmp_path):
     logs = []
     for n in range(8):

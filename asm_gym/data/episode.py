@@ -166,7 +166,7 @@ class Episode:
 
         Raises:
             ValueError: bad columns; the rate is unknown or differs from the spec's; time runs
-                backwards; logs differ in scale or are copies of each other.
+                backwards.
         """
         hints = SchemaHints(rate=rate, clock=clock, action=action, labels=labels, ignore=ignore)
         tables = [laid_out(frame) for frame in frames]

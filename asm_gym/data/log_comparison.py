@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.reader_notes import listed
-from asm_gym.data.schema import LOG_SCHEMA, LogSchema
+from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
 
 Floats = NDArray[np.float64]
 
@@ -55,6 +55,13 @@ def refuse_unlike(episodes: Sequence[Episode], names: Sequence[str]) -> None:
     _refuse_copies(episodes, names)
     if len(episodes) > 1 and LOG_SCHEMA in episodes[0].info:
         _refuse_other_scales(episodes, names)
+
+
+def refuse_other_scales(episodes: Sequence[Episode]) -> None:
+    """Raise ValueError if a column of some whole logs has another scale; pieces are not compared."""
+    are_logs = all(LOG_SCHEMA in episode.info and ORIGIN in episode.info for episode in episodes)
+    if len(episodes) > 1 and are_logs:
+        _refuse_other_scales(episodes, [f"episode {n}" for n in range(len(episodes))])
 
 
 def _refuse_copies(episodes: Sequence[Episode], names: Sequence[str]) -> None:

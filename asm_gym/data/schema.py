@@ -65,7 +65,7 @@ class LogSchema:
 
     Example:
         >>> import numpy as np
-        >>> from asm_gym.data.schema import LogSchema
+        >>> from asm_gym import LogSchema
         >>> t = np.arange(100) / 50
         >>> log = {"time": t, "q_0 [rad]": np.sin(t), "q_1 [rad]": np.cos(t)}
         >>> schema = LogSchema.infer([log])

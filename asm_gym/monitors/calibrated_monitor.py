@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from asm_gym.checkpoint import Checkpoint
 from asm_gym.data.episode import Episode
+from asm_gym.data.log_comparison import refuse_other_scales
 from asm_gym.detection import Blocks, Detection, EvidenceDetection, ModelOutput, Nominal
 from asm_gym.detection.base import Arrays
 from asm_gym.detection.commands import healthy_commands, learned_motion
@@ -167,6 +168,7 @@ class CalibratedMonitor:
                 raise TypeError(f"{self._name} has no warm start: leave warm_start out")
             self._require_fitted()
         check_nominal(episodes, self.spec, self.model.shortest)
+        refuse_other_scales(episodes)
         new = self._copy()  # an interrupt leaves this one as it was
         new._learn(episodes, progress or (lambda done, total: None), warm_start)
         new.about = about_episodes(episodes, with_actions=not warm_start)
