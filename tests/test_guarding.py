@@ -285,3 +285,17 @@ def test_a_guarded_environment_keeps_gymnasiums_contract_and_its_info_equals_its
         env.reset(seed=4)
         said.append([env.step(np.full(7, 0.3, np.float32))[4] for _ in range(3)])
     assert data_equivalence(*said, exact=True)
+
+
+def test_a_reflex_does_the_same_in_the_second_episode_as_in_the_first(lift):
+    """The hand presses on the table: the way back is that of the own episode, in each of two alike."""
+    env = NeuralASMSafety(lift, NeuralASM.pretrained("panda"), on_alarm="retract")
+    down = np.zeros(env.action_space.shape, np.float32)
+    down[2] = -1.0
+    episodes = []
+    for _ in range(2):
+        env.reset(seed=3)
+        steps = [env.step(down)[-1] for _ in range(60)]
+        assert any(info["asm"]["intervened"] for info in steps)
+        episodes.append([info["asm"]["executed_action"].tolist() for info in steps])
+    assert episodes[0] == episodes[1]

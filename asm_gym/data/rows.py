@@ -200,7 +200,7 @@ class RowReader:
         try:
             csv = CsvLines(line)
             ColumnMatch(self._schema, csv.names)
-        except ValueError:
+        except Exception:  # csv.Error is no ValueError, and no line may end a watch
             return False
         self._csv = csv
         self._match = None

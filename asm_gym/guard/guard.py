@@ -152,7 +152,6 @@ class Guard:
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._everyone = ~self._nobody
         self._all_active = True  # what the records say
-        self._ends_step = False
         self._marked = False  # there is something to say of the row: it failed, or is to be decided
         self._unreported: Mapping[int, str] = NOTHING  # what failed when the command was chosen
 
@@ -328,9 +327,7 @@ class Guard:
         if active is not self._everyone or not self._all_active:
             records["active"] = active
             self._all_active = bool(active.all())
-        if ends_step != self._ends_step:
-            records["ends_step"] = ends_step
-            self._ends_step = ends_step
+        records["ends_step"] = ends_step
         load = sensed.load
         if load is None:
             load = self._no_load
