@@ -112,6 +112,8 @@ class Args(LogOptions):
 def record_live(args: Args, say: Callable[[str], None]) -> Args:
     """Record a live source; return how to learn from that, cut into as many pieces as the promise needs."""
     file = args.out.with_suffix(".jsonl")
+    if file == args.out or str(args.data) == f"tail:{file}":
+        raise ValueError(f"rows are kept in {file}, which is in use: give --out another name")
     lines = lines_from(str(args.data), sys.stdin, SILENCE_S)
     seconds, ended = record(lines, file, args.minutes)
     say(f"{ended}, kept in {file}")
@@ -292,10 +294,10 @@ def fit(args: Args, console: Console) -> int:
     """Read, learn, calibrate, save, and print a summary."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     live = live_source(str(args.data)) is not None
+    writable(args.out)
     if live:
         args = record_live(args, say)
     start = time.perf_counter()
-    writable(args.out)
 
     with noted() as notes:
         episodes, left_out = read(args, console)

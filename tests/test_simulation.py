@@ -196,6 +196,27 @@ def test_nobody_tells_the_robot_of_a_payload():
     env.close()
 
 
+@pytest.mark.parametrize("controller", ["OSC_POSITION", "JOINT_TORQUE"])
+def test_a_payload_is_felt_under_the_controllers_of_robosuite_too(controller):
+    """The weight of 1 kg at the hand, by the nominal model at the live position, and not by a stale one."""
+    env = gym.make("asm_gym/Lift-v0", controller=controller, sensor_noise=0.0).unwrapped
+    env.reset(seed=0)
+    felt = env.stream_spec.slices["external_torque"]
+    rest = np.zeros(env.action_space.shape, np.float32)
+    before = [env.step(rest)[4]["stream"][felt] for _ in range(5)][-1]
+    model, data = env.simulation.model, env.simulation.data
+    hand = model.body("robot0_right_hand").id
+    model.body_mass[hand] += 1.0
+    after = env.step(rest)[4]["stream"][felt]
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, data.xipos[hand], hand)
+    weight = (jacobian.T @ [0, 0, -9.81])[:7]
+    assert np.abs(after - before).max() < 1.5 * np.abs(weight).max()
+    if controller == "OSC_POSITION":  # the arm is held against the weight
+        assert np.dot(after - before, weight) > 0.3 * np.dot(weight, weight)
+    env.close()
+
+
 def test_two_arms_give_two_sets_of_channels_and_move_alone():
     env = gym.make("asm_gym/TwoArmLift-v0", robot=("Panda", "UR5e"), sensor_noise=0.0)
     env.reset(seed=0)

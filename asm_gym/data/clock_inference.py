@@ -306,7 +306,8 @@ def _rises(values: NDArray[Any]) -> bool:
     """Return whether numbers (T,) rise in nearly all rows."""
     if not is_numeric(values) or len(values) < 3 or not np.isfinite(values).all():
         return False
-    return bool(np.mean(np.diff(values) > 0) > 1 - MOST_REPEATED)
+    steps = np.diff(values.astype(np.float64))  # a fall of unsigned numbers would be a leap
+    return bool(np.mean(steps > 0) > 1 - MOST_REPEATED)
 
 
 def _unit_of_rising(name: str, values: NDArray[Any]) -> float | None:

@@ -215,9 +215,11 @@ class LogSchema:
 
     def _is_label(self, name: str, values: NDArray[Any]) -> bool:
         """Return whether a column labels faults: by the schema, or if that has no such column."""
-        for column in self.columns:
-            if column.name == name or fnmatchcase(name, column.name):
-                return column.role == LABEL
+        exact = [column for column in self.columns if column.name == name]
+        patterns = [column for column in self.columns if fnmatchcase(name, column.name)]
+        matching = exact + patterns
+        if matching:
+            return matching[0].role == LABEL
         return is_called_label(name, values)
 
     def to_json(self) -> dict[str, Any]:

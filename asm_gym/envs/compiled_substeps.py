@@ -182,11 +182,16 @@ def feel(goals: Goals, limits: SubstepLimits, k: int, samples: Floats) -> None:
 
 
 @compiled
+def evaluate_nominal(views: Views, nominal: NominalViews) -> None:
+    """Evaluate the nominal model's dynamics, where controllers are not compiled."""
+    _evaluate_nominal(views, nominal)
+
+
+@compiled
 def brake_beneath(
     views: Views, nominal: NominalViews, arms: Arms, goals: Goals, work: Work, limits: SubstepLimits
 ) -> None:
     """Brake the arms that are held or too fast, where their controllers are not compiled."""
-    _evaluate_nominal(views, nominal)
     for a in range(len(arms)):
         if goals[a].held:
             control(views, nominal, arms[a], goals[a], work)

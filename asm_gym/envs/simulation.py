@@ -183,6 +183,7 @@ class Simulation:
             nominal = self.nominal.now()
             self.env.sim.step1()
             self.env._pre_action(self._action.copy(), self._fresh)
+            kernels.evaluate_nominal(self.views, nominal)
             if self._goals.held.any() or self.speed_limits.min() < np.inf:
                 kernels.brake_beneath(
                     self.views, nominal, self.arms, self._goals, self._work, self._limits

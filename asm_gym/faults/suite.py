@@ -138,7 +138,7 @@ KINDS: Registry[Kind] = Registry(
         "torque_scale": graded(sensor.Scale, _ON_TORQUE_SENSOR, factor=(1.05, 1.15, 1.5)),
         "wrist_bias": graded(sensor.Bias, _ON_WRIST_SENSOR, amount=(0.5, 2.0, 8.0)),
         "frozen_wrist": graded(
-            sensor.Freeze, channel="wrist_force", element=None, duration=(5, 15, None)
+            sensor.Freeze, {"channel": "wrist_sensor"}, element=None, duration=(5, 15, None)
         ),
         "action_delay": graded(action.ActionDelay, steps=(1, 3, 6)),
         "action_drop": graded(action.ActionDrop, probability=(0.1, 0.3, 0.7)),

@@ -3,7 +3,7 @@
     event ► hook ► topic ► queue ► a thread that writes lines to standard output
 
 Printing comes last and in a thread of its own: a pipe that is closed or that nobody reads stops
-neither the watch nor the hook. It is an alarm to hook and topic.
+neither the watch nor the hook. That it fails is told to hook and topic as an alarm.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from asm_gym.guard.live_events import ALARM, OUTPUT, LiveEvent
 
 MOST_WAITING = 1000  # lines that wait to be written; later ones are left out
 STUCK_S = 1.0  # a line that takes longer to write is not read by anybody [s]
+RETRY_S = 0.01  # time between two attempts to write to a full pipe [s]
 LAST_S = 2.0  # how long the end of a watch waits for its last lines [s]
+
+# Problems of standard output.
+CLOSED = "standard output is closed"
+NOBODY_READS = "nobody reads standard output"
 
 Tell = Callable[[LiveEvent], object]
 
@@ -42,8 +47,9 @@ class LineWriter:
         self._file = file
         self._lines: Queue[str] = Queue(MOST_WAITING)
         self._since: float | None = None  # when the line that is being written was begun [s]
-        if file is None:
-            self.problem = "standard output is closed"
+        self._is_closed = file is None
+        if self._is_closed:
+            self.problem = CLOSED
         Thread(target=self._write_all, daemon=True).start()
 
     def put(self, line: str) -> None:
@@ -53,28 +59,30 @@ class LineWriter:
             self._lines.put_nowait(line + "\n")
 
     def close(self) -> None:
-        """Wait until all lines are written, or none can be."""
+        """Wait, at most ``LAST_S``, until all lines are written."""
         end = time.monotonic() + LAST_S
-        while self._lines.unfinished_tasks and not self.problem and time.monotonic() < end:
+        while self._lines.unfinished_tasks and not self._is_closed and time.monotonic() < end:
             time.sleep(0.001)
-        self._check_progress()
+        if self._lines.unfinished_tasks:
+            self.problem = self.problem or NOBODY_READS
 
     def _check_progress(self) -> None:
         """Note that nobody reads."""
         since = self._since
         is_stuck = since is not None and time.monotonic() - since > STUCK_S
         if is_stuck or self._lines.full():
-            self.problem = self.problem or "nobody reads standard output"
+            self.problem = self.problem or NOBODY_READS
 
     def _write_all(self) -> None:
-        """Write lines one after another until one cannot be written."""
-        while not self.problem or self._lines.full():
+        """Write lines one after another, also after a while in which nobody read."""
+        while not self._is_closed:
             line = self._lines.get()
             self._since = time.monotonic()
             try:
                 self._write(line)
             except (OSError, ValueError):  # ValueError: the file is closed
-                self.problem = self.problem or "standard output is closed"
+                self.problem = self.problem or CLOSED
+                self._is_closed = True
                 return
             self._since = None
             self._lines.task_done()
@@ -88,7 +96,10 @@ class LineWriter:
             return
         rest = line.encode(errors="replace")
         while rest:
-            rest = rest[os.write(number, rest) :]
+            try:
+                rest = rest[os.write(number, rest) :]
+            except BlockingIOError:  # a full pipe that does not block
+                time.sleep(RETRY_S)
 
 
 class AlarmOutlets:

@@ -365,7 +365,9 @@ class Guard:
                 self._fail(row, robot, joined(*failures))
 
     def _fail(self, row: Row, robot: int, failure: str) -> None:
-        """Note that something failed in the row of a robot: its surprise is infinite."""
+        """Note that something failed in the row of an active robot: its surprise is infinite."""
+        if not self.table.records["active"][robot]:
+            return
         row.failures[robot] = joined(row.failures.get(robot, ""), failure)
         self.table.records["failed"][robot] = True
         self._marked = True
