@@ -251,6 +251,7 @@ def _candidate(named: NamedClock, table: Table, dt: float | None) -> _Candidate:
     if median == 0:
         return _Candidate(clock, times, repeated)
     jitter = float(np.median(np.abs(steps / median - 1)))
+    # Rounded, so that of clocks about as steady the first column is read.
     return _Candidate(clock, times, repeated, round(jitter, 2))
 
 

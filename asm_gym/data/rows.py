@@ -85,7 +85,7 @@ class RowReader:
         self._now = 0.0  # when the newest line came
         self._lacks_since = math.inf  # when the first line came that lacks columns
         self._lacking: ValueError | None = None  # what all publishers lack up to now
-        self._aside: float | None = None  # stamp of the last row, if it was left out [s]
+        self._left_out_stamp: float | None = None  # stamp of the last row, if it was left out [s]
 
     def begin(self) -> None:
         """Begin anew with the clock; columns stay."""
@@ -159,17 +159,18 @@ class RowReader:
 
     def _stamped(self, numbers: NDArray[np.float64], stamp: float) -> Row:
         """Return a row at its place in time; one that came late is left out."""
-        aside = self._aside
-        self._aside = None
+        aside = self._left_out_stamp
+        self._left_out_stamp = None
         problem = ""
         try:
             lost = self._pace.lost(stamp)
         except ClockWentBack as error:
             problem = str(error)
             if aside is None or not 0 < stamp - aside <= LONGEST_STEP_S:
-                self._aside = stamp
+                self._left_out_stamp = stamp
                 problem += ": the row is left out (--clock NAME chooses)"
                 return Row(numbers=numbers, read=False, stamp=stamp, problem=problem)
+            # The second late row agrees with the first: the clock was set anew.
             self.begin()
             lost = self._pace.lost(stamp)
         return Row(
@@ -243,7 +244,7 @@ class RowReader:
         if not present and self._match is not None:
             return None  # of a publisher whose numbers are not read
         row = self._publishers.row(message, present, self._now)
-        if row is None or not self._is_whole(row, bool(present)):
+        if row is None or not self._match_columns(row, bool(present)):
             return None
         assert self._match is not None
         numbers = {name: number(row[name]) for name in self._match.headers if name in row}
@@ -257,12 +258,15 @@ class RowReader:
         first = self._clock.told_unit(stamp)
         if first is None:
             return stamp
+        # The unit was wrong up to now: count the rows anew, from the first stamp in the new unit.
         self.begin()
         self._pace.lost(first)
         return self._clock.stamp(row)
 
-    def _is_whole(self, row: Mapping[str, Any], has_numbers: bool) -> bool:
-        """Return whether all columns of the schema are there; another publisher may add some.
+    def _match_columns(self, row: Mapping[str, Any], has_numbers: bool) -> bool:
+        """Find the columns of the schema in a row; return whether all are there.
+
+        Another publisher may add some.
 
         Raises:
             ValueError: columns are missing, and no publisher can add them any more.

@@ -202,7 +202,7 @@ class Commander:
 
 
 def _limits(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None) -> Floats32:
-    """Return (5, A) the bounds of actions, and beyond which of them, and at which step, one is not executed.
+    """Return (5, A): least and greatest action, least and greatest that is executed, greatest step.
 
     Numbers with bounds may be anything within them; others stay near healthy ``commands`` (3, A).
     """

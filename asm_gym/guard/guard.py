@@ -487,13 +487,13 @@ class Guard:
             return Outcome(response=response, decision=decision)
         robot.alarm = True
         robot.event = FAULT_EVENT
-        if self._only_contact(evidence):
+        if self._is_knock(evidence):
             robot.event = KNOCK_EVENT
         return Outcome(evidence.terms, int(robot.event), response, decision)
 
     @staticmethod
-    def _only_contact(evidence: RowEvidence) -> bool:
-        """Return whether an alarm is of a contact alone, which surprise does not exceed its threshold by."""
+    def _is_knock(evidence: RowEvidence) -> bool:
+        """Return whether an alarm is of a contact, or of surprise that a knock keeps under the threshold."""
         return set(evidence.terms) <= {CONTACT, SURPRISE} and not evidence.robot.over
 
     def _respond(self, evidence: RowEvidence) -> Response:
@@ -503,6 +503,8 @@ class Guard:
         if asked != BY_CAUSE and self._graded:
             return unexplained(asked, reason)
         response, columns = self._diagnostician.prescribe(evidence)
+        # Complete the sensors that diagnosis blames: what is only missing is completed already.
+        # Then diagnosis begins anew, on the completed rows.
         if columns.size or (response.name == "complete" and not evidence.only_lost):
             if self._validator.suspect(evidence.index, columns):
                 self._diagnostician.begin(evidence.index)

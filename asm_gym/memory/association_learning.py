@@ -3,7 +3,7 @@
     r_t = (Δ_t - D a_t) / s                        what the linear part leaves
     ε_t = ψ((r_t - U f(h_t)) / σ),  ψ(ε) = min(max(ε, -1), 1)
     ΔU ∝ ε_t f(h_t)ᵀ     ΔV ∝ ε_h a_tᵀ,   ε_h = f'(h_t) ⊙ Bᵀ ε_t
-    c = Σ_n ψ(r_n) Δ̂_n / Σ_n Δ̂_n², in [0, 1]       share of the hidden units' predictions Δ̂ to believe
+    c = Σ_n min(max(r_n, -3), 3) Δ̂_n / Σ_n Δ̂_n², in [0, 1]       share of the hidden units' predictions Δ̂ to believe
     ΔW_S ∝ (ε²/σ² - 1) f(h_t)ᵀ                     gradient of the Gaussian log likelihood
     τ = argmax Σ_n log t_4(ε_n/(σ_n g_n)) - log g_n   how much a prediction is doubted by its leverage
 

@@ -63,11 +63,13 @@ class CalibratedMonitor:
             ceilings; None before, or without such.
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
-        blocks_: the same by the hour, as ``detection.conformal`` counts it.
+        blocks_: surprise in blocks of time, for promises by the hour (``detection.conformal``).
         promised_: ``"episode"`` or ``"hour"``, the unit of the promise.
         healthy_: (N,) largest force of each of ``felt_channels`` in these episodes [N m], [N], a lower bound of contact
             limits; empty if the stream has no such channels.
-        pace_: (N, 16) speed of the hands in these episodes, by place and direction, of each task; see ``HandSpeedMap``.
+        pace_: by task, (N, 16) speed of the hands in these episodes by place and direction; see ``HandSpeedMap``.
+        motion_: how hands move by commands (``detection.commands``); None without hands.
+        commands_: (3, A) least, most and greatest step of the commands of these episodes; None without.
     """
 
     model: StreamModel
@@ -232,9 +234,9 @@ class CalibratedMonitor:
         the episodes' maxima may exceed the threshold, their tail is modelled, and
         ``promise.modelled`` is true.
 
-        Of 300 episodes or more, one in three (or ten) says how far each sense goes at its worst,
-        where the detection is that of evidence and the others suffice for the rate; they alone set
-        the threshold. Without that fewer faults are found.
+        With evidence detection, of 300 episodes or more a third (a tenth, if the rate needs more of
+        the others) tells how far each sense goes at its worst, and the others set the threshold.
+        Without that fewer faults are found.
 
         Args:
             episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an

@@ -226,18 +226,18 @@ def unwritten(state: Any) -> Any:
 
 
 @partial(compiled, calls=("memory", "detection", "."))
-def observe_rows(memory: Bound, rows: Any, judged: Any, attribution: Any) -> Any:
+def observe_rows(bound: Bound, rows: Any, judged: Any, attribution: Any) -> Any:
     """Observe the next rows, write the new state, and return the memory's errors (B, X).
 
     A detector of no errors judges nothing: then ``judged`` and ``attribution`` stay as they are.
 
     Args:
-        memory: see ``RowKernel.bound``.
+        bound: what was learned, the state before, and the state to write (``RowKernel.bound``).
         rows: (B, D), perhaps not finite.
         judged: (B,) of ``JUDGED``, written.
         attribution: (B, D) share of each number in the surprise, written.
     """
-    learned, before, after = memory.parts
+    learned, before, after = bound.parts
     weights, wants_context, detector, repetition, senses = learned.parts
     reading = read(weights, before.model.history, after.model.history, rows)
     carry_on(weights, before.model, after.model, reading, wants_context)

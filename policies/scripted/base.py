@@ -149,6 +149,7 @@ class Expert(StatefulPolicy):
         # indices of the action that move arms
         self.moves = np.setdiff1d(np.arange(self.size), inner.gripper_actions)
         # Plans have the Panda's pace; other arms drift further from their course.
+        # Plans are made for the pace and reach of a Panda.
         self.is_careful = set(inner.robots) != {"Panda"}
         self.gain = 3.0 if self.is_careful else 2.0
 

@@ -63,7 +63,7 @@ class CarryScene(Scene):
     thing: Any  # pose of the object; None where nothing is left to carry
     fingers: Vector  # velocities of the gripper's joints
     wrist: float  # angle of the arm's last joint [rad]
-    is_careful: bool
+    is_careful: bool  # the arm is not a Panda, whose pace the plans are made for
     gain: float  # of the hand's commands
 
     @property

@@ -10,12 +10,14 @@ import numpy as np
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
 from asm_gym.policies.scripted.geometry import UP, Pose, Vector, about_vertical, length, matrix
 
-WALL = 0.09  # above the bins' floor, so high the fingertips keep the palm off the walls' tops [m]
+LOWEST_FINGERTIPS = (
+    0.09  # above the bins' floor, so high the fingertips keep the palm off the walls' tops [m]
+)
 REACH_OF_PANDA = 0.8  # further from its base a hand comes down with its elbow at its stop [m]
 PALM_ALONG = 0.103  # half of a Panda's palm, along which its fingers close [m]
 PALM_ACROSS = 0.035  # and across [m]
 PALM_HEIGHT = 0.03  # of a Panda's palm above the fingertips [m]
-BIN_HEIGHT = 0.1  # of the walls above the bins' origin [m]
+WALL_HEIGHT = 0.1  # of the walls above the bins' origin [m]
 SPARE = 0.01  # so much room beside a wall is enough [m]
 ASKEW = (0.0, 0.2, -0.2, 0.4, -0.4)  # how far from square to an object fingers may close [rad]
 SLOWLY = 0.3  # with which share of its speed a palm comes down that will meet a wall
@@ -84,7 +86,7 @@ class PickPlaceExpert(CarryExpert):
         env = self.robosuite
         to_walls = env.bin_size[:2] / 2 - np.abs(thing.at[:2] - env.bin1_pos[:2])
         palm = thing.at[2] + grip + PALM_HEIGHT
-        if not self.is_careful and palm < env.bin1_pos[2] + BIN_HEIGHT:
+        if not self.is_careful and palm < env.bin1_pos[2] + WALL_HEIGHT:
             return beside_walls(half, thing.turned, to_walls)
 
         # Of the narrow axes that one which lies furthest from the walls.
@@ -99,21 +101,22 @@ class PickPlaceExpert(CarryExpert):
         if not self.is_careful:
             return ()
         reach = place - self.robosuite.robots[0].base_pos
-        bearing = np.arctan2(reach[0], -reach[1])
-        across = float(bearing - np.arctan2(closing[1], closing[0]))
-        return (across, across + np.pi)
+        sideways = np.arctan2(reach[0], -reach[1])  # at right angles to the reach
+        heading = float(sideways - np.arctan2(closing[1], closing[0]))
+        return (heading, heading + np.pi)
 
     def _place(self, number: int, half: Vector, grip: float) -> Vector:
         """Return where (3,) to let go.
 
-        It is nearer to the arm, because it is stretched out at the far side of the bins.
+        That is off the compartment's middle: towards the arm, or beyond a Panda's reach towards the
+        middle of the bins.
         """
         env = self.robosuite
         place = np.array(env.target_bin_placements[number], np.float64)
         away = place[:2] - env.robots[0].base_pos[:2]
         is_far = length(away) > REACH_OF_PANDA
         if is_far and not self.is_careful:
-            # Away from the nearest wall, and higher: the arm reaches furthest at shoulder height.
+            # Away from the outer walls, and higher: the arm reaches furthest at shoulder height.
             inwards = env.bin2_pos[:2] - place[:2]
             place[:2] += 0.08 * inwards / length(inwards)
             place[2] += 0.02
@@ -121,7 +124,7 @@ class PickPlaceExpert(CarryExpert):
             place[:2] -= self._nearer(away, half)
 
         # Lower, and the palm would stand on a wall.
-        place[2] += max(half[2] + 0.015, WALL - grip)
+        place[2] += max(half[2] + 0.015, LOWEST_FINGERTIPS - grip)
         if self.is_careful:  # stretched out, another arm may stand nearer to a wall than it should
             place[2] += 0.04
         return place
