@@ -18,7 +18,7 @@ from rich.console import Console
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import check_hours, check_per_hour
 from asm_gym.evaluation.defaults import WINDOW_S
-from asm_gym.evaluation.scoring import NOMINAL_ROLES
+from asm_gym.evaluation.scoring import HEALTHY_ROLES
 from asm_gym.evaluation.tables import markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.files import write_text
@@ -168,7 +168,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     hours = [load_episode(file) for file in files]
     if args.corpus is not None:
         hours += Corpus.open(args.corpus).episodes(
-            *NOMINAL_ROLES, policies=("scripted",), tasks=args.shown
+            *HEALTHY_ROLES, policies=("scripted",), tasks=args.shown
         )
     return [episode for episode in hours if episode.success]
 

@@ -14,7 +14,7 @@ from stable_baselines3 import SAC
 
 from asm_gym import collect
 from asm_gym.data.episode import Episode, EpisodeLabel
-from asm_gym.evaluation.scoring import NOMINAL_ROLES, Recordings
+from asm_gym.evaluation.scoring import HEALTHY_ROLES, Recordings
 from asm_gym.rollouts import progress
 from asm_gym.rollouts.run_folder import claimed, make_missing
 from asm_gym.rollouts.run_trials import environment
@@ -192,11 +192,11 @@ def test_episodes_that_fail_or_crash_by_themselves_are_not_normal():
     found = Recordings.of([*nominal, crash, failure, *faulty])
     assert found.left_out == (1, 1)
     assert [e.labelled.seed for e in found.roles["faulty"]] == [3]
-    assert [e.labelled.seed for role in NOMINAL_ROLES for e in found.roles[role]] == [0, 1, 2, 3]
+    assert [e.labelled.seed for role in HEALTHY_ROLES for e in found.roles[role]] == [0, 1, 2, 3]
     assert [e.labelled.seed for e in found.twins] == [3, 7]
     unfelt = [
         replace(recording(role, 0, 1.0), contact_force=np.zeros(0, np.float32))
-        for role in NOMINAL_ROLES
+        for role in HEALTHY_ROLES
     ]
     assert Recordings.of(unfelt).left_out == (0, 0)
 

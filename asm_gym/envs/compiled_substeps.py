@@ -151,7 +151,10 @@ def read_hand_velocity(views: Views, arm: Arm, row: Floats) -> None:
 
 @inner
 def largest_load(most: Floats, k: int, samples: Floats, largest: float) -> float:
-    """Return the largest share of a limit in substep ``k``, or ``largest`` before; infinite for NaN."""
+    """Return the greater of ``largest`` and the largest |load| / limit in substep ``k``.
+
+    ``most`` (A, FELT) are the limits. A load that is NaN makes it infinite.
+    """
     for a in range(len(most)):
         for i in range(FELT):
             load = abs(samples[a, k, i]) / most[a, i]
@@ -165,8 +168,8 @@ def largest_load(most: Floats, k: int, samples: Floats, largest: float) -> float
 def feel(goals: Goals, limits: SubstepLimits, k: int, samples: Floats) -> None:
     """Compare the load of the arms in substep ``k`` with the limits.
 
-    Where a limit is the first to be passed in a control step, and asks for it, all arms are held from the next substep
-    on where they then are; those that are held already, where they were.
+    Note the first substep in which a limit is passed; if ``status.stops``, hold all arms from the
+    next substep on. Arms that are held already keep their place.
     """
     status = limits.status[0]
     status.substeps += 1
@@ -205,8 +208,9 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
     """Run ``count`` physics substeps, controllers and sensors included.
 
     Args:
-        bound: ``Views``, ``NominalViews``, ``Arms``, ``Goals``, ``Work``, ``SubstepLimits``; the action (A,) in
-            robosuite's units; samples (A, K, SAMPLE), written at ``first`` and after.
+        bound: its ``parts`` are, in this order: ``Views``, ``NominalViews``, ``Arms``, ``Goals``,
+            ``Work``, ``SubstepLimits``; the action (N,) in robosuite's units; samples (A, K, SAMPLE)
+            of A arms and K substeps of a row, written at ``first`` and after.
         fresh: the action moves the set-points in the first of these substeps.
         first: index of the first substep within the row.
 
@@ -234,11 +238,14 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
 def sense(
     sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Floats, row: Floats
 ) -> None:
-    """Turn standard normal draws (M,) in ``row`` into readings with ``noise`` (M,).
+    """Turn standard normal draws into readings.
 
     Args:
-        sources, where: arrays that the arms' sensors read; (P, 2) each number's source and its index there.
+        sources: arrays that the arms' sensors read.
+        where: (P, 2) source of each of their numbers, and its index there.
         beside: (M - P,) true values of the other numbers.
+        noise: (M,) standard deviations.
+        row: (M,) draws on entry, readings on return.
     """
     own = len(where)
     for n in range(own):

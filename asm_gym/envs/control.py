@@ -40,7 +40,7 @@ HOLD_STIFFNESS = 400.0  # Kp of an arm that is held [1/s²]; Kd is 2 √Kp
 YIELDS_AT = 60.0  # Y: force at the hand from which a held arm at rest gives way [N]
 POSTURE_STIFFNESS = 10.0  # Kp of the posture of spare joints [1/s²]; Kd is 2 √Kp
 
-# Of ``Goal.held``.
+# States of ``Goal.held``; 0 is free.
 HELD = 1  # to be held from the next substep on
 BRAKING = 2  # on its way to rest
 YIELDING = 3  # since it came to rest
@@ -351,7 +351,7 @@ def track_pose(views: Views, arm: Arm, goal: Goal, work: Work) -> None:
 
 @partial(inner, inlined=True)
 def fastest_point(views: Views, arm: Arm) -> float:
-    """Return the greatest speed of an arm's hand and links, as far as each ``REACHES`` [m/s]."""
+    """Return the greatest speed of any point within ``REACHES`` of the hand or of a link's origin [m/s]."""
     origin = views.subtree_com[arm.root]  # at which MuJoCo's velocities of bodies are
     hand = arm.links[0]
     fastest = point_speed(views.cvel[hand], views.site_xpos[arm.site], origin)

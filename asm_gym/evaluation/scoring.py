@@ -24,7 +24,7 @@ from asm_gym.monitors import EVIDENCE, CalibratedMonitor, make_monitor, monitor_
 from asm_gym.monitors.calibration import AlarmRate
 from asm_gym.version import __version__
 
-NOMINAL_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
+HEALTHY_ROLES = ("fit", "calibration", "nominal")  # roles of episodes without a fault
 
 CODE = ("memory", "detection", "monitors", "scaling.py", "spec.py")
 """Rooms and files of the package whose code decides what a monitor learns."""
@@ -53,11 +53,11 @@ class Recordings(NamedTuple):
         for recording in recordings:
             label = recording.labelled
             # An alarm in a failed episode would be no false one.
-            if label.role in NOMINAL_ROLES and not recording.success:
+            if label.role in HEALTHY_ROLES and not recording.success:
                 failed += 1
             elif (label.task, label.seed) not in crashed:
                 roles.setdefault(label.role, []).append(recording)
-        for role in NOMINAL_ROLES:
+        for role in HEALTHY_ROLES:
             if role not in roles:
                 raise ValueError(
                     f"none of the {role} episodes succeeded without a crash: "
@@ -69,8 +69,9 @@ class Recordings(NamedTuple):
 
 def scenes_with_crash(recordings: Sequence[Episode]) -> set[tuple[str, int]]:
     """Return task and seed of the solved nominal episodes in which the robot crashes."""
-    solved = [r for r in recordings if r.labelled.role in NOMINAL_ROLES and r.success]
+    solved = [r for r in recordings if r.labelled.role in HEALTHY_ROLES and r.success]
     labels = [r.labelled for r in solved]
+    # Episodes that are judged do not say what is usual.
     is_reference = [label.role != "nominal" for label in labels]
     crashed = crashes(solved, [label.task for label in labels], is_reference)
     return {(labels[n].task, labels[n].seed) for n in crashed}

@@ -1,6 +1,6 @@
-"""The fault suite: every kind at three severities.
+"""The fault suite: every kind at three severities, but ``missing_object``, which has one.
 
-The joint, axis, direction or reading that a fault acts on is drawn from the episode's seed.
+The joint, axis and direction that a fault acts on are drawn from the episode's seed.
 """
 
 from __future__ import annotations
@@ -66,16 +66,16 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 
 class Drawn(NamedTuple):
-    """What is drawn for an episode: the joint, axis, direction and bodies that its faults act on."""
+    """What the faults of an episode act on: a drawn joint, axis and direction, and two bodies."""
 
     env: RobosuiteEnv
     prefix: str  # of the first arm's channels
     joint: int  # of the first arm
     axis: int  # of the action
-    translation: int  # an axis of the action that moves the hand, not one that turns it
+    translation: int  # 0 to 2: an axis of translation, of the action and of the wrist force
     direction: Vector3
-    link: str
-    hand: str
+    link: str  # body that the first arm's fifth joint moves
+    hand: str  # body of its hand
     onset: int
     seed: int
 
@@ -196,7 +196,7 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
     joint = int(rng.integers(len(robot._ref_joint_vel_indexes)))
     axis = int(rng.integers(flatdim(env.action_space) - len(env.gripper_actions)))
     translation = int(rng.integers(3))
-    elbow = model.jnt_bodyid[model.actuator_trnid[env.simulation.motors[4], 0]]
+    fifth = model.jnt_bodyid[model.actuator_trnid[env.simulation.motors[4], 0]]
     return Drawn(
         env=env,
         prefix=prefix_of(0, len(env.robots)),
@@ -204,7 +204,7 @@ def draw(env: RobosuiteEnv, onset: int, seed: int) -> Drawn:
         axis=axis,
         translation=translation,
         direction=(x, y, z),
-        link=model.body(elbow).name,
+        link=model.body(fifth).name,
         hand=robot.robot_model.eef_name["right"],
         onset=onset,
         seed=seed,
@@ -221,7 +221,7 @@ def suite_fault(kind: str, env: RobosuiteEnv, severity: str, onset: int, seed: i
 def possible(kind: str, env: RobosuiteEnv) -> bool:
     """Whether the environment has what a kind of fault acts on: a loose object, a gripper."""
     try:
-        KINDS[kind](draw(env, 0, 0), 1).check(env)
+        KINDS[kind](draw(env, 0, 0), 1).check(env)  # at any severity and seed the same
     except ValueError:
         return False
     return True

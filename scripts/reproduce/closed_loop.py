@@ -1,10 +1,10 @@
 """Networks that act in closed loop in the tasks of ``workspace``.
 
-The network that settles is surprised by its own energy of each row,
+The network that settles is surprised where its own energy of a row, of a group of senses, passes a ceiling:
 
-    F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = W f(μ_t);   ceilings by group of senses
+    F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = max(W f(μ_t) + b, least)
 
-leaves out a group that alone is over its ceiling, and yields where several are.
+It leaves out a group that alone is over its ceiling, and yields where several are.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Reading(NamedTuple):
 
     state: Floats  # (H,) or (T, H) f(μ)
     error: Floats  # (N,) or (T, N) of senses, changes and commands, in σ
-    energy: Floats  # (G,) or (T, G) of ``GROUPS``, in their ceilings
+    energy: Floats  # (G,) or (T, G) of ``GROUPS``, as multiples of their ceilings
 
 
 class Settling:
@@ -53,7 +53,7 @@ class Settling:
         episodes: healthy ones, of which it learns how far its errors spread in each state: log σ² = W f(μ).
 
     Attributes:
-        ceilings: (G,) of the energies of ``GROUPS``.
+        ceilings: (G,) energy of each of ``GROUPS`` from which it counts; 1 until the caller sets them.
     """
 
     def __init__(
