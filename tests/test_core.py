@@ -92,7 +92,16 @@ ONE_IMPORT = {
         ("NeuralASM", "NeuralASMSafety", "VectorNeuralASMSafety", "StreamRecorder"), None
     ),
     **dict.fromkeys(
-        ("Channel", "Episode", "StreamSpec", "make_monitor", "make_policy", "harmless"), None
+        (
+            "Channel",
+            "Episode",
+            "LogSchema",
+            "StreamSpec",
+            "make_monitor",
+            "make_policy",
+            "harmless",
+        ),
+        None,
     ),
     **dict.fromkeys(("register_monitor", "register_policy", "register_task"), None),
     **dict.fromkeys(exceptions.__all__, None),
