@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from asm_gym.data.inspection import Inspection, inspect_log
+from asm_gym.data.inspection import inspect_log
 from asm_gym.data.logs import Source, first_sources, read_sources
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema import LogSchema
@@ -51,42 +51,55 @@ class Args(LogOptions):
     """File to write the schema to, which says how the logs are read; edit it, and name it to fit and watch."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A recording, and how it is read.
+
+    Args:
+        source: where it was found; a log is cut where its clock begins anew.
+        schema: how it is read.
+        problem: why no schema can be inferred as the logs are; empty if one can.
+    """
+
+    source: Source
+    schema: LogSchema
+    problem: str = ""
+
+
 def inspect(args: Args, console: Console) -> int:
     """Read, print the table of the first log and a line of every other, and draw pictures."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    said: set[str] = set()
-    first: Inspection | None = None
+    remarks: set[str] = set()  # that were said: what is alike in many logs is said once
     trouble = False
     with noted() as notes:
-        hints = args.hints()
-        for n, (source, schema, problem) in enumerate(sources_with_schema(args, hints)):
-            log = inspect_log(source.name, table_of_source(source), schema, problem)
+        for number, recording in enumerate(recordings(args)):
+            source = recording.source
+            log = inspect_log(
+                source.name, table_of_source(source), recording.schema, recording.problem
+            )
             trouble = trouble or bool(log.trouble)
             say(log.caption())
-            lines = [] if first is not None else table(log.facts())
-            lines += [f"- {line}" for line in log.remarks()]
-            for line in lines:
-                if line not in said:  # what is alike in many logs is said once
+            if number == 0:
+                for line in table(log.facts()):
                     say(line)
-            said.update(line for line in lines if line.startswith("- "))
-            if n < args.logs:
+            for remark in log.remarks():
+                if remark not in remarks:
+                    say(f"- {remark}")
+            remarks.update(log.remarks())
+            if number < args.logs:
                 picture = args.out / f"{picture_name(source)}.png"
                 say(f"Wrote {figures.save(figures.log_figure(log), picture)}")
-            if first is None:
-                first = log
-                if args.schema is not None:
-                    write_schema(args.schema, schema)
-                    say(f"Wrote {args.schema}. Next: asm-gym fit {args.log} --schema {args.schema}")
+            if number == 0 and args.schema is not None:
+                write_schema(args.schema, recording.schema)
+                say(f"Wrote {args.schema}. Next: asm-gym fit {args.log} --schema {args.schema}")
     for note in notes:
         say(f"Note: {note}.")
     return ended(notes, BAD_NEWS if trouble else DONE)
 
 
-def sources_with_schema(args: Args, hints: SchemaHints) -> Iterator[tuple[Source, LogSchema, str]]:
-    """Yield the recordings, cut where their clock begins anew, and the schema of the first of them.
-
-    Also yields why no schema can be inferred as it is; empty if one can.
-    """
+def recordings(args: Args) -> Iterator[Recording]:
+    """Yield the recordings, with the schema of the first of them."""
+    hints = args.hints()
     sources, first = first_sources(read_sources(args.log, hints))
     schema = None
     problem = ""
@@ -97,15 +110,21 @@ def sources_with_schema(args: Args, hints: SchemaHints) -> Iterator[tuple[Source
             schema = infer_schema(tables, hints)
         except ValueError as error:
             problem = str(error)
+            # Any rate goes without the clock; the schema says none.
             schema = infer_schema(tables, replace(hints, clock="", rate=1.0))
+            schema = replace(schema, rate=0.0)
     for source in sources:
         if source.episode is not None or schema is None:
-            yield source, infer_schema([table_of_source(source)], SchemaHints(channels=("*",))), ""
+            own = infer_schema([table_of_source(source)], SchemaHints(channels=("*",)))
+            yield Recording(source=source, schema=own)
             continue
         parts = recordings_in(source.columns, schema.clock)
         for number, part in enumerate(parts, 1):
-            name = source.name if len(parts) == 1 else f"{source.name} part {number}"
-            yield replace(source, name=name, columns=part), schema, problem
+            name = source.name
+            if len(parts) > 1:
+                name = f"{source.name} part {number}"
+            part_source = replace(source, name=name, columns=part)
+            yield Recording(source=part_source, schema=schema, problem=problem)
 
 
 def picture_name(source: Source) -> str:

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.tables import MOST_BYTES, Columns, is_numeric
 from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 from asm_gym.files import regular_file
-
-MOST_BYTES = 512  # 8-bit integers in a row of senses; more are a picture
 
 
 def read_parquet(path: Path) -> Columns:

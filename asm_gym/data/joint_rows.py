@@ -23,6 +23,7 @@ class JointRows:
     def __init__(self, schema: LogSchema) -> None:
         self._spec = schema.spec
         self._clock = LiveClock(schema, "")
+        self._clock_is_found = False
         self._joint = ""  # the column that says whose numbers a row holds
         self._gathered: dict[str, Any] = {}  # of the joints that came
 
@@ -63,7 +64,9 @@ class JointRows:
 
     def _is_later(self, before: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
         """Return whether a row is of a later moment than the joints before it."""
-        self._clock.find(row, ())
+        if not self._clock_is_found:
+            self._clock.find(row, ())
+            self._clock_is_found = True
         first = self._clock.stamp(before)
         stamp = self._clock.stamp(row)
         if first is None or stamp is None:

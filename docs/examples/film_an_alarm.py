@@ -22,15 +22,10 @@ for step in range(100):
     if step % 2:
         continue
     asm = info["asm"]
-    colour = (
-        "red"
-        if asm["alarm"]
-        else "orange"
-        if asm["intervened"]
-        else "gold"
-        if asm["completed"]
-        else "white"
-    )
+    colour = "white"
+    for key, marked in {"completed": "gold", "intervened": "orange", "alarm": "red"}.items():
+        if asm[key]:
+            colour = marked  # the last that holds is the gravest
     picture = ImageOps.expand(Image.fromarray(env.render()).resize((320, 320)), 8, colour)
     fault, doing = ", ".join(info["fault"]) or "no fault", asm["response"] or asm["state"]
     doing = " ".join([doing, *asm["completed"], "is completed"]) if asm["completed"] else doing
