@@ -133,7 +133,7 @@ class RowReader:
         """Return a line that is no row."""
         kind = "no row of numbers"
         if self._csv is None and not self._is_known:
-            kind += ", and no header of the memory's columns"
+            kind += ", and no header"
         missing = np.full(self._spec.size, np.nan)
         return Row(numbers=missing, read=False, problem=f"line {self.line} is {kind}: {error}")
 
