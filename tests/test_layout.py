@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 import asm_gym
-from tests.wheel import LINKS, ROOT
+from tests.wheel import ROOT
 
 LAYERS = (
     *(
@@ -42,15 +41,8 @@ def layer(module: str) -> str:
 
 def modules() -> dict[str, ast.Module]:
     """Every module of the package by its long name, parsed."""
-    files = [
-        f
-        for f in (ROOT / "asm_gym").rglob("*.py")
-        if f.relative_to(ROOT / "asm_gym").parts[0] not in LINKS
-    ]
+    files = (ROOT / "asm_gym").rglob("*.py")
     named = {".".join(f.relative_to(ROOT).with_suffix("").parts): f for f in files}
-    for link in LINKS:
-        for f in (ROOT / link).rglob("*.py"):
-            named[".".join(("asm_gym", *f.relative_to(ROOT).with_suffix("").parts))] = f
     return {
         name: ast.parse(f.read_text(encoding="utf-8"), str(f)) for name, f in sorted(named.items())
     }
@@ -101,7 +93,7 @@ def test_nothing_is_imported_by_its_short_name() -> None:
         f"{name} imports {w}"
         for name, whats in everywhere.items()
         for w in whats
-        if w.split(".")[0] in LINKS
+        if w.split(".")[0] in ("policies", "wrappers", "scripts")
     ]
     assert not short, "write asm_gym.wrappers, asm_gym.policies, asm_gym.scripts"
 
@@ -144,10 +136,3 @@ def test_every_name_of_the_package_is_what_its_room_calls_so():
     assert set(asm_gym.__all__) == set(asm_gym._HOME) <= set(dir(asm_gym))
     with pytest.raises(AttributeError, match=r"module 'asm_gym' has no attribute 'Tracer'"):
         asm_gym.Tracer  # noqa: B018 (looked up)
-
-
-@pytest.mark.parametrize("link", LINKS)
-def test_the_links_are_relative_and_resolve(link: str) -> None:
-    path = ROOT / "asm_gym" / link
-    assert os.readlink(path) == f"../{link}"
-    assert (path / "__init__.py").is_file()

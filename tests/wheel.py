@@ -8,16 +8,14 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINKS = ("policies", "wrappers", "scripts")
 
 
 def build_wheel(folder: Path) -> Path:
     """The wheel of this tree, built in ``folder`` by this Python."""
     source = folder / "source"
-    for name in ("asm_gym", *LINKS):
-        shutil.copytree(
-            ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
-        )
+    shutil.copytree(
+        ROOT / "asm_gym", source / "asm_gym", ignore=shutil.ignore_patterns("__pycache__")
+    )
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
     pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
