@@ -128,6 +128,7 @@ class Turn(NamedTuple):
     commands: Array  # (B, A + 1)
     own: NDArray[np.bool_]  # (B, 1) streams that take their own action
     alone: NDArray[np.bool_]  # (B, 1) streams whose next state follows from the prediction
+    begins: NDArray[np.bool_]  # (B, 1) whether an episode begins
 
     def commands_with(self, action: Array) -> Array:
         """Return the commands (B, A + 1) that are taken where ``action`` (B, A) is the streams' own."""
@@ -229,7 +230,7 @@ class Practice:
             self._alone = cue_ends & (self.rng.random(self.cue.shape) < free)
             if not self.learner.early:
                 own = self._alone
-            turn = Turn(now.senses, now.commands, own, self._alone)
+            turn = Turn(now.senses, now.commands, own, self._alone, now.begins)
             self.state, energy = self.learner.practise(state, turn, rate)
             total += energy
         return total
