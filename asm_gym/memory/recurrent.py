@@ -66,6 +66,7 @@ class Weights(NamedTuple):
     decay: Array  # (N,) ν
     turn: Array  # (N,) θ [rad a row]
     gain: Array  # (N,) γ; not learned
+    reads: Array  # (R,) 1 where a number of the row is carried on, 0 where it is only predicted; not learned
     B_re: Array  # noqa: N815 (N, R) real part of B
     B_im: Array  # noqa: N815 (N, R) imaginary part
     W_C: Array  # (H, I) from what is carried on to the state
@@ -88,6 +89,7 @@ def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int,
         "decay": (units,),
         "turn": (units,),
         "gain": (units,),
+        "reads": (row,),
         "B_re": (units, row),
         "B_im": (units, row),
         "W_C": (hidden, carried),
@@ -107,6 +109,7 @@ def multiplier(weights: Weights, i: int) -> tuple[float, float]:
 def advance(m: Array, rows: Array, weights: Weights) -> Array:
     """Return m_t (B, I) from m_{t-1} and the rows r_t (B, R)."""
     N = len(weights.decay)
+    rows = rows * weights.reads
     drive_re = outward(rows, weights.B_re)
     drive_im = outward(rows, weights.B_im)
     out = np.empty_like(m)
@@ -199,7 +202,8 @@ def follow_eligibility(eligible: Eligibility, m: Array, rows: Array, weights: We
             for j in range(R):
                 E_re = eligible.B_re[n, i, j]
                 E_im = eligible.B_im[n, i, j]
-                eligible.B_re[n, i, j] = re * E_re - im * E_im + gain * rows[n, j]
+                read = weights.reads[j] * rows[n, j]
+                eligible.B_re[n, i, j] = re * E_re - im * E_im + gain * read
                 eligible.B_im[n, i, j] = re * E_im + im * E_re
 
 
@@ -328,6 +332,7 @@ def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Genera
     forgetting = np.geomspace(-np.log(SHORTEST), -np.log(LONGEST), units)
     weights = Weights._make(np.zeros(shape, np.float32) for shape in shapes.values())
     weights.decay[:] = np.log(forgetting)
+    weights.reads[:] = 1.0
     weights.turn[:] = rng.uniform(0.0, FASTEST, units)
     weights.gain[:] = np.sqrt(1 - np.exp(-2 * forgetting))
     for part in (weights.B_re, weights.B_im):
@@ -375,6 +380,7 @@ class RecurrentLearner(Learner):
     ) -> None:
         super().__init__(weights, schedule, rng)
         self.noise = np.float32(noise)
+        self.precision = np.ones(len(weights.W_F), np.float32)
         self.rng = rng
         self.eligible = Eligibility.none(schedule.batch_size, weights)
 
@@ -403,9 +409,10 @@ class RecurrentLearner(Learner):
 
         past = direct(state, taken, w.W_D)
         left = np.hstack([turn.senses, turn.commands[:, :-1]]) - past  # (B, S + A)
-        z = infer(mu, left, w.W_F, np.full_like(left, pi_x), inference)
+        pi_x = np.broadcast_to(pi_x * self.precision, left.shape).astype(np.float32)
+        z = infer(mu, left, w.W_F, pi_x, inference)
         error = left - sense(z, w.W_F)
-        energy = 0.5 * float(pi_z * np.sum((z - mu) ** 2) + pi_x * np.sum(error**2))
+        energy = 0.5 * float(pi_z * np.sum((z - mu) ** 2) + np.sum(pi_x * error**2))
         senses = turn.senses
         if turn.alone.any():
             expected = past + sense(mu, w.W_F)
@@ -428,10 +435,16 @@ def learn_recurrent(
     rng: np.random.Generator,
     tick: Tick,
     noise: float = 0.0,
+    reads: Array | None = None,
+    precision: Array | None = None,
 ) -> Trained:
     """Learn the synapses through time; see ``temporal.Learn``. ``noise`` is that on what is carried on."""
     sensory = trajectories[0].senses.shape[1]
     motor = trajectories[0].commands.shape[1] - 1
     weights = initial_weights(hidden, sensory, motor, rng)
+    if reads is not None:
+        weights.reads[:-1] = reads
     learner = RecurrentLearner(weights, schedule, rng, noise)
+    if precision is not None:
+        learner.precision = precision
     return learned_network(RecurrentNetwork, learner, trajectories, rng, tick)

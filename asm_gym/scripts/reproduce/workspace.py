@@ -42,6 +42,9 @@ SPEC = StreamSpec(
         Channel("thing_to_goal", 3, "m", group="object"),
         Channel("thing_to_goal_near", 3, group="object"),
         Channel("turn", 2, "rad", group="object"),
+        Channel("external_torque", 7, "N m", 0.15, "torque"),
+        Channel("wrist_force", 3, "N", 0.2, "wrench"),
+        Channel("wrist_torque", 3, "N m", 0.01, "wrench"),
         Channel("action", 7, group=MOTOR),
     ),
     0.05,
@@ -209,6 +212,9 @@ class Workspace:
             way,
             np.tanh(way / NEAR),
             self.rules.turn(self, pose),
+            self.read("external_torque"),
+            self.read("wrist_force"),
+            self.read("wrist_torque"),
             self.read("action"),
         )
         return np.concatenate(values)
