@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import HELD, Columns
+from asm_gym.data.table_layout import HELD, Columns
 from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 

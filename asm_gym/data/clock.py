@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.names import LONGER
-from asm_gym.data.tables import is_numeric
+from asm_gym.data.table_layout import is_numeric
 
 Floats = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from asm_gym.data.clock import DATE, DAY_S, NUMBER, LogClock, kind_of, numbers_o
 from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.names import CLOCK, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import is_numeric
+from asm_gym.data.table_layout import is_numeric
 
 Floats = NDArray[np.float64]
 Table = Mapping[str, NDArray[Any]]

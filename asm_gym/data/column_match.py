@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.names import TAU, factor, label_of, split_unit
-from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.table_layout import Columns, is_numeric
 
 if TYPE_CHECKING:
     from asm_gym.data.schema import LogSchema

@@ -59,7 +59,7 @@ from asm_gym.data.names import (
     split_unit,
 )
 from asm_gym.data.schema import is_called_label
-from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.table_layout import Columns, is_numeric
 from asm_gym.data.text import DOUBLED, numbers_in
 
 Floats = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from asm_gym.data.tables import is_key, named_columns, named_row
+from asm_gym.data.table_layout import is_key, named_columns, named_row
 from asm_gym.data.text import DOUBLED, Dialect, check_cells, header_of
 
 

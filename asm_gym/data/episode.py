@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
 from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns
-from asm_gym.data.tables import laid_out
+from asm_gym.data.table_layout import laid_out
 from asm_gym.exceptions import DamagedFile
 from asm_gym.files import regular_file
 from asm_gym.readings import spans as spans

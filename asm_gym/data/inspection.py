@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asm_gym.data.log_column import COMMAND, IGNORED, SENSE, LogColumn
 from asm_gym.data.names import split_unit
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.table_layout import Columns, is_numeric
 from asm_gym.data.timing import BRIDGED_ROWS, FAR, Timing, evenly, timing_of
 from asm_gym.readings import noise_of, resolution, spans
 
@@ -88,7 +88,7 @@ def inspect_log(name: str, table: Columns, schema: LogSchema, trouble: str = "")
 
     Args:
         name: of the log.
-        table: its columns, as ``asm_gym.data.tables.laid_out`` returns them.
+        table: its columns, as ``asm_gym.data.table_layout.laid_out`` returns them.
         schema: how it is read.
         trouble: why it cannot be read; empty if that is not known yet.
     """

@@ -8,7 +8,7 @@ from typing import Any
 from asm_gym.data.live_clock import LiveClock
 from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.tables import is_key
+from asm_gym.data.table_layout import is_key
 
 LATER = 0.5  # share of a period from which on a row is of a later moment
 

@@ -24,7 +24,7 @@ from asm_gym.data.names import is_label, split_unit
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns, recordings_in
-from asm_gym.data.tables import Columns, laid_out
+from asm_gym.data.table_layout import Columns, laid_out
 from asm_gym.data.text import read_json_lines, read_text
 from asm_gym.files import regular_file
 from asm_gym.validation import typed

@@ -25,7 +25,7 @@ from asm_gym.data.joint_rows import JointRows
 from asm_gym.data.live_clock import LONGEST_STEP_S, ClockWentBack, LiveClock, Pace
 from asm_gym.data.publishers import Publishers
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.tables import MOST_COLUMNS
+from asm_gym.data.table_layout import MOST_COLUMNS
 from asm_gym.data.text import flat_row
 
 

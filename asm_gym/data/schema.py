@@ -24,7 +24,7 @@ from asm_gym.data.column_match import ColumnMatch
 from asm_gym.data.log_column import COMMAND, COUNTER, LABEL, SENSE, UNCLEAR, LogColumn
 from asm_gym.data.names import TAU, TURN, TURNED, is_label, split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns, is_numeric, laid_out
+from asm_gym.data.table_layout import Columns, is_numeric, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
 from asm_gym.exceptions import DamagedFile
 from asm_gym.spec import MOTOR, Channel, StreamSpec

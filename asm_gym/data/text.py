@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.names import element_name
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import MOST_COLUMNS, Columns, check_width
+from asm_gym.data.table_layout import MOST_COLUMNS, Columns, check_width
 from asm_gym.data.text_exports import check_export, on_first_clock, scope_head, with_unit
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_file import write_schema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, recordings_in
-from asm_gym.data.tables import Columns
+from asm_gym.data.table_layout import Columns
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
 from asm_gym.scripts.log_options import LogOptions, ended
