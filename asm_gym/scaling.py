@@ -51,6 +51,17 @@ class ScaledRows(NamedTuple):
     finite: NDArray[np.bool_]  # (B, D)
 
 
+class RowScale(NamedTuple):
+    """How compiled code reads rows of a stream: the scale of each column, and what the columns are."""
+
+    mean: Floats  # (D,) of the training rows [unit of each channel]
+    spread: Floats  # (D,) their standard deviation
+    change: Floats  # (D,) standard deviation of the change over ``lag`` rows
+    sensory: Ints  # (X,) columns that are sensed
+    motor: Ints  # (A,) columns that are commanded
+    slow: Ints  # (S - X,) columns whose change is sensed too
+
+
 @dataclass(frozen=True, eq=False)
 class StreamScaler:
     """Standardises rows of a stream."""
@@ -65,7 +76,8 @@ class StreamScaler:
     def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]], lag: int = 1) -> Self:
         """Learn the scale from training episodes (T, D) of more than ``lag`` rows each."""
         rows = np.concatenate(streams).astype(np.float64)  # (N, D)
-        steps = np.concatenate([s[lag:].astype(np.float64) - s[:-lag] for s in streams])
+        parts = [stream[lag:].astype(np.float64) - stream[:-lag] for stream in streams]
+        steps = np.concatenate(parts)  # (M, D)
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
         change = np.maximum(steps.std(axis=0), _least_change(streams, spec.noise))
@@ -87,6 +99,18 @@ class StreamScaler:
         slow = self.change < SLOW * self.spread
         slow[self.spec.motor] = False
         return np.flatnonzero(slow)
+
+    @cached_property
+    def row_scale(self) -> RowScale:
+        """The same as writable arrays of the one type that compiled code takes."""
+        return RowScale(
+            mean=np.array(self.mean, np.float64),
+            spread=np.array(self.spread, np.float64),
+            change=np.array(self.change, np.float64),
+            sensory=self.spec.sensory.copy(),
+            motor=self.spec.motor.copy(),
+            slow=self.slow,
+        )
 
     @cached_property
     def size(self) -> int:
@@ -120,9 +144,12 @@ class StreamScaler:
 
     def read(self, rows: Rows, before: Rows, earlier: Rows) -> ScaledRows:
         """Read rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
-        x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
-        sensory, motor = self.spec.sensory, self.spec.motor
-        return read_rows(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow)
+        return read_rows(
+            rows=np.ascontiguousarray(rows, np.float64),
+            before=np.ascontiguousarray(before, np.float64),
+            earlier=np.ascontiguousarray(earlier, np.float64),
+            scale=self.row_scale,
+        )
 
 
 @inner
@@ -158,22 +185,15 @@ def _changed(number: float, before: float, change: float) -> float:
 
 
 @compiled
-def read_rows(
-    rows: Floats,
-    before: Floats,
-    earlier: Floats,
-    mean: Floats,
-    spread: Floats,
-    change: Floats,
-    sensory: Ints,
-    motor: Ints,
-    slow: Ints,
-) -> ScaledRows:
+def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) -> ScaledRows:
     """Read rows (B, D), see ``StreamScaler.read``."""
+    mean = scale.mean
+    spread = scale.spread
+    change = scale.change
     B, D = rows.shape
-    X = len(sensory)
-    L = len(slow)
-    A = len(motor)
+    X = len(scale.sensory)
+    L = len(scale.slow)
+    A = len(scale.motor)
     senses = np.zeros((B, X + L), np.float32)
     seen = np.zeros((B, X + L), np.float32)
     commands = np.ones((B, A + 1), np.float32)
@@ -187,19 +207,22 @@ def read_rows(
             if not (finite[n, i] and np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])):
                 whole[n, 0] = 0.0
             inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
+
         for j in range(X):
-            i = sensory[j]
+            i = scale.sensory[j]
             seen[n, j] = finite[n, i]
             senses[n, j] = _standardised(rows[n, i], mean[i], spread[i])
             changes[n, j] = _changed(rows[n, i], before[n, i], change[i])
             inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
+
         for j in range(L):
-            i = slow[j]
+            i = scale.slow[j]
             seen[n, X + j] = finite[n, i] and np.isfinite(before[n, i])
             senses[n, X + j] = _changed(rows[n, i], before[n, i], change[i])
             inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
+
         for j in range(A):
-            i = motor[j]
+            i = scale.motor[j]
             commands[n, j] = _standardised(rows[n, i], mean[i], spread[i])
             inputs[n, D + X + L + j] = _believed(commands[n, j])
     return ScaledRows(senses, seen, commands, inputs, changes, whole, finite)

@@ -39,7 +39,7 @@ from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNet
 from asm_gym.memory.traces import Weights, carry, weight_shapes
 from asm_gym.monitors.monitor_state import MonitorState
 from asm_gym.monitors.surprise import Surprise
-from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
+from asm_gym.scaling import RowScale, ScaledRows, StreamScaler, read_rows
 
 
 class RowWeights(NamedTuple):
@@ -52,12 +52,7 @@ class RowWeights(NamedTuple):
     wiring: Wiring
     W_K: NDArray[np.float32]
     b_K: NDArray[np.float32]  # noqa: N815
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    change: NDArray[np.float64]
-    sensory: NDArray[np.intp]
-    motor: NDArray[np.intp]
-    slow: NDArray[np.intp]
+    scale: RowScale
     inference: Inference
 
 
@@ -80,12 +75,7 @@ def row_weights(
         wiring=Wiring.of(network.association, scaler),
         W_K=single(names["W_K"]),
         b_K=single(names["b_K"]),
-        mean=np.array(scaler.mean, np.float64),
-        spread=np.array(scaler.spread, np.float64),
-        change=np.array(scaler.change, np.float64),
-        sensory=scaler.spec.sensory.copy(),
-        motor=scaler.spec.motor.copy(),
-        slow=scaler.slow,
+        scale=scaler.row_scale,
         inference=network.inference,
     )
 
@@ -311,17 +301,7 @@ def read(weights: RowWeights, before: RowHistory, after: RowHistory, rows: Any) 
         push(before.before[n], rows[n], after.before[n])
         push(before.earlier[n], last[n], after.earlier[n])
 
-    return read_rows(
-        rows=rows,
-        before=last,
-        earlier=past,
-        mean=weights.mean,
-        spread=weights.spread,
-        change=weights.change,
-        sensory=weights.sensory,
-        motor=weights.motor,
-        slow=weights.slow,
-    )
+    return read_rows(rows, last, past, weights.scale)
 
 
 @partial(inner, inlined=True)
