@@ -22,7 +22,7 @@ from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import by_condition, typical
-from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.report_page import write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import tabulate

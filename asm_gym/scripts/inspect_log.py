@@ -25,7 +25,7 @@ from asm_gym.data.schema_inference import SchemaHints, infer_schema, recordings_
 from asm_gym.data.table_layout import Columns
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
-from asm_gym.scripts.log_options import LogOptions, ended
+from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 
 FORMATS = {
     "from": "{:.4g}",
@@ -94,7 +94,7 @@ def inspect(args: Args, console: Console) -> int:
                 say(f"Wrote {args.schema}. Next: asm-gym fit {args.log} --schema {args.schema}")
     for note in notes:
         say(f"Note: {note}.")
-    return ended(notes, BAD_NEWS if trouble else DONE)
+    return exit_code_of_reading(notes, BAD_NEWS if trouble else DONE)
 
 
 def recordings(args: Args) -> Iterator[Recording]:

@@ -53,7 +53,7 @@ from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, REFUSED, option, origin, run
-from asm_gym.scripts.log_options import LogOptions, ended
+from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
@@ -152,7 +152,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
     else:
         say_table(found, notes, bridge, say)
         say(written)
-    return ended(notes, BAD_NEWS if found.alarms else DONE)
+    return exit_code_of_reading(notes, BAD_NEWS if found.alarms else DONE)
 
 
 def say_events(found: Review, notes: Sequence[str], say: Callable[[str], None]) -> None:
@@ -224,7 +224,7 @@ def publish(args: Args, found: Review) -> str:
     try:
         with needed_for("the report"):
             from asm_gym.evaluation import figures
-            from asm_gym.evaluation.report import write_report
+            from asm_gym.evaluation.report_page import write_report
     except ImportError as error:
         return f"Wrote {args.out / 'alarms.csv'}; {error}"
     over_time = "Surprise over time, the most surprising episode first (--figures sets how many)"
