@@ -233,7 +233,7 @@ class NeuralASM(CalibratedMonitor):
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
         super().with_learned(without_values(arrays), skills)
-        self.values_ = ValueJudge.found(self.spec, arrays, self.seed, self.urdf)
+        self.values_ = ValueJudge.restored(self.spec, arrays, self.seed, self.urdf)
         return self
 
     def _row_kernel(self) -> RowKernel | None:
