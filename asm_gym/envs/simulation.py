@@ -118,6 +118,7 @@ class Simulation:
 
     def _forget_limits(self) -> None:
         self.speed_limits[:] = np.inf
+        self._limits.load_share[:] = 0.0
         self._limits.status[:] = 0
         self._limits_set: ContactLimits | None = None
         # Arm, and column of a sample, of each number that limits apply to.
