@@ -42,7 +42,7 @@ OWN_CLOCKS = (
 )
 ALL_CLOCKS = (*SIMULATOR_CLOCKS, *OWN_CLOCKS)
 # What wrappers call how often they repeat an action.
-REPEATS = (
+REPEAT_NAMES = (
     "_skip",
     "skip",
     "repeat",
@@ -108,7 +108,7 @@ def repeats_of(env: Any) -> int:
     """Return how many steps of the innermost environment one step takes, as its wrappers say."""
     repeats = 1
     for layer in layers(env):
-        for name in REPEATS:
+        for name in REPEAT_NAMES:
             # Static: a wrapper may forward the names of the environment inside.
             value = getattr_static(layer, name, None)
             if isinstance(value, int | np.integer) and value > 1:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 FEWEST_CHANGES = 10  # from which a step can be told
 MOST_CHANGES = 0.95  # so large a share of them must be whole multiples of the step
-NEARLY = 0.1  # of a step, by which a whole multiple may be missed
-LOOSEST = 0.25  # however large the rounding is
+NEARLY_MULTIPLE = 0.1  # of a step, by which a whole multiple may be missed
+LOOSEST_MULTIPLE = 0.25  # however large the rounding is
 # Most changes must be of fewer steps than this, as every number is near a multiple of a small step.
 COARSE = 200.0
 
@@ -36,7 +36,7 @@ def resolution(values: NDArray[Any]) -> float:
     ratios = changes / step
     if _median(ratios) > COARSE:
         return 0.0
-    tolerance = np.minimum(NEARLY + 2 * rounding / step + 1e-3 * ratios, LOOSEST)
+    tolerance = np.minimum(NEARLY_MULTIPLE + 2 * rounding / step + 1e-3 * ratios, LOOSEST_MULTIPLE)
     is_multiple = np.abs(ratios - np.rint(ratios)) <= tolerance
     if np.count_nonzero(is_multiple) / len(ratios) < MOST_CHANGES:
         return 0.0

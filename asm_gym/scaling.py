@@ -31,12 +31,12 @@ Rows = NDArray[np.floating[Any]]
 
 SLOW = 0.3  # a channel is slow where a step's change is under this share of its spread
 LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
-FEW_VALUES = 5  # a channel of fewer different values is a flag or a mode
+FEWEST_VALUES = 5  # a channel of fewer different values is a flag or a mode
 MOST_SHOWN = 10_000  # rows from which the resolution of channels is estimated
 
 # Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted
 # from such a number.
-FARTHEST = 1e3
+FARTHEST_NUMBER = 1e3
 
 
 class ScaledRows(NamedTuple):
@@ -154,16 +154,16 @@ class StreamScaler:
 
 @inner
 def _bounded(number: float) -> float:
-    """Cut off at ``FARTHEST``; a difference of two infinite numbers is 0."""
+    """Cut off at ``FARTHEST_NUMBER``; a difference of two infinite numbers is 0."""
     if np.isnan(number):
         return 0.0
-    return min(max(number, -FARTHEST), FARTHEST)
+    return min(max(number, -FARTHEST_NUMBER), FARTHEST_NUMBER)
 
 
 @inner
 def _believed(number: float) -> float:
     """Return 0 where the number is unknown, or would be cut off."""
-    if abs(number) < FARTHEST:
+    if abs(number) < FARTHEST_NUMBER:
         return number
     return 0.0
 
@@ -259,6 +259,6 @@ def _resolutions(stream: NDArray[np.float32]) -> list[float]:
     """Return the resolution of each channel (D,) of a stream (T, D); 0 for a flag or a mode."""
     steps = [0.0] * stream.shape[1]
     for column, values in enumerate(stream.T):
-        if len(np.unique(values)) >= FEW_VALUES:
+        if len(np.unique(values)) >= FEWEST_VALUES:
             steps[column] = resolution(values)
     return steps

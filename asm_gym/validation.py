@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
-SHOWN = 80  # characters of a refused value that a message shows
+SHOWN_CHARACTERS = 80  # characters of a refused value that a message shows
 UNCHECKED = (int, float, bool, np.ndarray, object, Any)  # by ``typed``
 
 
@@ -159,7 +159,7 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
     known_names = list(map(str, names))
     hint = ""
     if isinstance(got, str):
-        for near in difflib.get_close_matches(got[:SHOWN], known_names, 1, 0.75):
+        for near in difflib.get_close_matches(got[:SHOWN_CHARACTERS], known_names, 1, 0.75):
             hint = f"; did you mean {near!r}?"
     raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(known_names)}{hint}")
 
@@ -189,8 +189,8 @@ def short_repr(value: object) -> str:
         text = repr(value)
     except ValueError:  # more digits than Python converts
         return "a number of thousands of digits"
-    if len(text) > SHOWN:
-        return f"{text[: SHOWN - 1]}…"
+    if len(text) > SHOWN_CHARACTERS:
+        return f"{text[: SHOWN_CHARACTERS - 1]}…"
     return text
 
 

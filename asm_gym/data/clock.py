@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 NUMBER = "number"
 DATE = "date"
 TIME_OF_DAY = "time of day"
-KINDS = (NUMBER, DATE, TIME_OF_DAY)
+CLOCK_KINDS = (NUMBER, DATE, TIME_OF_DAY)
 
 SINCE_1970 = 1e8  # a number of seconds from which on it counts from 1970: March 1973
 UNITS_SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (SINCE_1970, 1.0))
@@ -54,7 +54,7 @@ class LogClock:
     Args:
         columns: their names; two of them, seconds and a fraction, are added.
         units: seconds in a number of each.
-        kind: what their cells hold, one of ``KINDS``.
+        kind: what their cells hold, one of ``CLOCK_KINDS``.
         reason: why these columns are the clock.
     """
 
@@ -144,7 +144,7 @@ def numbers_of(column: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def kind_of(column: str, values: NDArray[Any]) -> str:
-    """Return what the cells (T,) of a clock hold, one of ``KINDS``.
+    """Return what the cells (T,) of a clock hold, one of ``CLOCK_KINDS``.
 
     Raises:
         ValueError: they hold no times.

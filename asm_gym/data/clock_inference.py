@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import DATE, DAY_S, NUMBER, LogClock, kind_of, numbers_of, unit_by_size
 from asm_gym.data.column_behaviour import are_whole, finite
-from asm_gym.data.names import CLOCK, COUNTERS, LONGER, SECONDS, is_clock, split_unit
+from asm_gym.data.names import CLOCK_NAME, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import is_numeric
 
@@ -28,8 +28,8 @@ Table = Mapping[str, NDArray[Any]]
 MOST_REPEATED = 0.02  # share of rows that may have the stamp of the row before: written twice
 DISAGREE = 0.01  # share by which two clocks may differ before the user is told
 ALIKE = 0.2  # share by which a clock may differ from the memory that tells its unit
-SHORTEST_S = 1e-3  # plausible times from row to row, which tell a unit,
-LONGEST_S = 1.0  # from this to that [s]
+SHORTEST_PERIOD_S = 1e-3  # plausible times from row to row, which tell a unit,
+LONGEST_PERIOD_S = 1.0  # from this to that [s]
 LEAST_DATE = 3e4  # Excel and MATLAB count days, from 1982 on so many
 LEAST_STAMP = 1e14  # microseconds since 1970, in March 1973: few other numbers are as large
 RISES = "rises from row to row"
@@ -97,7 +97,7 @@ def unit_by_name(name: str) -> float | None:
     """Return the seconds in a number of a clock's column, by its name; None if that says none."""
     if name.lower() == "ipoc":
         return 1e-3  # KUKA's counter of milliseconds
-    match = CLOCK.fullmatch(name.strip())
+    match = CLOCK_NAME.fullmatch(name.strip())
     if match is not None and match["unit"]:
         return SECONDS[match["unit"].lower()]
     in_brackets = split_unit(name)[1].lower()
@@ -201,7 +201,7 @@ def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
 
     name = plausible_unit(step, dt, are_whole(known))
     unit = UNNAMED_UNITS[name]
-    if known[0] > LEAST_DATE and step * DAY_S < LONGEST_S:
+    if known[0] > LEAST_DATE and step * DAY_S < LONGEST_PERIOD_S:
         name = "days"
         unit = DAY_S
     if unit != 1.0:
@@ -221,8 +221,8 @@ def plausible_unit(step: float, dt: float | None, is_whole: bool) -> str:
         dt: period of the memory that reads it; None without one [s].
         is_whole: all its numbers are whole.
     """
-    shortest = SHORTEST_S
-    longest = LONGEST_S
+    shortest = SHORTEST_PERIOD_S
+    longest = LONGEST_PERIOD_S
     if dt is not None:
         shortest = dt * (1 - ALIKE)
         longest = dt * (1 + ALIKE)

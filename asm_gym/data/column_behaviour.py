@@ -20,7 +20,7 @@ from asm_gym.data.names import TAU, TURN
 
 Floats = NDArray[np.float64]
 
-FEWEST = 8  # rows from which on a column is judged
+FEWEST_JUDGED_ROWS = 8  # rows from which on a column is judged
 STEADY = 0.9  # share of steps that must be the usual one in a counter
 STRAIGHT = 2e-3  # how far a second clock is off a straight line, as a share of its range
 SENTINEL_APART = 5.0  # ranges of all other numbers between these and a sentinel
@@ -45,7 +45,7 @@ def is_constant(values: NDArray[Any]) -> bool:
     return len(numbers) > 0 and bool(np.ptp(numbers) == 0.0)
 
 
-def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
+def counts(values: NDArray[Any], fewest: int = FEWEST_JUDGED_ROWS) -> bool:
     """Return whether a column (T,) counts rows, messages or ticks.
 
     A counter may lose rows, wrap and begin anew. An index of episodes counts too: it rises by one
@@ -69,14 +69,14 @@ def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
     rises = steps[steps > 0]
     is_multiple = rises % usual == 0
     starts = numbers[1:][steps < 0]
-    highest_start = numbers.min() + usual * (FEWEST + 1)
+    highest_start = numbers.min() + usual * (FEWEST_JUDGED_ROWS + 1)
     return bool(is_multiple.all() and (starts <= highest_start).all())
 
 
 def is_second_clock(values: NDArray[Any], times: Floats) -> bool:
     """Return whether a column (T,) goes on as ``times`` (T,) do."""
     is_known = np.isfinite(values) & np.isfinite(times)
-    if len(values) < FEWEST or not is_known.all():
+    if len(values) < FEWEST_JUDGED_ROWS or not is_known.all():
         return False
 
     since = values.astype(np.float64) - float(values[0])
@@ -105,7 +105,7 @@ def wrap_period(values: NDArray[Any], unit: str) -> float:
 
 def _turns_over(angle: Floats, turn: float) -> bool:
     """Return whether an angle (T,) jumps by a turn from one end of it to the other."""
-    if len(np.unique(angle)) <= FEWEST:
+    if len(np.unique(angle)) <= FEWEST_JUDGED_ROWS:
         return False
     lowest = angle.min()
     highest = angle.max()
@@ -149,4 +149,4 @@ def missing_value_sentinel(values: NDArray[Any]) -> float:
 def _stands_alone(is_sentinel: NDArray[np.bool_]) -> bool:
     """Return whether a sentinel stands often, and mostly in single rows."""
     rows = np.flatnonzero(is_sentinel)
-    return len(rows) >= FEWEST and bool(np.mean(np.diff(rows) > 1) >= SINGLE)
+    return len(rows) >= FEWEST_JUDGED_ROWS and bool(np.mean(np.diff(rows) > 1) >= SINGLE)

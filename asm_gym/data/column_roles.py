@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from asm_gym.data.clock import LogClock
 from asm_gym.data.clock_inference import clocks_among
 from asm_gym.data.column_behaviour import (
-    FEWEST,
+    FEWEST_JUDGED_ROWS,
     counts,
     is_constant,
     is_second_clock,
@@ -51,9 +51,9 @@ from asm_gym.data.log_column import (
     LogColumn,
 )
 from asm_gym.data.names import (
+    BASE_UNITS,
     COUNTERS,
     SENSE_NAME,
-    UNITS,
     element_of,
     is_command,
     split_unit,
@@ -234,10 +234,10 @@ def _by_behaviour(
     moving = [values for values in tables if not is_constant(values)]
     if not moving:
         return replace(column, role=CONSTANT, reason=f"never moves{READ_IT}")
-    if column.unit in UNITS or SENSE_NAME.fullmatch(column.name):
+    if column.unit in BASE_UNITS or SENSE_NAME.fullmatch(column.name):
         return column
 
-    fewest = FEWEST
+    fewest = FEWEST_JUDGED_ROWS
     if column.name.lower() in COUNTERS:
         fewest = 2
     for direction, sign in (("rises", 1.0), ("falls", -1.0)):

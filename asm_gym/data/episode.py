@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
-from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
+from asm_gym.data.schema import LOG_ORIGIN, LOG_SCHEMA, LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns
 from asm_gym.data.table_layout import laid_out
 from asm_gym.exceptions import DamagedFile
@@ -20,9 +20,9 @@ from asm_gym.readings import spans as spans
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
-KIND = "episode"
+EPISODE_KIND = "episode"
 CONTROLLER = "controller"  # where an episode, or a monitor, says under which one it was recorded
-ARRAYS = {
+EPISODE_ARRAYS = {
     "stream": "f",
     "actions": "f",
     "observations": "fiub",
@@ -187,7 +187,7 @@ class Episode:
             ValueError: the log does not fit the schema.
         """
         recorded = schema.read(table)
-        info: dict[str, Any] = {ORIGIN: recorded.origin}
+        info: dict[str, Any] = {LOG_ORIGIN: recorded.origin}
         if schema.memory_spec is None:
             info[LOG_SCHEMA] = schema.to_json()
         made: dict[str, Any] = {"faults": recorded.faults, "info": info} | fields
@@ -233,7 +233,9 @@ def save_episode(path: str | Path, episode: Episode) -> Path:
         "label": label,
         "info": episode.info,
     }
-    write_checkpoint(path, KIND, header, {name: getattr(episode, name) for name in ARRAYS})
+    write_checkpoint(
+        path, EPISODE_KIND, header, {name: getattr(episode, name) for name in EPISODE_ARRAYS}
+    )
     return Path(path)
 
 
@@ -242,9 +244,9 @@ def load_episode(path: str | Path) -> Episode:
     """Read what ``save_episode`` wrote. Raises FileNotFoundError, or ValueError where the file is damaged."""
     regular_file(path)
     try:
-        saved = read_checkpoint(Path(path), KIND)
+        saved = read_checkpoint(Path(path), EPISODE_KIND)
         header = saved.header
-        for name, kinds in ARRAYS.items():
+        for name, kinds in EPISODE_ARRAYS.items():
             array = saved.arrays.get(name)
             if array is not None and array.dtype.kind not in kinds:
                 raise ValueError(f"{name} cannot be of {array.dtype}")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.reader_notes import listed
-from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
+from asm_gym.data.schema import LOG_ORIGIN, LOG_SCHEMA, LogSchema
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,9 @@ def refuse_unlike(episodes: Sequence[Episode], names: Sequence[str]) -> None:
 
 def refuse_other_scales(episodes: Sequence[Episode]) -> None:
     """Raise ValueError if a column of some whole logs has another scale; pieces are not compared."""
-    are_logs = all(LOG_SCHEMA in episode.info and ORIGIN in episode.info for episode in episodes)
+    are_logs = all(
+        LOG_SCHEMA in episode.info and LOG_ORIGIN in episode.info for episode in episodes
+    )
     if len(episodes) > 1 and are_logs:
         _refuse_other_scales(episodes, [f"episode {n}" for n in range(len(episodes))])
 

@@ -19,7 +19,7 @@ from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot_datasets import INFO, read_lerobot
-from asm_gym.data.minari_datasets import METADATA, read_dataset
+from asm_gym.data.minari_datasets import METADATA_FILE, read_dataset
 from asm_gym.data.names import is_label, split_unit
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.schema import LogSchema
@@ -179,7 +179,7 @@ def read_sources(path: str | Path, hints: SchemaHints) -> Iterator[Source]:
                 success=success,
             )
     elif not files:
-        if next(path.rglob(METADATA), None) is None:
+        if next(path.rglob(METADATA_FILE), None) is None:
             known = ", ".join((*FILES, *HDF5))
             raise FileNotFoundError(
                 f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset"

@@ -22,7 +22,7 @@ from asm_gym.data.clock_inference import infer_clock
 from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.column_match import ColumnMatch
 from asm_gym.data.log_column import COMMAND, COUNTER, LABEL, SENSE, UNCLEAR, LogColumn
-from asm_gym.data.names import TAU, TURN, TURNED, is_label, split_unit
+from asm_gym.data.names import TAU, TURN, TURNED_ELEMENTS, is_label, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import Columns, is_numeric, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
@@ -30,7 +30,7 @@ from asm_gym.exceptions import DamagedFile
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 LOG_SCHEMA = "log_schema"  # where an episode and a memory keep the schema that they were read with
-ORIGIN = "origin"  # where an episode keeps the stamp of its first row [s]
+LOG_ORIGIN = "origin"  # where an episode keeps the stamp of its first row [s]
 RESAMPLED = 1.5  # a log is read at another rate by its clock, up to so many times its own
 RATE_TOLERANCE = 0.01  # share by which a rate may differ without a note
 NO_RATE = (
@@ -270,7 +270,7 @@ def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
         noise = 0.0
     if first.wrap:
         unit = TURN_UNITS.get(first.wrap, "deg")
-        return Channel(name, 2, unit, noise, group, TURNED)
+        return Channel(name, 2, unit, noise, group, TURNED_ELEMENTS)
 
     elements = tuple(column.element for column in columns)
     if not any(elements):
@@ -298,7 +298,7 @@ def _columns_of(channel: Channel) -> Iterator[LogColumn]:
     role = SENSE
     if channel.group == MOTOR:
         role = COMMAND
-    if channel.elements == TURNED:
+    if channel.elements == TURNED_ELEMENTS:
         turn = TURN[channel.unit]
         yield LogColumn(name=channel.name, role=role, unit=channel.unit, wrap=turn)
         return

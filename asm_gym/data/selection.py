@@ -15,11 +15,10 @@ from asm_gym.data.logs import Log
 from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.readings import spans
 
-SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
-AROUND_S = (
-    5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is not normal
-)
-ROUNDING = 1e-9  # share of an episode that is rounding error
+SHORTEST_PART_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
+# How near to marked rows nothing is learned from [s]: what led to a stop is not normal.
+FAULT_MARGIN_S = 5.0
+SHARE_ROUNDING = 1e-9  # share of an episode that is rounding error
 
 
 def normal_episodes(
@@ -60,7 +59,7 @@ def normal_episodes(
 
 def _unmarked_parts(episode: Episode) -> list[Episode]:
     """Return the parts of an episode with no marked row near."""
-    near = round(AROUND_S / episode.spec.dt)
+    near = round(FAULT_MARGIN_S / episode.spec.dt)
     marked_rows = np.convolve(episode.faults, np.ones(2 * near + 1), "same")
     return _parts(episode, marked_rows <= 0.5)
 
@@ -75,7 +74,7 @@ def complete_parts(episode: Episode) -> list[Episode]:
 
 def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
     """Return the stretches of rows that are wanted (T,), but for short ones."""
-    least = max(2, round(SHORTEST_S / episode.spec.dt))
+    least = max(2, round(SHORTEST_PART_S / episode.spec.dt))
     stretches = [_stretch(episode, start, stop) for start, stop in spans(wanted)]
     return [stretch for stretch in stretches if len(stretch) >= least]
 
@@ -147,9 +146,9 @@ def split_at_random(
         ValueError: fewer than ``needed`` would be left to calibrate on.
     """
     size = len(episodes)
-    calibration_size = math.floor(size * calibration_share + ROUNDING)
+    calibration_size = math.floor(size * calibration_share + SHARE_ROUNDING)
     if calibration_size < needed or calibration_size == size:
-        least = max(2, math.ceil(needed / calibration_share - ROUNDING))
+        least = max(2, math.ceil(needed / calibration_share - SHARE_ROUNDING))
         raise ValueError(
             f"this false-alarm rate needs {least} normal episodes, {needed} of them to "
             f"calibrate on, got {size}: record more, take a higher --false-alarm-rate, or "

@@ -26,12 +26,12 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.floating[Any]]
 
 JITTER = 0.35  # share of a step by which a stamp may be off, and its row still be the one due
-DRIFT = 0.011  # share by which a clock may be off the rate that is read, and no row be moved
-NEARLY = 0.15  # how near a whole multiple of the median a step is if rows were lost
-MOSTLY = 0.95  # share of steps that must be so near; else stamps jitter
+MOST_DRIFT = 0.011  # share by which a clock may be off the rate that is read, and no row be moved
+NEARLY_WHOLE = 0.15  # how near a whole multiple of the median a step is if rows were lost
+MOSTLY_WHOLE = 0.95  # share of steps that must be so near; else stamps jitter
 MOST_CUTS = 0.02  # share of rows at which time may go back or leap, and the log be cut there
 FAR = 2.5  # how much longer than nine in ten a step must be, so that nothing in it is known
-MOST_LOST = 4  # a log may have lost so many times its rows, or ten minutes
+MOST_TIMES_LOST = 4  # a log may have lost so many times its rows, or ten minutes
 LEAP_S = 600.0  # ten minutes: a longer step may be of a clock that was set anew [s]
 BRIDGED_ROWS = 2  # rows that are bridged if nobody says for how long
 PAID_BACK = 0.1  # share of rows that may be missing for good without an alarm
@@ -39,7 +39,7 @@ TOGETHER_S = 0.5  # alarms that are no further apart have one cause [s]
 
 # Reasons of alarms.
 SURPRISING = "surprise"
-MISSING = "missing data"
+MISSING_DATA = "missing data"
 NOT_FINITE = "not finite"
 LATE = "late"
 
@@ -80,7 +80,7 @@ def recordings(times: Floats) -> list[tuple[int, int]]:
     if not median > 0:
         return whole
 
-    longest = MOST_LOST * size * median + LEAP_S
+    longest = MOST_TIMES_LOST * size * median + LEAP_S
     is_cut = (steps < 0) | (steps > longest)
     cuts = np.flatnonzero(is_cut) + 1
     if not len(cuts) or len(cuts) > max(1, MOST_CUTS * size):
@@ -101,9 +101,9 @@ def period(times: Floats) -> float | None:
     steps = np.diff(times)
     median = float(np.median(steps))
     counts = np.rint(steps / median)
-    is_whole = np.abs(steps / median - counts) <= NEARLY
+    is_whole = np.abs(steps / median - counts) <= NEARLY_WHOLE
     is_counted = counts >= 1
-    if np.mean(is_counted & is_whole) >= MOSTLY:
+    if np.mean(is_counted & is_whole) >= MOSTLY_WHOLE:
         mean = steps[is_counted].sum() / counts[is_counted].sum()
     else:
         mean = steps[steps <= FAR * median].mean()
@@ -142,7 +142,7 @@ def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
     """
     steps = np.diff(times) / dt
     size = int(np.sum(steps)) + 1
-    if size > MOST_LOST * len(times) + LEAP_S / dt:
+    if size > MOST_TIMES_LOST * len(times) + LEAP_S / dt:
         gap = int(np.argmax(steps))
         raise ValueError(
             f"time jumps by {steps[gap] * dt:g} s after {times[gap]:g} s: cut the log there"
@@ -150,7 +150,7 @@ def evenly(rows: Floats, times: Floats, dt: float) -> Floats:
     counts = np.rint(steps)
     drift = steps.sum() / max(counts.sum(), 1) - 1
     is_near = (counts >= 1) & (np.abs(steps - counts) <= JITTER)
-    if abs(drift) <= DRIFT and is_near.all():
+    if abs(drift) <= MOST_DRIFT and is_near.all():
         places = np.cumsum(counts, dtype=np.intp)
         return _placed(rows, np.concatenate([[0], places]))
     due = times[0] + dt * np.arange(size)
@@ -233,7 +233,7 @@ def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np
 def reason(row: Rows) -> str:
     """Return why a row (D,) whose surprise is over the threshold is an alarm."""
     if np.isnan(row).any():
-        return MISSING
+        return MISSING_DATA
     if np.isfinite(row).all():
         return SURPRISING
     return NOT_FINITE

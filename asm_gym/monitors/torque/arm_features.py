@@ -18,7 +18,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import POSITION, SPEED, ratio
+from asm_gym.data.names import POSITION_NAME, SPEED_NAME, ratio
 from asm_gym.detection.channel_columns import columns_where
 from asm_gym.monitors.torque.body_model import BodyModel, JointMotion
 from asm_gym.spec import StreamSpec
@@ -70,8 +70,8 @@ class ArmFeatures:
         Raises:
             ValueError: the text ``urdf`` is no body model of the joints that are sensed.
         """
-        positions = named_columns(spec, POSITION)
-        speeds = named_columns(spec, SPEED)
+        positions = named_columns(spec, POSITION_NAME)
+        speeds = named_columns(spec, SPEED_NAME)
         from_changes = not len(speeds)
         if from_changes:
             speeds = positions
@@ -174,7 +174,7 @@ def torque_columns(spec: StreamSpec) -> NDArray[np.intp]:
 
 def motion_columns(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of positions and speeds, by their names."""
-    return np.union1d(named_columns(spec, POSITION), named_columns(spec, SPEED))
+    return np.union1d(named_columns(spec, POSITION_NAME), named_columns(spec, SPEED_NAME))
 
 
 def judged_by_values(spec: StreamSpec) -> bool:
