@@ -23,7 +23,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.selection import SHORTEST_S, normal_episodes, pieces
+from asm_gym.data.selection import SHORTEST_PART_S, normal_episodes, pieces
 from asm_gym.data.timing import bridge_of, filled
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
@@ -123,7 +123,7 @@ def record_live(args: Args, say: Callable[[str], None]) -> Args:
         if args.needed:
             pieces_needed = args.needed / CALIBRATION_SHARE + SPARE
         piece_s = min(PIECE_S, seconds / pieces_needed)
-    return replace(args, data=file, split=max(piece_s, SHORTEST_S))
+    return replace(args, data=file, split=max(piece_s, SHORTEST_PART_S))
 
 
 def divide(
@@ -178,7 +178,7 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
             parts = parts_without_bridge
     if not flat(parts):
         raise ValueError(
-            f"no stretch of {SHORTEST_S:g} s is complete: rows that lack a number are "
+            f"no stretch of {SHORTEST_PART_S:g} s is complete: rows that lack a number are "
             f"{incomplete_columns(episodes)} of all; --ignore leaves such columns out, "
             "--bridge SECONDS fills longer gaps"
         )
