@@ -14,7 +14,7 @@ from asm_gym.evaluation.comparison import detectability_of
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
-from asm_gym.policies.scripted.base import ObservationReader
+from asm_gym.policies.scripted.expert import ObservationReader
 from asm_gym.rollouts.pretraining.body_evaluation import (
     EvaluationCase,
     Scores,

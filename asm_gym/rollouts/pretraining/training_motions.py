@@ -30,9 +30,9 @@ from asm_gym.data.episode import save_episode
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
-from asm_gym.policies.base import StatefulPolicy
-from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style
-from asm_gym.policies.scripted.geometry import Vector, move
+from asm_gym.policies.policy import StatefulPolicy
+from asm_gym.policies.scripted.expert import CLOSE, OPEN, ObservationReader, Style
+from asm_gym.policies.scripted.geometry import Vector, command_towards
 from asm_gym.rollouts.pretraining.healthy import HELD_OUT, MOTION_KEY, held_out
 from asm_gym.rollouts.run_trials import environment, record_stream
 from asm_gym.rollouts.seeds import role_seeds
@@ -291,16 +291,16 @@ class ReachingPolicy(StatefulPolicy):
 
     def begin(self, observation: Any) -> Aim:
         hand = self._read.hand(observation)
-        return self._next(hand.at, hand.turned)
+        return self._next(hand.position, hand.orientation)
 
     def act(
         self, observation: Any, state: Aim, deterministic: bool
     ) -> tuple[NDArray[np.float32], Aim]:
         """Return the next action (7,)."""
         hand = self._read.hand(observation)
-        if not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
+        if not state.left or np.linalg.norm(state.place - hand.position) < ARRIVED:
             state = self._next(state.began, state.upright)
-        motion = move(hand, state.place, state.turned, self._speed)
+        motion = command_towards(hand, state.place, state.turned, self._speed)
         action = np.append(motion, state.grip)
         return action.astype(np.float32), state._replace(left=state.left - 1)
 
