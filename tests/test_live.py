@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 from asm_gym.data import live
+from asm_gym.data.alarm_reasons import blamed, reason
+from asm_gym.data.bridging import Bridge, bridged, filled
 from asm_gym.data.live import SourceDied, live_source, record
 from asm_gym.data.live_clock import NEWEST, Pace
 from asm_gym.data.logs import read_logs
@@ -22,7 +24,6 @@ from asm_gym.data.publishers import Publishers
 from asm_gym.data.rows import RowReader
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints
-from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 

@@ -14,7 +14,7 @@ ALARM = "alarm"
 NOTE = "note"
 SUMMARY = "summary"
 
-# Reasons of alarms, beside those of ``asm_gym.data.timing``.
+# Reasons of alarms, beside those of ``asm_gym.data.alarm_reasons``.
 DIED = "source died"
 UNREADABLE = "unreadable"
 CLOCK = "clock"

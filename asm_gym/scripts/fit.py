@@ -19,12 +19,12 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.data import selection
+from asm_gym.data.bridging import bridge_of, filled
 from asm_gym.data.episode import Episode
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.selection import SHORTEST_PART_S, normal_episodes, pieces
-from asm_gym.data.timing import bridge_of, filled
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
@@ -275,7 +275,7 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         f"with it the squared error of held-out torques is {model.left_by_body:.2f} "
         "of that without it"
     )
-    if model.links is None:
+    if model.body is None:
         yield (
             f"{args.urdf} is not used: {gain}; "
             "check its masses, and that it names joints as the log does"
@@ -283,7 +283,7 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
     assigned = "by the best fit to the torques, as no column names a joint"
-    if model.links.by_name:
+    if model.body.by_name:
         assigned = "by name"
     yield f"{args.urdf} is used: {gain}; angles are assigned {assigned}: {joints}"
 

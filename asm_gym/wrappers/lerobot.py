@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.action_meaning import ActionMeans
+from asm_gym.data.alarm_reasons import blamed, reason
 from asm_gym.data.live_clock import ClockWentBack, Pace
-from asm_gym.data.timing import blamed, reason
 from asm_gym.detection.commands import command_limits
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.alarm_terms import FAILURE, OUT_OF_RANGE
