@@ -35,7 +35,7 @@ PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIA
 def folder(tmp_path, monkeypatch):
     """A folder with a recording of the UR10 alone, which has two joints here."""
     monkeypatch.setattr(real_arms, "read_joint_states", lambda path: pendulum_columns(1500))
-    place = tmp_path / "arms" / ARMS["ur10"].place
+    place = tmp_path / "arms" / ARMS["ur10"].bag
     place.parent.mkdir(parents=True)
     place.touch()
     (tmp_path / "arms" / "urdf").mkdir()

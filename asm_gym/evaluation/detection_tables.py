@@ -175,7 +175,7 @@ def kinds_table(result: BenchmarkResult) -> Table:
         for observer in observers:
             found = percent(observer.found.get(result.promise))
             row.append(f"{observer.auroc:.2f} / {found}")
-        rows.append(row)
+        rows.append(tuple(row))
     return Table(
         f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no "
         "observer could detect it.",

@@ -9,9 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from rich.console import Console
@@ -38,6 +36,7 @@ from asm_gym.scripts.command import Options, option, origin, run
 from asm_gym.tasks import TASKS, env_id
 
 PUSHED = "robot0_link5"  # link that is pushed
+RESPONSE = "graded"  # of the wrapper to an alarm, by its cause
 
 
 @dataclass(frozen=True)
@@ -46,10 +45,6 @@ class Args(Options):
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task."""
-    on_alarm: Literal["graded", "hold", "terminate"] = option(
-        "graded", known=("graded", "hold", "terminate")
-    )
-    """Response of the wrapper to an alarm; graded depends on the cause."""
     workers: int = option(os.cpu_count() or 1, least=1)
     """Number of processes."""
     out: Path = option(Path("runs/demo"), metavar="FOLDER")
@@ -97,17 +92,14 @@ def faults(seed: int, episodes: int) -> dict[str, list[Fault]]:
 def trials(args: Args) -> list[Trial]:
     """Return every episode to test on."""
     env = env_id(args.task)
-    nominal = args.nominal_episodes
-    broken = faults(args.seed, args.faulty_episodes)
-    seeds = iter(episode_seeds(args.seed, nominal + len(broken) * args.faulty_episodes, stage=2))
-    trials = [
-        Trial(env, seed, NOMINAL, faults=(), acting=args.on_alarm)
-        for seed in islice(seeds, nominal)
+    cases: list[tuple[str, tuple[Fault, ...]]] = [(NOMINAL, ())] * args.nominal_episodes
+    for kind, own in faults(args.seed, args.faulty_episodes).items():
+        cases += [(kind, (fault,)) for fault in own]
+    seeds = episode_seeds(args.seed, len(cases), stage=2)
+    return [
+        Trial(env, seed, kind, faults=own, acting=RESPONSE)
+        for (kind, own), seed in zip(cases, seeds, strict=True)
     ]
-    for name, kind in broken.items():
-        for fault, seed in zip(kind, seeds, strict=False):
-            trials.append(Trial(env, seed, name, faults=(fault,), acting=args.on_alarm))
-    return trials
 
 
 def fit(args: Args, console: Console) -> tuple[Path, Share]:
@@ -134,12 +126,12 @@ def demonstrate(args: Args, console: Console) -> None:
         pairs = parallel_map(work, trials(args), args.workers, progress)
     traces = [trace for pair in pairs for trace in pair]
     rows = by_condition(traces, WINDOW_S)
-    title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
+    title = f"Noticed while the policy acts alone; solved and force: alone → {RESPONSE}"
     table = tabulate(title, CONDITION_COLUMNS, rows)
     console.print("", table, "")
-    low, high = map(int, binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE))
+    low, high = binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE)
     result = (
-        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of "
+        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low:g} to {high:g} of "
         f"{args.nominal_episodes} nominal episodes raise an alarm by chance (95 %). The expert "
         f"succeeded in {expert.k} of {expert.n} episodes."
     )
