@@ -387,7 +387,7 @@ def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usua
     memory = SimpleNamespace(
         threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes]
     )
-    marks = evaluate_case(memory, "Lift", agents_own, 1.0, usual=10.0)
+    marks = evaluate_case(memory, "Lift", agents_own, expert_force=10.0)
     assert [[t.seed for t in own] for own in (marks.solved, marks.failed)] == [[0, 1, 2], [3]]
 
 

@@ -17,7 +17,6 @@ from rich.console import Console
 
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import check_hours, check_per_hour
-from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import HEALTHY_ROLES
 from asm_gym.evaluation.tables import markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
@@ -217,7 +216,7 @@ def evaluate(args: Args, memory: NeuralASM, console: Console) -> list[Scores]:
             files = record_missing(trials, config, folder, args.workers, progress)
             recordings = [load_episode(file) for file in files]
             force = usual.setdefault(case.task, usual_force(recordings))
-            scores.append(evaluate_case(memory, case.name, recordings, WINDOW_S, force))
+            scores.append(evaluate_case(memory, case.name, recordings, force))
     return scores
 
 
@@ -240,8 +239,8 @@ def publish(args: Args, memory: NeuralASM, scores: Sequence[Scores], console: Co
     rates = [*(rate for rate in PROMISES if rate > own), own]
     thresholds = {rate: memory.threshold_at(false_alarms_per_hour=rate) for rate in rates}
     tables = [
-        scores_table(scores, memory, WINDOW_S),
-        promises_table(scores, thresholds, WINDOW_S),
+        scores_table(scores, memory),
+        promises_table(scores, thresholds),
     ]
     adapted = summary([each.adapted(own) for each in scores])
     result = f"{summary(scores)}\nWith an adaptive threshold: {adapted}"
