@@ -169,7 +169,7 @@ def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_fo
     model = monitor.model
     assert isinstance(model, ValueAssociation)
     if case == "without masses":
-        assert (model.links, model.left_by_body > 1.0, found[urdf]) == (None, True, found[""])
+        assert (model.body, model.left_by_body > 1.0, found[urdf]) == (None, True, found[""])
     else:
         assert model.left_by_body < 0.5
         assert [joint for _, joint in model.joints] == [names[j] for j in order]
@@ -248,7 +248,7 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
     )
     asm.fit(cut[:20]).calibrate(cut[20:], 0.1).save(tmp_path / "x.asm")
     assert isinstance(asm.values_.monitor.model, ValueAssociation)
-    assert asm.values_.monitor.model.links is not None
+    assert asm.values_.monitor.model.body is not None
     (tmp_path / "arm.urdf").unlink()
     again = load_monitor(tmp_path / "x.asm")
     np.testing.assert_array_equal(again.score(cut[25]).value, asm.score(cut[25]).value)

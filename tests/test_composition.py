@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection, ModelOutput
 from asm_gym.detection.conformal import episode_threshold
@@ -150,6 +151,21 @@ def test_another_threshold_and_another_fit_leave_the_first_monitor_as_it_is(kalm
     np.testing.assert_array_equal(kalman.score(episode).value, before)
     with pytest.raises(ValueError, match="threshold must be a number, got nan"):
         kalman.with_threshold(np.nan)
+
+
+def test_a_copy_is_described_on_its_own(kalman):
+    other = kalman.with_threshold(np.inf)
+    other.about["tasks"] = ["Lift"]
+    assert "tasks" not in kalman.about
+
+
+def test_a_file_without_a_threshold_leaves_none_of_another_calibration(kalman, tmp_path):
+    calibrated = kalman.with_threshold(3.0)
+    kalman.with_detection("evidence").save(tmp_path / "other.asm")
+    calibrated.restore(read_checkpoint(tmp_path / "other.asm", "kalman"))
+    assert calibrated.threshold_ is None
+    assert calibrated.maxima_ is None
+    assert calibrated.with_threshold(3.0).with_learned(kalman.learned_).threshold_ is None
 
 
 def test_scores_of_the_literature_are_what_they_say():

@@ -35,6 +35,7 @@ from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
     Repetition,
+    RepetitionWeights,
     count_repetitions,
     evidence_steps,
 )
@@ -303,10 +304,14 @@ def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
 
 def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
     state, states = Repetition.start(1, rows.shape[1]), []
+    weights = RepetitionWeights(
+        columns=np.arange(rows.shape[1]),
+        steps=evidence_steps(counted[:2]),
+        most=np.full(rows.shape[1], most),
+        offset=np.zeros(rows.shape[1]),
+    )
     for row in rows:
-        state = state.followed_by(
-            row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most)
-        )
+        state = state.followed_by(row[None], weights)
         states.append(state)
     return states
 

@@ -152,20 +152,13 @@ class Detector(NamedTuple):
         context = (len(self.context_quantile) - 1) // 2
         return Evidence.start(batch, gains, errors, context)
 
-    def step(
-        self,
-        evidence: Evidence,
-        errors: Array,
-        context: Array,
-    ) -> tuple[Evidence, Floats]:
-        """Return the new evidence, and each error's share (B, X) of the value; ``context`` is (B, C)."""
+    def step(self, evidence: Evidence, output: ModelOutput) -> tuple[Evidence, Floats]:
+        """Return the evidence after a row of B streams, and each error's share (B, X) of the value."""
+        errors = np.asarray(output.errors, np.float64)
+        contexts = np.asarray(output.contexts, np.float64)
         after = self.start(len(errors))
         shares = np.empty(errors.shape)
-        output = ModelOutput(
-            errors=np.asarray(errors, np.float64),
-            contexts=np.asarray(context, np.float64),
-        )
-        step_evidence(self, evidence, after, output, shares)
+        step_evidence(self, evidence, after, ModelOutput(errors, contexts), shares)
         return after, shares
 
     def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:

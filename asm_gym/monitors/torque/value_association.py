@@ -124,14 +124,14 @@ class ValueAssociation(ScaledModel):
         return self.spec.sensory[self._judged]
 
     @property
-    def links(self) -> BodyModel | None:
+    def body(self) -> BodyModel | None:
         """The body model in use."""
         return self._features.body
 
     @property
     def joints(self) -> list[tuple[str, str]]:
         """The angles that a body model is told, and the joint that each is taken for."""
-        body = self.links
+        body = self.body
         if body is None:
             return []
         joint_of = dict(zip(body.columns.tolist(), body.names, strict=True))

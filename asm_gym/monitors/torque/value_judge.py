@@ -26,7 +26,6 @@ from asm_gym.detection.scores import Largest
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next, require_arrays
 from asm_gym.monitors.surprise import State, Surprise
-from asm_gym.monitors.torque.arm_features import ArmFeatures, judged_by_values
 from asm_gym.monitors.torque.crossfitting import quadratic_form, regular_inverse
 from asm_gym.monitors.torque.value_association import ALIKE_S, MOST_INPUTS, ValueAssociation
 from asm_gym.scaling import StreamScaler
@@ -60,16 +59,6 @@ class ValueJudge:
     usual: float = 1.0
     balance: float = 1.0
     power: float = 2.0
-
-    @staticmethod
-    def suits(spec: StreamSpec) -> bool:
-        """Return whether a memory of this stream judges values by default, see ``judged_by_values``."""
-        return judged_by_values(spec)
-
-    @staticmethod
-    def check_body(spec: StreamSpec, urdf: str) -> None:
-        """Raise ValueError unless the text of a body model fits the joints of a stream."""
-        ArmFeatures.of(spec, urdf)
 
     @classmethod
     def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self | None:
