@@ -17,6 +17,7 @@ import numpy as np
 
 from asm_gym.data.clock import NUMBER, SINCE_1970, LogClock
 from asm_gym.data.clock_inference import UNNAMED_UNITS, clock_called, clocks_among, resolve
+from asm_gym.data.names import LONGER
 from asm_gym.data.schema import LogSchema, can_resample
 
 NEWEST = 32  # rows that tell the rate, and after which it is told again
@@ -136,7 +137,7 @@ class LiveClock:
             return None
         return self._clock.moment(row)
 
-    def told_unit(self, stamp: float) -> float | None:
+    def first_in_new_unit(self, stamp: float) -> float | None:
         """Return the first stamp again if this one tells that the clock counts in another unit.
 
         The unit of a clock that says none is the one that fits the memory's rate best.
@@ -149,7 +150,8 @@ class LiveClock:
         if step < 1.0 or stamp >= SINCE_1970:
             return None
         rate = self._schema.rate
-        unit = min(UNNAMED_UNITS.values(), key=lambda unit: abs(math.log(step * unit * rate)))
+        units = [LONGER[unit] for unit in UNNAMED_UNITS]
+        unit = min(units, key=lambda unit: abs(math.log(step * unit * rate)))
         if unit == 1.0:
             return None
         self._clock = LogClock(self._clock.columns, (unit,))

@@ -37,7 +37,7 @@ LONGER = (
     SECONDS
     | dict.fromkeys(("min", "minutes"), 60.0)
     | dict.fromkeys(("h", "hours"), 3600.0)
-    | {"d": 86400.0}
+    | dict.fromkeys(("d", "days"), 86400.0)
 )
 """Those that stand in brackets: an ``angle_min`` holds no minutes."""
 

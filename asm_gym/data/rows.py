@@ -255,7 +255,7 @@ class RowReader:
         stamp = self._clock.stamp(row)
         if stamp is None:
             return None
-        first = self._clock.told_unit(stamp)
+        first = self._clock.first_in_new_unit(stamp)
         if first is None:
             return stamp
         # The unit was wrong up to now: count the rows anew, from the first stamp in the new unit.
