@@ -11,7 +11,7 @@ from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection, ModelOutput
 from asm_gym.detection.conformal import episode_threshold
-from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
+from asm_gym.detection.scores import AVERAGED_ROWS, Largest, Mahalanobis, MovingMean, Squares
 from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,
@@ -177,14 +177,18 @@ def test_scores_of_the_literature_are_what_they_say():
     white = Mahalanobis(spec).restore({"mahalanobis": np.diag([1.0, 0.5])})
     assert white.attribute_step((), output, rows, place)[1].tolist() == [[9.0, 4.0]]
     mean, state, said = MovingMean(spec), MovingMean(spec).start(1, 2), []
-    for n in range(WINDOW + 1):
+    for n in range(AVERAGED_ROWS + 1):
         state, parts = mean.attribute_step(
             state, ModelOutput(np.full((1, 2), n), output.contexts), rows, place
         )
         said.append(parts[0, 0])
-    squares = np.arange(WINDOW + 1) ** 2
+    squares = np.arange(AVERAGED_ROWS + 1) ** 2
     np.testing.assert_allclose(
-        said, [*(np.cumsum(squares) / np.arange(1, WINDOW + 2))[:WINDOW], squares[1:].mean()]
+        said,
+        [
+            *(np.cumsum(squares) / np.arange(1, AVERAGED_ROWS + 2))[:AVERAGED_ROWS],
+            squares[1:].mean(),
+        ],
     )
 
 

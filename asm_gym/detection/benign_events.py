@@ -31,7 +31,7 @@ KNOCKED_S = 1.0  # duration of its excuse [s]
 NEAR_STOP = 0.03  # a joint is at its stop from so far before it [rad]
 PAST_STOP = 0.1  # to so far past it [rad]
 # Largest joint speed [rad/s]: a joint farther from its stop in the row before is not at it now.
-FASTEST = 5.0
+FASTEST_JOINT = 5.0
 MOVING = 0.01  # speed of a sliding finger [m/s]
 MOVED_S = 0.1  # duration of its excuse [s]
 EXCUSED = 10.0  # divisor of surprise at a knock or a stop
@@ -105,7 +105,7 @@ class BenignEvents:
             fingers=_columns(spec, _is_finger_speed),
             joints=_columns(spec, lambda channel: bool(channel.stops)),
             stops=np.array(stops, np.float64).reshape(-1, 2),
-            closing=NEAR_STOP + FASTEST * spec.dt,
+            closing=NEAR_STOP + FASTEST_JOINT * spec.dt,
             knock_rows=max(1, round(KNOCKED_S / spec.dt)) + FADING,
             slide_rows=max(1, round(MOVED_S / spec.dt)),
         )

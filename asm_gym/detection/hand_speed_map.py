@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection.hand_speed import AXES, CELL_SIZE, DOWN, Floats, cell_near
+from asm_gym.detection.hand_speed import AXES, CELL_SIZE, DOWNWARDS, Floats, cell_near
 from asm_gym.spec import StreamSpec
 
 AnyFloats = NDArray[np.floating[Any]]
 
 # Columns of a map's cells.
 ARM_AND_PLACE = slice(0, 4)  # the arm, and the cell's place along x, y and z in cells
-FASTEST = slice(4, 16)
+FASTEST_COLUMNS = slice(4, 16)
 """Greatest speed along each axis of the twist, then against each [m/s], [rad/s]."""
 
 FARTHEST_CELL = 100  # hands that are more cells away from the origin are not learned of
@@ -44,7 +44,7 @@ class HandSpeedMap:
     """How fast healthy hands went, by place and direction.
 
     Args:
-        cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST``. The greatest counts where a place is given twice.
+        cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of an arm's momentum along its hand's motion, where no healthy hand was [N s].
 
     Raises:
@@ -62,7 +62,7 @@ class HandSpeedMap:
     ) -> None:
         if not _are_cells(cells):
             raise ValueError(
-                f"pace must be rows of {FASTEST.stop} numbers, "
+                f"pace must be rows of {FASTEST_COLUMNS.stop} numbers, "
                 f"places within {FARTHEST_CELL} cells, got {cells.shape}"
             )
         self.cells = cells
@@ -74,12 +74,12 @@ class HandSpeedMap:
         shape = np.add(offsets.max(axis=0), (1, 2, 2, 2))
         grid = np.zeros((*shape, 2 * AXES), np.float32)
         at = tuple(offsets.T)
-        np.maximum.at(grid, at, cells[:, FASTEST])
+        np.maximum.at(grid, at, cells[:, FASTEST_COLUMNS])
 
         # A hand may go as fast as others beside its cell; downwards, only as others at its height.
-        downward = grid[..., DOWN]
+        downward = grid[..., DOWNWARDS]
         self.grid = maximum_filter(grid, (1, 3, 3, 3, 1))
-        self.grid[..., DOWN] = maximum_filter(downward, (1, 3, 3, 1))
+        self.grid[..., DOWNWARDS] = maximum_filter(downward, (1, 3, 3, 1))
 
     @classmethod
     def of(
@@ -144,7 +144,7 @@ class HandSpeedMap:
 
 
 def _are_cells(cells: AnyFloats) -> bool:
-    if cells.ndim != 2 or cells.shape[1] != FASTEST.stop or cells.size == 0:
+    if cells.ndim != 2 or cells.shape[1] != FASTEST_COLUMNS.stop or cells.size == 0:
         return False
     near = np.abs(cells[:, ARM_AND_PLACE]) <= FARTHEST_CELL
     arms_and_speeds = np.delete(cells, (1, 2, 3), axis=1)
@@ -196,4 +196,4 @@ def _cells_of(
             speeds = ascending[kept - 1]
             cell = np.hstack((arm, place, speeds))
             cells.append(cell)
-    return np.reshape(cells, (-1, FASTEST.stop))
+    return np.reshape(cells, (-1, FASTEST_COLUMNS.stop))

@@ -26,7 +26,7 @@ from asm_gym.detection.base import Floats
 from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, scale, total
 from asm_gym.readings import noise_of, resolution
 
-STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
+STUCK_PROBABILITY = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
 REPETITION_OFFSET = 12.0
 """One in 160,000, which among a hundred senses happens once in some thousand rows."""
 RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal episodes
@@ -162,9 +162,9 @@ def evidence_steps(surprise: Floats) -> Floats:
     """
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
-        by_change = (1.0 - STUCK) / (1.0 - p)
-        steps = np.log([by_change, STUCK / p])  # (now, before, X)
-    of_watched = np.where(p < STUCK, steps, 0.0)
+        by_change = (1.0 - STUCK_PROBABILITY) / (1.0 - p)
+        steps = np.log([by_change, STUCK_PROBABILITY / p])  # (now, before, X)
+    of_watched = np.where(p < STUCK_PROBABILITY, steps, 0.0)
     return np.ascontiguousarray(of_watched.swapaxes(0, 1))
 
 

@@ -25,7 +25,7 @@ from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_f
 from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 
-LEAST_SPREAD = 1e-6  # of a channel [its unit]
+LEAST_CHANNEL_SPREAD = 1e-6  # of a channel [its unit]
 
 
 class FixedLimit(StreamModel):
@@ -53,7 +53,7 @@ class FixedLimit(StreamModel):
         rows = streams[:, self._columns].astype(float)
         scale = np.ones(rows.shape[1])
         if self.scaled:
-            scale = np.maximum(rows.std(axis=0), LEAST_SPREAD)
+            scale = np.maximum(rows.std(axis=0), LEAST_CHANNEL_SPREAD)
         return self.restore({"limit_centre": rows.mean(axis=0), "limit_scale": scale})
 
     def start(self, batch: int) -> RowHistory:

@@ -24,7 +24,7 @@ from asm_gym.monitors.torque.body_model import JointMotion, explained_torque, jo
 from asm_gym.scaling import rows_apart
 from asm_gym.spec import StreamSpec
 
-AVERAGED_S = 0.1  # time that a residual is averaged over [s]
+RESIDUAL_S = 0.1  # time that a residual is averaged over [s]
 LEAST_SPREAD = 1e-9  # of a speed and of a residual [their units]
 
 Floats = NDArray[np.float64]
@@ -63,7 +63,7 @@ class FrictionRule(StreamModel):
         self._speeds = speeds[:joints]
         self.lag = rows_apart(spec.dt)
         self._lag_s = self.lag * spec.dt
-        self.window = max(1, round(AVERAGED_S / spec.dt))
+        self.window = max(1, round(RESIDUAL_S / spec.dt))
         self.shortest = self.lag + self.window
 
     @property

@@ -19,13 +19,14 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.linear_association import check_inputs
+from asm_gym.monitors.baselines.fixed_limits import LEAST_CHANNEL_SPREAD
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
 LEAST_VARIANCE = 1e-4  # of w and v, standardised
-LEAST_SPREAD = 1e-6  # of a channel [its unit]
+
 
 Floats = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ class Kalman(StreamModel):
         sensed = [episode.stream[:, sensory].astype(np.float64) for episode in episodes]
         all_sensed = np.concatenate(sensed)
         mean = all_sensed.mean(axis=0)
-        spread = np.maximum(all_sensed.std(axis=0), LEAST_SPREAD)
+        spread = np.maximum(all_sensed.std(axis=0), LEAST_CHANNEL_SPREAD)
         states = [(rows - mean) / spread for rows in sensed]
 
         before = np.concatenate([rows[:-1] for rows in states])  # (N, X)

@@ -25,8 +25,8 @@ from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
 
-TORQUE = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
-COMMANDED = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
+TORQUE_NAME = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
+COMMANDED_NAME = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
 
 WIDTHS = (0.01, 0.1, 1.0)  # w, shares of a speed's spread
 MOST_ANGLES = 12  # of more angles no sines are taken: their products would be too many
@@ -169,7 +169,7 @@ def named_columns(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp
 
 def torque_columns(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of measured torques or currents, by their names."""
-    return np.setdiff1d(named_columns(spec, TORQUE), named_columns(spec, COMMANDED))
+    return np.setdiff1d(named_columns(spec, TORQUE_NAME), named_columns(spec, COMMANDED_NAME))
 
 
 def motion_columns(spec: StreamSpec) -> NDArray[np.intp]:

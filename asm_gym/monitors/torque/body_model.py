@@ -26,7 +26,7 @@ from asm_gym.monitors.torque.urdf import parsed_urdf
 Floats = NDArray[np.float64]
 
 COMPARED_ROWS = 300  # rows by which orders of joints are compared
-SMALLEST = 1e-12  # spread of a speed, and variance of a torque
+LEAST_VARIATION = 1e-12  # spread of a speed, and variance of a torque
 STEEPNESS = 10.0  # of the friction that orders of joints are compared with, in spreads of a speed
 WORD_PENALTY = 1e-3  # what each word of a joint's name takes from its score
 
@@ -93,12 +93,12 @@ class BodyModel:
 
     def _unexplained(self, motion: JointMotion, torque: Floats) -> float:
         """Return the share of each torque's variance that body and friction leave, summed over joints."""
-        spread = np.maximum(motion.speed.std(axis=0), SMALLEST)
+        spread = np.maximum(motion.speed.std(axis=0), LEAST_VARIATION)
         friction = np.tanh(STEEPNESS * motion.speed / spread)
         parts = [*self.torques(motion), motion.speed, friction, np.ones_like(friction)]
         inputs = np.stack(parts, axis=-1)  # (N, J, 5)
         rest = torque - explained_torque(inputs, joint_weights(inputs, torque))
-        variance = np.maximum(torque.var(axis=0), SMALLEST)
+        variance = np.maximum(torque.var(axis=0), LEAST_VARIATION)
         return float((rest.var(axis=0) / variance).sum())
 
     def torques(self, motion: JointMotion) -> tuple[Floats, Floats]:

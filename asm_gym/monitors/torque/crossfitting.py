@@ -21,20 +21,20 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
 
-FOLDS = 5
-ALL_ROWS = FOLDS  # index of the equations of all rows, after those without each fold
-PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # λ, of standardised inputs
+CROSSFIT_FOLDS = 5
+ALL_ROWS = CROSSFIT_FOLDS  # index of the equations of all rows, after those without each fold
+RIDGE_PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # λ, of standardised inputs
 STIFFNESS = 1e-3  # λ_h
-LEAST_SPREAD = 1e-4  # of what is left of a standardised number
+LEAST_REMAINDER = 1e-4  # of what is left of a standardised number
 
 
 def folds_of(lengths: Sequence[int]) -> Places:
     """Return the fold (N,) of each row of episodes: whole episodes, or blocks where they are few."""
-    if len(lengths) >= FOLDS:
-        return np.repeat(np.arange(len(lengths)) % FOLDS, lengths)
+    if len(lengths) >= CROSSFIT_FOLDS:
+        return np.repeat(np.arange(len(lengths)) % CROSSFIT_FOLDS, lengths)
     rows = sum(lengths)
     numbers = np.arange(rows, dtype=np.intp)
-    return numbers * FOLDS // max(rows, 1)
+    return numbers * CROSSFIT_FOLDS // max(rows, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class FoldEquations:
         inputs: Z (N, I).
         values: X (N, X), to be predicted.
         fold: (N,) of each row.
-        grams: ZᵀZ/N (FOLDS + 1, I, I).
-        products: ZᵀX/N (FOLDS + 1, I, X).
+        grams: ZᵀZ/N (CROSSFIT_FOLDS + 1, I, I).
+        products: ZᵀX/N (CROSSFIT_FOLDS + 1, I, X).
     """
 
     inputs: Floats
@@ -76,7 +76,7 @@ class FoldEquations:
     def errors(self, used: Places, targets: Places, penalty: float) -> Floats:
         """Return the errors (N, M) in each row by the equations without its fold."""
         errors = self.values[:, targets].copy()
-        for fold in range(FOLDS):
+        for fold in range(CROSSFIT_FOLDS):
             rows = self.fold == fold
             inputs = self.inputs[rows][:, used]
             errors[rows] -= inputs @ self.weights(fold, used, targets, penalty)
@@ -89,7 +89,7 @@ class FoldEquations:
         among_used = np.ix_(used, used)
         inverses = [regular_inverse(gram[among_used]) for gram in self.grams]
         h = np.zeros(len(self.fold))
-        for fold in range(FOLDS):
+        for fold in range(CROSSFIT_FOLDS):
             rows = self.fold == fold
             inputs = self.inputs[rows][:, used]
             h[rows] = quadratic_form(inputs, inverses[fold])
@@ -102,9 +102,9 @@ class FoldEquations:
 
 
 def _mean_products(inputs: Floats, values: Floats, fold: Places) -> Floats:
-    """Return ZᵀX/N without the rows of each fold, and of all rows at last (FOLDS + 1, I, X)."""
+    """Return ZᵀX/N without the rows of each fold, and of all rows at last (CROSSFIT_FOLDS + 1, I, X)."""
     products_of_folds = []
-    for number in range(FOLDS):
+    for number in range(CROSSFIT_FOLDS):
         rows = fold == number
         products_of_folds.append(inputs[rows].T @ values[rows])
     products = np.array(products_of_folds)
@@ -112,7 +112,7 @@ def _mean_products(inputs: Floats, values: Floats, fold: Places) -> Floats:
     others = total - products
 
     all_rows = len(inputs)
-    other_rows = all_rows - np.bincount(fold, minlength=FOLDS)
+    other_rows = all_rows - np.bincount(fold, minlength=CROSSFIT_FOLDS)
     counts = np.maximum(np.append(other_rows, all_rows), 1)
     return np.array([*others, total]) / counts[:, None, None]
 
@@ -171,7 +171,7 @@ class CrossFit:
 
     def _fit_alone(self, value: Places, used: Places) -> None:
         """Fit one value (1,) to the inputs of its own joint."""
-        penalty = PENALTIES[0]
+        penalty = RIDGE_PENALTIES[0]
         self.errors[:, value] = self.equations.errors(used, value, penalty)
         self.joint_alone[value] = 1.0
         weights = self.equations.weights(ALL_ROWS, used, value, penalty)
@@ -179,13 +179,13 @@ class CrossFit:
 
     def _fit_group(self, targets: Places, used: Places) -> None:
         """Fit a group by the penalty that leaves the least; a value stays alone where that leaves less."""
-        errors = [self.equations.errors(used, targets, penalty) for penalty in PENALTIES]
+        errors = [self.equations.errors(used, targets, penalty) for penalty in RIDGE_PENALTIES]
         squares = (np.array(errors) ** 2).sum(axis=1)  # (P, M)
         squares_alone = (self.errors[:, targets] ** 2).sum(axis=0)
         is_alone = self.joint_alone[targets] > 0
         improves = squares.min(axis=0) < np.where(is_alone, squares_alone, np.inf)
         best = squares.argmin(axis=0)  # (M,) which penalty
-        for n, penalty in enumerate(PENALTIES):
+        for n, penalty in enumerate(RIDGE_PENALTIES):
             chosen = np.flatnonzero(improves & (best == n))
             if not len(chosen):
                 continue
@@ -201,4 +201,4 @@ class CrossFit:
         """(X,) share of each value's variance that is predicted in rows of other folds."""
         variance = self.equations.values.var(axis=0)
         unexplained = (self.errors**2).mean(axis=0)
-        return 1.0 - unexplained / np.maximum(variance, LEAST_SPREAD**2)
+        return 1.0 - unexplained / np.maximum(variance, LEAST_REMAINDER**2)

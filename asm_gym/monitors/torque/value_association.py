@@ -39,7 +39,7 @@ from asm_gym.monitors.torque.arm_features import (
 )
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.monitors.torque.crossfitting import (
-    LEAST_SPREAD,
+    LEAST_REMAINDER,
     CrossFit,
     FoldEquations,
     folds_of,
@@ -54,7 +54,9 @@ Places = NDArray[np.intp]
 
 ALIKE_S = 0.1  # time that errors are averaged over [s]
 PREDICTED = 0.5  # R² from which on a value is judged
-MOST_INPUTS = 1024  # with more inputs no leverage is computed: the matrices would be too large
+MOST_LEVERAGE_INPUTS = (
+    1024  # with more inputs no leverage is computed: the matrices would be too large
+)
 
 LEARNED = (
     "derived_mean",  # (M,) of the features φ
@@ -169,7 +171,7 @@ class ValueAssociation(ScaledModel):
     def _largest_mean(self, errors: Floats, lengths: Sequence[int]) -> Floats:
         """Return q (V,) of the errors (N, V) of episodes that are so long."""
         episode_ends = np.cumsum(lengths)[:-1]
-        largest = np.full(errors.shape[1], LEAST_SPREAD)
+        largest = np.full(errors.shape[1], LEAST_REMAINDER)
         for episode in np.split(errors, episode_ends):
             means = np.abs(running_mean(episode, self.window))
             largest = np.maximum(largest, means.max(axis=0))
@@ -242,7 +244,7 @@ class ValueAssociation(ScaledModel):
         if not self.urdf:
             return by_sines
         by_body = self._fit_on(self._ordered_body(rows), rows, fold)
-        left_by_sines = max(self._unexplained(by_sines), LEAST_SPREAD)
+        left_by_sines = max(self._unexplained(by_sines), LEAST_REMAINDER)
         self.left_by_body = self._unexplained(by_body) / left_by_sines
         if self.left_by_body < 1.0:
             return by_body
@@ -269,7 +271,7 @@ class ValueAssociation(ScaledModel):
         """Return the regression of rows on the features of an arm; ``fold`` is (N,)."""
         derived = features(self._physical(rows))
         mean = derived.mean(axis=0)
-        spread = np.maximum(derived.std(axis=0), LEAST_SPREAD)
+        spread = np.maximum(derived.std(axis=0), LEAST_REMAINDER)
         inputs = inputs_of(rows, (derived - mean) / spread)
         size = inputs.shape[1]
         check_inputs(size)
@@ -323,7 +325,7 @@ class ValueAssociation(ScaledModel):
         regression = fit.regression
         size = regression.weights.shape[1]
         errors = regression.errors[:, judged]
-        if size > MOST_INPUTS:
+        if size > MOST_LEVERAGE_INPUTS:
             return errors, np.zeros((0, size, size))
         groups = self.senses_.groups[judged]
         by_groups = regression.joint_alone[judged] == 0

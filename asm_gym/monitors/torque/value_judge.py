@@ -27,7 +27,11 @@ from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next, require_arrays
 from asm_gym.monitors.surprise import State, Surprise
 from asm_gym.monitors.torque.crossfitting import quadratic_form, regular_inverse
-from asm_gym.monitors.torque.value_association import ALIKE_S, MOST_INPUTS, ValueAssociation
+from asm_gym.monitors.torque.value_association import (
+    ALIKE_S,
+    MOST_LEVERAGE_INPUTS,
+    ValueAssociation,
+)
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -68,7 +72,7 @@ class ValueJudge:
         model = _model(monitor)
         if not len(model.judged(monitor.learned_["R2_values"])):
             return None
-        if model.senses_.inputs > MOST_INPUTS:
+        if model.senses_.inputs > MOST_LEVERAGE_INPUTS:
             return cls(monitor, leverage=np.zeros((0, 0)))
 
         readings = [model.senses_.read_episode(episode.stream) for episode in episodes]
