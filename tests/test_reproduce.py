@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import re
 from dataclasses import replace
 
@@ -23,9 +22,10 @@ def test_spread_is_over_seeds_and_not_over_measurements():
     records = [
         {"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs
     ]
-    assert kit.over_seeds(records, "x", kind="a") == pytest.approx((4.0, math.sqrt(8)))
-    assert kit.shown(records, "x", 1, kind="a") == "4.0 ± 2.8"
-    assert kit.shown(records, "x", kind="b") == ""
+    records.append({"seed": 0, "x": 1.0, "kind": "b", "when": "late"})
+    table = kit.grid("", [{"when": "early"} | record for record in records], "x", "kind", "when", 1)
+    assert table.headings == ["", "early", "late"]
+    assert table.rows == [("a", "4.0 ± 2.8", ""), ("b", "", "1.0")]
 
 
 @pytest.mark.parametrize(

@@ -296,7 +296,7 @@ def hours_of(episodes: list[Episode]) -> float:
 def read(args: Args, console: Console) -> tuple[list[Episode], str]:
     """Return the normal episodes, and which others were left out; ValueError where there is none."""
     logs = read_logs(args.data, args.hints(args.action), args.given_schema())
-    with stage("reading", console, {}) as progress:
+    with stage("reading", console) as progress:
         episodes, counts = normal_episodes(logs, args.split is not None, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in counts.items())
     if episodes:
@@ -330,7 +330,7 @@ def fit(args: Args, console: Console) -> int:
     fitting, calibration = divide(args, stretches, is_live)
 
     spec = fitting[0].spec
-    with stage("learning", console, {}) as progress:
+    with stage("learning", console) as progress:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)

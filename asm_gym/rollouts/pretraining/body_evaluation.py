@@ -117,6 +117,16 @@ def usual_force(recordings: Sequence[Episode]) -> float:
     return float(np.median(known))
 
 
+def seeds_with_crash(recordings: Sequence[Episode], expert_force: float) -> set[int]:
+    """Return the seeds of solved nominal episodes with a far greater force than the expert's usual one [N]."""
+    seeds = set()
+    for episode in recordings:
+        force = usual_force([episode])
+        if np.isfinite(force) and force > CRASH * expert_force:
+            seeds.add(episode.labelled.seed)
+    return seeds
+
+
 def evaluate_case(
     memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], expert_force: float
 ) -> Scores:
@@ -128,11 +138,7 @@ def evaluate_case(
         recordings: of one policy in one task.
         expert_force: usual greatest force of the task's expert [N]; an agent that often crashes is no reference.
     """
-    crashed = set()
-    for episode in recordings:
-        force = usual_force([episode])
-        if np.isfinite(force) and force > CRASH * expert_force:
-            crashed.add(episode.labelled.seed)
+    crashed = seeds_with_crash(recordings, expert_force)
     nominal = [e for e in recordings if e.labelled.role == "nominal"]
     faulty = [e for e in recordings if e.labelled.role == "faulty"]
     faulty = [e for e in faulty if e.labelled.seed not in crashed]
