@@ -114,18 +114,13 @@ class HandSpeedMap:
     def learned(streams: Sequence[AnyFloats], spec: StreamSpec) -> NDArray[np.float32] | None:
         """Return the cells (N, 16) of healthy streams (T, D); None where these do not tell how hands move."""
         cells = []
-        columns = np.arange(spec.size)
-        hands = [name for name in spec.slices if name.endswith("hand_position")]
-        for arm, position in enumerate(hands):
+        positions = [name for name in spec.slices if name.endswith("hand_position")]
+        for arm, position in enumerate(positions):
             hand = position.removesuffix("position")
-            names = (
-                position,
-                f"{hand}velocity",
-                f"{hand}angular_velocity",
-            )
+            names = (position, f"{hand}velocity", f"{hand}angular_velocity")
             if spec.slices.keys() >= set(names):
-                parts = [columns[spec.slices[name]] for name in names]
-                rows = _motions(streams, np.concatenate(parts))
+                columns = np.hstack([np.arange(spec.size)[spec.slices[name]] for name in names])
+                rows = _motions(streams, columns)
                 cells.append(_cells_of(arm, rows, len(streams)))
         if not cells:
             return None
@@ -154,21 +149,16 @@ def _are_cells(cells: AnyFloats) -> bool:
 
 def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
-    motions = [
-        np.insert(
-            np.asarray(stream[:, columns], np.float64),
-            0,
-            episode,
-            axis=1,
-        )
-        for episode, stream in enumerate(streams)
-    ]
+    motions = []
+    for episode, stream in enumerate(streams):
+        motion = np.asarray(stream[:, columns], np.float64)
+        motions.append(np.insert(motion, 0, episode, axis=1))
     rows = np.concatenate(motions)
     places = rows[:, 1:4] / CELL_SIZE
     rows[:, 1:4] = np.floor(places)
-    near = np.abs(places) < FARTHEST_CELL
-    known = np.isfinite(rows).all(axis=1)
-    return rows[known & near.all(axis=1)]
+    is_near = (np.abs(places) < FARTHEST_CELL).all(axis=1)
+    is_known = np.isfinite(rows).all(axis=1)
+    return rows[is_known & is_near]
 
 
 def _cells_of(
@@ -181,19 +171,15 @@ def _cells_of(
     visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)
     twists = rows[:, 4:]
     fastest = np.zeros((len(visits), 2 * AXES))
-    directions = np.hstack((twists, -twists))
-    np.maximum.at(fastest, visit_of.ravel(), directions)
+    np.maximum.at(fastest, visit_of.ravel(), np.hstack((twists, -twists)))
 
     cells = []
     visited = visits[:, 1:]
     for place in np.unique(visited, axis=0):
         here = np.all(visited == place, axis=1)
         ascending = np.sort(fastest[here], axis=0)
-        fastest_here = FASTEST_EPISODES * len(ascending)
-        odd = ODD_EPISODES * episodes
-        kept = len(ascending) - int(fastest_here + odd)
+        left_out = FASTEST_EPISODES * len(ascending) + ODD_EPISODES * episodes
+        kept = len(ascending) - int(left_out)
         if kept > 0:
-            speeds = ascending[kept - 1]
-            cell = np.hstack((arm, place, speeds))
-            cells.append(cell)
+            cells.append(np.hstack((arm, place, ascending[kept - 1])))
     return np.reshape(cells, (-1, FASTEST_COLUMNS.stop))
