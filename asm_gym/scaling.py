@@ -81,7 +81,8 @@ class StreamScaler:
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
         change = np.maximum(steps.std(axis=0), _least_change(streams, spec.noise))
-        return cls(spec, mean, spread, np.where(change > 0, change, spread), lag)
+        change = np.where(change > 0, change, spread)
+        return cls(spec, mean, spread, change, lag)
 
     @classmethod
     def of(cls, spec: StreamSpec, arrays: Mapping[str, Any], lag: int = 1) -> Self:
@@ -125,9 +126,9 @@ class StreamScaler:
     @cached_property
     def groups(self) -> NDArray[np.intp]:
         """(X,) the group of each change, by number; where all are of one group, every number is its own."""
-        channels = self.spec.channels
-        names = np.repeat([c.group for c in channels], [c.size for c in channels])
-        _, groups = np.unique(names[self.spec.sensory], return_inverse=True)
+        names = [channel.group for channel in self.spec.channels for _ in channel.labels]
+        sensory_names = np.array(names)[self.spec.sensory]
+        _, groups = np.unique(sensory_names, return_inverse=True)
         if not groups.any():
             return np.arange(len(groups))
         return groups.astype(np.intp)
@@ -135,12 +136,14 @@ class StreamScaler:
     @cached_property
     def inputs(self) -> int:
         """I."""
-        return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
+        return self.spec.size + self.size + len(self.spec.motor) + 1
 
     def read_episode(self, stream: Rows) -> ScaledRows:
         """Read all rows of an episode (T, D); nothing has moved before the first ``lag``."""
-        before = np.concatenate([stream[: self.lag], stream[: -self.lag]])
-        return self.read(stream, before, np.concatenate([before[: self.lag], before[: -self.lag]]))
+        lag = self.lag
+        before = np.concatenate([stream[:lag], stream[:-lag]])
+        earlier = np.concatenate([before[:lag], before[:-lag]])
+        return self.read(stream, before, earlier)
 
     def read(self, rows: Rows, before: Rows, earlier: Rows) -> ScaledRows:
         """Read rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
@@ -204,22 +207,28 @@ def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) ->
     for n in range(B):
         for i in range(D):
             finite[n, i] = np.isfinite(rows[n, i])
-            if not (finite[n, i] and np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])):
+            was_finite = np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])
+            if not (finite[n, i] and was_finite):
                 whole[n, 0] = 0.0
             inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
 
         for j in range(X):
             i = scale.sensory[j]
+            value = rows[n, i]
+            last = before[n, i]
             seen[n, j] = finite[n, i]
-            senses[n, j] = _standardised(rows[n, i], mean[i], spread[i])
-            changes[n, j] = _changed(rows[n, i], before[n, i], change[i])
-            inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
+            senses[n, j] = _standardised(value, mean[i], spread[i])
+            changes[n, j] = _changed(value, last, change[i])
+            inputs[n, D + j] = _believed((value - last) / change[i])
 
         for j in range(L):
             i = scale.slow[j]
-            seen[n, X + j] = finite[n, i] and np.isfinite(before[n, i])
-            senses[n, X + j] = _changed(rows[n, i], before[n, i], change[i])
-            inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
+            k = X + j
+            value = rows[n, i]
+            last = before[n, i]
+            seen[n, k] = finite[n, i] and np.isfinite(last)
+            senses[n, k] = _changed(value, last, change[i])
+            inputs[n, D + k] = _believed((last - earlier[n, i]) / change[i])
 
         for j in range(A):
             i = scale.motor[j]
@@ -252,7 +261,8 @@ def _least_change(
     """
     episodes = max(1, MOST_SHOWN // max(1, len(streams[0])))
     steps = [_resolutions(stream[:MOST_SHOWN]) for stream in streams[:episodes]]
-    return np.sqrt(2.0) * np.maximum(noise / 2, np.max(steps, axis=0) / np.sqrt(12.0))
+    rounding = np.max(steps, axis=0) / np.sqrt(12.0)
+    return np.sqrt(2.0) * np.maximum(noise / 2, rounding)
 
 
 def _resolutions(stream: NDArray[np.float32]) -> list[float]:

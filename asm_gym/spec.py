@@ -123,8 +123,9 @@ class StreamSpec:
 
     def __repr__(self) -> str:
         """Return source, rate, and size and unit of each channel."""
-        channels = ", ".join(f"{c.name} ({c.size}) [{c.unit}]" for c in self.channels)
-        return f"<StreamSpec of {self.source or 'a stream'} at {1 / self.dt:g} Hz: {channels}>"
+        parts = [f"{c.name} ({c.size}) [{c.unit}]" for c in self.channels]
+        source = self.source or "a stream"
+        return f"<StreamSpec of {source} at {1 / self.dt:g} Hz: {', '.join(parts)}>"
 
     @cached_property
     def size(self) -> int:

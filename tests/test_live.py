@@ -397,7 +397,7 @@ def test_a_source_that_makes_no_sense_is_refused(source, message):
 
 def paced(stamps: np.ndarray, dt: float = 0.02) -> tuple[list[int | None], Pace]:
     pace = Pace(dt)
-    return [pace.lost(float(t)) for t in stamps], pace
+    return [pace.rows_lost_before(float(t)) for t in stamps], pace
 
 
 def test_every_row_of_its_own_rate_is_read_however_it_jitters():
@@ -412,7 +412,7 @@ def test_every_row_of_its_own_rate_is_read_however_it_jitters():
 def test_of_another_rate_nothing_is_judged_until_it_is_right_again(step):
     other = step * np.arange(100)
     found, pace = paced([*other, *(other[-1] + 0.02 * np.arange(1, 100))])
-    assert pace.right
+    assert pace.is_right
     assert found[NEWEST:100] == [None] * (100 - NEWEST)
     assert found[-30:] == [0] * 30
 

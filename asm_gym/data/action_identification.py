@@ -85,7 +85,7 @@ class _Target(NamedTuple):
     offset: float = 0.0  # -e/b
 
 
-def found_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
+def identify_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
     """Return what recorded episodes show of the numbers of their actions."""
     spec = episodes[0].spec
     variables = _variables(episodes)
@@ -130,6 +130,7 @@ def _variables(episodes: Sequence[Episode]) -> Floats:
 
 
 def _statistics(variables: Floats) -> _Statistics:
+    """Return the statistics of variables (N, V, D)."""
     rows, *shape = variables.shape
     mean = variables.mean(axis=0)
     spread = variables.std(axis=0)
@@ -164,10 +165,12 @@ def _strongest(
     most = 0.0
     _, bracket, element = spec.labels[column].partition("[")
     for sense in senses.tolist():
-        is_own = spec.labels[sense].endswith(bracket + element)
+        preference = 1.0
+        if spec.labels[sense].endswith(bracket + element):
+            preference = OWN_PREFERENCE
         for lag in range(LATEST_LAG + 1):
             response = _response(statistics, sense, column, lag)
-            strength = response.explained * (OWN_PREFERENCE if is_own else 1.0)
+            strength = response.explained * preference
             if strength > most:
                 strongest = response
                 most = strength
@@ -200,12 +203,15 @@ def _response(statistics: _Statistics, sense: int, column: int, lag: int) -> _Re
     *variance, certainty = np.diag(precision)
     momentum, moves, returns = -precision[:3, 3] / certainty
     explained = moves**2 * certainty / variance[1]
-    if explained < max(LEAST_EXPLAINED, CERTAIN**2 / statistics.rows):
+    least_certain = CERTAIN**2 / statistics.rows
+    if explained < max(LEAST_EXPLAINED, least_certain):
         return _Response()
 
     pull = -returns / moves
-    pull_variance = (variance[2] / certainty - returns**2) / moves**2 / statistics.rows
-    if CERTAIN**2 * pull_variance > max(abs(pull), DELTA_PULL) ** 2:
+    return_variance = variance[2] / certainty - returns**2
+    pull_variance = return_variance / moves**2 / statistics.rows
+    least_pull = max(abs(pull), DELTA_PULL)
+    if CERTAIN**2 * pull_variance > least_pull**2:
         return _Response()
 
     return _Response(
@@ -226,6 +232,7 @@ def _target(statistics: _Statistics, column: int, place: _Response) -> _Target:
         if abs(slope / usual - 1) < NEAR_USUAL:
             slope = usual
     offset = mean[column] - slope * mean[place.sense]
-    if abs(offset) < NEAR_USUAL * (spread[column] + abs(mean[column])):
+    usual_size = spread[column] + abs(mean[column])
+    if abs(offset) < NEAR_USUAL * usual_size:
         offset = 0.0
     return _Target(place.sense, float(slope), float(offset))

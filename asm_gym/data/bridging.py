@@ -39,19 +39,21 @@ class Bridge:
         self.dt = dt
         self._spent = np.zeros(size)
 
-    def over(self, missing: NDArray[np.bool_]) -> bool:
+    def goes_over(self, missing: NDArray[np.bool_]) -> bool:
         """Return whether the next row lacks numbers (D,), and none for longer than it may."""
         spent = self._spent + self.dt
         paid_back = np.maximum(self._spent - PAID_BACK * self.dt, 0.0)
         self._spent = np.where(missing, spent, paid_back)
-        is_short = self._spent[missing] <= self.seconds * (1 + 1e-9)
+        longest = self.seconds * (1 + 1e-9)
+        is_short = self._spent[missing] <= longest
         return bool(missing.any() and is_short.all())
 
 
 def bridged(stream: NDArray[np.floating[Any]], dt: float, seconds: float) -> NDArray[np.bool_]:
     """Return which rows (T,) of a recording (T, D) a bridge of so many seconds goes over."""
     bridge = Bridge(seconds, dt, stream.shape[1])
-    return np.array([bridge.over(missing) for missing in np.isnan(stream)], np.bool_)
+    is_bridged = [bridge.goes_over(missing) for missing in np.isnan(stream)]
+    return np.array(is_bridged, np.bool_)
 
 
 def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np.float32]:
@@ -61,7 +63,8 @@ def filled(stream: NDArray[np.float32], dt: float, seconds: float) -> NDArray[np
     for column in result.T:
         for start, stop in spans(np.isnan(column)):
             is_inside = start > 0 and stop < len(column)
-            if is_inside and stop - start <= longest:
+            is_short = stop - start <= longest
+            if is_inside and is_short:
                 ends = [start - 1, stop]
                 column[start:stop] = np.interp(range(start, stop), ends, column[ends])
     return result

@@ -103,7 +103,7 @@ class LogClock:
         Raises:
             ValueError: a cell is no time.
         """
-        cells = [row.get(column) for column in self.columns]
+        cells: list[Any] = [row.get(column) for column in self.columns]
         if None in cells:
             return None
         if self.kind != NUMBER:

@@ -103,11 +103,11 @@ class Episode:
 
     def __repr__(self) -> str:
         """Return length, source and outcome in a line."""
-        parts = [f"{len(self)} rows of {self.spec.size}", f"{len(self) * self.spec.dt:g} s"]
+        rows = len(self)
+        outcome = "no success"
         if self.success:
-            parts.append("success")
-        else:
-            parts.append("no success")
+            outcome = "success"
+        parts = [f"{rows} rows of {self.spec.size}", f"{rows * self.spec.dt:g} s", outcome]
         if self.seed is not None:
             parts.append(f"seed {self.seed}")
         if self.faults.any():
@@ -133,10 +133,13 @@ class Episode:
     @classmethod
     @typed
     def from_table(
-        cls, frame: Any, channels: LogSchema | StreamSpec | Sequence[str] | None = None, **how: Any
+        cls,
+        frame: Any,
+        channels: LogSchema | StreamSpec | Sequence[str] | None = None,
+        **options: Any,
     ) -> Episode:
         """Make an episode from one log; the arguments are those of ``from_tables``."""
-        return cls.from_tables([frame], channels, **how)[0]
+        return cls.from_tables([frame], channels, **options)[0]
 
     @classmethod
     @typed
@@ -211,11 +214,10 @@ def check_recorded(episode: Episode) -> None:
         raise ValueError(f"{rows} rows of a stream need {rows} faults, got {len(episode.faults)}")
     if steps and rows % steps:
         raise ValueError(f"{steps} actions cannot have {rows} rows of a stream")
-    bad = np.flatnonzero(~np.isfinite(episode.rewards))
-    if len(bad):
-        raise ValueError(
-            f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}"
-        )
+    not_finite = np.flatnonzero(~np.isfinite(episode.rewards))
+    if len(not_finite):
+        step = not_finite[0]
+        raise ValueError(f"the reward of step {step} must be finite, got {episode.rewards[step]}")
 
 
 @typed

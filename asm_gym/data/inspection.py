@@ -94,7 +94,8 @@ def inspect_log(name: str, table: Columns, schema: LogSchema, trouble: str = "")
         trouble: why it cannot be read; empty if that is not known yet.
     """
     columns = {header: _column_of(header, schema) for header in table}
-    rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
+    size = len(next(iter(table.values())))
+    rows = np.arange(size, dtype=np.float64)
     unread = Inspection(name=name, table=table, columns=columns, times=rows)
     try:
         if trouble:
@@ -133,15 +134,16 @@ def _jitter(timing: Timing, dt: float) -> float:
     if not len(steps):
         return 0.0
     nine_in_ten = float(np.quantile(steps, 0.9))
-    is_gap = steps > FAR * max(1.0, nine_in_ten)
-    return float(steps[~is_gap].std())
+    longest = FAR * max(1.0, nine_in_ten)
+    return float(steps[steps <= longest].std())
 
 
 def _gaps(timing: Timing, dt: float) -> NDArray[np.float64]:
     """Return from when to when (N, 2) nothing came, as ``fit`` and ``watch`` see it [s]."""
     times = timing.times.seconds
-    rows = evenly(np.ones((len(times), 1)), times, dt)[:, 0]
-    ends = [(start - 1, stop) for start, stop in spans(np.isnan(rows))]
+    ones = np.ones((len(times), 1))
+    is_lost = np.isnan(evenly(ones, times, dt)[:, 0])
+    ends = [(start - 1, stop) for start, stop in spans(is_lost)]  # [rows]
     return times[0] + dt * np.array(ends, np.float64).reshape(-1, 2)
 
 
@@ -149,14 +151,16 @@ def _facts(column: LogColumn, values: NDArray[Any]) -> dict[str, Any]:
     """Return what the values (T,) of a column are like."""
     if not is_numeric(values):
         values = np.zeros(0)
-    known = values[np.isfinite(values) & (values != column.missing)]
+    is_known = np.isfinite(values) & (values != column.missing)
+    known = values[is_known]
     missing = len(values) - len(known)
     ends = [np.nan, np.nan]
     if len(known):
         ends = [float(known.min()), float(known.max())]
     repeats = 0.0
     if len(values) > 1:
-        repeats = float(np.mean(values[1:] == values[:-1]))
+        is_repeated = values[1:] == values[:-1]
+        repeats = float(is_repeated.mean())
     return {
         "channel": column.name,
         "unit": column.unit,

@@ -20,7 +20,7 @@ from typing import NamedTuple, TextIO
 from asm_gym.data.dds_topics import follow_topics
 from asm_gym.data.rows import SourceDied
 from asm_gym.data.text import decoded
-from asm_gym.files import named, no_links, regular_file
+from asm_gym.files import naming, no_links, regular_file
 from asm_gym.validation import check_number
 
 SOURCE_POLL_S = 0.002  # how often a source is looked at for more [s]
@@ -78,7 +78,9 @@ def _follow_pipe(place: str, stdin: TextIO, silence: float, first: float) -> Ite
 
     def more() -> bytes | None:
         ready, _, _ = select.select([number], [], [], SOURCE_POLL_S)
-        return os.read(number, LARGEST_DATAGRAM) if ready else None
+        if not ready:
+            return None
+        return os.read(number, LARGEST_DATAGRAM)
 
     yield from _lines(more, silence, first)
 
@@ -88,9 +90,9 @@ def _follow_file(place: str, stdin: TextIO, silence: float, first: float) -> Ite
     regular_file(path)
 
     def more() -> bytes | None:
-        found = file.read(LARGEST_DATAGRAM)
-        if found:
-            return found
+        chunk = file.read(LARGEST_DATAGRAM)
+        if chunk:
+            return chunk
         if path.stat().st_size < file.tell():
             raise ValueError(f"{path} became shorter while it was followed")
         time.sleep(SOURCE_POLL_S)
@@ -110,7 +112,6 @@ def _follow_datagrams(place: str, stdin: TextIO, silence: float, first: float) -
         )
     port, sender, sender_port = match.groups()
     check_number("port", int(port), low=1, high=65_535, whole=True)
-    is_near = sender is None or IPv4Address(sender).is_loopback
 
     def more() -> bytes | None:
         try:
@@ -119,10 +120,14 @@ def _follow_datagrams(place: str, stdin: TextIO, silence: float, first: float) -
             return None
         if sender not in (None, address) or sender_port not in (None, str(source_port)):
             return None
-        return (datagram.rstrip(b"\n") or b"an empty datagram") + b"\n"
+        line = datagram.rstrip(b"\n") or b"an empty datagram"
+        return line + b"\n"
 
+    interface = "0.0.0.0"
+    if sender is None or IPv4Address(sender).is_loopback:
+        interface = "127.0.0.1"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1" if is_near else "0.0.0.0", int(port)))
+        receiver.bind((interface, int(port)))
         receiver.settimeout(SOURCE_POLL_S)
         yield from _lines(more, silence, first)
 
@@ -188,7 +193,7 @@ def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:
     reason = "the source ended"
     rows = 0
     seconds = 0.0
-    with named(to), open(to, "w", encoding="utf-8", opener=no_links) as file:
+    with naming(to), open(to, "w", encoding="utf-8", opener=no_links) as file:
         try:
             for line in filter(str.strip, lines):
                 if not rows:

@@ -114,7 +114,9 @@ def _episodes_of(source: Source, schema: LogSchema) -> Iterator[Log]:
         parts = recordings_in(source.columns, schema.clock_in(source.columns))
         _note_unknown(source.columns, schema)
         for number, part in enumerate(parts, 1):
-            name = source.name if len(parts) == 1 else f"{source.name} part {number}"
+            name = source.name
+            if len(parts) > 1:
+                name += f" part {number}"
             yield Log(name, Episode.read(part, schema, success=source.success))
     except ValueError as error:
         raise ValueError(f"{source.file or source.name}: {error}") from error
@@ -124,8 +126,11 @@ def _note_unknown(table: Columns, schema: LogSchema) -> None:
     """Tell the user of columns that the schema of the first logs does not have."""
     if schema.memory_spec is not None:
         return
-    known = schema.names
-    unknown = [name for name in table if not is_label(name) and split_unit(name)[0] not in known]
+    unknown = []
+    for name in table:
+        is_known = split_unit(name)[0] in schema.names
+        if not is_known and not is_label(name):
+            unknown.append(name)
     if unknown:
         note(f"not read, as the schema of the first logs lacks it: {', '.join(unknown)[:120]}")
 
@@ -200,7 +205,7 @@ def _sources_of_files(files: dict[str, Path], hints: SchemaHints) -> Iterator[So
             raise
         except Exception as error:  # each format's reader raises whatever the damage leads to
             damaged += 1
-            message = f"{file}: {_said(error)}"
+            message = f"{file}: {_message_of(error)}"
             if damaged == len(files):
                 raise ValueError(message) from error
             note(UNREAD + message)
@@ -208,7 +213,7 @@ def _sources_of_files(files: dict[str, Path], hints: SchemaHints) -> Iterator[So
             yield from sources
 
 
-def _said(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """Return the message of an error in a line."""
     message = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, ValueError):
@@ -247,7 +252,9 @@ def _files_at(path: Path) -> dict[str, Path]:
             raise ValueError(f"{path}: files that can be read end in {', '.join(known)}")
         return {path.name: path}
 
-    root = path / "episodes" if (path / "episodes").is_dir() else path
+    root = path / "episodes"
+    if not root.is_dir():
+        root = path
     files = {}
     for file in sorted(root.rglob("*")):
         name = file.relative_to(root)

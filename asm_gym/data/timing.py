@@ -45,8 +45,9 @@ def timing_of(table: Mapping[str, NDArray[Any]], clock: LogClock) -> Timing:
         ValueError: its clock cannot be read.
     """
     times = clock.times(table)
-    repeats = np.diff(times.seconds, prepend=np.nan) == 0.0
-    if np.mean(repeats) > MOST_REPEATED:
+    steps = np.diff(times.seconds, prepend=np.nan)
+    repeats = steps == 0.0
+    if repeats.mean() > MOST_REPEATED:
         repeats[:] = False
     elif repeats.any():
         note(f"{repeats.sum()} rows have the same time as the one before, and are left out")
@@ -59,9 +60,9 @@ def recordings(times: Floats) -> list[tuple[int, int]]:
     """Return the stretches of rows, half-open, between which time (T,) goes back or leaps."""
     size = len(times)
     whole = [(0, size)]
-    if size < 2:
-        return whole
     steps = np.diff(times)
+    if not len(steps):
+        return whole
     median = float(np.median(steps))
     if not median > 0:
         return whole
@@ -69,10 +70,11 @@ def recordings(times: Floats) -> list[tuple[int, int]]:
     longest = MOST_TIMES_LOST * size * median + LEAP_S
     is_cut = (steps < 0) | (steps > longest)
     cuts = np.flatnonzero(is_cut) + 1
-    if not len(cuts) or len(cuts) > max(1, MOST_CUTS * size):
+    most_cuts = max(1, MOST_CUTS * size)
+    if not 1 <= len(cuts) <= most_cuts:
         return whole
-    ends = pairwise([0, *cuts.tolist(), size])
-    return [(start, stop) for start, stop in ends if stop - start > 1]
+    stretches = pairwise([0, *cuts.tolist(), size])
+    return [(start, stop) for start, stop in stretches if stop - start > 1]
 
 
 def period(times: Floats) -> float | None:
@@ -100,16 +102,16 @@ def period(times: Floats) -> float | None:
 
 def _check_increasing(times: Floats) -> None:
     """Raise ValueError unless times are finite and increase."""
-    is_finite = np.isfinite(times)
-    if not is_finite.all():
-        row = int(np.argmin(is_finite))
+    not_finite = np.flatnonzero(~np.isfinite(times))
+    if len(not_finite):
+        row = not_finite[0]
         raise ValueError(
             f"time must be a number in every row, got {times[row]} in row {row}: --rate HZ goes "
             "without"
         )
-    rises = np.diff(times) > 0
-    if not rises.all():
-        row = int(np.argmin(rises))
+    not_rising = np.flatnonzero(np.diff(times) <= 0)
+    if len(not_rising):
+        row = not_rising[0]
         raise ValueError(
             f"time must increase from row to row, got {times[row]:g} s before "
             f"{times[row + 1]:g} s: cut the log there, choose another clock with --clock NAME, or "
@@ -154,12 +156,15 @@ def _placed(rows: Floats, places: NDArray[np.intp]) -> Floats:
 
 def _interpolated(rows: Floats, times: Floats, due: Floats, dt: float) -> Floats:
     """Return rows (N, D) at the times (N,) at which they are due, NaN within gaps."""
-    longest = FAR * max(dt, float(np.quantile(np.diff(times), 0.9)))
-    after = np.clip(np.searchsorted(times, due), 1, len(times) - 1)
+    nine_in_ten = float(np.quantile(np.diff(times), 0.9))
+    longest = FAR * max(dt, nine_in_ten)
+    after = np.searchsorted(times, due)
+    after = np.clip(after, 1, len(times) - 1)
     next_stamp = times[after]
     last_stamp = times[after - 1]
     at_stamp = (next_stamp == due) | (last_stamp == due)
     in_gap = next_stamp - last_stamp > longest
-    interpolated = np.column_stack([np.interp(due, times, column) for column in rows.T])
+    columns = [np.interp(due, times, column) for column in rows.T]
+    interpolated = np.column_stack(columns)
     interpolated[in_gap & ~at_stamp] = np.nan
     return interpolated

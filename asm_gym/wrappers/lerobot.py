@@ -279,7 +279,7 @@ class LeRobotGuard(Adapter):
     def _check_rate(self) -> None:
         """Log that rows come at another rate than the memory reads."""
         try:
-            self._pace.lost(time.monotonic())
+            self._pace.rows_lost_before(time.monotonic())
         except ClockWentBack as error:
             self._pace = Pace(self._spec.dt)
             _log.warning("%s", error)
