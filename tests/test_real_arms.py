@@ -10,8 +10,8 @@ from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import real_arms
 from asm_gym.scripts.reproduce.real_arms import (
+    ADDED_FAULTS,
     ARMS,
-    FAULTS,
     NEWTONS,
     SLIP,
     Job,
@@ -56,7 +56,7 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     for kind in ("frozen", "slipped", "late", "step"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
-        own = slices[FAULTS[kind].column]
+        own = slices[ADDED_FAULTS[kind].column]
         assert not changed[:100].any()
         assert changed[100:, own].any(axis=0).sum() == 1
         assert not np.delete(changed, np.arange(episode.spec.size)[own], axis=1).any()
@@ -128,4 +128,4 @@ def test_every_monitor_meets_the_same_faults(folder):
         for m in ("kalman", "friction_rule")
     )
     assert one == other
-    assert set(one) == {*FAULTS, ""}
+    assert set(one) == {*ADDED_FAULTS, ""}

@@ -27,7 +27,7 @@ from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
 from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 
-DRAWN = 3  # logs of a folder that are drawn; each other log gets one line
+DRAWN_LOGS = 3  # logs of a folder that are drawn; each other log gets one line
 FORMATS = {
     "from": "{:.4g}",
     "to": "{:.4g}",
@@ -85,7 +85,7 @@ def inspect(args: Args, console: Console) -> int:
                 if remark not in printed:
                     say(f"- {remark}")
             printed.update(log.remarks())
-            if number < DRAWN:
+            if number < DRAWN_LOGS:
                 picture = args.out / f"{picture_name(source)}.png"
                 figures.save(figures.log_figure(log), picture)
                 say(f"Wrote {picture}")

@@ -61,7 +61,7 @@ AT_ONCE = 64  # episodes scored side by side
 LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy")  # options
 RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
 PRINTED = 20  # alarms of a recording; the file holds them all
-DRAWN = 4  # episodes in the report, the most surprising ones
+DRAWN_EPISODES = 4  # episodes in the report, the most surprising ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,9 @@ class Review:
     """Alarms in the recordings that were scored up to now."""
 
     alarms: list[Alarm] = field(default_factory=list)
-    worst: list[ScoredEpisode] = field(default_factory=list)  # ``DRAWN``, the most surprising first
+    worst: list[ScoredEpisode] = field(
+        default_factory=list
+    )  # ``DRAWN_EPISODES``, the most surprising first
     episodes: int = 0
     excused: Counter[str] = field(default_factory=Counter)  # events that were no alarms
     bridged_rows: int = 0
@@ -117,7 +119,7 @@ class Review:
             self.excused.update(recorded.excused_in(trace))
             self.worst.append(trace)
         self.worst.sort(key=lambda trace: -recorded.sensed_peak(trace))
-        del self.worst[DRAWN:]
+        del self.worst[DRAWN_EPISODES:]
         self.episodes += len(logs)
 
     def summary(self) -> str:

@@ -28,7 +28,7 @@ from asm_gym.rollouts.trial import Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
 PROMISES = (10.0, 5.0, 3.0, 1.0)  # false alarms per hour that a threshold promises
-SEVERITIES = ("medium", "strong")  # of faults; mild ones are hardly detectable
+EVALUATED_SEVERITIES = ("medium", "strong")  # of faults; mild ones are hardly detectable
 MOST_IN_ALARM = 0.5  # of episodes, that an adaptive threshold may aim for
 SCENES = 12  # faults happen in the first so many scenes
 
@@ -55,7 +55,7 @@ class EvaluationCase(NamedTuple):
         task = task_spec(self.task)
         seeds = role_seeds(seed, self.task, "nominal", episodes)
         trials = nominal_trials(task.id, "nominal", seeds)
-        faults = product(kinds, SEVERITIES)
+        faults = product(kinds, EVALUATED_SEVERITIES)
         for (kind, severity), scene in zip(faults, cycle(seeds[:SCENES]), strict=False):
             trials.append(faulty_trial(task.id, kind, severity, scene, task.horizon))
         return trials
@@ -237,7 +237,10 @@ def promises_table(scores: Sequence[Scores], thresholds: Mapping[float, float]) 
         thresholds: by the false alarms per hour that each promises.
     """
     healthy, faulty = all_episodes(scores)
-    severities = {f"{' and '.join(SEVERITIES)} found": SEVERITIES, "mild found": ("mild",)}
+    severities = {
+        f"{' and '.join(EVALUATED_SEVERITIES)} found": EVALUATED_SEVERITIES,
+        "mild found": ("mild",),
+    }
     for heading, names in list(severities.items()):
         if not any(trace.severity in names for trace in faulty):
             del severities[heading]

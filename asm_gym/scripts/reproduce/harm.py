@@ -45,11 +45,11 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
-TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")
+RAMMED_TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")
 """Tasks of hostile policies."""
-UNKNOWN = ("PickPlaceMilk", "NutAssemblyRound")
+UNMET_TASKS = ("PickPlaceMilk", "NutAssemblyRound")
 """Tasks that the Panda's memory has not met, with healthy policies alone."""
-ALL_TASKS = (*TASKS, *UNKNOWN)
+ALL_TASKS = (*RAMMED_TASKS, *UNMET_TASKS)
 HEALTHY = [
     *product(ALL_TASKS, ["scripted"]),
     ("Lift", "lift_sac"),
@@ -57,7 +57,7 @@ HEALTHY = [
     ("Door", "door_sac"),
 ]
 """Tasks and policies that do no harm on purpose."""
-FAULTS = {
+FAULT_SEVERITIES = {
     "frozen_encoder": "medium",
     "encoder_bias": "medium",
     "encoder_dropout": "medium",
@@ -153,7 +153,7 @@ class Case(NamedTuple):
 def cases(config: Config) -> list[tuple[Case, int]]:
     """Return every case and its number of episodes."""
     trials = {task: Trial(env_id(task), 0) for task in config.tasks}
-    rammed = [trials[task] for task in config.tasks if task not in UNKNOWN]
+    rammed = [trials[task] for task in config.tasks if task not in UNMET_TASKS]
     hostile = [Case("hostile", name, trial) for trial, name in product(rammed, HOSTILE)]
     slower = [
         Case("hostile", "down", trial, speed=speed) for trial, speed in product(rammed, SLOWER)
@@ -161,7 +161,7 @@ def cases(config: Config) -> list[tuple[Case, int]]:
     elsewhere = [case._replace(config=arm) for arm, case in product(ELSEWHERE, hostile)]
     healthy = [Case("healthy", policy, trials[task]) for task, policy in HEALTHY if task in trials]
     faulty = []
-    for case, (fault, severity) in product(healthy, FAULTS.items()):
+    for case, (fault, severity) in product(healthy, FAULT_SEVERITIES.items()):
         if case.trial.task in FAULTY_TASKS:
             trial = replace(case.trial, kind=fault, severity=severity)
             faulty.append(case._replace(kind="faulty", trial=trial))

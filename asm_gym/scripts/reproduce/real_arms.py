@@ -200,7 +200,7 @@ class Fault(NamedTuple):
     needs_body: bool = False
 
 
-FAULTS = {
+ADDED_FAULTS = {
     "push": Fault("effort", push, needs_body=True),
     "payload": Fault("effort", payload, needs_body=True),
     "step": Fault("effort", step),
@@ -212,7 +212,7 @@ FAULTS = {
 
 def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
     """Return the piece with a fault from the onset on; None where the piece does not allow it."""
-    fault = FAULTS[kind]
+    fault = ADDED_FAULTS[kind]
     if fault.needs_body and piece.body is None:
         return None
     added = fault.added(piece, rng)
@@ -329,7 +329,7 @@ def examined(job: Job, folder: Path) -> list[Record]:
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
     kinds = [""] * len(use.tested)
     episodes = [*use.tested]
-    for episode, kind in product(use.tested, FAULTS):
+    for episode, kind in product(use.tested, ADDED_FAULTS):
         piece = Piece(episode, onset=len(episode) // 2, ranges=high - low, body=body)
         faulty = with_fault(kind, piece, rng)
         if faulty is not None:
@@ -402,7 +402,7 @@ def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]
     Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass.
     """
     row = {"Monitor": name}
-    for kind in FAULTS:
+    for kind in ADDED_FAULTS:
         faulty = records[records.kind == kind]
         if len(faulty):
             row[f"{kind} *"] = f"{faulty.found.astype(int).sum()} of {len(faulty)}"
