@@ -25,7 +25,7 @@ from asm_gym.files import regular_file, written_whole
 from asm_gym.validation import typed
 
 FORMAT = "asm-gym"
-VERSION = 1
+FORMAT_VERSION = 1
 HEADER = "header.json"
 END = b"PK\x05\x06"  # begins the record at the end of a zip,
 END_BYTES = 22  # which is so long without a comment
@@ -83,7 +83,7 @@ def write_checkpoint(
         arrays: by name.
     """
     contents = {name: np.asarray(array) for name, array in arrays.items()}
-    about = {"format": FORMAT, "version": VERSION, "kind": kind, **header}
+    about = {"format": FORMAT, "version": FORMAT_VERSION, "kind": kind, **header}
     text = json.dumps(about | {"arrays": _declared(contents)}, allow_nan=False)
     with written_whole(path) as file, zipfile.ZipFile(file, "w") as archive:
         # dated 1980: the same content has the same bytes at any time
@@ -103,10 +103,10 @@ def read_checkpoint(path: str | Path, kind: str) -> Checkpoint:
         ValueError: it is of another kind, or of a newer format.
     """
     header = read_header(path)
-    if header.get("version") != VERSION:
+    if header.get("version") != FORMAT_VERSION:
         raise ValueError(
             f"{path} has checkpoint format {header.get('version')!r}, this asm-gym reads "
-            f"{VERSION}; a newer asm-gym may have written it"
+            f"{FORMAT_VERSION}; a newer asm-gym may have written it"
         )
     if header.get("kind") != kind:
         raise ValueError(f"{path} is a checkpoint of {header.get('kind')!r}, not of {kind!r}")

@@ -42,7 +42,7 @@ OWN_CLOCKS = (
 )
 ALL_CLOCKS = (*SIMULATOR_CLOCKS, *OWN_CLOCKS)
 # What wrappers call how often they repeat an action.
-REPEATS = (
+REPEAT_NAMES = (
     "_skip",
     "skip",
     "repeat",
@@ -74,7 +74,9 @@ def control_period(env: gym.Env[Any, Any] | VectorEnv[Any, Any, Any]) -> float:
         return _period_of_stream(env)
     declared = repeats_of(env) * declared_period(env)
     # A declared period is tried on simulators only: a copy of another environment may move a robot.
-    clocks = SIMULATOR_CLOCKS if declared else ALL_CLOCKS
+    clocks: Sequence[str] = ALL_CLOCKS
+    if declared:
+        clocks = SIMULATOR_CLOCKS
     measured = _measured_in_copy(env, clocks)
     if measured and not _same(measured, declared):
         return measured
@@ -85,14 +87,15 @@ def declared_period(env: Any) -> float:
     """Return the control period that the innermost environment declares [s]; 0 without one."""
     bare = env.unwrapped
     for name in ("dt", "tau", "control_timestep"):
-        found = getattr(bare, name, None)
-        if callable(found):
-            found = found()
-        if period := _positive(found):
+        declared = getattr(bare, name, None)
+        if callable(declared):
+            declared = declared()
+        if period := _positive(declared):
             return period
 
-    timestep = getattr(getattr(getattr(bare, "model", None), "opt", None), "timestep", None)
-    if period := _positive(getattr(bare, "frame_skip", None)) * _positive(timestep):
+    options = getattr(getattr(bare, "model", None), "opt", None)
+    timestep = _positive(getattr(options, "timestep", None))
+    if period := _positive(getattr(bare, "frame_skip", None)) * timestep:
         return period
 
     config = getattr(bare, "config", None)
@@ -108,7 +111,7 @@ def repeats_of(env: Any) -> int:
     """Return how many steps of the innermost environment one step takes, as its wrappers say."""
     repeats = 1
     for layer in layers(env):
-        for name in REPEATS:
+        for name in REPEAT_NAMES:
             # Static: a wrapper may forward the names of the environment inside.
             value = getattr_static(layer, name, None)
             if isinstance(value, int | np.integer) and value > 1:

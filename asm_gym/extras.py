@@ -39,9 +39,10 @@ def check_simulator() -> None:
     """Raise ImportError where the installed MuJoCo or robosuite does not fit the environments."""
     for name, tested in TESTED.items():
         with suppress(PackageNotFoundError):  # its importer says so
-            if not tested.contains(found := version(name), prereleases=True):
+            installed = version(name)
+            if not tested.contains(installed, prereleases=True):
                 raise ImportError(
-                    f"the environments need {name}{tested}, got {found}: {fitting(name)}"
+                    f"the environments need {name}{tested}, got {installed}: {fitting(name)}"
                 )
 
 

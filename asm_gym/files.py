@@ -34,7 +34,7 @@ def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
     temporary = path.with_name(f".{path.name}.{token_hex(4)}{UNFINISHED}")
     try:
         # "x" follows no link; who may read it, the umask says.
-        with named(path), temporary.open("xb") as file:
+        with naming(path), temporary.open("xb") as file:
             yield file
         os.replace(temporary, path)
     except BaseException:
@@ -54,7 +54,7 @@ def no_links(path: str, flags: int) -> int:
 
 
 @contextmanager
-def named(path: Path) -> Iterator[None]:
+def naming(path: Path) -> Iterator[None]:
     """Name the file where a disk is full: Python does not, of a file that is open."""
     try:
         yield

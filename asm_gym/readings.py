@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 FEWEST_CHANGES = 10  # from which a step can be told
 MOST_CHANGES = 0.95  # so large a share of them must be whole multiples of the step
-NEARLY = 0.1  # of a step, by which a whole multiple may be missed
-LOOSEST = 0.25  # however large the rounding is
+NEARLY_MULTIPLE = 0.1  # of a step, by which a whole multiple may be missed
+LOOSEST_MULTIPLE = 0.25  # however large the rounding is
 # Most changes must be of fewer steps than this, as every number is near a multiple of a small step.
 COARSE = 200.0
 
@@ -27,18 +27,23 @@ def resolution(values: NDArray[Any]) -> float:
     known = values[np.isfinite(values)].astype(np.float64)
     if len(known) < FEWEST_CHANGES:
         return 0.0
-    rounding = float(np.spacing(np.float32(np.abs(known).max())))
-    changes = np.abs(np.diff(known))
-    changes = changes[changes > 2 * rounding]
+    largest = np.float32(np.abs(known).max())
+    rounding = float(np.spacing(largest))
+    differences = np.abs(np.diff(known))
+    changes = differences[differences > 2 * rounding]
     if len(changes) < FEWEST_CHANGES:
         return 0.0
-    step = _median(changes[changes < 1.5 * changes.min()])
+
+    is_smallest = changes < 1.5 * changes.min()
+    step = _median(changes[is_smallest])
     ratios = changes / step
     if _median(ratios) > COARSE:
         return 0.0
-    tolerance = np.minimum(NEARLY + 2 * rounding / step + 1e-3 * ratios, LOOSEST)
-    is_multiple = np.abs(ratios - np.rint(ratios)) <= tolerance
-    if np.count_nonzero(is_multiple) / len(ratios) < MOST_CHANGES:
+    tolerance = NEARLY_MULTIPLE + 2 * rounding / step + 1e-3 * ratios
+    tolerance = np.minimum(tolerance, LOOSEST_MULTIPLE)
+    deviations = np.abs(ratios - np.rint(ratios))
+    multiples = np.count_nonzero(deviations <= tolerance)
+    if multiples / len(ratios) < MOST_CHANGES:
         return 0.0
     return float(f"{step:.4g}")
 
@@ -52,7 +57,8 @@ def noise_of(values: NDArray[Any]) -> float:
     known = values[np.isfinite(values)].astype(np.float64)
     if len(known) < 8:
         return 0.0
-    spread = _median(np.abs(np.diff(known, 3))) / 0.6745 / np.sqrt(20)
+    third_differences = np.abs(np.diff(known, 3))
+    spread = _median(third_differences) / 0.6745 / np.sqrt(20)
     return float(f"{spread:.3g}")
 
 

@@ -31,12 +31,12 @@ Rows = NDArray[np.floating[Any]]
 
 SLOW = 0.3  # a channel is slow where a step's change is under this share of its spread
 LAPSE = 0.05  # time over which a change is taken, where rows come faster [s]
-FEW_VALUES = 5  # a channel of fewer different values is a flag or a mode
+FEWEST_VALUES = 5  # a channel of fewer different values is a flag or a mode
 MOST_SHOWN = 10_000  # rows from which the resolution of channels is estimated
 
 # Where standardised numbers are cut off, so that no finite row overflows; nothing is predicted
 # from such a number.
-FARTHEST = 1e3
+FARTHEST_NUMBER = 1e3
 
 
 class ScaledRows(NamedTuple):
@@ -49,6 +49,17 @@ class ScaledRows(NamedTuple):
     changes: NDArray[np.float32]  # (B, X) what is judged; 0 where unseen
     whole: NDArray[np.float32]  # (B, 1) 1 where nothing was unseen in any of the three rows, else 0
     finite: NDArray[np.bool_]  # (B, D)
+
+
+class RowScale(NamedTuple):
+    """How compiled code reads rows of a stream: the scale of each column, and what the columns are."""
+
+    mean: Floats  # (D,) of the training rows [unit of each channel]
+    spread: Floats  # (D,) their standard deviation
+    change: Floats  # (D,) standard deviation of the change over ``lag`` rows
+    sensory: Ints  # (X,) columns that are sensed
+    motor: Ints  # (A,) columns that are commanded
+    slow: Ints  # (S - X,) columns whose change is sensed too
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +76,13 @@ class StreamScaler:
     def fit(cls, spec: StreamSpec, streams: Sequence[NDArray[np.float32]], lag: int = 1) -> Self:
         """Learn the scale from training episodes (T, D) of more than ``lag`` rows each."""
         rows = np.concatenate(streams).astype(np.float64)  # (N, D)
-        steps = np.concatenate([s[lag:].astype(np.float64) - s[:-lag] for s in streams])
+        parts = [stream[lag:].astype(np.float64) - stream[:-lag] for stream in streams]
+        steps = np.concatenate(parts)  # (M, D)
         mean = rows.mean(axis=0)
         spread = _spread(rows, mean, spec.noise)
         change = np.maximum(steps.std(axis=0), _least_change(streams, spec.noise))
-        return cls(spec, mean, spread, np.where(change > 0, change, spread), lag)
+        change = np.where(change > 0, change, spread)
+        return cls(spec, mean, spread, change, lag)
 
     @classmethod
     def of(cls, spec: StreamSpec, arrays: Mapping[str, Any], lag: int = 1) -> Self:
@@ -89,6 +102,18 @@ class StreamScaler:
         return np.flatnonzero(slow)
 
     @cached_property
+    def row_scale(self) -> RowScale:
+        """The same as writable arrays of the one type that compiled code takes."""
+        return RowScale(
+            mean=np.array(self.mean, np.float64),
+            spread=np.array(self.spread, np.float64),
+            change=np.array(self.change, np.float64),
+            sensory=self.spec.sensory.copy(),
+            motor=self.spec.motor.copy(),
+            slow=self.slow,
+        )
+
+    @cached_property
     def size(self) -> int:
         """S."""
         return len(self.spec.sensory) + len(self.slow)
@@ -101,9 +126,9 @@ class StreamScaler:
     @cached_property
     def groups(self) -> NDArray[np.intp]:
         """(X,) the group of each change, by number; where all are of one group, every number is its own."""
-        channels = self.spec.channels
-        names = np.repeat([c.group for c in channels], [c.size for c in channels])
-        _, groups = np.unique(names[self.spec.sensory], return_inverse=True)
+        names = [channel.group for channel in self.spec.channels for _ in channel.labels]
+        sensory_names = np.array(names)[self.spec.sensory]
+        _, groups = np.unique(sensory_names, return_inverse=True)
         if not groups.any():
             return np.arange(len(groups))
         return groups.astype(np.intp)
@@ -111,32 +136,37 @@ class StreamScaler:
     @cached_property
     def inputs(self) -> int:
         """I."""
-        return self.spec.size + len(self.spec.sensory) + len(self.slow) + len(self.spec.motor) + 1
+        return self.spec.size + self.size + len(self.spec.motor) + 1
 
     def read_episode(self, stream: Rows) -> ScaledRows:
         """Read all rows of an episode (T, D); nothing has moved before the first ``lag``."""
-        before = np.concatenate([stream[: self.lag], stream[: -self.lag]])
-        return self.read(stream, before, np.concatenate([before[: self.lag], before[: -self.lag]]))
+        lag = self.lag
+        before = np.concatenate([stream[:lag], stream[:-lag]])
+        earlier = np.concatenate([before[:lag], before[:-lag]])
+        return self.read(stream, before, earlier)
 
     def read(self, rows: Rows, before: Rows, earlier: Rows) -> ScaledRows:
         """Read rows (B, D), those ``lag`` rows before, and as long before those; what is not finite is unseen."""
-        x, y, z = (np.ascontiguousarray(r, np.float64) for r in (rows, before, earlier))
-        sensory, motor = self.spec.sensory, self.spec.motor
-        return read_rows(x, y, z, self.mean, self.spread, self.change, sensory, motor, self.slow)
+        return read_rows(
+            rows=np.ascontiguousarray(rows, np.float64),
+            before=np.ascontiguousarray(before, np.float64),
+            earlier=np.ascontiguousarray(earlier, np.float64),
+            scale=self.row_scale,
+        )
 
 
 @inner
 def _bounded(number: float) -> float:
-    """Cut off at ``FARTHEST``; a difference of two infinite numbers is 0."""
+    """Cut off at ``FARTHEST_NUMBER``; a difference of two infinite numbers is 0."""
     if np.isnan(number):
         return 0.0
-    return min(max(number, -FARTHEST), FARTHEST)
+    return min(max(number, -FARTHEST_NUMBER), FARTHEST_NUMBER)
 
 
 @inner
 def _believed(number: float) -> float:
     """Return 0 where the number is unknown, or would be cut off."""
-    if abs(number) < FARTHEST:
+    if abs(number) < FARTHEST_NUMBER:
         return number
     return 0.0
 
@@ -158,22 +188,15 @@ def _changed(number: float, before: float, change: float) -> float:
 
 
 @compiled
-def read_rows(
-    rows: Floats,
-    before: Floats,
-    earlier: Floats,
-    mean: Floats,
-    spread: Floats,
-    change: Floats,
-    sensory: Ints,
-    motor: Ints,
-    slow: Ints,
-) -> ScaledRows:
+def read_rows(rows: Floats, before: Floats, earlier: Floats, scale: RowScale) -> ScaledRows:
     """Read rows (B, D), see ``StreamScaler.read``."""
+    mean = scale.mean
+    spread = scale.spread
+    change = scale.change
     B, D = rows.shape
-    X = len(sensory)
-    L = len(slow)
-    A = len(motor)
+    X = len(scale.sensory)
+    L = len(scale.slow)
+    A = len(scale.motor)
     senses = np.zeros((B, X + L), np.float32)
     seen = np.zeros((B, X + L), np.float32)
     commands = np.ones((B, A + 1), np.float32)
@@ -184,22 +207,31 @@ def read_rows(
     for n in range(B):
         for i in range(D):
             finite[n, i] = np.isfinite(rows[n, i])
-            if not (finite[n, i] and np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])):
+            was_finite = np.isfinite(before[n, i]) and np.isfinite(earlier[n, i])
+            if not (finite[n, i] and was_finite):
                 whole[n, 0] = 0.0
             inputs[n, i] = _believed((before[n, i] - mean[i]) / spread[i])
+
         for j in range(X):
-            i = sensory[j]
+            i = scale.sensory[j]
+            value = rows[n, i]
+            last = before[n, i]
             seen[n, j] = finite[n, i]
-            senses[n, j] = _standardised(rows[n, i], mean[i], spread[i])
-            changes[n, j] = _changed(rows[n, i], before[n, i], change[i])
-            inputs[n, D + j] = _believed((rows[n, i] - before[n, i]) / change[i])
+            senses[n, j] = _standardised(value, mean[i], spread[i])
+            changes[n, j] = _changed(value, last, change[i])
+            inputs[n, D + j] = _believed((value - last) / change[i])
+
         for j in range(L):
-            i = slow[j]
-            seen[n, X + j] = finite[n, i] and np.isfinite(before[n, i])
-            senses[n, X + j] = _changed(rows[n, i], before[n, i], change[i])
-            inputs[n, D + X + j] = _believed((before[n, i] - earlier[n, i]) / change[i])
+            i = scale.slow[j]
+            k = X + j
+            value = rows[n, i]
+            last = before[n, i]
+            seen[n, k] = finite[n, i] and np.isfinite(last)
+            senses[n, k] = _changed(value, last, change[i])
+            inputs[n, D + k] = _believed((last - earlier[n, i]) / change[i])
+
         for j in range(A):
-            i = motor[j]
+            i = scale.motor[j]
             commands[n, j] = _standardised(rows[n, i], mean[i], spread[i])
             inputs[n, D + X + L + j] = _believed(commands[n, j])
     return ScaledRows(senses, seen, commands, inputs, changes, whole, finite)
@@ -229,13 +261,14 @@ def _least_change(
     """
     episodes = max(1, MOST_SHOWN // max(1, len(streams[0])))
     steps = [_resolutions(stream[:MOST_SHOWN]) for stream in streams[:episodes]]
-    return np.sqrt(2.0) * np.maximum(noise / 2, np.max(steps, axis=0) / np.sqrt(12.0))
+    rounding = np.max(steps, axis=0) / np.sqrt(12.0)
+    return np.sqrt(2.0) * np.maximum(noise / 2, rounding)
 
 
 def _resolutions(stream: NDArray[np.float32]) -> list[float]:
     """Return the resolution of each channel (D,) of a stream (T, D); 0 for a flag or a mode."""
     steps = [0.0] * stream.shape[1]
     for column, values in enumerate(stream.T):
-        if len(np.unique(values)) >= FEW_VALUES:
+        if len(np.unique(values)) >= FEWEST_VALUES:
             steps[column] = resolution(values)
     return steps

@@ -6,8 +6,10 @@ The sensors are read after the control step in which the action was commanded (t
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import chain
 from numbers import Real
 from typing import Any
 
@@ -74,14 +76,16 @@ class Channel:
         """Name of each number, such as ``joint_position[3]``; the bare name for a single number."""
         if self.size == 1 and not self.elements:
             return (self.name,)
-        return tuple(f"{self.name}[{e}]" for e in (self.elements or range(self.size)))
+        elements: Iterable[object] = self.elements or range(self.size)
+        return tuple(f"{self.name}[{element}]" for element in elements)
 
 
 def _is_pair(stops: Any) -> bool:
-    numbers = (
-        isinstance(stops, tuple) and len(stops) == 2 and all(isinstance(x, Real) for x in stops)
-    )
-    return numbers and bool(stops[0] < stops[1])
+    """Return whether a joint's stops are two numbers, the least first."""
+    if not isinstance(stops, tuple) or len(stops) != 2:
+        return False
+    are_numbers = all(isinstance(stop, Real) for stop in stops)
+    return are_numbers and bool(stops[0] < stops[1])
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,6 @@ class StreamSpec:
         channels: in their order in a row.
         dt: control period [s].
         source: name of the robot, for example ``Panda``; not compared between specs.
-        missing: numbers that stand for missing data in logs, such as -99999; not compared between specs.
 
     Example:
         >>> from asm_gym import Channel, StreamSpec
@@ -104,91 +107,95 @@ class StreamSpec:
     channels: tuple[Channel, ...]
     dt: float
     source: str = ""
-    missing: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.channels, tuple) or not all(
-            isinstance(c, Channel) for c in self.channels
-        ):
+        is_tuple = isinstance(self.channels, tuple)
+        if not is_tuple or not all(isinstance(channel, Channel) for channel in self.channels):
             raise TypeError(
                 f"channels must be a tuple of Channel objects, got {short_repr(self.channels)}"
             )
-        names = [c.name for c in self.channels]
+        names = [channel.name for channel in self.channels]
         if len(set(names)) != len(names):
             raise ValueError(f"channel names must be unique, got {names}")
-        if not any(c.group != MOTOR for c in self.channels):
+        if all(channel.group == MOTOR for channel in self.channels):
             raise ValueError("a stream needs at least one channel that is not an action")
         check_number("dt", self.dt, above=0.0)
 
     def __repr__(self) -> str:
         """Return source, rate, and size and unit of each channel."""
-        channels = ", ".join(f"{c.name} ({c.size}) [{c.unit}]" for c in self.channels)
-        return f"<StreamSpec of {self.source or 'a stream'} at {1 / self.dt:g} Hz: {channels}>"
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """D units, one for each of ``labels``."""
-        return tuple(c.unit for c in self.channels for _ in c.labels)
+        parts = [f"{c.name} ({c.size}) [{c.unit}]" for c in self.channels]
+        source = self.source or "a stream"
+        return f"<StreamSpec of {source} at {1 / self.dt:g} Hz: {', '.join(parts)}>"
 
     @cached_property
     def size(self) -> int:
         """D, the length of a row."""
-        return sum(c.size for c in self.channels)
+        return sum(channel.size for channel in self.channels)
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """D names, one for each number in a row."""
-        return tuple(label for c in self.channels for label in c.labels)
+        return tuple(label for channel in self.channels for label in channel.labels)
 
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Columns of each channel in a row."""
-        ends = np.cumsum([c.size for c in self.channels])
-        return {
-            c.name: slice(int(e) - c.size, int(e)) for c, e in zip(self.channels, ends, strict=True)
-        }
+        slices = {}
+        start = 0
+        for channel in self.channels:
+            slices[channel.name] = slice(start, start + channel.size)
+            start += channel.size
+        return slices
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """D units, one for each of ``labels``."""
+        return tuple(self._of_numbers("unit"))
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:
         """(D,) standard deviation of the sensor noise [unit of each channel]."""
-        return np.array([c.noise for c in self.channels for _ in c.labels], np.float64)
+        return np.array(self._of_numbers("noise"), np.float64)
 
     @cached_property
     def resolution(self) -> NDArray[np.float64]:
         """(D,) smallest difference of two readings [unit of each channel]; 0 where unknown."""
-        return np.array([c.resolution for c in self.channels for _ in c.labels], np.float64)
+        return np.array(self._of_numbers("resolution"), np.float64)
 
     @cached_property
     def motor(self) -> NDArray[np.intp]:
         """Indices of the commanded action."""
-        return np.flatnonzero([c.group == MOTOR for c in self.channels for _ in c.labels])
+        return np.flatnonzero([group == MOTOR for group in self._of_numbers("group")])
 
     @cached_property
     def sensory(self) -> NDArray[np.intp]:
         """Indices of everything that is sensed."""
-        return np.flatnonzero([c.group != MOTOR for c in self.channels for _ in c.labels])
+        return np.flatnonzero([group != MOTOR for group in self._of_numbers("group")])
+
+    def _of_numbers(self, attribute: str) -> list[Any]:
+        """Return an attribute of the channel of each of the D numbers."""
+        return [getattr(channel, attribute) for channel in self.channels for _ in channel.labels]
 
     def check_row(self, stream: NDArray[np.floating[Any]]) -> None:
         """Raise ValueError unless the last axis of ``stream`` is D long."""
         if stream.ndim < 1 or stream.shape[-1] != self.size:
+            names = ", ".join(channel.name for channel in self.channels)
             raise ValueError(
-                f"a stream of this spec has {self.size} numbers a step "
-                f"({', '.join(c.name for c in self.channels)}), "
+                f"a stream of this spec has {self.size} numbers a step ({names}), "
                 f"got an array of shape {stream.shape}"
             )
 
     def difference(self, other: StreamSpec) -> list[str]:
         """Return one line for each reason why a memory of this spec cannot read streams of ``other``."""
-        mine, theirs = ({c.name: c for c in s.channels} for s in (self, other))
-        lines = [f"{n}: missing" for n in mine if n not in theirs] + [
-            f"{n}: new" for n in theirs if n not in mine
-        ]
-        for name in (n for n in mine if n in theirs):
-            a, b = mine[name], theirs[name]
-            pairs = ("size", a.size, b.size), ("unit", a.unit, b.unit), ("group", a.group, b.group)
-            lines += [f"{name}: {what} {x} against {y}" for what, x, y in pairs if x != y][:1]
-        if not lines and list(mine) != list(theirs):
-            lines.append(f"order: {', '.join(mine)} against {', '.join(theirs)}")
+        own_channels = {channel.name: channel for channel in self.channels}
+        others = {channel.name: channel for channel in other.channels}
+        lines = [f"{name}: missing" for name in own_channels if name not in others]
+        lines += [f"{name}: new" for name in others if name not in own_channels]
+        for name, own in own_channels.items():
+            if name in others:
+                lines += _difference(own, others[name])
+        if not lines and list(own_channels) != list(others):
+            lines.append(f"order: {', '.join(own_channels)} against {', '.join(others)}")
         if abs(self.dt - other.dt) > 1e-9:
             lines.append(f"dt: {self.dt} s against {other.dt} s")
         return lines
@@ -208,17 +215,8 @@ class StreamSpec:
         """Read what ``to_json`` wrote. Raises DamagedFile where it is something else."""
         try:
             raw = json.loads(text)
-            channels = tuple(
-                Channel(
-                    **{
-                        **c,
-                        "elements": tuple(c["elements"]),
-                        "stops": tuple(map(tuple, c.get("stops", ()))),
-                    }
-                )
-                for c in raw["channels"]
-            )
-            return cls(channels, raw["dt"], raw["source"], tuple(raw.get("missing", ())))
+            channels = tuple(_channel_of(saved) for saved in raw["channels"])
+            return cls(channels, raw["dt"], raw["source"])
         except (ValueError, TypeError, KeyError) as error:
             reason = f"{error}, in {short_repr(text)}"
             raise DamagedFile("the text of a stream's spec", reason) from error
@@ -244,30 +242,48 @@ class StreamSpec:
         return cls((*_channels("observation", observation), motor), dt, "spaces")
 
 
+def _difference(own: Channel, other: Channel) -> list[str]:
+    """Return the first way in which a channel differs from one of the same name, as a line or none."""
+    for attribute in ("size", "unit", "group"):
+        expected = getattr(own, attribute)
+        got = getattr(other, attribute)
+        if expected != got:
+            return [f"{own.name}: {attribute} {expected} against {got}"]
+    return []
+
+
+def _channel_of(saved: dict[str, Any]) -> Channel:
+    """Return the channel that JSON holds."""
+    elements = tuple(saved["elements"])
+    stops = tuple(map(tuple, saved.get("stops", ())))
+    return Channel(**saved | {"elements": elements, "stops": stops})
+
+
 def _channels(name: str, space: spaces.Space[Any]) -> list[Channel]:
     """Return a channel for each key of a dict, in Gymnasium's order of flattening; one of anything else."""
-    if not isinstance(space, spaces.Dict):
-        size = spaces.flatdim(space)
-        return [Channel(name, size)] if size else []
-    prefix = "" if name == "observation" else f"{name}."
-    return [channel for key, part in space.items() for channel in _channels(f"{prefix}{key}", part)]
+    if isinstance(space, spaces.Dict):
+        prefix = f"{name}."
+        if name == "observation":
+            prefix = ""
+        parts = [_channels(f"{prefix}{key}", part) for key, part in space.items()]
+        return list(chain.from_iterable(parts))
+    size = spaces.flatdim(space)
+    if not size:
+        return []
+    return [Channel(name, size)]
 
 
 def flat(space: spaces.Space[Any], value: Any) -> NDArray[Any]:
     """Return an observation or action (n,) as ``StreamSpec.from_spaces`` lays it out."""
-    return (
-        np.ravel(value)
-        if isinstance(space, spaces.Box)
-        else np.asarray(spaces.flatten(space, value))
-    )
+    if isinstance(space, spaces.Box):
+        return np.ravel(value)
+    return np.asarray(spaces.flatten(space, value))
 
 
 def flat_rows(space: spaces.Space[Any], values: Any, rows: int) -> NDArray[np.float32]:
     """Return (rows, n) of so many observations or actions, which dicts hold by key."""
     if isinstance(space, spaces.Dict):
         return np.hstack([flat_rows(part, values[key], rows) for key, part in space.items()])
-    if isinstance(space, spaces.Box):
-        return np.asarray(values, np.float32).reshape(rows, -1)
-    return np.array([spaces.flatten(space, value) for value in values], np.float32).reshape(
-        rows, -1
-    )
+    if not isinstance(space, spaces.Box):
+        values = [spaces.flatten(space, value) for value in values]
+    return np.array(values, np.float32).reshape(rows, -1)

@@ -36,11 +36,9 @@ class StreamSource:
         self._check = PeriodCheck(env, control_period(env))
         if self.own:
             self._refuse_lost_rows()
-        else:
-            refuse_running_statistics(env)
-            self._spaces = StreamSpec.from_spaces(
-                env.observation_space, env.action_space, self.period
-            )
+            return
+        refuse_running_statistics(env)
+        self._spaces = StreamSpec.from_spaces(env.observation_space, env.action_space, self.period)
 
     @property
     def period(self) -> float:
@@ -97,22 +95,23 @@ class StreamSource:
             if "stream" not in info:
                 raise KeyError('info has no "stream"')
             return info["stream"]
-        spaces = self._env.observation_space, self._env.action_space
-        parts = [
-            flat(space, value) for space, value in zip(spaces, (observation, action), strict=True)
-        ]
-        return as_float32(np.concatenate(parts))
+        sensed = flat(self._env.observation_space, observation)
+        commanded = flat(self._env.action_space, action)
+        return as_float32(np.concatenate([sensed, commanded]))
 
     def first(self, observation: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(D,) what was sensed after ``reset``, when nothing had been commanded."""
         if self.own:
             return self.row(observation, None, info)
         sensed = flat(self._env.observation_space, observation)
-        return as_float32(np.concatenate([sensed, np.zeros(self._spaces.size - len(sensed))]))
+        nothing = np.zeros(self._spaces.size - len(sensed))
+        return as_float32(np.concatenate([sensed, nothing]))
 
     def rows(self, observation: Any, action: Any, info: dict[str, Any]) -> NDArray[np.float32]:
         """(n, D) all that was sensed since the last step; n is 1 unless the stream runs faster than control."""
-        return info["streams"] if "streams" in info else self.row(observation, action, info)[None]
+        if "streams" in info:
+            return info["streams"]
+        return self.row(observation, action, info)[None]
 
 
 def stepped(env: gym.Env[Any, Any], action: Any) -> StepResult:
@@ -120,27 +119,29 @@ def stepped(env: gym.Env[Any, Any], action: Any) -> StepResult:
 
     Raises TypeError unless it is the five values of Gymnasium.
     """
-    found: Any = env.step(action)
-    if not isinstance(found, tuple) or len(found) != 5:
-        size = len(found) if isinstance(found, tuple) else 1
-        cost = (
+    result: Any = env.step(action)
+    if isinstance(result, tuple) and len(result) == 5:
+        return result
+    size = 1
+    advice = ""
+    if isinstance(result, tuple):
+        size = len(result)
+    if size == 6:
+        advice = (
             "; of Safety-Gymnasium, "
             "safety_gymnasium.wrappers.SafetyGymnasium2Gymnasium(env) makes them"
         )
-        raise TypeError(
-            f"step of {type(env.unwrapped).__name__} returns {size} values, and Gymnasium's "
-            f"returns observation, reward, terminated, truncated, info{cost if size == 6 else ''}"
-        )
-    return found
+    raise TypeError(
+        f"step of {type(env.unwrapped).__name__} returns {size} values, and Gymnasium's "
+        f"returns observation, reward, terminated, truncated, info{advice}"
+    )
 
 
 def refuse_running_statistics(env: Any, guard: str = "NeuralASMSafety") -> None:
     """Raise UnsupportedEnvironment for a wrapper by which a sense reads differently the longer it runs."""
+    kinds = NormalizeObservation | VectorNormalizeObservation
     for layer in layers(env):
-        if (
-            isinstance(layer, NormalizeObservation | VectorNormalizeObservation)
-            and layer.update_running_mean
-        ):
+        if isinstance(layer, kinds) and layer.update_running_mean:
             raise UnsupportedEnvironment(
                 "NormalizeObservation inside the guard changes its scaling over time",
                 advice=f"put it outside, as in NormalizeObservation({guard}(env, monitor)), "

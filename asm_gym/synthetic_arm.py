@@ -20,31 +20,33 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 Floats = NDArray[np.float64]
 JOINTS = 7
 SUBSTEPS = 10  # of the simulation in a control step
-DT = 0.01  # control period [s]
-FASTEST = 3.0  # command [rad/s]
+CONTROL_PERIOD_S = 0.01  # control period [s]
+FASTEST_COMMAND = 3.0  # command [rad/s]
 MASS = np.array([2.5, 2.5, 1.5, 1.5, 0.5, 0.5, 0.2])  # [kg m²]
-GRAVITY = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]
+GRAVITY_TORQUE = np.array([0.0, 30.0, 10.0, 12.0, 2.0, 1.5, 0.0])  # [N m]
 COUPLING = 0.15  # between neighbouring joints, as a share of the geometric mean of their masses
 
 
 @compiled
 def _gravity(position: Floats) -> Floats:
     """Return the torques (7,) that hold the arm with a load of 1."""
-    return GRAVITY * np.sin(np.cumsum(position) + 0.5)
+    return GRAVITY_TORQUE * np.sin(np.cumsum(position) + 0.5)
 
 
 @compiled
 def _advance(
     q: Floats, v: Floats, command: Floats, load: float, inverse: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return position, velocity and torque (7,) after a control step."""
+    """Return position, velocity and torque (7,) after a control step; ``inverse`` is that of M."""
+    dt = CONTROL_PERIOD_S / SUBSTEPS
     torque = command
     for _ in range(SUBSTEPS):
         compensated = _gravity(q)
         torque = 60 * MASS * (command - v) + compensated
         friction = 3 * MASS * v + 0.5 * MASS * np.tanh(20 * v)
-        v = v + DT / SUBSTEPS * (inverse @ (torque - load * compensated - friction))
-        q = q + DT / SUBSTEPS * v
+        accelerating = torque - load * compensated - friction
+        v = v + dt * (inverse @ accelerating)
+        q = q + dt * v
     return q, v, torque
 
 
@@ -59,20 +61,22 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             Channel("joint_torque", JOINTS, "N m", noise=0.05, group="torque"),
             Channel("command", JOINTS, "rad/s", group=MOTOR),
         ),
-        dt=DT,
+        dt=CONTROL_PERIOD_S,
         source="SyntheticArm",
     )
-    dt = DT
+    dt = CONTROL_PERIOD_S
     action_means = "velocity"
 
     def __init__(self, horizon: int = 400) -> None:
         self.horizon = horizon
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (3 * JOINTS,), np.float32)
-        self.action_space = gym.spaces.Box(-FASTEST, FASTEST, (JOINTS,), np.float32)
-        coupled = np.diag(np.full(JOINTS - 1, COUPLING), 1)
-        coupling = (coupled + coupled.T) * np.sqrt(np.outer(MASS, MASS))
-        self._inverse = np.linalg.inv(np.diag(MASS) + coupling)  # of M (7, 7)
-        self._noise = self.stream_spec.noise[: 3 * JOINTS]
+        sensed = 3 * JOINTS
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (sensed,), np.float32)
+        self.action_space = gym.spaces.Box(-FASTEST_COMMAND, FASTEST_COMMAND, (JOINTS,), np.float32)
+        neighbours = np.diag(np.full(JOINTS - 1, COUPLING), 1)
+        coupling = (neighbours + neighbours.T) * np.sqrt(np.outer(MASS, MASS))
+        mass_matrix = np.diag(MASS) + coupling  # M (7, 7)
+        self._inverse = np.linalg.inv(mass_matrix)
+        self._noise = self.stream_spec.noise[:sensed]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -88,14 +92,16 @@ class SyntheticArm(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move one step by the commanded velocities [rad/s]."""
-        command = np.clip(np.asarray(action, np.float64), -FASTEST, FASTEST)
+        command = np.clip(np.asarray(action, np.float64), -FASTEST_COMMAND, FASTEST_COMMAND)
         self._q, self._v, torque = _advance(self._q, self._v, command, self._load, self._inverse)
         self._steps += 1
+        truncated = self._steps >= self.horizon
         observation = self._sense(torque)
         stream = np.concatenate([observation, np.asarray(action, np.float32)])
-        return observation, 0.0, False, self._steps >= self.horizon, {"stream": stream}
+        return observation, 0.0, False, truncated, {"stream": stream}
 
     def _sense(self, torque: Floats) -> NDArray[np.float32]:
+        """Return the observation (21,) of the state and the torques (7,)."""
         exact = np.concatenate([self._q, self._v, torque])
         noise = self._noise * self.np_random.standard_normal(len(exact))
         return np.asarray(exact + noise, np.float32)

@@ -34,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 
 P = ParamSpec("P")
 R = TypeVar("R")
-SHOWN = 80  # characters of a refused value that a message shows
+SHOWN_CHARACTERS = 80  # characters of a refused value that a message shows
 UNCHECKED = (int, float, bool, np.ndarray, object, Any)  # by ``typed``
 
 
@@ -95,7 +95,9 @@ def check_number(
         noun = "whole number"
     if isinstance(value, bool | np.bool_) or not isinstance(value, kind):
         raise _refused(name, noun, bounds, value)
-    convert: Any = int if isinstance(value, Integral) else float
+    convert: Any = float
+    if isinstance(value, Integral):
+        convert = int
     number: float = convert(value)
     # NaN alone differs from itself; math.isnan takes no integer of thousands of digits.
     if number != number or not _within(number, bounds):
@@ -159,7 +161,7 @@ def check_choice(what: str, got: Any, known: Iterable[Any]) -> None:
     known_names = list(map(str, names))
     hint = ""
     if isinstance(got, str):
-        for near in difflib.get_close_matches(got[:SHOWN], known_names, 1, 0.75):
+        for near in difflib.get_close_matches(got[:SHOWN_CHARACTERS], known_names, 1, 0.75):
             hint = f"; did you mean {near!r}?"
     raise ValueError(f"unknown {what} {short_repr(got)}; known: {', '.join(known_names)}{hint}")
 
@@ -189,8 +191,8 @@ def short_repr(value: object) -> str:
         text = repr(value)
     except ValueError:  # more digits than Python converts
         return "a number of thousands of digits"
-    if len(text) > SHOWN:
-        return f"{text[: SHOWN - 1]}…"
+    if len(text) > SHOWN_CHARACTERS:
+        return f"{text[: SHOWN_CHARACTERS - 1]}…"
     return text
 
 
@@ -235,9 +237,8 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin in (typing.Union, UnionType):
         return any(_fits(value, each) for each in get_args(kind))
     if origin is Sequence:
-        return _is_listed(value) and all(
-            _fits(item, each) for each in get_args(kind) for item in value
-        )
+        (item_kind,) = get_args(kind)
+        return _is_listed(value) and all(_fits(item, item_kind) for item in value)
     if origin in UNCHECKED or not isinstance(origin, type):
         return True
     if getattr(origin, "_is_protocol", False):
@@ -261,14 +262,17 @@ def _methods(protocol: type) -> list[str]:
 
 def _within(number: float, bounds: Mapping[str, float | None]) -> bool:
     """Return whether a number lies within its bounds."""
-    return all(bound is None or BOUNDS[name].holds(number, bound) for name, bound in bounds.items())
+    given = {name: bound for name, bound in bounds.items() if bound is not None}
+    return all(BOUNDS[name].holds(number, bound) for name, bound in given.items())
 
 
 def _described(what: str, bounds: Mapping[str, float | None]) -> str:
     """Return for example ``whole number of at least 1``, or ``number in (0, 1]``."""
-    given = [
-        (bound, bounds[name]) for name, bound in BOUNDS.items() if bounds.get(name) is not None
-    ]
+    given = []
+    for name, bound in BOUNDS.items():
+        number = bounds.get(name)
+        if number is not None:
+            given.append((bound, number))
     if len(given) == 2:
         (lower, least), (upper, greatest) = given
         return f"{what} in {lower.bracket}{least:g}, {greatest:g}{upper.bracket}"

@@ -22,7 +22,7 @@ def joint_twist(simulation, arm, speeds):
 
 def present_twist(simulation, arm):
     """Return the twist (6,) that the hand has now [m/s], [rad/s]."""
-    joints = int(simulation.arms.joints[arm])
+    joints = int(simulation.arms.joint_count[arm])
     return joint_twist(simulation, arm, simulation.data.qvel[simulation.arms.dofs[arm, :joints]])
 
 

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from asm_gym.data.action_identification import found_meaning
+from asm_gym.data.action_identification import identify_meaning
 from asm_gym.data.action_meaning import ACTIONS, ActionMeaning
 from asm_gym.monitors import Surprise
 from asm_gym.policies.hold import Hold
@@ -105,7 +105,7 @@ LIKE = {"velocity": ("velocity", "delta"), "delta": ("velocity", "delta")}
 @pytest.mark.parametrize("case", CASES)
 def test_recorded_episodes_tell_what_actions_mean(case):
     env = CASES[case]
-    found = found_meaning(recorded(env))
+    found = identify_meaning(recorded(env))
     assert all(f in LIKE.get(m, (m,)) for f, m in zip(found.means, env.means, strict=True)), found
     for j, means in enumerate(env.means):
         if means == "target":
@@ -135,7 +135,7 @@ class Surprised:
 
 def guarded(env, means=None, on_alarm="hold", at=40):
     recorder = StreamRecorder(env)
-    found = None if means else found_meaning(recorded(env))
+    found = None if means else identify_meaning(recorded(env))
     return NeuralASMSafety(
         env, Surprised(recorder.stream_spec, at, found), on_alarm, action_means=means
     )
@@ -177,7 +177,7 @@ def test_a_held_arm_stays_though_the_sense_of_its_place_lies(case, many, lie):
             return sensed
 
     like = CASES[case]
-    found, means, arms = found_meaning(recorded(like)), like.means, []
+    found, means, arms = identify_meaning(recorded(like)), like.means, []
 
     def make():
         arms.append(Lying(means, lag=like.lag, unit=like.unit))
@@ -228,7 +228,7 @@ def test_a_hold_is_refused_where_nothing_tells_what_actions_mean_and_the_option_
         guarded(CASES["torques"])
     with pytest.warns(UserWarning, match="contradicts the recorded episodes: number 0"):
         NeuralASMSafety(
-            env, Surprised(spec, 5, found_meaning(recorded(env))), "hold", action_means="velocity"
+            env, Surprised(spec, 5, identify_meaning(recorded(env))), "hold", action_means="velocity"
         )
 
 

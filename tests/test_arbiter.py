@@ -175,17 +175,17 @@ def reflexes(
 
 def test_retract_undoes_the_last_actions_newest_first_and_then_stays():
     felt = reflexes("retract")
-    felt.path[0, -2:, 0], felt.path_steps[0] = (0.2, 0.3), 2
+    felt.arrays.path[0, -2:, 0], felt.arrays.path_steps[0] = (0.2, 0.3), 2
     moves = [felt.move(0, "retract").action[0] for _ in range(3)]
     np.testing.assert_allclose(moves, [-0.3, -0.2, 0.0], rtol=1e-6)
 
 
 def test_comply_gives_way_beyond_what_is_usual_and_tolerated():
     felt = reflexes("comply")
-    felt.torque[0], felt.usual_torque[0] = [5.0, -9.0], [0.0, -5.0]
+    felt.arrays.torque[0], felt.arrays.usual_torque[0] = [5.0, -9.0], [0.0, -5.0]
     beyond = np.array([3.0, -2.0])
     np.testing.assert_allclose(felt.move(0, "comply").action, COMPLIANCE * 0.05 * beyond, rtol=1e-6)
-    felt.torque[0] = felt.usual_torque[0]
+    felt.arrays.torque[0] = felt.arrays.usual_torque[0]
     assert not felt.move(0, "comply").action.any()
 
 

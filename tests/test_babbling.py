@@ -14,7 +14,7 @@ from asm_gym.evaluation.comparison import detectability_of
 from asm_gym.evaluation.metrics import DetectionMetrics, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode, onset_row
 from asm_gym.monitors import NeuralASM, Surprise
-from asm_gym.policies.scripted.base import ObservationReader
+from asm_gym.policies.scripted.expert import ObservationReader
 from asm_gym.rollouts.pretraining.body_evaluation import (
     EvaluationCase,
     Scores,
@@ -27,12 +27,12 @@ from asm_gym.rollouts.pretraining.training_motions import (
     AROUND,
     DISTURBED,
     EXPERT,
-    HELD,
     NOISE,
     NOISE_ALONE,
     PACE,
     PRESS,
     REACHING,
+    STEPS_TO_GRIP,
     TURNED,
     MotionPolicy,
     ReachingPolicy,
@@ -95,22 +95,24 @@ def test_a_hand_that_reaches_comes_near_one_place_after_another_and_turns(robot)
     for _ in range(95):
         action, state = reach.predict(observation, state)
         assert np.linalg.norm(action[:3]) <= PACE * (1 + 1e-6)
-        if not aims or state.place is not aims[-1].place:
-            far = np.linalg.norm(read(observation, "hand_position") - state.place)
+        if not aims or state.position is not aims[-1].position:
+            far = np.linalg.norm(read(observation, "hand_position") - state.position)
             aims.append(state)
             progress.append(0.0)
         observation = env.step(action)[0]
         progress[-1] = max(
-            progress[-1], 1 - np.linalg.norm(read(observation, "hand_position") - state.place) / far
+            progress[-1],
+            1 - np.linalg.norm(read(observation, "hand_position") - state.position) / far,
         )
     env.close()
     assert len(aims) >= 2
     assert progress[0] > 0.3  # of the way
-    away = np.array([a.place - a.began for a in aims])
+    away = np.array([a.position - a.first_position for a in aims])
     assert (away >= AROUND[0]).all()
     assert (away <= AROUND[1]).all()
     assert {a.grip for a in aims} <= {-1.0, 1.0}
-    turned = [np.arccos(np.clip((np.trace(a.upright.T @ a.turned) - 1) / 2, -1, 1)) for a in aims]
+    turns = [a.first_orientation.T @ a.orientation for a in aims]
+    turned = [np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) for turn in turns]
     assert 0 < min(turned) <= max(turned) <= np.linalg.norm(TURNED)
 
 
@@ -144,7 +146,7 @@ def test_what_is_held_is_pressed_down_or_aside_for_a_while_and_the_grip_is_kept(
     babbler._guide = Holding()
     actions = np.array([babbler.predict(None)[0] for _ in range(3000)])
     pressed = np.abs(actions[:, :3]).max(axis=1) > 0.05
-    assert not pressed[: 10 + HELD].any()  # nothing was held for long
+    assert not pressed[: 10 + STEPS_TO_GRIP].any()  # nothing was held for long
     assert 0.3 < pressed.mean() < 0.7
     assert PRESS.strength[1] >= np.abs(actions[pressed, :3]).max() > 0.4
     starts = actions[1:][pressed[1:] & ~pressed[:-1]]
@@ -387,7 +389,7 @@ def test_an_agent_that_crashes_in_most_of_its_episodes_does_not_say_what_is_usua
     memory = SimpleNamespace(
         threshold=1.0, spec=ARM, score_episodes=lambda episodes: [quiet(e) for e in episodes]
     )
-    marks = evaluate_case(memory, "Lift", agents_own, 1.0, usual=10.0)
+    marks = evaluate_case(memory, "Lift", agents_own, expert_force=10.0)
     assert [[t.seed for t in own] for own in (marks.solved, marks.failed)] == [[0, 1, 2], [3]]
 
 

@@ -68,6 +68,8 @@ def test_senses_that_tell_nothing_are_named_and_no_precision_is_infinite(change)
     (line,) = mute_channels(episodes)
     assert all(name in line for name in named)
     assert mute_channels(sine_episodes(12)) == []
+    still = changed(sine_episodes(3), lambda stream: stream.fill(0.5))
+    assert len(mute_channels(still)) == still[0].spec.size
     monitor = fresh("neural_asm", episodes[0].spec).fit(episodes)
     known = monitor.model.network.association
     assert known.leverage_scale[1].max() > 0

@@ -12,7 +12,7 @@ import pytest
 from asm_gym.data.episode import Episode
 from asm_gym.data.selection import pieces
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
-from asm_gym.monitors.torque.body_model import BodyModel
+from asm_gym.monitors.torque.body_model import BodyModel, JointMotion
 from asm_gym.monitors.torque.urdf import read_urdf
 from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.scripts.cli import main
@@ -73,7 +73,7 @@ def test_torques_are_those_of_mujoco():
     model = mujoco.MjModel.from_xml_string(arm().replace("</robot>", apart))
     data = mujoco.MjData(model)
     told = np.random.default_rng(0).uniform(-1, 1, (3, 6, 3))
-    found = np.add(*body.torques(*told))
+    found = np.add(*body.torques(JointMotion(*told)))
     for n in range(6):
         for k, name in enumerate(("elbow", "lift", "shoulder")):
             there = model.joint(name)
@@ -95,7 +95,9 @@ def test_a_pendulum_weighs_what_a_pendulum_weighs():
         '<joint name="j" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 -1 0"/></joint></robot>'
     )
     q = np.linspace(-3, 3, 9)[:, None]  # about y, which is the inertia's z
-    weight, motion = BodyModel.of(urdf, ["q"]).torques(q, np.ones_like(q), np.full_like(q, 3.0))
+    weight, motion = BodyModel.of(urdf, ["q"]).torques(
+        JointMotion(q, np.ones_like(q), np.full_like(q, 3.0))
+    )
     np.testing.assert_allclose(weight, 2 * 9.81 * 0.5 * np.cos(q), atol=1e-9)
     np.testing.assert_allclose(motion, (0.1 + 2 * 0.5**2) * 3.0, atol=1e-9)
 
@@ -121,8 +123,8 @@ def test_several_roots_stand_side_by_side():
     more = arm().replace("</robot>", '<link name="camera"/></robot>')
     told = np.random.default_rng(0).uniform(-1, 1, (3, 6, 3))
     for one, other in zip(
-        BodyModel.of(arm(), SENSED).torques(*told),
-        BodyModel.of(more, SENSED).torques(*told),
+        BodyModel.of(arm(), SENSED).torques(JointMotion(*told)),
+        BodyModel.of(more, SENSED).torques(JointMotion(*told)),
         strict=True,
     ):
         np.testing.assert_allclose(one, other)
@@ -133,7 +135,7 @@ def test_unnamed_joints_are_taken_in_the_order_that_explains_the_torques(order):
     columns = recorded(20)
     q, v, torque = (columns[name][:, order] for name in ("position", "velocity", "effort"))
     body = BodyModel.of(arm(), ["q[0]", "q[1]", "q[2]"]).in_best_order(
-        q, v, np.gradient(v, 0.01, axis=0), torque
+        JointMotion(q, v, np.gradient(v, 0.01, axis=0)), torque
     )
     assert [order[k] for k in body.columns] == [0, 1, 2]
 
@@ -167,7 +169,7 @@ def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_fo
     model = monitor.model
     assert isinstance(model, ValueAssociation)
     if case == "without masses":
-        assert (model.links, model.left_by_body > 1.0, found[urdf]) == (None, True, found[""])
+        assert (model.body, model.left_by_body > 1.0, found[urdf]) == (None, True, found[""])
     else:
         assert model.left_by_body < 0.5
         assert [joint for _, joint in model.joints] == [names[j] for j in order]
@@ -175,7 +177,7 @@ def test_a_body_model_is_used_where_it_explains_unseen_torques_and_pushes_are_fo
 
 
 def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_without_mass_weigh_nothing():
-    carried = BodyModel.of(arm(), SENSED[1:2]).torques(*np.zeros((3, 1, 1)))[0].item()
+    carried = BodyModel.of(arm(), SENSED[1:2]).torques(JointMotion(*np.zeros((3, 1, 1))))[0].item()
     up = np.cos(0.1) * np.cos(0.2)  # of the lift's axis
     assert carried == pytest.approx((4 + 3 + 2 + 0.7 + 1) * 9.81 * up)
     mimic = arm().replace(
@@ -184,7 +186,7 @@ def test_joints_that_nobody_senses_and_joints_that_mimic_are_fixed_and_links_wit
     assert BodyModel.of(mimic, SENSED[1:]).names == ("lift", "shoulder")
     massless = re.sub("<inertial>.*?</inertial>", "", arm())
     np.testing.assert_allclose(
-        BodyModel.of(massless, SENSED).torques(*np.ones((3, 1, 3))), 0.0, atol=1e-9
+        BodyModel.of(massless, SENSED).torques(JointMotion(*np.ones((3, 1, 3)))), 0.0, atol=1e-9
     )
 
 
@@ -221,7 +223,7 @@ def recorded(seconds: float, seed: int = 0, rate: float = 100.0) -> dict[str, np
     q = sum(size * np.sin(np.outer(t, w[k]) + phase[k]) for k in range(2))
     v = sum(size * w[k] * np.cos(np.outer(t, w[k]) + phase[k]) for k in range(2))
     a = -sum(size * w[k] ** 2 * np.sin(np.outer(t, w[k]) + phase[k]) for k in range(2))
-    load = np.add(*BodyModel.of(arm(), ["q"] * 3).torques(q, v, a))
+    load = np.add(*BodyModel.of(arm(), ["q"] * 3).torques(JointMotion(q, v, a)))
     said = {"position": q, "velocity": v, "effort": load + 0.5 * np.tanh(v / 0.02) + 0.2 * v}
     return {"time": t} | {
         n: x + s * rng.normal(size=q.shape) for (n, x), s in zip(said.items(), NOISE, strict=True)
@@ -246,7 +248,7 @@ def test_a_memory_expects_torques_by_it_and_needs_the_file_no_more(tmp_path):
     )
     asm.fit(cut[:20]).calibrate(cut[20:], 0.1).save(tmp_path / "x.asm")
     assert isinstance(asm.values_.monitor.model, ValueAssociation)
-    assert asm.values_.monitor.model.links is not None
+    assert asm.values_.monitor.model.body is not None
     (tmp_path / "arm.urdf").unlink()
     again = load_monitor(tmp_path / "x.asm")
     np.testing.assert_array_equal(again.score(cut[25]).value, asm.score(cut[25]).value)

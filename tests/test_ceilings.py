@@ -34,7 +34,7 @@ def shaken(episodes, column=3, by=4.0):
 def test_of_many_episodes_a_third_sets_ceilings_and_the_others_the_threshold(asm):
     hours = list(shaken(sine_episodes(450, seed=20)))
     before, detection = asm.detection.detector_, asm.detection
-    maxima = calibration._worst_of(asm, detection, hours[::3])
+    maxima = np.array(calibration._largest_strengths(asm, detection, hours[::3]))
     asm.calibrate(hours, false_alarm_rate=0.05)
     after = asm.detection.detector_
     np.testing.assert_allclose((maxima <= after.ceiling).mean(axis=0), HOURS_QUANTILE, atol=0.01)

@@ -7,10 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from asm_gym.checkpoint import read_checkpoint
 from asm_gym.data.episode import Episode
 from asm_gym.detection import EvidenceDetection, ModelOutput
 from asm_gym.detection.conformal import episode_threshold
-from asm_gym.detection.scores import WINDOW, Largest, Mahalanobis, MovingMean, Squares
+from asm_gym.detection.scores import AVERAGED_ROWS, Largest, Mahalanobis, MovingMean, Squares
 from asm_gym.monitors import (
     DETECTIONS,
     MONITORS,
@@ -152,6 +153,21 @@ def test_another_threshold_and_another_fit_leave_the_first_monitor_as_it_is(kalm
         kalman.with_threshold(np.nan)
 
 
+def test_a_copy_is_described_on_its_own(kalman):
+    other = kalman.with_threshold(np.inf)
+    other.about["tasks"] = ["Lift"]
+    assert "tasks" not in kalman.about
+
+
+def test_a_file_without_a_threshold_leaves_none_of_another_calibration(kalman, tmp_path):
+    calibrated = kalman.with_threshold(3.0)
+    kalman.with_detection("evidence").save(tmp_path / "other.asm")
+    calibrated.restore(read_checkpoint(tmp_path / "other.asm", "kalman"))
+    assert calibrated.threshold_ is None
+    assert calibrated.maxima_ is None
+    assert calibrated.with_threshold(3.0).with_learned(kalman.learned_).threshold_ is None
+
+
 def test_scores_of_the_literature_are_what_they_say():
     spec, place = sine_spec(2, 0), lambda parts: parts
     output = ModelOutput(np.array([[3.0, -4.0]], np.float32), np.zeros((1, 0)))
@@ -161,14 +177,18 @@ def test_scores_of_the_literature_are_what_they_say():
     white = Mahalanobis(spec).restore({"mahalanobis": np.diag([1.0, 0.5])})
     assert white.attribute_step((), output, rows, place)[1].tolist() == [[9.0, 4.0]]
     mean, state, said = MovingMean(spec), MovingMean(spec).start(1, 2), []
-    for n in range(WINDOW + 1):
+    for n in range(AVERAGED_ROWS + 1):
         state, parts = mean.attribute_step(
             state, ModelOutput(np.full((1, 2), n), output.contexts), rows, place
         )
         said.append(parts[0, 0])
-    squares = np.arange(WINDOW + 1) ** 2
+    squares = np.arange(AVERAGED_ROWS + 1) ** 2
     np.testing.assert_allclose(
-        said, [*(np.cumsum(squares) / np.arange(1, WINDOW + 2))[:WINDOW], squares[1:].mean()]
+        said,
+        [
+            *(np.cumsum(squares) / np.arange(1, AVERAGED_ROWS + 2))[:AVERAGED_ROWS],
+            squares[1:].mean(),
+        ],
     )
 
 

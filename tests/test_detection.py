@@ -20,7 +20,7 @@ from asm_gym.detection import (
 )
 from asm_gym.detection.alarm_rule import MINUTE
 from asm_gym.detection.conformal import Promise, episode_threshold, hourly_promise, hourly_threshold
-from asm_gym.detection.detector import USUAL, habituate, usual_levels
+from asm_gym.detection.detector import USUAL_QUANTILE, habituate, usual_levels
 from asm_gym.detection.evidence import (
     CONTEXT_GAIN,
     POWER,
@@ -35,6 +35,7 @@ from asm_gym.detection.repetition import (
     MOST_BEYOND,
     REPETITION_OFFSET,
     Repetition,
+    RepetitionWeights,
     count_repetitions,
     evidence_steps,
 )
@@ -117,7 +118,7 @@ def test_habituation_finds_the_quantile_of_each_context_and_no_more_than_nominal
     found = habituate(context, level, rng)
     for which in (0, 1):
         below = (level < context @ found[:2] + found[2])[context[:, which] > 0].mean()
-        assert below == pytest.approx(USUAL, abs=0.015)
+        assert below == pytest.approx(USUAL_QUANTILE, abs=0.015)
     contexts = [rng.normal(size=(100, 40)).astype(np.float32) for _ in range(90)]
     limited = usual_levels(contexts, [2.0 * c[:, 0] + rng.normal(size=100) for c in contexts], rng)
     nominal, wild = usual(limited, np.concatenate(contexts)), usual(limited, 1e3 * contexts[0])
@@ -303,10 +304,14 @@ def test_faults_above_the_ceiling_and_confirmed_alarms_do_not_move_it():
 
 def repetitions(rows: np.ndarray, counted: np.ndarray, most: float = np.inf) -> list[Repetition]:
     state, states = Repetition.start(1, rows.shape[1]), []
+    weights = RepetitionWeights(
+        columns=np.arange(rows.shape[1]),
+        steps=evidence_steps(counted[:2]),
+        most=np.full(rows.shape[1], most),
+        offset=np.zeros(rows.shape[1]),
+    )
     for row in rows:
-        state = state.followed_by(
-            row[None], evidence_steps(counted[:2]), np.full(rows.shape[1], most)
-        )
+        state = state.followed_by(row[None], weights)
         states.append(state)
     return states
 

@@ -452,6 +452,14 @@ def test_a_fitted_monitor_is_kept_and_a_damaged_one_is_fitted_anew(tmp_path):
     assert kept.stat().st_size > 1000
 
 
+def test_recordings_of_the_same_names_and_other_rows_share_no_fitted_monitor(tmp_path):
+    first = fitted(tmp_path, "kalman", recordings(), 0)
+    louder = [replace(r, stream=1.5 * r.stream) for r in recordings()]
+    second = fitted(tmp_path, "kalman", louder, 0)
+    episode = recordings()[0]
+    assert not np.allclose(first.score(episode).value, second.score(episode).value)
+
+
 # ------------------------------------------------------------------ tables
 
 

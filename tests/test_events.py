@@ -9,7 +9,7 @@ from asm_gym.detection.alarm_rule import EVENTS
 from asm_gym.detection.benign_events import (
     EXCUSED,
     FADING,
-    FASTEST,
+    FASTEST_JOINT,
     KNOCKED_S,
     NEAR_STOP,
     SLIPPED,
@@ -60,7 +60,7 @@ def test_what_the_senses_say_of_a_row(row, event, divisor):
 
 
 def test_a_joint_that_was_seen_on_its_way_is_at_its_stop_and_one_that_jumps_there_is_not():
-    on_its_way = 1.0 - NEAR_STOP - 0.9 * FASTEST * ARM.dt
+    on_its_way = 1.0 - NEAR_STOP - 0.9 * FASTEST_JOINT * ARM.dt
     # at 20 Hz a joint of 5 rad/s gets from there to its stop in a row
     path = [
         0.5,

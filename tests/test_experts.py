@@ -10,8 +10,8 @@ import asm_gym  # noqa: F401
 from asm_gym import collect
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.registry import EXPERTS
-from asm_gym.policies.scripted.base import Style, has_settled
-from asm_gym.policies.scripted.geometry import UP, about, flattest_side, gripping
+from asm_gym.policies.scripted.expert import Style, has_settled
+from asm_gym.policies.scripted.geometry import UP, flattest_side, pointing_down, rotation_about
 from asm_gym.policies.scripted.pick_place import (
     ASKEW,
     PALM_ACROSS,
@@ -83,8 +83,8 @@ def test_a_faster_hand_solves_its_task_sooner():
 
 @pytest.mark.parametrize("degrees", [0, 30, 44, 46, 80, 135])
 def test_fingers_close_along_the_nearest_side_of_a_cube(degrees):
-    cube, hand = about(UP, np.radians(degrees)), np.diag([1.0, -1.0, -1.0])
-    target = gripping(hand, flattest_side(cube), np.pi / 2)
+    cube, hand = rotation_about(UP, np.radians(degrees)), np.diag([1.0, -1.0, -1.0])
+    target = pointing_down(hand, flattest_side(cube), np.pi / 2)
     np.testing.assert_allclose(target[:, 2], [0, 0, -1])
     assert np.linalg.det(target) == pytest.approx(1.0)
     assert np.abs(cube.T @ target[:, 1]).max() == pytest.approx(1.0)
@@ -111,7 +111,7 @@ BREAD, BIN_AT, BIN = np.array([0.024, 0.02, 0.024]), np.array([0.1, -0.25]), np.
 
 def chosen(x, y, heading):
     """How to close on bread that lies at (x, y) in a bin, what room that leaves, and the corners of the palm."""
-    turned = about(UP, heading)
+    turned = rotation_about(UP, heading)
     closing, room = beside_walls(BREAD, turned, BIN / 2 - np.abs(np.array([x, y]) - BIN_AT))
     along = (turned @ closing)[:2]
     across = np.array([-along[1], along[0]])

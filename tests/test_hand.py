@@ -7,7 +7,8 @@ import pytest
 
 from asm_gym.compilation import compiled
 from asm_gym.detection.kinematics import Chain
-from asm_gym.guard.hand_check import HandChecks, compare_hands_of
+from asm_gym.guard.hand_check import HandChecks
+from asm_gym.guard.hand_comparison import compare_hands_of
 from asm_gym.monitors import NeuralASM
 from asm_gym.wrappers import NeuralASMSafety
 
@@ -82,7 +83,7 @@ class Check:
 
     @property
     def vouched(self):
-        return self.hands.right(0)
+        return self.hands.consistent(0)
 
 
 def said(check, stream, since=0, missing=None):

@@ -37,7 +37,7 @@ def record(guard, seed, value, policy="down", kind="hostile", success=True):
         "over_s": value / 100,
         "alarms": 2,
         "cost": 5.0,
-        "held": 0,
+        "overridden": 0,
         "time": 2.0 if success else np.nan,
     }
     return case | forces | {"guard": guard, "seed": seed, "success": success}

@@ -6,6 +6,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import asm_gym  # noqa: F401
+from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.backend import CONTROLLERS
 from asm_gym.envs.control import YIELDS_AT
 from asm_gym.envs.robots import robot_named
@@ -167,6 +168,22 @@ def test_a_flag_left_behind_is_forgotten_by_reset_and_used_up_by_a_step(lift):
     env.holding = True
     assert env.step(action)[4]["stream"][at][0] == 0.0
     assert env.step(action)[4]["stream"][at][0] == 0.5
+
+
+def test_what_pressed_in_an_episode_before_changes_no_bit_of_a_hold_in_the_next_one():
+    env = gym.make("asm_gym/Stack-v0").unwrapped  # Lift loads its model anew
+
+    def held_at_once():
+        env.reset(seed=3)
+        env.holding = True
+        return np.stack([env.step(np.zeros(7, np.float32))[4]["stream"] for _ in range(4)])
+
+    expected = held_at_once()
+    env.reset(seed=5)
+    env.contact_limits = ContactLimits(wrist_force=0.01, external_torque=0.01)
+    assert env.step(np.zeros(7, np.float32))[4]["contact_load"] > 1.0
+    np.testing.assert_array_equal(held_at_once(), expected)
+    env.close()
 
 
 @pytest.mark.slow

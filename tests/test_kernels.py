@@ -27,17 +27,17 @@ def test_a_solution_solves_and_where_a_matrix_is_singular_numbers_that_depend_on
     M, L = A @ A.T, np.empty((6, 6))
     b = rng.standard_normal((2, 6))
     x = b.copy()
-    called(control.solve)(M, 6, L, x, 1)
+    called(control.solve)(M, 6, L, x[1])
     np.testing.assert_allclose(M @ x[1], b[1], atol=1e-10)
     np.testing.assert_array_equal(x[0], b[0])
     x = np.array([[4.0, 3.0, 2.0]])
-    called(control.solve)(np.diag([2.0, 0.0, 1.0]), 3, L, x, 0)
+    called(control.solve)(np.diag([2.0, 0.0, 1.0]), 3, L, x[0])
     np.testing.assert_allclose(x, [[2.0, 0.0, 2.0]], atol=1e-12)
     x = np.array([[2.0, 2.0, 5.0]])
-    called(control.solve)(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 3, L, x, 0)
+    called(control.solve)(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 3, L, x[0])
     np.testing.assert_allclose(x, [[2.0, 0.0, 5.0]], atol=1e-12)
     x = np.ones((1, 3))
-    called(control.solve)(np.full((3, 3), np.nan), 3, L, x, 0)
+    called(control.solve)(np.full((3, 3), np.nan), 3, L, x[0])
     np.testing.assert_array_equal(x, 0.0)
 
 
@@ -52,9 +52,11 @@ def test_an_arms_mass_matrix_and_jacobian_and_its_hands_velocity_are_mujocos(som
     nominal, samples = somewhere.nominal.unedited, np.zeros((1, 1, kernels.SAMPLE))
     called(control.read_arm)(somewhere.views, nominal, arms[0], work)
     kernels.sample(somewhere.views, nominal, arms, 0, samples)
-    np.testing.assert_array_equal(work.M, whole[np.ix_(dofs, dofs)])
-    np.testing.assert_array_equal([work.h, work.v], [data.qfrc_bias[dofs], data.qvel[dofs]])
-    np.testing.assert_allclose(work.J, np.vstack([linear, angular])[:, dofs], atol=1e-12)
+    np.testing.assert_array_equal(work.mass, whole[np.ix_(dofs, dofs)])
+    np.testing.assert_array_equal(
+        [work.bias, work.velocities], [data.qfrc_bias[dofs], data.qvel[dofs]]
+    )
+    np.testing.assert_allclose(work.jacobian, np.vstack([linear, angular])[:, dofs], atol=1e-12)
     velocity = np.concatenate([linear @ data.qvel, angular @ data.qvel])
     np.testing.assert_allclose(samples[0, 0, kernels.VELOCITY], velocity, atol=1e-12)
 
@@ -71,10 +73,10 @@ def test_operational_space_torques_are_robosuites(n):
     _, position, turning, nullspace = opspace_matrices(M, J, J[:3].copy(), J[3:].copy())
     decoupled = np.concatenate([position @ wrench[:3], turning @ wrench[3:]])
     expected = J.T @ decoupled + bias + nullspace_torques(M, nullspace, rest, q, v)
-    work.M[:n, :n], work.J[:, :n], work.h[:n], work.F[0] = M, J, bias, wrench
-    work.tau[:n] = M @ (10 * (rest - q) - 2 * np.sqrt(10) * v)
+    work.mass[:n, :n], work.jacobian[:, :n], work.bias[:n], work.force[:] = M, J, bias, wrench
+    work.torques[:n] = M @ (10 * (rest - q) - 2 * np.sqrt(10) * v)
     called(control.osc_torques)(work, n)
-    np.testing.assert_allclose(work.tau[:n], expected, atol=1e-9)
+    np.testing.assert_allclose(work.torques[:n], expected, atol=1e-9)
 
 
 def test_a_summary_is_the_mean_the_signed_peak_and_the_last():

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 
 from asm_gym.data import live
+from asm_gym.data.alarm_reasons import blamed, reason
+from asm_gym.data.bridging import Bridge, bridged, filled
 from asm_gym.data.live import SourceDied, live_source, record
 from asm_gym.data.live_clock import NEWEST, Pace
 from asm_gym.data.logs import read_logs
@@ -22,7 +24,6 @@ from asm_gym.data.publishers import Publishers
 from asm_gym.data.rows import RowReader
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints
-from asm_gym.data.timing import Bridge, blamed, bridged, filled, reason
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 
@@ -396,7 +397,7 @@ def test_a_source_that_makes_no_sense_is_refused(source, message):
 
 def paced(stamps: np.ndarray, dt: float = 0.02) -> tuple[list[int | None], Pace]:
     pace = Pace(dt)
-    return [pace.lost(float(t)) for t in stamps], pace
+    return [pace.rows_lost_before(float(t)) for t in stamps], pace
 
 
 def test_every_row_of_its_own_rate_is_read_however_it_jitters():
@@ -411,7 +412,7 @@ def test_every_row_of_its_own_rate_is_read_however_it_jitters():
 def test_of_another_rate_nothing_is_judged_until_it_is_right_again(step):
     other = step * np.arange(100)
     found, pace = paced([*other, *(other[-1] + 0.02 * np.arange(1, 100))])
-    assert pace.right
+    assert pace.is_right
     assert found[NEWEST:100] == [None] * (100 - NEWEST)
     assert found[-30:] == [0] * 30
 

@@ -18,10 +18,10 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 
+from asm_gym.data.bridging import bridge_of
 from asm_gym.data.episode import Episode
 from asm_gym.data.logs import Log
 from asm_gym.data.rows import SourceDied
-from asm_gym.data.timing import bridge_of
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK
 from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -248,8 +248,6 @@ def test_what_a_watch_writes_stays_in_its_folder_and_holds_no_formula(
         str(tmp_path / "x.asm"),
         "--out",
         str(out),
-        "--figures",
-        "2",
     ]
     monkeypatch.setattr("sys.argv", ["asm-gym", *command])
     assert main(command) == 1

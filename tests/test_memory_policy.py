@@ -21,7 +21,7 @@ from asm_gym.monitors.memory_policy import (
     CommandReadout,
     NeuralASMPolicy,
 )
-from asm_gym.monitors.skills import learn_to_act, lessons
+from asm_gym.monitors.skills import learn_to_act, next_commands
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec
@@ -119,10 +119,10 @@ def test_a_situation_is_paired_with_what_was_intended_next():
     stream = np.arange(40.0).reshape(4, 10)
     done = Episode.from_stream(stream, spec)
     intended = replace(done, actions=np.full((4, 2), 7.0, np.float32))
-    m, commands = lessons(senses, [done])
+    m, commands = next_commands(senses, [done])
     np.testing.assert_array_equal(m[:, 0], PLACED * stream[:3, 0])
     np.testing.assert_array_equal(commands, stream[1:, 8:])
-    np.testing.assert_array_equal(lessons(senses, [intended])[1], np.full((3, 2), 7.0))
+    np.testing.assert_array_equal(next_commands(senses, [intended])[1], np.full((3, 2), 7.0))
 
 
 def test_the_memory_steers_to_the_goal_and_closes_there(pilot):

@@ -174,17 +174,17 @@ def test_a_sense_that_sticks_is_alone_over_its_ceiling_and_counts_no_more_once_l
     rng = np.random.default_rng(0)
     trained = learn_settling(trajectories(reader, train), 64, schedule, rng, lambda: None)
     model = closed_loop.Settling(reader, trained.network, train)
-    assert np.mean([model.felt(e.stream)[1] ** 2 for e in train]) == pytest.approx(1.0, abs=0.1)
+    assert np.mean([model.read_stream(e.stream)[1] ** 2 for e in train]) == pytest.approx(1.0, abs=0.1)
     model.ceilings = 1.5 * np.max(
-        [model.felt(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0
+        [model.read_stream(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0
     )
     stuck = wandering(30).stream.astype(np.float64)
     stuck[40:, workspace.JOINTS] = stuck[40, workspace.JOINTS]
-    energies = model.felt(stuck)[2][42:48].max(axis=0)
+    energies = model.read_stream(stuck)[2][42:48].max(axis=0)
     assert energies.argmax() == list(workspace.GROUPS).index("joint")
     assert energies[0] > 1.0
     stuck[40:, workspace.JOINTS] = np.nan
-    assert model.felt(stuck)[2][50:, 0].max() < 1e-3
+    assert model.read_stream(stuck)[2][50:, 0].max() < 1e-3
 
 
 def test_every_task_is_seen_by_the_same_senses(lift):

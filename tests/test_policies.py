@@ -5,7 +5,7 @@ import pytest
 
 from asm_gym.policies import make_policy, rollout
 from asm_gym.policies.hold import Hold
-from asm_gym.policies.scripted.base import Style
+from asm_gym.policies.scripted.expert import Style
 from tests.fakes import FakeEnv
 
 

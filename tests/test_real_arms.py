@@ -10,8 +10,8 @@ from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.scripts.cli import main
 from asm_gym.scripts.reproduce import real_arms
 from asm_gym.scripts.reproduce.real_arms import (
+    ADDED_FAULTS,
     ARMS,
-    FAULTS,
     NEWTONS,
     SLIP,
     Job,
@@ -35,7 +35,7 @@ PENDULUMS = f"""<robot name="two"><link name="base"/><link name="upper">{INERTIA
 def folder(tmp_path, monkeypatch):
     """A folder with a recording of the UR10 alone, which has two joints here."""
     monkeypatch.setattr(real_arms, "read_joint_states", lambda path: pendulum_columns(1500))
-    place = tmp_path / "arms" / ARMS["ur10"].place
+    place = tmp_path / "arms" / ARMS["ur10"].bag
     place.parent.mkdir(parents=True)
     place.touch()
     (tmp_path / "arms" / "urdf").mkdir()
@@ -56,7 +56,7 @@ def test_faults_change_one_joint_from_the_onset_on_and_nothing_else():
     for kind in ("frozen", "slipped", "late", "step"):
         found = with_fault(kind, piece, rng)
         changed = found.stream != episode.stream
-        own = slices[FAULTS[kind].column]
+        own = slices[ADDED_FAULTS[kind].column]
         assert not changed[:100].any()
         assert changed[100:, own].any(axis=0).sum() == 1
         assert not np.delete(changed, np.arange(episode.spec.size)[own], axis=1).any()
@@ -128,4 +128,4 @@ def test_every_monitor_meets_the_same_faults(folder):
         for m in ("kalman", "friction_rule")
     )
     assert one == other
-    assert set(one) == {*FAULTS, ""}
+    assert set(one) == {*ADDED_FAULTS, ""}

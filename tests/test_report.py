@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from asm_gym.evaluation import figures
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import by_condition, false_alarms
-from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.report_page import write_report
 from asm_gym.evaluation.scored_episode import InterventionOutcome, ScoredEpisode
 from asm_gym.evaluation.tables import Table, tabulate
 

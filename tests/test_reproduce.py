@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 import re
 from dataclasses import replace
 
@@ -23,9 +22,10 @@ def test_spread_is_over_seeds_and_not_over_measurements():
     records = [
         {"seed": s, "x": x, "kind": "a"} for s, xs in enumerate([(1, 3), (5, 7)]) for x in xs
     ]
-    assert kit.over_seeds(records, "x", kind="a") == pytest.approx((4.0, math.sqrt(8)))
-    assert kit.shown(records, "x", 1, kind="a") == "4.0 ± 2.8"
-    assert kit.shown(records, "x", kind="b") == ""
+    records.append({"seed": 0, "x": 1.0, "kind": "b", "when": "late"})
+    table = kit.grid("", [{"when": "early"} | record for record in records], "x", "kind", "when", 1)
+    assert table.headings == ["", "early", "late"]
+    assert table.rows == [("a", "4.0 ± 2.8", ""), ("b", "", "1.0")]
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
             "lift_sac", solved, [ten_minutes(9, 99.0)], DetectionMetrics("", faults, solved, 1.0)
         )
     ]
-    table = promises_table(marks, {1.0: 4.5, 5.0: 1.5}, 1.0)
+    table = promises_table(marks, {1.0: 4.5, 5.0: 1.5})
     assert "1.00 healthy hours" in table.caption
     assert [row[:2] for row in table.rows] == [("1", "4.5"), ("5", "1.5")]
     # peaks 5 and 6; peaks 2 to 6
@@ -117,7 +117,7 @@ def test_each_promise_is_held_against_the_alarms_of_all_that_the_memory_never_me
         ("100 % of 2", "100 % of 1"),
     ]
     severe = [marks[0]._replace(metrics=DetectionMetrics("", faults[:2], solved, 1.0))]
-    assert [row[-1] for row in promises_table(severe, {1.0: 4.5, 5.0: 1.5}, 1.0).rows] == [
+    assert [row[-1] for row in promises_table(severe, {1.0: 4.5, 5.0: 1.5}).rows] == [
         "50 % of 2",
         "100 % of 2",
     ]

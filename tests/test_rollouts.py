@@ -217,6 +217,6 @@ def test_in_a_pipe_progress_is_a_line_now_and_then_and_in_a_terminal_a_bar(monke
     ]
     assert set(seconds) == {"recording [all]"}
     out = io.StringIO()
-    with progress.stage("recording", Console(file=out, force_terminal=True, width=80), {}) as tell:
+    with progress.stage("recording", Console(file=out, force_terminal=True, width=80)) as tell:
         tell(3, 12)
     assert "12/12" in out.getvalue()

@@ -79,7 +79,6 @@ def test_a_hard_push_raises_an_alarm_even_in_a_memory_that_has_learned_little(fo
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--on-alarm", "dance"], "graded"),
         (["--workers", "0"], "workers"),
         (["asm_gym/Juggle-v0"], "Juggle"),
         (["Lfit"], "did you mean 'Lift'?"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from asm_gym.scaling import FARTHEST, StreamScaler
+from asm_gym.scaling import FARTHEST_NUMBER, StreamScaler
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 SPEC = StreamSpec(
@@ -59,7 +59,7 @@ def test_a_gap_hides_the_value_and_the_changes_on_both_its_sides(streams):
 def test_huge_numbers_are_cut_off_and_stay_finite(streams):
     senses = StreamScaler.fit(SPEC, streams)
     reading = senses.read(np.full((1, 4), 1.7e308), np.full((1, 4), -1.7e308), np.zeros((1, 4)))
-    assert (reading.senses == FARTHEST).all()
-    assert (reading.changes == FARTHEST).all()
+    assert (reading.senses == FARTHEST_NUMBER).all()
+    assert (reading.changes == FARTHEST_NUMBER).all()
     assert not reading.inputs[0, :-1].any()  # nothing is expected from them
     assert reading.seen.all()

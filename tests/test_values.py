@@ -17,8 +17,8 @@ from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_mo
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
 from asm_gym.monitors.stream_model import model_outputs
 from asm_gym.monitors.surprise import Surprise
-from asm_gym.monitors.torque.arm_features import forces, judged_by_values, motion
-from asm_gym.monitors.torque.value_association import ValueAssociation, averaged
+from asm_gym.monitors.torque.arm_features import judged_by_values, motion_columns, torque_columns
+from asm_gym.monitors.torque.value_association import ValueAssociation, running_mean
 from asm_gym.monitors.torque.value_judge import ValueJudge
 from asm_gym.scripts.cli import main
 from asm_gym.spec import Channel
@@ -67,7 +67,7 @@ def test_errors_are_averaged_over_a_tenth_of_a_second_each_over_its_own_largest_
     expected = [padded[t : t + 10].sum(axis=0) / 10 / model.learned_["largest"] for t in range(100)]
     np.testing.assert_allclose(found, expected, atol=1e-12)
     np.testing.assert_allclose(
-        averaged(np.array(left), 10), np.array(expected) * model.learned_["largest"], atol=1e-12
+        running_mean(np.array(left), 10), np.array(expected) * model.learned_["largest"], atol=1e-12
     )
     most = [np.abs(o.errors).max(axis=0) for o in model_outputs(model, cut[:20])]
     assert (
@@ -109,8 +109,8 @@ def test_torques_are_judged_however_well_they_are_told_and_where_an_arm_may_go_i
     model = ValueAssociation(cut[0].spec).fit(
         cut, np.random.default_rng(0), lambda done, total: None
     )
-    assert forces(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
-    assert motion(cut[0].spec).tolist() == [0, 1, 2, 3]
+    assert torque_columns(cut[0].spec).tolist() == model.error_columns.tolist() == [4, 5]
+    assert motion_columns(cut[0].spec).tolist() == [0, 1, 2, 3]
     assert model.learned_["R2_values"][5] < 0.5
 
 
@@ -160,13 +160,13 @@ def test_changes_count_for_less_as_the_variance_of_a_regression_in_a_fresh_row_s
     lag = senses.lag
     np.testing.assert_allclose(found[:lag], 1.0)  # no change is known yet
     np.testing.assert_allclose(found[lag:], root[lag:], rtol=1e-4)
-    again = ValueJudge.found(cut[0].spec, values.arrays, seed=0)
+    again = ValueJudge.restored(cut[0].spec, values.arrays, seed=0)
     np.testing.assert_array_equal(again.leverage, values.leverage)
     with pytest.raises(ValueError, match="the leverage of values should be of shape"):
-        ValueJudge.found(cut[0].spec, values.arrays | {"values.leverage": np.eye(3)}, seed=0)
+        ValueJudge.restored(cut[0].spec, values.arrays | {"values.leverage": np.eye(3)}, seed=0)
     old = {name: array for name, array in values.arrays.items() if name != "values.far"}
     with pytest.raises(ValueError, match="has no far: make it anew"):
-        ValueJudge.found(cut[0].spec, old, seed=0)
+        ValueJudge.restored(cut[0].spec, old, seed=0)
 
 
 def test_the_rule_takes_friction_from_torque_and_needs_a_speed():

@@ -2,7 +2,7 @@
 
 For each number u of the action, and each sense x with its change d_t = x_t - x_{t-1} in a row,
 
-    d_t = a d_{t-1} + b u_{t-k} + c x_{t-1} + e         k = 0 … LATEST
+    d_t = a d_{t-1} + b u_{t-k} + c x_{t-1} + e         k = 0 … LATEST_LAG
 
     target    c < 0, and x follows u: the state moves towards the action, and stays at u = -(c x + e)/b
     delta     c ~ 0: it moves by the action, and stays at 0; a velocity likewise
@@ -29,33 +29,31 @@ from asm_gym.data.action_meaning import (
     ActionMeaning,
 )
 from asm_gym.data.episode import Episode
-from asm_gym.data.names import SPEED
+from asm_gym.data.names import SPEED_NAME
 from asm_gym.spec import StreamSpec
 
-LATEST = 3  # most rows after which a command may act
-MOST_ROWS = 20_000  # rows that are examined
+LATEST_LAG = 3  # most rows after which a command may act
+MOST_EXAMINED_ROWS = 20_000  # rows that are examined
 FEWEST_ROWS = 50  # with fewer, nothing is known
 LEAST_EXPLAINED = 0.05  # share of the otherwise unexplained change that the action must explain
 CERTAIN = 5.0  # standard errors by which a weight must differ from 0
-RIDGE = (
-    1e-12  # variance that is added to each standardised variable, so that none is a sum of others
-)
-TOWARDS = 0.3  # pull from which on a state moves towards an action
-BY = 0.1  # pull up to which it moves by the action
-FOLLOWS = 0.8  # least correlation of a state with its target
-COASTS = 0.95  # momentum above which a state moves on by itself
-OWN = (
-    1.1  # preference for a sense of the action's own element, such as state[elbow] of action[elbow]
-)
-RATE = 0.9  # least correlation of a rate with the change of its sense
+# Variance that is added to each standardised variable, so that none is a sum of others.
+RIDGE = 1e-12
+TARGET_PULL = 0.3  # pull from which on a state moves towards an action
+DELTA_PULL = 0.1  # pull up to which it moves by the action
+TARGET_CORRELATION = 0.8  # least correlation of a state with its target
+COASTING_MOMENTUM = 0.95  # momentum above which a state moves on by itself
+# Preference for a sense of the action's own element, such as state[elbow] of action[elbow].
+OWN_PREFERENCE = 1.1
+RATE_CORRELATION = 0.9  # least correlation of a rate with the change of its sense
 USUAL_SLOPES = 1.0, np.pi / 180, 180 / np.pi  # of targets in the unit of the sense, or in degrees
-NEAR = 0.05  # slopes and offsets within this share of the usual ones are those
+NEAR_USUAL = 0.05  # slopes and offsets within this share of the usual ones are those
 
-# Variables of each column of the stream; the first LATEST + 1 are its value so many rows ago.
+# Variables of each column of the stream; the first LATEST_LAG + 1 are its value so many rows ago.
 NOW = 0
 PREVIOUS = 1
-CHANGE = LATEST + 1  # from the previous row to now
-PREVIOUS_CHANGE = LATEST + 2
+CHANGE = LATEST_LAG + 1  # from the previous row to now
+PREVIOUS_CHANGE = LATEST_LAG + 2
 
 Floats = NDArray[np.float64]
 
@@ -87,7 +85,7 @@ class _Target(NamedTuple):
     offset: float = 0.0  # -e/b
 
 
-def found_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
+def identify_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
     """Return what recorded episodes show of the numbers of their actions."""
     spec = episodes[0].spec
     variables = _variables(episodes)
@@ -119,19 +117,20 @@ def found_meaning(episodes: Sequence[Episode]) -> ActionMeaning:
 
 def _variables(episodes: Sequence[Episode]) -> Floats:
     """Return the variables (N, V, D) of recorded rows."""
-    lags = np.arange(LATEST + 1)
+    lags = np.arange(LATEST_LAG + 1)
     parts: list[Floats] = []
     for episode in episodes:
-        rows = np.arange(LATEST, len(episode))
+        rows = np.arange(LATEST_LAG, len(episode))
         values = episode.stream.astype(np.float64)[rows[:, None] - lags]
         changes = values[:, :2] - values[:, 1:3]
         parts.append(np.concatenate([values, changes], axis=1))
-        if sum(map(len, parts)) >= MOST_ROWS:
+        if sum(map(len, parts)) >= MOST_EXAMINED_ROWS:
             break
     return np.concatenate(parts)
 
 
 def _statistics(variables: Floats) -> _Statistics:
+    """Return the statistics of variables (N, V, D)."""
     rows, *shape = variables.shape
     mean = variables.mean(axis=0)
     spread = variables.std(axis=0)
@@ -152,8 +151,8 @@ def _places_and_rates(
     senses = spec.sensory
     of_changes = np.abs(statistics.correlation[CHANGE, :, NOW])  # (D, D)
     np.fill_diagonal(of_changes, 0.0)
-    is_change = of_changes[senses].max(axis=0) > RATE
-    is_named = [SPEED.fullmatch(label) is not None for label in spec.labels]
+    is_change = of_changes[senses].max(axis=0) > RATE_CORRELATION
+    is_named = [SPEED_NAME.fullmatch(label) is not None for label in spec.labels]
     is_rate = np.logical_or(is_change, is_named)[senses]
     return senses[~is_rate], senses[is_rate]
 
@@ -166,10 +165,12 @@ def _strongest(
     most = 0.0
     _, bracket, element = spec.labels[column].partition("[")
     for sense in senses.tolist():
-        is_own = spec.labels[sense].endswith(bracket + element)
-        for lag in range(LATEST + 1):
+        preference = 1.0
+        if spec.labels[sense].endswith(bracket + element):
+            preference = OWN_PREFERENCE
+        for lag in range(LATEST_LAG + 1):
             response = _response(statistics, sense, column, lag)
-            strength = response.explained * (OWN if is_own else 1.0)
+            strength = response.explained * preference
             if strength > most:
                 strongest = response
                 most = strength
@@ -178,13 +179,13 @@ def _strongest(
 
 def _meaning(place: _Response, rate: _Response) -> str:
     """Return the meaning of a number of the action that moves a place, a rate, both, or none."""
-    if place.pull >= TOWARDS and place.follows >= FOLLOWS:
+    if place.pull >= TARGET_PULL and place.follows >= TARGET_CORRELATION:
         return TARGET
-    if rate.pull < TOWARDS or place.momentum > COASTS:
+    if rate.pull < TARGET_PULL or place.momentum > COASTING_MOMENTUM:
         return TORQUE
-    if abs(place.pull) <= BY:
+    if abs(place.pull) <= DELTA_PULL:
         return DELTA
-    if rate.follows >= FOLLOWS:
+    if rate.follows >= TARGET_CORRELATION:
         return VELOCITY
     return UNKNOWN
 
@@ -202,12 +203,15 @@ def _response(statistics: _Statistics, sense: int, column: int, lag: int) -> _Re
     *variance, certainty = np.diag(precision)
     momentum, moves, returns = -precision[:3, 3] / certainty
     explained = moves**2 * certainty / variance[1]
-    if explained < max(LEAST_EXPLAINED, CERTAIN**2 / statistics.rows):
+    least_certain = CERTAIN**2 / statistics.rows
+    if explained < max(LEAST_EXPLAINED, least_certain):
         return _Response()
 
     pull = -returns / moves
-    pull_variance = (variance[2] / certainty - returns**2) / moves**2 / statistics.rows
-    if CERTAIN**2 * pull_variance > max(abs(pull), BY) ** 2:
+    return_variance = variance[2] / certainty - returns**2
+    pull_variance = return_variance / moves**2 / statistics.rows
+    least_pull = max(abs(pull), DELTA_PULL)
+    if CERTAIN**2 * pull_variance > least_pull**2:
         return _Response()
 
     return _Response(
@@ -225,9 +229,10 @@ def _target(statistics: _Statistics, column: int, place: _Response) -> _Target:
     spread = statistics.spread[NOW]
     slope = place.pull * spread[column] / spread[place.sense]
     for usual in USUAL_SLOPES:
-        if abs(slope / usual - 1) < NEAR:
+        if abs(slope / usual - 1) < NEAR_USUAL:
             slope = usual
     offset = mean[column] - slope * mean[place.sense]
-    if abs(offset) < NEAR * (spread[column] + abs(mean[column])):
+    usual_size = spread[column] + abs(mean[column])
+    if abs(offset) < NEAR_USUAL * usual_size:
         offset = 0.0
     return _Target(place.sense, float(slope), float(offset))

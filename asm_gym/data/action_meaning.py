@@ -51,7 +51,7 @@ class ActionMeaning:
         return cls(**{name: tuple(values) for name, values in saved.items()})
 
     @classmethod
-    def told(
+    def declared(
         cls,
         means: ActionMeans,
         size: int,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import MOST_BYTES, Columns, is_numeric
+from asm_gym.data.table_layout import MOST_BYTES, Columns, is_numeric
 from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 from asm_gym.files import regular_file

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import HELD, Columns
+from asm_gym.data.table_layout import HELD_PERIODS, Columns
 from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require
 
@@ -138,7 +138,7 @@ def _with_newest(rows: Any, other: Any) -> Any:
         rows,
         other[["came", *new]],
         on="came",
-        tolerance=HELD * period,
+        tolerance=HELD_PERIODS * period,
     )
 
 

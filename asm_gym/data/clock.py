@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.names import LONGER
-from asm_gym.data.tables import is_numeric
+from asm_gym.data.table_layout import is_numeric
 
 Floats = NDArray[np.float64]
 
 NUMBER = "number"
 DATE = "date"
 TIME_OF_DAY = "time of day"
-KINDS = (NUMBER, DATE, TIME_OF_DAY)
+CLOCK_KINDS = (NUMBER, DATE, TIME_OF_DAY)
 
 SINCE_1970 = 1e8  # a number of seconds from which on it counts from 1970: March 1973
 UNITS_SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (SINCE_1970, 1.0))
@@ -54,7 +54,7 @@ class LogClock:
     Args:
         columns: their names; two of them, seconds and a fraction, are added.
         units: seconds in a number of each.
-        kind: what their cells hold, one of ``KINDS``.
+        kind: what their cells hold, one of ``CLOCK_KINDS``.
         reason: why these columns are the clock.
     """
 
@@ -103,13 +103,13 @@ class LogClock:
         Raises:
             ValueError: a cell is no time.
         """
+        cells: list[Any] = [row.get(column) for column in self.columns]
+        if None in cells:
+            return None
+        if self.kind != NUMBER:
+            return self._moment_of_text(str(cells[0]).strip())
         seconds = 0.0
-        for column, unit in zip(self.columns, self.units, strict=True):
-            cell = row.get(column)
-            if cell is None:
-                return None
-            if self.kind != NUMBER:
-                return self._moment_of_text(str(cell).strip())
+        for cell, unit in zip(cells, self.units, strict=True):
             if cell == "":
                 cell = math.nan
             seconds += float(cell) * unit
@@ -144,7 +144,7 @@ def numbers_of(column: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def kind_of(column: str, values: NDArray[Any]) -> str:
-    """Return what the cells (T,) of a clock hold, one of ``KINDS``.
+    """Return what the cells (T,) of a clock hold, one of ``CLOCK_KINDS``.
 
     Raises:
         ValueError: they hold no times.
@@ -155,10 +155,11 @@ def kind_of(column: str, values: NDArray[Any]) -> str:
         return DATE
     if is_numeric(values):
         return NUMBER
-    text = _text(values)
-    if (pd.to_numeric(text, errors="coerce").notna() | text.isna()).all():
+    text = _text(values).dropna()
+    numbers = pd.to_numeric(text, errors="coerce")
+    if numbers.notna().all():
         return NUMBER
-    if text.str.fullmatch(_TIME_OF_DAY).fillna(True).all():
+    if text.str.fullmatch(_TIME_OF_DAY).all():
         return TIME_OF_DAY
     _nanoseconds(column, values)
     return DATE
@@ -175,8 +176,9 @@ def _refuse_words(column: str, text: Any, numbers: Any) -> None:
     """Raise ValueError if a cell of ``text`` became no number."""
     wrong = text[numbers.isna() & text.notna()]
     if len(wrong):
+        example = str(wrong.iloc[0])[:40]
         raise ValueError(
-            f"the clock {column!r} must hold a time, got {str(wrong.iloc[0])[:40]!r}: "
+            f"the clock {column!r} must hold a time, got {example!r}: "
             "--rate HZ reads the rows without it"
         )
 
@@ -190,12 +192,16 @@ def _since_first(numbers: NDArray[Any], unit: float, least: float) -> Times:
         least: first time from which on it is the origin [s]; that of others is 0.
     """
     known = numbers[np.isfinite(numbers)]
-    if not len(known) or float(known[0]) * unit < least:
+    if not len(known):
         return Times(0.0, numbers * unit)
     first = known[0]
+    origin = float(first) * unit
+    if origin < least:
+        return Times(0.0, numbers * unit)
     if numbers.dtype.kind in "biu":
         numbers = numbers.astype(np.int64)
-    return Times(float(first) * unit, np.asarray(numbers - first, np.float64) * unit)
+    since_first = np.asarray(numbers - first, np.float64)
+    return Times(origin, since_first * unit)
 
 
 def _seconds_of_day(values: NDArray[Any]) -> Floats:
@@ -203,8 +209,10 @@ def _seconds_of_day(values: NDArray[Any]) -> Floats:
     import pandas as pd
 
     text = _text(values).str.replace(",", ".", regex=False)
-    seconds = (pd.to_timedelta(text) / pd.Timedelta(seconds=1)).to_numpy(np.float64)
-    midnights = np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -DAY_S / 2)
+    durations = pd.to_timedelta(text)
+    seconds = durations.dt.total_seconds().to_numpy(np.float64)
+    steps = np.diff(seconds, prepend=seconds[:1])
+    midnights = np.cumsum(steps < -DAY_S / 2)
     return np.asarray(seconds + DAY_S * midnights)
 
 
@@ -224,8 +232,7 @@ def _nanoseconds(column: str, values: NDArray[Any]) -> NDArray[Any]:
     text = _text(values)
     ends = text.dropna().iloc[[0, -1]]
     orders: list[dict[str, Any]] = [DAY_FIRST, MONTH_FIRST]
-    if len(text) > 1:
-        orders.sort(key=lambda order: _span(ends, order))
+    orders.sort(key=lambda order: _span(ends, order))
     for order in (ISO, *orders):
         with suppress(ValueError, TypeError):
             dates = pd.to_datetime(text, utc=True, **order).dt.as_unit("ns")

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import DATE, DAY_S, NUMBER, LogClock, kind_of, numbers_of, unit_by_size
 from asm_gym.data.column_behaviour import are_whole, finite
-from asm_gym.data.names import CLOCK, COUNTERS, LONGER, SECONDS, is_clock, split_unit
+from asm_gym.data.names import CLOCK_NAME, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import is_numeric
+from asm_gym.data.table_layout import is_numeric
 
 Floats = NDArray[np.float64]
 Table = Mapping[str, NDArray[Any]]
@@ -28,12 +28,12 @@ Table = Mapping[str, NDArray[Any]]
 MOST_REPEATED = 0.02  # share of rows that may have the stamp of the row before: written twice
 DISAGREE = 0.01  # share by which two clocks may differ before the user is told
 ALIKE = 0.2  # share by which a clock may differ from the memory that tells its unit
-SHORTEST_S = 1e-3  # plausible times from row to row, which tell a unit,
-LONGEST_S = 1.0  # from this to that [s]
+SHORTEST_PERIOD_S = 1e-3  # plausible times from row to row, which tell a unit,
+LONGEST_PERIOD_S = 1.0  # from this to that [s]
 LEAST_DATE = 3e4  # Excel and MATLAB count days, from 1982 on so many
 LEAST_STAMP = 1e14  # microseconds since 1970, in March 1973: few other numbers are as large
 RISES = "rises from row to row"
-UNNAMED_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+UNNAMED_UNITS = ("s", "ms", "us", "ns")  # in which a clock that says no unit may count
 
 _FRACTION = re.compile(
     r"(?P<stem>.*?)[._\[ ]*(?P<unit>nanosec(?:ond)?s?|nanos|nsecs?|ns|usecs?|us|micros)\]?", re.I
@@ -87,8 +87,9 @@ def _pairs(names: Sequence[str]) -> dict[str, NamedClock]:
         before = name[: match.start("unit")]
         behind = name[match.end("unit") :]
         for word in _SECONDS:
-            seconds = by_lower_name.get(f"{before}{word}{behind}".lower(), name)
-            if seconds != name:
+            called = f"{before}{word}{behind}".lower()
+            seconds = by_lower_name.get(called)
+            if seconds is not None:
                 pairs.setdefault(seconds, NamedClock((seconds, name), (1.0, unit)))
     return pairs
 
@@ -97,7 +98,7 @@ def unit_by_name(name: str) -> float | None:
     """Return the seconds in a number of a clock's column, by its name; None if that says none."""
     if name.lower() == "ipoc":
         return 1e-3  # KUKA's counter of milliseconds
-    match = CLOCK.fullmatch(name.strip())
+    match = CLOCK_NAME.fullmatch(name.strip())
     if match is not None and match["unit"]:
         return SECONDS[match["unit"].lower()]
     in_brackets = split_unit(name)[1].lower()
@@ -157,7 +158,8 @@ def clock_called(wanted: str, names: Collection[str]) -> NamedClock:
     headers |= {name: name for name in names}
     header = headers.get(wanted) or headers.get(bare)
     if header is None:
-        raise ValueError(f"no column is called {wanted!r}; there are: {', '.join(names)[:300]}")
+        known = ", ".join(names)
+        raise ValueError(f"no column is called {wanted!r}; there are: {known[:300]}")
     if header == wanted or not unit:
         return _clock_of(header, _pairs(list(names)))
     if unit.lower() not in LONGER:
@@ -190,27 +192,26 @@ def resolve(named: NamedClock, table: Table, dt: float | None, reason: str) -> L
 def _unit_of(column: str, numbers: NDArray[Any], dt: float | None) -> float:
     """Return the seconds in a number of a clock that says no unit, and tell the user."""
     known = finite(numbers)
-    if not len(known):
-        return 1.0
-    by_size = unit_by_size(known[0])
+    by_size = None
+    if len(known):
+        by_size = unit_by_size(known[0])
     if by_size is not None or len(known) < 3:
         return by_size or 1.0
     step = float(np.median(np.diff(known)))
     if step <= 0:
         return 1.0
 
-    name = plausible_unit(step, dt, are_whole(known))
-    unit = UNNAMED_UNITS[name]
-    if known[0] > LEAST_DATE and step * DAY_S < LONGEST_S:
-        name = "days"
-        unit = DAY_S
-    if unit != 1.0:
+    unit = plausible_unit(step, dt, are_whole(known))
+    if known[0] > LEAST_DATE and step * DAY_S < LONGEST_PERIOD_S:
+        unit = "days"
+    if unit != "s":
+        rate = 1 / (step * LONGER[unit])
         note(
-            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {name}, "
-            f"{1 / (step * unit):.4g} rows a second; in s it would be {1 / step:.4g}: "
+            f"{column!r} goes on by {step:g} from row to row and says no unit: read in {unit}, "
+            f"{rate:.4g} rows a second; in s it would be {1 / step:.4g}: "
             f"--clock '{column} [s]', or the line `clock` of the schema, says otherwise"
         )
-    return unit
+    return LONGER[unit]
 
 
 def plausible_unit(step: float, dt: float | None, is_whole: bool) -> str:
@@ -221,15 +222,18 @@ def plausible_unit(step: float, dt: float | None, is_whole: bool) -> str:
         dt: period of the memory that reads it; None without one [s].
         is_whole: all its numbers are whole.
     """
-    shortest = SHORTEST_S
-    longest = LONGEST_S
+    shortest = SHORTEST_PERIOD_S
+    longest = LONGEST_PERIOD_S
     if dt is not None:
         shortest = dt * (1 - ALIKE)
         longest = dt * (1 + ALIKE)
-    plausible = [name for name, unit in UNNAMED_UNITS.items() if shortest <= step * unit <= longest]
+    units = UNNAMED_UNITS
     if dt is None and is_whole:
-        plausible.reverse()  # 0, 1, 2, … is a controller's count of ms, and no log of seconds
-    return next(iter(plausible), "s")
+        units = units[::-1]  # 0, 1, 2, … is a controller's count of ms, and no log of seconds
+    for unit in units:
+        if shortest <= step * LONGER[unit] <= longest:
+            return unit
+    return "s"
 
 
 def _candidate(named: NamedClock, table: Table, dt: float | None) -> _Candidate:
@@ -250,9 +254,10 @@ def _candidate(named: NamedClock, table: Table, dt: float | None) -> _Candidate:
     repeated = float(np.mean(steps == 0.0))
     if median == 0:
         return _Candidate(clock, times, repeated)
-    jitter = float(np.median(np.abs(steps / median - 1)))
+    deviations = np.abs(steps / median - 1)
     # Rounded, so that of clocks about as steady the first column is read.
-    return _Candidate(clock, times, repeated, round(jitter, 2))
+    jitter = round(float(np.median(deviations)), 2)
+    return _Candidate(clock, times, repeated, jitter)
 
 
 def _note_disagreement(candidates: list[_Candidate]) -> None:
@@ -265,10 +270,11 @@ def _note_disagreement(candidates: list[_Candidate]) -> None:
     for other in others:
         other_span = float(np.ptp(other.times))
         if other_span > 0 and abs(other_span / span - 1) > DISAGREE:
+            rate = steps / span
+            other_rate = steps / other_span
             note(
-                f"{first.clock.name!r} and {other.clock.name!r} disagree, {steps / span:.4g} and "
-                f"{steps / other_span:.4g} rows a second: the former is read; "
-                "--clock NAME chooses"
+                f"{first.clock.name!r} and {other.clock.name!r} disagree, {rate:.4g} and "
+                f"{other_rate:.4g} rows a second: the former is read; --clock NAME chooses"
             )
 
 
@@ -308,14 +314,16 @@ def _rises(values: NDArray[Any]) -> bool:
     if not is_numeric(values) or len(values) < 3 or not np.isfinite(values).all():
         return False
     steps = np.diff(values.astype(np.float64))  # a fall of unsigned numbers would be a leap
-    return bool(np.mean(steps > 0) > 1 - MOST_REPEATED)
+    rising_share = np.mean(steps > 0)
+    return bool(rising_share > 1 - MOST_REPEATED)
 
 
 def _unit_of_rising(name: str, values: NDArray[Any]) -> float | None:
     """Return the seconds in a number of a column that rises; None if nothing tells."""
     if _is_index(name) and not are_whole(values):
         return 1.0  # an index of seconds
+    first = float(values[0])
     unit = unit_by_name(name)
-    if unit is None and float(values[0]) >= LEAST_STAMP:
-        unit = unit_by_size(float(values[0]))
+    if unit is None and first >= LEAST_STAMP:
+        return unit_by_size(first)
     return unit

@@ -10,7 +10,6 @@ sentinel        an end of the range that repeats, SENTINEL_APART ranges away fro
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from asm_gym.data.names import TAU, TURN
 
 Floats = NDArray[np.float64]
 
-FEWEST = 8  # rows from which on a column is judged
+FEWEST_JUDGED_ROWS = 8  # rows from which on a column is judged
 STEADY = 0.9  # share of steps that must be the usual one in a counter
 STRAIGHT = 2e-3  # how far a second clock is off a straight line, as a share of its range
 SENTINEL_APART = 5.0  # ranges of all other numbers between these and a sentinel
@@ -42,17 +41,20 @@ def are_whole(numbers: NDArray[Any]) -> bool:
 def is_constant(values: NDArray[Any]) -> bool:
     """Return whether a column (T,) holds numbers and never moves."""
     numbers = finite(values)
-    return len(numbers) > 0 and bool(np.ptp(numbers) == 0.0)
+    if not len(numbers):
+        return False
+    return bool(np.ptp(numbers) == 0.0)
 
 
-def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
+def counts(values: NDArray[Any], fewest: int = FEWEST_JUDGED_ROWS) -> bool:
     """Return whether a column (T,) counts rows, messages or ticks.
 
     A counter may lose rows, wrap and begin anew. An index of episodes counts too: it rises by one
     after several rows.
     """
     numbers = finite(values)
-    if len(numbers) < max(fewest, len(values)) or not are_whole(numbers):
+    lacks_some = len(numbers) < len(values)
+    if lacks_some or len(numbers) < fewest or not are_whole(numbers):
         return False
 
     steps = np.diff(numbers)
@@ -62,21 +64,22 @@ def counts(values: NDArray[Any], fewest: int = FEWEST) -> bool:
         return len(np.unique(numbers)) > 2
 
     usual = np.median(steps)
-    is_steady = np.mean(steps == usual) >= STEADY
-    if usual <= 0 or not is_steady:
+    usual_share = np.mean(steps == usual)
+    if usual <= 0 or usual_share < STEADY:
         return False
 
     rises = steps[steps > 0]
-    is_multiple = rises % usual == 0
+    skips_whole_steps = (rises % usual == 0).all()
     starts = numbers[1:][steps < 0]
-    highest_start = numbers.min() + usual * (FEWEST + 1)
-    return bool(is_multiple.all() and (starts <= highest_start).all())
+    highest_start = numbers.min() + usual * (FEWEST_JUDGED_ROWS + 1)
+    begins_low = (starts <= highest_start).all()
+    return bool(skips_whole_steps and begins_low)
 
 
 def is_second_clock(values: NDArray[Any], times: Floats) -> bool:
     """Return whether a column (T,) goes on as ``times`` (T,) do."""
     is_known = np.isfinite(values) & np.isfinite(times)
-    if len(values) < FEWEST or not is_known.all():
+    if len(values) < FEWEST_JUDGED_ROWS or not is_known.all():
         return False
 
     since = values.astype(np.float64) - float(values[0])
@@ -88,14 +91,15 @@ def is_second_clock(values: NDArray[Any], times: Floats) -> bool:
     centred = times - times.mean()
     slope, offset = np.polyfit(centred, since, 1)
     off_line = since - offset - slope * centred
-    return bool(np.abs(off_line).max() <= STRAIGHT * span)
+    farthest = np.abs(off_line).max()
+    return bool(farthest <= STRAIGHT * span)
 
 
 def wrap_period(values: NDArray[Any], unit: str) -> float:
     """Return the turn of a column (T,) that holds an angle which turns over, 360 or 2π; else 0."""
-    turns: Iterable[float] = (360.0, TAU)
+    turns = [360.0, TAU]
     if unit:
-        turns = (TURN.get(unit, 0.0),)
+        turns = [turn for name, turn in TURN.items() if name == unit]
     angle = finite(values)
     for turn in turns:
         if _turns_over(angle, turn):
@@ -105,7 +109,7 @@ def wrap_period(values: NDArray[Any], unit: str) -> float:
 
 def _turns_over(angle: Floats, turn: float) -> bool:
     """Return whether an angle (T,) jumps by a turn from one end of it to the other."""
-    if len(np.unique(angle)) <= FEWEST:
+    if len(np.unique(angle)) <= FEWEST_JUDGED_ROWS:
         return False
     lowest = angle.min()
     highest = angle.max()
@@ -113,14 +117,17 @@ def _turns_over(angle: Floats, turn: float) -> bool:
     if lowest < -0.05 * turn:
         start = -turn / 2
     end = start + turn
-    reaches_ends = lowest - start < 0.1 * turn and end - highest < 0.1 * turn
-    if not reaches_ends or highest - lowest > 1.01 * turn:
+    margin = 0.1 * turn
+    reaches_ends = lowest - start < margin and end - highest < margin
+    is_longer = highest - lowest > 1.01 * turn
+    if is_longer or not reaches_ends:
         return False
 
     steps = np.diff(angle)
     jumps = np.abs(steps) > 0.6 * turn
-    between_turns = np.abs(steps - turn * np.rint(steps / turn))
-    is_smooth = between_turns < 0.25 * turn
+    turns = np.rint(steps / turn)
+    without_turns = np.abs(steps - turn * turns)
+    is_smooth = without_turns < 0.25 * turn
     return bool(jumps.any() and is_smooth.all())
 
 
@@ -139,9 +146,9 @@ def missing_value_sentinel(values: NDArray[Any]) -> float:
             continue
         spread = np.ptp(others)
         distance = np.abs(others - sentinel).min()
-        if spread == 0 or distance <= SENTINEL_APART * spread:
-            continue
-        if abs(sentinel) >= LEAST_SENTINEL or _stands_alone(values == sentinel):
+        is_apart = spread > 0 and distance > SENTINEL_APART * spread
+        is_large = abs(sentinel) >= LEAST_SENTINEL
+        if is_apart and (is_large or _stands_alone(values == sentinel)):
             return float(sentinel)
     return math.nan
 
@@ -149,4 +156,7 @@ def missing_value_sentinel(values: NDArray[Any]) -> float:
 def _stands_alone(is_sentinel: NDArray[np.bool_]) -> bool:
     """Return whether a sentinel stands often, and mostly in single rows."""
     rows = np.flatnonzero(is_sentinel)
-    return len(rows) >= FEWEST and bool(np.mean(np.diff(rows) > 1) >= SINGLE)
+    if len(rows) < FEWEST_JUDGED_ROWS:
+        return False
+    single_share = np.mean(np.diff(rows) > 1)
+    return bool(single_share >= SINGLE)

@@ -7,7 +7,7 @@ wrapped angle        sin(2π x / wrap) and cos(2π x / wrap)
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.names import TAU, factor, label_of, split_unit
-from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.table_layout import Columns, is_numeric
 
 if TYPE_CHECKING:
     from asm_gym.data.schema import LogSchema
@@ -47,14 +47,15 @@ class ColumnMatch:
         lacking = []
         for column, place in _with_places(schema.read_columns, by_name):
             candidates = (column.name, column.label, place)
-            header = next((by_name[name] for name in candidates if name in by_name), None)
-            if header is None:
+            headers = [by_name[name] for name in candidates if name in by_name]
+            if not headers:
                 lacking.append(column.label)
                 continue
-            own_name, own_unit = split_unit(header)
-            self.headers.append(header)
+            name, unit = split_unit(headers[0])
+            units = factor(name, unit, column.unit or "1")
+            self.headers.append(headers[0])
             self._columns.append(column)
-            scales.append(column.scale * factor(own_name, own_unit, column.unit or "1"))
+            scales.append(column.scale * units)
             sentinels.append(column.missing)
         if lacking and whole:
             raise ValueError(_what_is_missing(lacking, schema, by_name))
@@ -85,16 +86,18 @@ class ColumnMatch:
 
     def _numbers(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the numbers (..., D) of a stream of those of its columns (..., C)."""
-        numbers = np.where(cells == self._sentinels, np.nan, cells) * self._scales
+        known = np.where(cells == self._sentinels, np.nan, cells)
+        scaled = known * self._scales
         if not self._wraps:
-            return numbers
+            return scaled
         parts = []
-        for k, column in enumerate(self._columns):
+        for place, column in enumerate(self._columns):
+            numbers = scaled[..., place]
             if column.wrap:
-                angle = numbers[..., k] * TAU / column.wrap
+                angle = numbers * TAU / column.wrap
                 parts += [np.sin(angle), np.cos(angle)]
             else:
-                parts.append(numbers[..., k])
+                parts.append(numbers)
         return np.stack(parts, axis=-1)
 
 
@@ -106,17 +109,20 @@ def _headers_by_name(names: Iterable[str]) -> dict[str, str]:
 
 
 def _with_places(
-    columns: Iterable[LogColumn], by_name: Mapping[str, str]
+    columns: Sequence[LogColumn], by_name: Mapping[str, str]
 ) -> Iterator[tuple[LogColumn, str]]:
     """Yield each column, and its place in a list of its channel, ``q[1]``, if no name is there."""
-    columns = list(columns)
-    named = {c.channel for c in columns if c.name in by_name or c.label in by_name}
+    named = set()  # channels of which a column is there by name
+    for column in columns:
+        if column.name in by_name or column.label in by_name:
+            named.add(column.channel)
     count = Counter[str]()
     for column in columns:
+        channel = column.channel
         place = ""
-        if column.channel not in named:
-            place = f"{column.channel}[{count[column.channel]}]"
-        count[column.channel] += 1
+        if channel not in named:
+            place = f"{channel}[{count[channel]}]"
+        count[channel] += 1
         yield column, place
 
 
@@ -124,7 +130,8 @@ def _what_is_missing(lacking: list[str], schema: LogSchema, by_name: Mapping[str
     """Say which columns of a schema are not there, and which are there that it does not know."""
     message = f"the memory reads channels that are not there: {', '.join(lacking)}"
     known = {by_name.get(name) for name in schema.names}
-    unknown = sorted(set(by_name.values()).difference(known))
+    unknown = set(by_name.values()).difference(known)
     if unknown:
-        message += f"; there are, and its schema lacks them: {', '.join(unknown)[:120]}"
+        names = ", ".join(sorted(unknown))
+        message += f"; there are, and its schema lacks them: {names[:120]}"
     return message

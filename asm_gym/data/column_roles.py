@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from asm_gym.data.clock import LogClock
 from asm_gym.data.clock_inference import clocks_among
 from asm_gym.data.column_behaviour import (
-    FEWEST,
+    FEWEST_JUDGED_ROWS,
     counts,
     is_constant,
     is_second_clock,
@@ -51,15 +51,15 @@ from asm_gym.data.log_column import (
     LogColumn,
 )
 from asm_gym.data.names import (
+    BASE_UNITS,
     COUNTERS,
     SENSE_NAME,
-    UNITS,
     element_of,
     is_command,
     split_unit,
 )
 from asm_gym.data.schema import is_called_label
-from asm_gym.data.tables import Columns, is_numeric
+from asm_gym.data.table_layout import Columns, is_numeric
 from asm_gym.data.text import DOUBLED, numbers_in
 
 Floats = NDArray[np.float64]
@@ -99,18 +99,18 @@ def classify_columns(
     Raises:
         ValueError: a pattern of ``channels`` or ``action`` matches no column.
     """
-    columns = _named_columns(tables[0])
-    named_as_read = (*hints.channels, *hints.action)
+    columns = _columns_by_header(tables[0])
+    chosen = (*hints.channels, *hints.action)
     own_stamps: Sequence[str] = ()  # columns of the clock
     if clock is not None:
         own_stamps = clock.columns
     others = [column for header, column in columns.items() if header not in own_stamps]
-    _check_patterns(named_as_read, others)
+    _check_patterns(chosen, others)
 
     stamps: set[str] = set()  # columns that are called clocks
     if not hints.channels:
-        for named in clocks_among(tables[0]):
-            stamps.update(named.columns)
+        for clock_columns in clocks_among(tables[0]):
+            stamps.update(clock_columns.columns)
     numbers = _numbers_by_header(tables)
     times = [_times_of(table, clock) for table in tables]
     originals: dict[tuple[int, ...], str] = {}  # names of columns by their cells in all tables
@@ -118,7 +118,7 @@ def classify_columns(
     for header, column in columns.items():
         column = _by_name(header, column, tables[0][header], hints)
         column = _by_clock(header, column, clock, stamps)
-        if column.role == SENSE and not column.matches(named_as_read):
+        if column.role == SENSE and not column.matches(chosen):
             column = _by_behaviour(column, numbers[header], times)
             column = _unless_copy(column, numbers[header], originals)
         if column.role == SENSE:
@@ -151,10 +151,11 @@ def _times_of(table: Columns, clock: LogClock | None) -> Floats:
     """Return when rows were sensed (T,) [s]; their numbers if no clock tells."""
     if clock is not None and clock.is_in(table):
         return clock.times(table).seconds
-    return np.arange(len(next(iter(table.values()), ())), dtype=np.float64)
+    rows = max(map(len, table.values()), default=0)
+    return np.arange(rows, dtype=np.float64)
 
 
-def _named_columns(table: Columns) -> dict[str, LogColumn]:
+def _columns_by_header(table: Columns) -> dict[str, LogColumn]:
     """Return the columns by their headers, with unit, channel and element."""
     columns = {}
     elements = {}
@@ -220,9 +221,9 @@ def _by_text(column: LogColumn, values: NDArray[Any]) -> LogColumn:
     if is_number[is_filled].mean() < MOSTLY_NUMBERS:
         return replace(column, role=IGNORED, reason="holds words")
     row = int(np.argmax(is_filled & ~is_number))
+    word = str(values[row])[:40]
     reason = (
-        f"must hold numbers, got {str(values[row])[:40]!r} in row {row + 1}; "
-        f"--ignore '{column.name}' leaves it out"
+        f"must hold numbers, got {word!r} in row {row + 1}; --ignore '{column.name}' leaves it out"
     )
     return replace(column, role=UNCLEAR, reason=reason)
 
@@ -234,10 +235,10 @@ def _by_behaviour(
     moving = [values for values in tables if not is_constant(values)]
     if not moving:
         return replace(column, role=CONSTANT, reason=f"never moves{READ_IT}")
-    if column.unit in UNITS or SENSE_NAME.fullmatch(column.name):
+    if column.unit in BASE_UNITS or SENSE_NAME.fullmatch(column.name):
         return column
 
-    fewest = FEWEST
+    fewest = FEWEST_JUDGED_ROWS
     if column.name.lower() in COUNTERS:
         fewest = 2
     for direction, sign in (("rises", 1.0), ("falls", -1.0)):
@@ -257,10 +258,11 @@ def _unless_copy(
     column: LogColumn, tables: Sequence[NDArray[Any]], originals: dict[tuple[int, ...], str]
 ) -> LogColumn:
     """Return a sense as a copy if another one has the same numbers in every table."""
-    cells = tuple(hash(np.ascontiguousarray(v, np.float64).tobytes()) for v in tables)
+    arrays = [np.ascontiguousarray(values, np.float64) for values in tables]
+    cells = tuple(hash(array.tobytes()) for array in arrays)
     original = originals.setdefault(cells, column.name)
-    is_copy = original != column.name and is_command(original) == is_command(column.name)
-    if column.role == SENSE and is_copy:
+    are_alike = is_command(original) == is_command(column.name)
+    if column.role == SENSE and are_alike and original != column.name:
         return replace(column, role=COPY, reason=f"equals {original}{READ_IT}")
     return column
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
-from asm_gym.data.tables import is_key, named_columns, named_row
+from asm_gym.data.table_layout import is_key, named_columns, named_row
 from asm_gym.data.text import DOUBLED, Dialect, check_cells, header_of
 
 
@@ -28,20 +29,22 @@ class CsvLines:
         self.header = header.strip()
         self.dialect = Dialect.of(header)
         self.names: list[str] = []
-        self._first: dict[str, str] = {}  # the first column of a name, by those that repeat it
-        names = header_of(self.dialect.cells(header))
-        for place, name in enumerate(names):
+        self._originals: dict[str, str] = {}  # the first column of a name, by those that repeat it
+        count = Counter[str]()
+        for name in header_of(self.dialect.cells(header)):
+            count[name] += 1
             unique = name
-            if name in self.names:
-                unique = f"{name}{DOUBLED}{names[:place].count(name) + 1}"
-                self._first[unique] = name
+            if count[name] > 1:
+                unique = f"{name}{DOUBLED}{count[name]}"
+                self._originals[unique] = name
             self.names.append(unique)
         self._named = named_columns(self.names)
 
     @property
     def names_all_columns(self) -> bool:
         """Whether the header names all columns, and no cell does."""
-        return not self._named and not any(map(is_key, self.names))
+        has_key = any(map(is_key, self.names))
+        return not self._named and not has_key
 
     def cells(self, line: str, read: Collection[str]) -> dict[str, Any]:
         """Return the cells of a line by name.
@@ -55,8 +58,10 @@ class CsvLines:
         """
         texts = self.dialect.cells(line)
         check_cells(texts, len(self.names), "it has")
-        cells = dict(zip(self.names, map(self.dialect.plain, texts), strict=False))
-        for name, first in self._first.items():
-            if name not in read and cells[name] != cells[first]:
-                raise ValueError(f"its columns of the same name differ: {first!r}")
+        plain = map(self.dialect.plain, texts)
+        cells = dict(zip(self.names, plain, strict=False))
+        for name, original in self._originals.items():
+            differs = cells[name] != cells[original]
+            if differs and name not in read:
+                raise ValueError(f"its columns of the same name differ: {original!r}")
         return named_row(cells, self._named)

@@ -24,7 +24,7 @@ from asm_gym.extras import require
 
 CONNECT_S = 5.0  # how long a topic may take to be found [s]
 WAIT_S = 0.05  # how often the end of a topic is looked for while nothing comes [s]
-AT_ONCE = 2048  # messages taken, and kept for the reader, at once: four seconds of 500 Hz
+MESSAGES_AT_ONCE = 2048  # messages taken, and kept for the reader, at once: four seconds of 500 Hz
 
 FIELDS = {
     "builtin_interfaces/msg/Time": "int32 sec, uint32 nanosec",
@@ -144,7 +144,7 @@ def _kind(participant: Any, name: str) -> str:
     deadline = time.monotonic() + CONNECT_S
     while topic not in types and time.monotonic() < deadline:
         time.sleep(WAIT_S)
-        for publication in reader.take(N=AT_ONCE):
+        for publication in reader.take(N=MESSAGES_AT_ONCE):
             if hasattr(publication, "topic_name"):
                 types[publication.topic_name] = publication.type_name
     if topic not in types:
@@ -161,7 +161,7 @@ def _reader(participant: Any, name: str, kind: str) -> Any:
     policy = _dds("core").Policy
     quality = _dds("core").Qos(
         policy.Reliability.BestEffort,
-        policy.History.KeepLast(AT_ONCE),
+        policy.History.KeepLast(MESSAGES_AT_ONCE),
     )
     topic = _topic(participant, name, kind)
     return _dds("sub").DataReader(participant, topic, qos=quality)
@@ -180,7 +180,7 @@ def _samples(
     while time.monotonic() - newest <= silence:
         arrivals.wait(_dds("util").duration(seconds=WAIT_S))
         for name in (*others, clock):
-            for sample in readers[name].take(N=AT_ONCE):
+            for sample in readers[name].take(N=MESSAGES_AT_ONCE):
                 if not sample.sample_info.valid_data:
                     continue  # it only says that a writer went
                 if name == clock:

@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.checkpoint import DAMAGE, read_checkpoint, write_checkpoint
-from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
+from asm_gym.data.schema import LOG_ORIGIN, LOG_SCHEMA, LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns
-from asm_gym.data.tables import laid_out
+from asm_gym.data.table_layout import laid_out
 from asm_gym.exceptions import DamagedFile
 from asm_gym.files import regular_file
 from asm_gym.readings import spans as spans
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32, typed
 
-KIND = "episode"
+EPISODE_KIND = "episode"
 CONTROLLER = "controller"  # where an episode, or a monitor, says under which one it was recorded
-ARRAYS = {
+EPISODE_ARRAYS = {
     "stream": "f",
     "actions": "f",
     "observations": "fiub",
@@ -103,11 +103,11 @@ class Episode:
 
     def __repr__(self) -> str:
         """Return length, source and outcome in a line."""
-        parts = [f"{len(self)} rows of {self.spec.size}", f"{len(self) * self.spec.dt:g} s"]
+        rows = len(self)
+        outcome = "no success"
         if self.success:
-            parts.append("success")
-        else:
-            parts.append("no success")
+            outcome = "success"
+        parts = [f"{rows} rows of {self.spec.size}", f"{rows * self.spec.dt:g} s", outcome]
         if self.seed is not None:
             parts.append(f"seed {self.seed}")
         if self.faults.any():
@@ -133,10 +133,13 @@ class Episode:
     @classmethod
     @typed
     def from_table(
-        cls, frame: Any, channels: LogSchema | StreamSpec | Sequence[str] | None = None, **how: Any
+        cls,
+        frame: Any,
+        channels: LogSchema | StreamSpec | Sequence[str] | None = None,
+        **options: Any,
     ) -> Episode:
         """Make an episode from one log; the arguments are those of ``from_tables``."""
-        return cls.from_tables([frame], channels, **how)[0]
+        return cls.from_tables([frame], channels, **options)[0]
 
     @classmethod
     @typed
@@ -187,7 +190,7 @@ class Episode:
             ValueError: the log does not fit the schema.
         """
         recorded = schema.read(table)
-        info: dict[str, Any] = {ORIGIN: recorded.origin}
+        info: dict[str, Any] = {LOG_ORIGIN: recorded.origin}
         if schema.memory_spec is None:
             info[LOG_SCHEMA] = schema.to_json()
         made: dict[str, Any] = {"faults": recorded.faults, "info": info} | fields
@@ -211,11 +214,10 @@ def check_recorded(episode: Episode) -> None:
         raise ValueError(f"{rows} rows of a stream need {rows} faults, got {len(episode.faults)}")
     if steps and rows % steps:
         raise ValueError(f"{steps} actions cannot have {rows} rows of a stream")
-    bad = np.flatnonzero(~np.isfinite(episode.rewards))
-    if len(bad):
-        raise ValueError(
-            f"the reward of step {bad[0]} must be finite, got {episode.rewards[bad[0]]}"
-        )
+    not_finite = np.flatnonzero(~np.isfinite(episode.rewards))
+    if len(not_finite):
+        step = not_finite[0]
+        raise ValueError(f"the reward of step {step} must be finite, got {episode.rewards[step]}")
 
 
 @typed
@@ -233,7 +235,9 @@ def save_episode(path: str | Path, episode: Episode) -> Path:
         "label": label,
         "info": episode.info,
     }
-    write_checkpoint(path, KIND, header, {name: getattr(episode, name) for name in ARRAYS})
+    write_checkpoint(
+        path, EPISODE_KIND, header, {name: getattr(episode, name) for name in EPISODE_ARRAYS}
+    )
     return Path(path)
 
 
@@ -242,9 +246,9 @@ def load_episode(path: str | Path) -> Episode:
     """Read what ``save_episode`` wrote. Raises FileNotFoundError, or ValueError where the file is damaged."""
     regular_file(path)
     try:
-        saved = read_checkpoint(Path(path), KIND)
+        saved = read_checkpoint(Path(path), EPISODE_KIND)
         header = saved.header
-        for name, kinds in ARRAYS.items():
+        for name, kinds in EPISODE_ARRAYS.items():
             array = saved.arrays.get(name)
             if array is not None and array.dtype.kind not in kinds:
                 raise ValueError(f"{name} cannot be of {array.dtype}")

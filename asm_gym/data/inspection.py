@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.bridging import BRIDGED_ROWS
 from asm_gym.data.log_column import COMMAND, IGNORED, SENSE, LogColumn
 from asm_gym.data.names import split_unit
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.tables import Columns, is_numeric
-from asm_gym.data.timing import BRIDGED_ROWS, FAR, Timing, evenly, timing_of
+from asm_gym.data.table_layout import Columns, is_numeric
+from asm_gym.data.timing import FAR, Timing, evenly, timing_of
 from asm_gym.readings import noise_of, resolution, spans
 
 FEW_VALUES = 8  # a channel of fewer different values hardly moves
@@ -88,12 +89,13 @@ def inspect_log(name: str, table: Columns, schema: LogSchema, trouble: str = "")
 
     Args:
         name: of the log.
-        table: its columns, as ``asm_gym.data.tables.laid_out`` returns them.
+        table: its columns, as ``asm_gym.data.table_layout.laid_out`` returns them.
         schema: how it is read.
         trouble: why it cannot be read; empty if that is not known yet.
     """
     columns = {header: _column_of(header, schema) for header in table}
-    rows = np.arange(len(next(iter(table.values()))), dtype=np.float64)
+    size = len(next(iter(table.values())))
+    rows = np.arange(size, dtype=np.float64)
     unread = Inspection(name=name, table=table, columns=columns, times=rows)
     try:
         if trouble:
@@ -132,15 +134,16 @@ def _jitter(timing: Timing, dt: float) -> float:
     if not len(steps):
         return 0.0
     nine_in_ten = float(np.quantile(steps, 0.9))
-    is_gap = steps > FAR * max(1.0, nine_in_ten)
-    return float(steps[~is_gap].std())
+    longest = FAR * max(1.0, nine_in_ten)
+    return float(steps[steps <= longest].std())
 
 
 def _gaps(timing: Timing, dt: float) -> NDArray[np.float64]:
     """Return from when to when (N, 2) nothing came, as ``fit`` and ``watch`` see it [s]."""
     times = timing.times.seconds
-    rows = evenly(np.ones((len(times), 1)), times, dt)[:, 0]
-    ends = [(start - 1, stop) for start, stop in spans(np.isnan(rows))]
+    ones = np.ones((len(times), 1))
+    is_lost = np.isnan(evenly(ones, times, dt)[:, 0])
+    ends = [(start - 1, stop) for start, stop in spans(is_lost)]  # [rows]
     return times[0] + dt * np.array(ends, np.float64).reshape(-1, 2)
 
 
@@ -148,14 +151,16 @@ def _facts(column: LogColumn, values: NDArray[Any]) -> dict[str, Any]:
     """Return what the values (T,) of a column are like."""
     if not is_numeric(values):
         values = np.zeros(0)
-    known = values[np.isfinite(values) & (values != column.missing)]
+    is_known = np.isfinite(values) & (values != column.missing)
+    known = values[is_known]
     missing = len(values) - len(known)
     ends = [np.nan, np.nan]
     if len(known):
         ends = [float(known.min()), float(known.max())]
     repeats = 0.0
     if len(values) > 1:
-        repeats = float(np.mean(values[1:] == values[:-1]))
+        is_repeated = values[1:] == values[:-1]
+        repeats = float(is_repeated.mean())
     return {
         "channel": column.name,
         "unit": column.unit,

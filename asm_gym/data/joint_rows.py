@@ -8,7 +8,7 @@ from typing import Any
 from asm_gym.data.live_clock import LiveClock
 from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.tables import is_key
+from asm_gym.data.table_layout import is_key
 
 LATER = 0.5  # share of a period from which on a row is of a later moment
 
@@ -25,16 +25,19 @@ class JointRows:
         self._clock = LiveClock(schema, "")
         self._clock_is_found = False
         self._joint = ""  # the column that says whose numbers a row holds
-        self._gathered: dict[str, Any] = {}  # of the joints that came
+        self._gathered: dict[str, Any] = {}  # numbers of the joints of one moment so far
 
     def find(self, row: Mapping[str, Any]) -> None:
         """Find the column that names a joint of the memory, if there is one."""
-        labels = self._spec.labels
-        joints = {label.partition("[")[2].rstrip("]") for label in labels if "[" in label}
-        keys = [name for name in row if is_key(name) and str(row[name]).strip() in joints]
-        self._joint = next(iter(keys), "")
+        elements = [label.partition("[")[2] for label in self._spec.labels if "[" in label]
+        joints = [element.rstrip("]") for element in elements]
+        self._joint = ""
+        for name, value in row.items():
+            if is_key(name) and str(value).strip() in joints:
+                self._joint = name
+                return
 
-    def whole(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    def complete_row(self, row: Mapping[str, Any]) -> Mapping[str, Any] | None:
         """Return the row of all joints once it is complete, or one of a later moment comes.
 
         Where rows are not of one joint each, return them as they are.
@@ -49,25 +52,25 @@ class JointRows:
             elif name != self._joint:
                 own[element_name(name, joint)] = value
 
-        before = self._gathered
-        has_joint = any(name in before and not is_clock(name) for name in own)
-        if has_joint or self._is_later(before, row):
+        gathered = self._gathered
+        has_joint = any(name in gathered and not is_clock(name) for name in own)
+        if has_joint or self._is_later(gathered, row):
             self._gathered = own
-            return before
-        whole = own | before  # the time is that of the first
-        names = {split_unit(name)[0] for name in whole}
+            return gathered
+        gathered = own | gathered  # the time is that of the first
+        names = {split_unit(name)[0] for name in gathered}
         if not names.issuperset(self._spec.labels):
-            self._gathered = whole
+            self._gathered = gathered
             return None
         self._gathered = {}
-        return whole
+        return gathered
 
-    def _is_later(self, before: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
+    def _is_later(self, gathered: Mapping[str, Any], row: Mapping[str, Any]) -> bool:
         """Return whether a row is of a later moment than the joints before it."""
         if not self._clock_is_found:
             self._clock.find(row, ())
             self._clock_is_found = True
-        first = self._clock.stamp(before)
+        first = self._clock.stamp(gathered)
         stamp = self._clock.stamp(row)
         if first is None or stamp is None:
             return False

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from asm_gym.data.arrays import read_parquet
-from asm_gym.data.tables import Columns, as_array
+from asm_gym.data.table_layout import Columns, as_array
 
 INFO = Path("meta") / "info.json"
 
 # Features that are read begin so; pictures are left out.
-SENSED = "observation."
-COMMANDED = "action"
+SENSED_PREFIX = "observation."
+COMMANDED_PREFIX = "action"
 
 
 def read_lerobot(folder: Path) -> Iterator[tuple[Columns, float, bool]]:
@@ -74,9 +74,9 @@ def _features(folder: Path) -> tuple[float, dict[str, list[str]]]:
     for name, feature in features.items():
         dtype = str(feature.get("dtype"))
         is_number = dtype.startswith(("float", "int"))
-        if is_number and name.startswith((SENSED, COMMANDED)):
+        if is_number and name.startswith((SENSED_PREFIX, COMMANDED_PREFIX)):
             read[name] = _element_names(feature.get("names"))
-    if not any(name.startswith(SENSED) for name in read):
+    if not any(name.startswith(SENSED_PREFIX) for name in read):
         known = ", ".join(features)
         raise ValueError(
             f"{folder} has no feature that is sensed, observation.… of numbers: {known}",

@@ -20,12 +20,12 @@ from typing import NamedTuple, TextIO
 from asm_gym.data.dds_topics import follow_topics
 from asm_gym.data.rows import SourceDied
 from asm_gym.data.text import decoded
-from asm_gym.files import named, no_links, regular_file
+from asm_gym.files import naming, no_links, regular_file
 from asm_gym.validation import check_number
 
-POLL_S = 0.002  # how often a source is looked at for more [s]
-LARGEST = 65_535  # bytes of a datagram
-LONGEST = 1_000_000  # bytes of a line: more than a row of any robot
+SOURCE_POLL_S = 0.002  # how often a source is looked at for more [s]
+LARGEST_DATAGRAM = 65_535  # bytes of a datagram
+LONGEST_LINE_BYTES = 1_000_000  # bytes of a line: more than a row of any robot
 TICK_S = 0.02  # how often an empty line says that no line came [s]
 UDP = re.compile(r"(\d+)(?:@([^:]+)(?::(\d+))?)?")  # PORT, PORT@ADDRESS or PORT@ADDRESS:PORT
 
@@ -77,8 +77,10 @@ def _follow_pipe(place: str, stdin: TextIO, silence: float, first: float) -> Ite
         return
 
     def more() -> bytes | None:
-        ready, _, _ = select.select([number], [], [], POLL_S)
-        return os.read(number, LARGEST) if ready else None
+        ready, _, _ = select.select([number], [], [], SOURCE_POLL_S)
+        if not ready:
+            return None
+        return os.read(number, LARGEST_DATAGRAM)
 
     yield from _lines(more, silence, first)
 
@@ -88,12 +90,12 @@ def _follow_file(place: str, stdin: TextIO, silence: float, first: float) -> Ite
     regular_file(path)
 
     def more() -> bytes | None:
-        found = file.read(LARGEST)
-        if found:
-            return found
+        chunk = file.read(LARGEST_DATAGRAM)
+        if chunk:
+            return chunk
         if path.stat().st_size < file.tell():
             raise ValueError(f"{path} became shorter while it was followed")
-        time.sleep(POLL_S)
+        time.sleep(SOURCE_POLL_S)
         return None
 
     with path.open("rb") as file:
@@ -110,20 +112,23 @@ def _follow_datagrams(place: str, stdin: TextIO, silence: float, first: float) -
         )
     port, sender, sender_port = match.groups()
     check_number("port", int(port), low=1, high=65_535, whole=True)
-    is_near = sender is None or IPv4Address(sender).is_loopback
 
     def more() -> bytes | None:
         try:
-            datagram, (address, source_port) = receiver.recvfrom(LARGEST)
+            datagram, (address, source_port) = receiver.recvfrom(LARGEST_DATAGRAM)
         except TimeoutError:
             return None
         if sender not in (None, address) or sender_port not in (None, str(source_port)):
             return None
-        return (datagram.rstrip(b"\n") or b"an empty datagram") + b"\n"
+        line = datagram.rstrip(b"\n") or b"an empty datagram"
+        return line + b"\n"
 
+    interface = "0.0.0.0"
+    if sender is None or IPv4Address(sender).is_loopback:
+        interface = "127.0.0.1"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1" if is_near else "0.0.0.0", int(port)))
-        receiver.settimeout(POLL_S)
+        receiver.bind((interface, int(port)))
+        receiver.settimeout(SOURCE_POLL_S)
         yield from _lines(more, silence, first)
 
 
@@ -163,7 +168,7 @@ def _lines(more: Callable[[], bytes | None], silence: float, first: float) -> It
             newest = now
             limit = silence
             *lines, rest = (rest + chunk).split(b"\n")
-            rest = rest[: LONGEST + 1]  # what is longer is no row, and costs no memory
+            rest = rest[: LONGEST_LINE_BYTES + 1]  # what is longer is no row, and costs no memory
         elif now - newest > limit:
             raise SourceDied(f"nothing came for {limit:g} s")
         for line in lines:
@@ -177,8 +182,8 @@ def _lines(more: Callable[[], bytes | None], silence: float, first: float) -> It
 
 def _text_of(line: bytes) -> str:
     """Return a line as text; one that is too long says so."""
-    if len(line) > LONGEST:
-        return f"a line of more than {LONGEST} bytes"
+    if len(line) > LONGEST_LINE_BYTES:
+        return f"a line of more than {LONGEST_LINE_BYTES} bytes"
     return decoded(line)[0]
 
 
@@ -188,7 +193,7 @@ def record(lines: Iterable[str], to: Path, minutes: float) -> tuple[float, str]:
     reason = "the source ended"
     rows = 0
     seconds = 0.0
-    with named(to), open(to, "w", encoding="utf-8", opener=no_links) as file:
+    with naming(to), open(to, "w", encoding="utf-8", opener=no_links) as file:
         try:
             for line in filter(str.strip, lines):
                 if not rows:

@@ -17,6 +17,7 @@ import numpy as np
 
 from asm_gym.data.clock import NUMBER, SINCE_1970, LogClock
 from asm_gym.data.clock_inference import UNNAMED_UNITS, clock_called, clocks_among, resolve
+from asm_gym.data.names import LONGER
 from asm_gym.data.schema import LogSchema, can_resample
 
 NEWEST = 32  # rows that tell the rate, and after which it is told again
@@ -31,19 +32,19 @@ class Pace:
     """Follow the stamps of a source for a memory whose rows are ``dt`` [s] apart.
 
     Attributes:
-        right: rows come at the memory's rate.
+        is_right: rows come at the memory's rate.
         change: how the rate changed with the newest row; empty if it did not.
     """
 
     def __init__(self, dt: float) -> None:
         self.dt = dt
-        self.right = True
+        self.is_right = True
         self.change = ""
         self._steps: deque[float] = deque(maxlen=NEWEST)
         self._rows = 0
-        self._before: float | None = None
+        self._last_stamp: float | None = None  # [s]
 
-    def lost(self, stamp: float) -> int | None:
+    def rows_lost_before(self, stamp: float) -> int | None:
         """Return how many rows were lost before the one of this stamp [s]; None if it is not to be read.
 
         Raises:
@@ -53,36 +54,36 @@ class Pace:
         if not math.isfinite(stamp):
             raise ValueError(f"its time is {stamp}")
         self.change = ""
-        before = self._before
+        last_stamp = self._last_stamp
         step = self.dt
-        if before is not None:
-            step = stamp - before
+        if last_stamp is not None:
+            step = stamp - last_stamp
         if not 0 < step <= LONGEST_STEP_S:
             problem = "must increase"
             if step > 0:
                 problem = "leapt"
-            raise ClockWentBack(f"time {problem}, got {stamp:g} s after {before:g} s")
-        self._before = stamp
+            raise ClockWentBack(f"time {problem}, got {stamp:g} s after {last_stamp:g} s")
+        self._last_stamp = stamp
         self._rows += 1
-        if before is None:
+        if last_stamp is None:
             return 0
 
         self._steps.append(step)
         if self._rows % NEWEST == 1:
             self._check_rate()
-        if not self.right:
+        if not self.is_right:
             return None
         return max(0, round(step / self.dt) - 1)
 
     def _check_rate(self) -> None:
         """Compare the newest steps with the memory's."""
         own = median(self._steps)
-        right = can_resample(own / self.dt)
-        if right == self.right:
+        was_right = self.is_right
+        self.is_right = can_resample(own / self.dt)
+        if self.is_right == was_right:
             return
-        self.right = right
         self.change = f"rows come at {1 / own:.4g} a second"
-        if right:
+        if self.is_right:
             self.change += " again"
         else:
             self.change += f", and the memory reads {1 / self.dt:.4g}"
@@ -136,7 +137,7 @@ class LiveClock:
             return None
         return self._clock.moment(row)
 
-    def told_unit(self, stamp: float) -> float | None:
+    def first_in_new_unit(self, stamp: float) -> float | None:
         """Return the first stamp again if this one tells that the clock counts in another unit.
 
         The unit of a clock that says none is the one that fits the memory's rate best.
@@ -149,7 +150,8 @@ class LiveClock:
         if step < 1.0 or stamp >= SINCE_1970:
             return None
         rate = self._schema.rate
-        unit = min(UNNAMED_UNITS.values(), key=lambda unit: abs(math.log(step * unit * rate)))
+        units = [LONGER[unit] for unit in UNNAMED_UNITS]
+        unit = min(units, key=lambda unit: abs(math.log(step * unit * rate)))
         if unit == 1.0:
             return None
         self._clock = LogClock(self._clock.columns, (unit,))

@@ -24,7 +24,7 @@ COPY = "copy"
 COUNTER = "counter"
 IGNORED = "ignored"
 UNCLEAR = "unclear"
-ROLES = (SENSE, COMMAND, LABEL, CLOCK, CONSTANT, COPY, COUNTER, IGNORED, UNCLEAR)
+COLUMN_ROLES = (SENSE, COMMAND, LABEL, CLOCK, CONSTANT, COPY, COUNTER, IGNORED, UNCLEAR)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class LogColumn:
 
     Args:
         name: in the log, without the unit behind it.
-        role: one of ``ROLES``; senses and commands are read.
+        role: one of ``COLUMN_ROLES``; senses and commands are read.
         unit: of its numbers after ``scale``; empty if the log does not say.
         channel: to which its numbers belong; by default its name.
         element: which of several numbers of the channel it is.
@@ -58,7 +58,7 @@ class LogColumn:
     reason: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
-        check_choice(f"role of {self.name!r}", self.role, ROLES)
+        check_choice(f"role of {self.name!r}", self.role, COLUMN_ROLES)
         for what in ("unit", "channel", "element"):
             text = getattr(self, what)
             if not isinstance(text, str):

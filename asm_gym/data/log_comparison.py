@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.data.log_column import LogColumn
 from asm_gym.data.reader_notes import listed
-from asm_gym.data.schema import LOG_SCHEMA, ORIGIN, LogSchema
+from asm_gym.data.schema import LOG_ORIGIN, LOG_SCHEMA, LogSchema
 
 Floats = NDArray[np.float64]
 
@@ -40,7 +40,8 @@ class _OtherScale(NamedTuple):
         """Return its name, how many times larger it is in some logs, and what that may be."""
         difference = f"{self.column.name} {self.factor:.2g} times"
         for guess, factor in KNOWN_FACTORS.items():
-            if 0.6 < self.factor / factor < 1.6:
+            ratio = self.factor / factor
+            if 0.6 < ratio < 1.6:
                 difference += f" ({guess}?)"
         return difference
 
@@ -59,7 +60,8 @@ def refuse_unlike(episodes: Sequence[Episode], names: Sequence[str]) -> None:
 
 def refuse_other_scales(episodes: Sequence[Episode]) -> None:
     """Raise ValueError if a column of some whole logs has another scale; pieces are not compared."""
-    are_logs = all(LOG_SCHEMA in episode.info and ORIGIN in episode.info for episode in episodes)
+    keys = (LOG_SCHEMA, LOG_ORIGIN)
+    are_logs = all(key in episode.info for episode in episodes for key in keys)
     if len(episodes) > 1 and are_logs:
         _refuse_other_scales(episodes, [f"episode {n}" for n in range(len(episodes))])
 
@@ -104,9 +106,8 @@ def _other_scales(episodes: Sequence[Episode], schema: LogSchema) -> list[_Other
         compared.add(channel)
         place = schema.spec.slices[channel]
         scales = [_scale(episode.stream[:, place], column.noise) for episode in episodes]
-        found = _split_by_scale(np.array(scales))
-        if found is not None:
-            factor, logs = found
+        factor, logs = _split_by_scale(np.array(scales))
+        if logs:
             unlike.append(_OtherScale(column, factor, logs))
     return unlike
 
@@ -123,23 +124,26 @@ def _scale(numbers: NDArray[np.float32], noise: float) -> tuple[float, float]:
     return spread, float(np.quantile(np.abs(known), 0.95))
 
 
-def _split_by_scale(scales: Floats) -> tuple[float, list[int]] | None:
-    """Return by what factor some logs differ from the others, and which; None if they are alike.
+def _split_by_scale(scales: Floats) -> tuple[float, list[int]]:
+    """Return by what factor some logs differ from the others, and which; none if they are alike.
 
     Args:
         scales: (N, 2) spread and range of a channel in each log; NaN if it stands.
     """
-    moving = np.flatnonzero(np.isfinite(scales).all(axis=1))
+    moves = np.isfinite(scales).all(axis=1)
+    moving = np.flatnonzero(moves)
     if len(moving) < 2:
-        return None
+        return 1.0, []
     order = moving[np.argsort(scales[moving, 0])]
     ordered = scales[order]  # (M, 2) by their spread
-    split = int(np.argmax(np.diff(np.log(ordered[:, 0])))) + 1
+    steps = np.diff(np.log(ordered[:, 0]))
+    split = int(np.argmax(steps)) + 1
     small = np.median(ordered[:split], axis=0)
-    factors = np.median(ordered[split:], axis=0) / small
+    large = np.median(ordered[split:], axis=0)
+    factors = large / small
     if factors.min() < FACTOR:
-        return None
-    odd = order[split:]
-    if len(odd) > split:
-        odd = order[:split]
-    return float(factors[0]), sorted(odd.tolist())
+        return 1.0, []
+    fewer = order[split:]
+    if len(fewer) > split:
+        fewer = order[:split]
+    return float(factors[0]), sorted(fewer.tolist())

@@ -19,12 +19,12 @@ from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot_datasets import INFO, read_lerobot
-from asm_gym.data.minari_datasets import METADATA, read_dataset
+from asm_gym.data.minari_datasets import METADATA_FILE, read_dataset
 from asm_gym.data.names import is_label, split_unit
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns, recordings_in
-from asm_gym.data.tables import Columns, laid_out
+from asm_gym.data.table_layout import Columns, laid_out
 from asm_gym.data.text import read_json_lines, read_text
 from asm_gym.files import regular_file
 from asm_gym.validation import typed
@@ -114,7 +114,9 @@ def _episodes_of(source: Source, schema: LogSchema) -> Iterator[Log]:
         parts = recordings_in(source.columns, schema.clock_in(source.columns))
         _note_unknown(source.columns, schema)
         for number, part in enumerate(parts, 1):
-            name = source.name if len(parts) == 1 else f"{source.name} part {number}"
+            name = source.name
+            if len(parts) > 1:
+                name += f" part {number}"
             yield Log(name, Episode.read(part, schema, success=source.success))
     except ValueError as error:
         raise ValueError(f"{source.file or source.name}: {error}") from error
@@ -124,8 +126,11 @@ def _note_unknown(table: Columns, schema: LogSchema) -> None:
     """Tell the user of columns that the schema of the first logs does not have."""
     if schema.memory_spec is not None:
         return
-    known = schema.names
-    unknown = [name for name in table if not is_label(name) and split_unit(name)[0] not in known]
+    unknown = []
+    for name in table:
+        is_known = split_unit(name)[0] in schema.names
+        if not is_known and not is_label(name):
+            unknown.append(name)
     if unknown:
         note(f"not read, as the schema of the first logs lacks it: {', '.join(unknown)[:120]}")
 
@@ -179,7 +184,7 @@ def read_sources(path: str | Path, hints: SchemaHints) -> Iterator[Source]:
                 success=success,
             )
     elif not files:
-        if next(path.rglob(METADATA), None) is None:
+        if next(path.rglob(METADATA_FILE), None) is None:
             known = ", ".join((*FILES, *HDF5))
             raise FileNotFoundError(
                 f"{path} holds no episodes: no {known}, no LeRobot or Minari dataset"
@@ -200,7 +205,7 @@ def _sources_of_files(files: dict[str, Path], hints: SchemaHints) -> Iterator[So
             raise
         except Exception as error:  # each format's reader raises whatever the damage leads to
             damaged += 1
-            message = f"{file}: {_said(error)}"
+            message = f"{file}: {_message_of(error)}"
             if damaged == len(files):
                 raise ValueError(message) from error
             note(UNREAD + message)
@@ -208,7 +213,7 @@ def _sources_of_files(files: dict[str, Path], hints: SchemaHints) -> Iterator[So
             yield from sources
 
 
-def _said(error: Exception) -> str:
+def _message_of(error: Exception) -> str:
     """Return the message of an error in a line."""
     message = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, ValueError):
@@ -247,7 +252,9 @@ def _files_at(path: Path) -> dict[str, Path]:
             raise ValueError(f"{path}: files that can be read end in {', '.join(known)}")
         return {path.name: path}
 
-    root = path / "episodes" if (path / "episodes").is_dir() else path
+    root = path / "episodes"
+    if not root.is_dir():
+        root = path
     files = {}
     for file in sorted(root.rglob("*")):
         name = file.relative_to(root)

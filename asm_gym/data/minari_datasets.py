@@ -33,10 +33,10 @@ from asm_gym.tasks import TASKS
 from asm_gym.validation import check_text, typed
 
 # Files of a dataset's folder ``data``.
-METADATA = "metadata.json"
-ARRAYS = "main_data.hdf5"
+METADATA_FILE = "metadata.json"
+ARRAYS_FILE = "main_data.hdf5"
 # Those that this package writes, or wrote in an earlier version.
-OWN_FILES = (METADATA, ARRAYS, "SHA256SUMS")
+OWN_FILES = (METADATA_FILE, ARRAYS_FILE, "SHA256SUMS")
 SPARE_BYTES = 10_000_000  # beside the arrays of a dataset, that a disk must have
 
 
@@ -134,7 +134,7 @@ def _check_room(data: Path, episodes: Sequence[Episode]) -> None:
         for value in vars(episode).values():
             size += getattr(value, "nbytes", 0)
     if shutil.disk_usage(data).free < size:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / ARRAYS))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / ARRAYS_FILE))
 
 
 def _write(
@@ -201,9 +201,9 @@ def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
 
     spec = None
     try:
-        if (folder / ARRAYS).exists():
-            check_hdf5(folder / ARRAYS)
-        metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+        if (folder / ARRAYS_FILE).exists():
+            check_hdf5(folder / ARRAYS_FILE)
+        metadata = json.loads((folder / METADATA_FILE).read_text(encoding="utf-8"))
         if "stream_spec" in metadata:
             spec = StreamSpec.from_json(metadata["stream_spec"])
         dataset = minari.MinariDataset(folder)
@@ -229,10 +229,10 @@ def read_dataset(path: str | Path, env_id: str | None = None) -> list[Episode]:
 
 def _find_dataset(path: Path) -> Path:
     """Return the folder of the only dataset at or below a path. Raises FileNotFoundError or ValueError."""
-    if (path / METADATA).is_file():
+    if (path / METADATA_FILE).is_file():
         return path
     folders = []
-    for file in sorted(path.rglob(f"data/{METADATA}")):
+    for file in sorted(path.rglob(f"data/{METADATA_FILE}")):
         names = file.relative_to(path).parts
         # A kill leaves hidden folders.
         if not any(name.startswith(".") for name in names):

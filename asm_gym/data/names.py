@@ -8,7 +8,7 @@ from functools import cache
 from typing import NamedTuple
 
 TAU = 2 * math.pi
-UNITS = {
+BASE_UNITS = {
     name: (base, size)
     for base, sizes in {
         "rad": {"rad|radian|radians": 1.0, "deg|°|degree|degrees": math.pi / 180},
@@ -37,7 +37,7 @@ LONGER = (
     SECONDS
     | dict.fromkeys(("min", "minutes"), 60.0)
     | dict.fromkeys(("h", "hours"), 3600.0)
-    | {"d": 86400.0}
+    | dict.fromkeys(("d", "days"), 86400.0)
 )
 """Those that stand in brackets: an ``angle_min`` holds no minutes."""
 
@@ -49,7 +49,7 @@ TURN = {"deg": 360.0, "°": 360.0, "degree": 360.0, "degrees": 360.0} | dict.fro
     ("rad", "radian", "radians"), TAU
 )
 """A whole turn, by the unit of an angle."""
-TURNED = ("sin", "cos")  # elements of a channel that stands for an angle which turns over
+TURNED_ELEMENTS = ("sin", "cos")  # elements of a channel that stands for an angle which turns over
 
 _OF = (
     r"(?:elapsed|rel|relative|ros|unix|epoch|sys|system|robot|controller|host|log|utc|sample|"
@@ -57,7 +57,7 @@ _OF = (
 )
 _WHAT = r"(?:time[ _]?stamps?|time|stamp|date[ _]?time|date|zeit(?:stempel)?|uhrzeit)"
 _UNIT = "|".join(sorted(map(re.escape, SECONDS), key=len, reverse=True))
-CLOCK = re.compile(
+CLOCK_NAME = re.compile(
     rf"[%_#\s]*(?:(?:.*[./])?(?:header[._])?(?:{_OF}[ _]?)?{_WHAT}|t)"
     rf"(?:[ _.]*[\[(]?\s*(?P<unit>{_UNIT})\s*[\])]?)?",
     re.I,
@@ -69,15 +69,17 @@ def _word(words: str) -> re.Pattern[str]:
     return re.compile(rf"(.*[^a-z])?({words})([^a-z].*)?", re.I)
 
 
-LABEL = _word(
+LABEL_NAME = _word(
     "labels?|anomal(y|ies|ous)|faults?|faulty|failures?|protective_?stop|"
     "grip_?lost|y_true|ground_?truth|outliers?"
 )
-COMMAND = _word("target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?")
+COMMAND_NAME = _word(
+    "target|desired|cmd|commands?|commanded|set_?points?|goal|ref|reference|actions?"
+)
 _SPEEDS = "vel|velocity|velocities|speeds?|qd|dq|qvel|joint_vel"
 _PLACES = "pos|position|positions|angles?|q|qpos|joint_pos"
-SPEED = _word(_SPEEDS)
-POSITION = _word(_PLACES)
+SPEED_NAME = _word(_SPEEDS)
+POSITION_NAME = _word(_PLACES)
 
 SENSE_NAME = _word(
     f"{_PLACES}|{_SPEEDS}|forces?|torques?|wrench|efforts?|currents?|tau|"
@@ -122,7 +124,7 @@ def split_unit(column: str) -> tuple[str, str]:
     if match := _WITH_UNIT.fullmatch(column):
         return match["name"], match["unit"]
     match = _UNIT_AT_ONCE.fullmatch(column)
-    if match and (match["unit"] in UNITS or match["unit"] in SECONDS):
+    if match and (match["unit"] in BASE_UNITS or match["unit"] in SECONDS):
         return match["name"], match["unit"]
     match = _UNIT_BEHIND.fullmatch(column)
     if match is None:
@@ -144,10 +146,10 @@ def ratio(unit: str, other: str) -> float | None:
     """Return how many of ``other`` are in one ``unit``; None if they measure something else."""
     if unit == other:
         return 1.0
-    if unit not in UNITS or other not in UNITS:
+    if unit not in BASE_UNITS or other not in BASE_UNITS:
         return None
-    base, size = UNITS[unit]
-    other_base, other_size = UNITS[other]
+    base, size = BASE_UNITS[unit]
+    other_base, other_size = BASE_UNITS[other]
     if base != other_base:
         return None
     return size / other_size
@@ -183,14 +185,14 @@ def is_clock(name: str) -> bool:
         return False
     if unit in LONGER:
         name = bare
-    return CLOCK.fullmatch(name) is not None
+    return CLOCK_NAME.fullmatch(name) is not None
 
 
 def is_label(name: str) -> bool:
     """Tell whether a column is called as one that says what is wrong."""
-    return LABEL.fullmatch(name) is not None
+    return LABEL_NAME.fullmatch(name) is not None
 
 
 def is_command(name: str) -> bool:
     """Tell whether a column was commanded and not sensed."""
-    return COMMAND.fullmatch(name) is not None
+    return COMMAND_NAME.fullmatch(name) is not None

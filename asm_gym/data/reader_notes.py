@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 UNREAD = "left out, for it cannot be read: "  # begins a note on a file
-SHOWN = 6  # names that a message lists
+SHOWN_NAMES = 6  # names that a message lists
 
 
 class LogWarning(UserWarning):
@@ -21,9 +21,9 @@ def note(message: str) -> None:
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names of a list, and how many others there are."""
-    text = ", ".join(names[:SHOWN])
-    if len(names) > SHOWN:
-        text += f" and {len(names) - SHOWN} others"
+    text = ", ".join(names[:SHOWN_NAMES])
+    if len(names) > SHOWN_NAMES:
+        text += f" and {len(names) - SHOWN_NAMES} others"
     return text
 
 

@@ -25,7 +25,7 @@ from asm_gym.data.joint_rows import JointRows
 from asm_gym.data.live_clock import LONGEST_STEP_S, ClockWentBack, LiveClock, Pace
 from asm_gym.data.publishers import Publishers
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.tables import MOST_COLUMNS
+from asm_gym.data.table_layout import MOST_COLUMNS
 from asm_gym.data.text import flat_row
 
 
@@ -159,20 +159,21 @@ class RowReader:
 
     def _stamped(self, numbers: NDArray[np.float64], stamp: float) -> Row:
         """Return a row at its place in time; one that came late is left out."""
-        aside = self._left_out_stamp
+        left_out_stamp = self._left_out_stamp
         self._left_out_stamp = None
         problem = ""
         try:
-            lost = self._pace.lost(stamp)
+            lost = self._pace.rows_lost_before(stamp)
         except ClockWentBack as error:
             problem = str(error)
-            if aside is None or not 0 < stamp - aside <= LONGEST_STEP_S:
+            agrees = left_out_stamp is not None and 0 < stamp - left_out_stamp <= LONGEST_STEP_S
+            if not agrees:
                 self._left_out_stamp = stamp
                 problem += ": the row is left out (--clock NAME chooses)"
                 return Row(numbers=numbers, read=False, stamp=stamp, problem=problem)
             # The second late row agrees with the first: the clock was set anew.
             self.begin()
-            lost = self._pace.lost(stamp)
+            lost = self._pace.rows_lost_before(stamp)
         return Row(
             numbers=numbers,
             lost=lost or 0,
@@ -236,7 +237,7 @@ class RowReader:
         """Return the numbers and the stamp of a row by name; a number that it lacks is NaN."""
         if self._match is None:
             self._joints.find(cells)
-        message = self._joints.whole(cells)
+        message = self._joints.complete_row(cells)
         if message is None:
             return None
         match = self._match or ColumnMatch(self._schema, message, whole=False)
@@ -255,12 +256,12 @@ class RowReader:
         stamp = self._clock.stamp(row)
         if stamp is None:
             return None
-        first = self._clock.told_unit(stamp)
+        first = self._clock.first_in_new_unit(stamp)
         if first is None:
             return stamp
         # The unit was wrong up to now: count the rows anew, from the first stamp in the new unit.
         self.begin()
-        self._pace.lost(first)
+        self._pace.rows_lost_before(first)
         return self._clock.stamp(row)
 
     def _match_columns(self, row: Mapping[str, Any], has_numbers: bool) -> bool:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
+from itertools import chain
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -22,15 +23,15 @@ from asm_gym.data.clock_inference import infer_clock
 from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.column_match import ColumnMatch
 from asm_gym.data.log_column import COMMAND, COUNTER, LABEL, SENSE, UNCLEAR, LogColumn
-from asm_gym.data.names import TAU, TURN, TURNED, is_label, split_unit
+from asm_gym.data.names import TAU, TURN, TURNED_ELEMENTS, is_label, split_unit
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import Columns, is_numeric, laid_out
+from asm_gym.data.table_layout import Columns, is_numeric, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of
 from asm_gym.exceptions import DamagedFile
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 LOG_SCHEMA = "log_schema"  # where an episode and a memory keep the schema that they were read with
-ORIGIN = "origin"  # where an episode keeps the stamp of its first row [s]
+LOG_ORIGIN = "origin"  # where an episode keeps the stamp of its first row [s]
 RESAMPLED = 1.5  # a log is read at another rate by its clock, up to so many times its own
 RATE_TOLERANCE = 0.01  # share by which a rate may differ without a note
 NO_RATE = (
@@ -89,7 +90,7 @@ class LogSchema:
     @classmethod
     def of_spec(cls, spec: StreamSpec) -> Self:
         """Return the schema of a stream whose columns are called as its labels are."""
-        columns = [column for channel in spec.channels for column in _columns_of(channel)]
+        columns = chain.from_iterable(map(_columns_of, spec.channels))
         return cls(tuple(columns), 1.0 / spec.dt, find_clock="", memory_spec=spec)
 
     @classmethod
@@ -138,12 +139,12 @@ class LogSchema:
             if count > 1:
                 raise ValueError(f"columns must have different names, got {name!r} twice")
         if not names:
-            reasons = "; ".join(f"{column.name} {column.reason}" for column in self.columns)
-            got = reasons[:300] or "nothing"
+            reasons = [f"{column.name} {column.reason}" for column in self.columns]
+            got = "; ".join(reasons)[:300] or "nothing"
             raise ValueError(f"a log must hold columns of numbers, got {got}")
         if not self.rate:
-            counters = [column.name for column in self.columns if column.role == COUNTER]
             message = NO_RATE
+            counters = [column.name for column in self.columns if column.role == COUNTER]
             if counters:
                 message += f"; {counters[0]!r} counts: --clock '{counters[0]} [ms]'?"
             raise ValueError(message)
@@ -160,7 +161,8 @@ class LogSchema:
         table = laid_out(table)
         spec = self.spec
         match = ColumnMatch(self, table)
-        rows = np.column_stack([match.rows(table), *self._marks(table, match.headers)])
+        marks = self._marks(table, match.headers)
+        rows = np.column_stack([match.rows(table), *marks])
         origin = None
         clock = self.clock_in(table)
         if clock is not None:
@@ -169,11 +171,12 @@ class LogSchema:
             rows = evenly(rows[timing.kept], timing.times.seconds, spec.dt)
             origin = timing.times.origin + float(timing.times.seconds[0])
 
+        stream = rows[:, : spec.size].astype(np.float32)
+        marked = np.nan_to_num(rows[:, spec.size :])
         faults: NDArray[np.bool_] = np.zeros(0, np.bool_)
-        marks = rows[:, spec.size :]
-        if marks.size:
-            faults = np.asarray(np.nan_to_num(marks).any(axis=1))
-        return Recorded(rows[:, : spec.size].astype(np.float32), spec, faults, origin)
+        if marked.size:
+            faults = np.asarray(marked.any(axis=1))
+        return Recorded(stream, spec, faults, origin)
 
     def clock_in(self, table: Columns) -> LogClock | None:
         """Return the clock of a table; None if its rows come at ``rate``.
@@ -215,11 +218,11 @@ class LogSchema:
 
     def _is_label(self, name: str, values: NDArray[Any]) -> bool:
         """Return whether a column labels faults: by the schema, or if that has no such column."""
-        exact = [column for column in self.columns if column.name == name]
-        patterns = [column for column in self.columns if fnmatchcase(name, column.name)]
-        matching = exact + patterns
-        if matching:
-            return matching[0].role == LABEL
+        exact = [column.role for column in self.columns if column.name == name]
+        matching = [column.role for column in self.columns if fnmatchcase(name, column.name)]
+        roles = exact + matching
+        if roles:
+            return roles[0] == LABEL
         return is_called_label(name, values)
 
     def to_json(self) -> dict[str, Any]:
@@ -262,15 +265,15 @@ def _channel(name: str, columns: Sequence[LogColumn]) -> Channel:
     """
     first = columns[0]
     unit = _common_unit(name, columns)
-    noise = float(np.median([column.noise for column in columns]))
     group = first.channel or name
     if first.role == COMMAND:
         group = MOTOR
-    if group == MOTOR:
-        noise = 0.0
+    noise = 0.0
+    if group != MOTOR:
+        noise = float(np.median([column.noise for column in columns]))
     if first.wrap:
         unit = TURN_UNITS.get(first.wrap, "deg")
-        return Channel(name, 2, unit, noise, group, TURNED)
+        return Channel(name, 2, unit, noise, group, TURNED_ELEMENTS)
 
     elements = tuple(column.element for column in columns)
     if not any(elements):
@@ -284,9 +287,10 @@ def _common_unit(name: str, columns: Sequence[LogColumn]) -> str:
     Raises:
         ValueError: they are of several units, or only some of them are commands.
     """
-    if len({column.role for column in columns}) > 1:
-        names = ", ".join(sorted(column.name for column in columns))
-        raise ValueError(f"channel {name!r} is commanded in part: {names}")
+    roles = {column.role for column in columns}
+    if len(roles) > 1:
+        names = sorted(column.name for column in columns)
+        raise ValueError(f"channel {name!r} is commanded in part: {', '.join(names)}")
     units = sorted({column.unit for column in columns if column.unit})
     if len(units) > 1:
         raise ValueError(f"channel {name!r} is of several units: {', '.join(units)}")
@@ -298,7 +302,7 @@ def _columns_of(channel: Channel) -> Iterator[LogColumn]:
     role = SENSE
     if channel.group == MOTOR:
         role = COMMAND
-    if channel.elements == TURNED:
+    if channel.elements == TURNED_ELEMENTS:
         turn = TURN[channel.unit]
         yield LogColumn(name=channel.name, role=role, unit=channel.unit, wrap=turn)
         return

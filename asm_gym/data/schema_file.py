@@ -11,8 +11,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from asm_gym.data.clock import KINDS, NUMBER, LogClock
-from asm_gym.data.log_column import ROLES, LogColumn
+from asm_gym.data.clock import CLOCK_KINDS, NUMBER, LogClock
+from asm_gym.data.log_column import COLUMN_ROLES, LogColumn
 from asm_gym.data.names import LONGER
 from asm_gym.data.schema import LogSchema
 from asm_gym.files import write_text
@@ -20,12 +20,12 @@ from asm_gym.validation import check_choice, check_number
 
 HEAD = f"""\
 # How asm-gym reads these logs. Edit it, and name it: asm-gym fit LOGS --schema FILE
-# Roles: {", ".join(ROLES)}.
+# Roles: {", ".join(COLUMN_ROLES)}.
 # Further keys of a column: unit, wrap (turn of an angle that turns over), missing (number for
 # missing data), scale (its numbers are multiplied by it), varies = true (logs may differ in range).
 """
-NO_RATE = "# rate = 100.0  # rows a second [Hz]: no clock tells it"
-NO_CLOCK = "# clock = { columns = [...], units = ['s'], kind = 'number' }  # there is none"
+RATE_COMMENT = "# rate = 100.0  # rows a second [Hz]: no clock tells it"
+CLOCK_COMMENT = "# clock = { columns = [...], units = ['s'], kind = 'number' }  # there is none"
 DEFAULTS = LogColumn(name="")
 NOT_IN_COMMENTS = r"[\x00-\x1f\x7f]"
 KEYS = [each.name for each in fields(LogColumn) if each.name not in ("name", "reason")]
@@ -33,10 +33,10 @@ KEYS = [each.name for each in fields(LogColumn) if each.name not in ("name", "re
 
 def write_schema(path: Path, schema: LogSchema) -> None:
     """Write a schema to a file."""
-    rate = NO_RATE
+    rate = RATE_COMMENT
     if schema.rate:
         rate = f"rate = {schema.rate!r}  # rows a second [Hz]"
-    clock = NO_CLOCK
+    clock = CLOCK_COMMENT
     if schema.clock is not None:
         table = {
             "columns": schema.clock.columns,
@@ -136,7 +136,7 @@ def _clock(table: Any) -> LogClock:
         columns = tuple(str(name) for name in table["columns"])
         units = tuple(LONGER[unit] for unit in table["units"])
         kind = table.get("kind", NUMBER)
-        check_choice("kind", kind, KINDS)
+        check_choice("kind", kind, CLOCK_KINDS)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         known = ", ".join(LONGER)
         raise ValueError(f"needs columns, units of {known}, and a kind: {error}") from error

@@ -28,7 +28,7 @@ from asm_gym.data.column_roles import (
 from asm_gym.data.log_column import CLOCK, IGNORED, LABEL, LogColumn
 from asm_gym.data.reader_notes import listed, note
 from asm_gym.data.schema import RATE_TOLERANCE, LogSchema, can_resample
-from asm_gym.data.tables import Columns
+from asm_gym.data.table_layout import Columns
 from asm_gym.data.timing import recordings, timing_of
 from asm_gym.readings import noise_of
 from asm_gym.validation import check_number
@@ -82,7 +82,7 @@ def infer_schema(tables: Sequence[Columns], hints: SchemaHints) -> LogSchema:
     """Return the schema of logs of one robot.
 
     Args:
-        tables: the first logs, as ``asm_gym.data.tables.laid_out`` returns them.
+        tables: the first logs, as ``asm_gym.data.table_layout.laid_out`` returns them.
         hints: what the user says.
 
     Raises:

@@ -15,11 +15,10 @@ from asm_gym.data.logs import Log
 from asm_gym.data.schema import LOG_SCHEMA
 from asm_gym.readings import spans
 
-SHORTEST_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
-AROUND_S = (
-    5.0  # how near to marked rows nothing is learned from [s]: what led to a stop is not normal
-)
-ROUNDING = 1e-9  # share of an episode that is rounding error
+SHORTEST_PART_S = 0.5  # least length of a part between lost rows that is worth learning from [s]
+# How near to marked rows nothing is learned from [s]: what led to a stop is not normal.
+FAULT_MARGIN_S = 5.0
+SHARE_ROUNDING = 1e-9  # share of an episode that is rounding error
 
 
 def normal_episodes(
@@ -44,10 +43,11 @@ def normal_episodes(
         progress(n, n)  # how many there are is known at the end
         episode = log.episode
         is_marked = bool(episode.faults.any())
+        is_faulty = episode.label is not None and episode.label.role == "faulty"
         if between_marks and is_marked and episode.spec.source == "table":
             for number, part in enumerate(_unmarked_parts(episode)):
                 kept.append(Log(f"{log.name} part {number}", part))
-        elif is_marked or (episode.label is not None and episode.label.role == "faulty"):
+        elif is_marked or is_faulty:
             left_out["with a fault"] += 1
         elif not episode.success:
             left_out["failed"] += 1
@@ -60,9 +60,10 @@ def normal_episodes(
 
 def _unmarked_parts(episode: Episode) -> list[Episode]:
     """Return the parts of an episode with no marked row near."""
-    near = round(AROUND_S / episode.spec.dt)
-    marked_rows = np.convolve(episode.faults, np.ones(2 * near + 1), "same")
-    return _parts(episode, marked_rows <= 0.5)
+    margin = round(FAULT_MARGIN_S / episode.spec.dt)  # [rows]
+    window = np.ones(2 * margin + 1)
+    marked_near = np.convolve(episode.faults, window, "same")
+    return _parts(episode, marked_near <= 0.5)
 
 
 def complete_parts(episode: Episode) -> list[Episode]:
@@ -75,7 +76,7 @@ def complete_parts(episode: Episode) -> list[Episode]:
 
 def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
     """Return the stretches of rows that are wanted (T,), but for short ones."""
-    least = max(2, round(SHORTEST_S / episode.spec.dt))
+    least = max(2, round(SHORTEST_PART_S / episode.spec.dt))
     stretches = [_stretch(episode, start, stop) for start, stop in spans(wanted)]
     return [stretch for stretch in stretches if len(stretch) >= least]
 
@@ -83,7 +84,8 @@ def _parts(episode: Episode, wanted: NDArray[np.bool_]) -> list[Episode]:
 def _stretch(episode: Episode, start: int, stop: int) -> Episode:
     """Return some rows of an episode as one of their own, with the schema of their log."""
     info = {key: value for key, value in episode.info.items() if key == LOG_SCHEMA}
-    return Episode.from_stream(episode.stream[start:stop], episode.spec, success=True, info=info)
+    rows = episode.stream[start:stop]
+    return Episode.from_stream(rows, episode.spec, success=True, info=info)
 
 
 def pieces(episode: Episode, seconds: float) -> list[Episode]:
@@ -126,12 +128,12 @@ def split_in_time(
     fitting: list[Episode] = []
     calibration: list[Episode] = []
     for parts in logs:
-        head = math.ceil(len(parts) * (1 - calibration_share))
-        tail = head + 1
+        head_end = math.ceil(len(parts) * (1 - calibration_share))
+        tail_start = head_end + 1
         if len(logs) == 1 and len(parts) <= 2:
-            tail = head
-        fitting += parts[:head]
-        calibration += parts[tail:]
+            tail_start = head_end
+        fitting += parts[:head_end]
+        calibration += parts[tail_start:]
     if not fitting or not calibration:
         count = len(fitting) + len(calibration)
         raise ValueError(f"{count} pieces are too few to learn from and to calibrate on")
@@ -147,9 +149,10 @@ def split_at_random(
         ValueError: fewer than ``needed`` would be left to calibrate on.
     """
     size = len(episodes)
-    calibration_size = math.floor(size * calibration_share + ROUNDING)
+    calibration_size = math.floor(size * calibration_share + SHARE_ROUNDING)
     if calibration_size < needed or calibration_size == size:
-        least = max(2, math.ceil(needed / calibration_share - ROUNDING))
+        whole_share = needed / calibration_share
+        least = max(2, math.ceil(whole_share - SHARE_ROUNDING))
         raise ValueError(
             f"this false-alarm rate needs {least} normal episodes, {needed} of them to "
             f"calibrate on, got {size}: record more, take a higher --false-alarm-rate, or "

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.names import element_name
 from asm_gym.data.reader_notes import note
-from asm_gym.data.tables import MOST_COLUMNS, Columns, check_width
+from asm_gym.data.table_layout import MOST_COLUMNS, Columns, check_width
 from asm_gym.data.text_exports import check_export, on_first_clock, scope_head, with_unit
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ LONGEST_LINE = LONGEST_WORD * MOST_COLUMNS  # characters of a line
 LONGEST_UNIT = 12  # characters of a unit
 SEPARATORS = ";\t,|"
 FLAGS = {"true": 1.0, "false": 0.0}
-MISSING = re.compile(r"|-|--|n/?a|#n/a|<na>|-?nan|null|none|-?1\.#(ind|qnan)", re.I)
-BEFORE = " #%"  # may stand before a header
+MISSING_CELL = re.compile(r"|-|--|n/?a|#n/a|<na>|-?nan|null|none|-?1\.#(ind|qnan)", re.I)
+HEADER_MARKS = " #%"  # may stand before a header
 COMMENT = r"\s*#"  # begins a line that is no row
 COMMA_OF_TIME = r"(:\d\d),(\d)"  # before the fraction of a second: 10:15:00,020
 DOUBLED = " #"  # stands, with a number, behind the name of a column that another has
@@ -177,7 +177,7 @@ def _header_place(lines: Sequence[str]) -> int:
     with_numbers = 0
     for place, line in enumerate(lines):
         dialect = Dialect.of(line)
-        cells = dialect.cells(line.lstrip(BEFORE))
+        cells = dialect.cells(line.lstrip(HEADER_MARKS))
         below = [other for other in lines[place + 1 :] if not re.match(COMMENT, other)]
         rows = [dialect.cells(other) for other in below[:ROWS_COMPARED]]
         is_table = all(_fits(row, len(cells)) for row in rows)
@@ -195,7 +195,7 @@ def _table(path: Path, lines: pd.Series[str], columns: Sequence[str]) -> _Table:
     """The table in some lines: a header, perhaps units, and rows; ``columns`` name the columns of rows alone."""
     header = "".join(lines.iloc[:1])
     dialect = Dialect.of(header)
-    cells = dialect.cells(header.lstrip(BEFORE))
+    cells = dialect.cells(header.lstrip(HEADER_MARKS))
     names = _names(dialect, cells, columns)
     if columns and dialect.count_numbers(cells):
         header = ""
@@ -310,7 +310,7 @@ def _column(cells: Any, comma: bool) -> NDArray[Any]:
         return numbers
     text = pd.Series(cells, dtype=object).fillna("")
     words = text.astype(str).str.strip()
-    is_missing = words.str.fullmatch(MISSING)
+    is_missing = words.str.fullmatch(MISSING_CELL)
     words[is_missing] = ""
     if is_missing[is_lost].all():
         return numbers

@@ -71,7 +71,13 @@ class RunningThreshold:
     def follow(
         self, largest: float, judged_by: float | None = None, confirmed: bool = False
     ) -> None:
-        """Move after an episode of this greatest surprise, unless an alarm in it was ``confirmed`` as true."""
+        """Move the threshold after an episode.
+
+        Args:
+            largest: surprise of the episode.
+            judged_by: threshold that was in use; by default the present one.
+            confirmed: an alarm in it was true, so that the episode does not count.
+        """
         if judged_by is None:
             judged_by = self.value
         alarm = bool(rows_over(largest, judged_by))

@@ -14,7 +14,6 @@ slowest evidence, a being the least of the usual gains.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.alarm_rule import JUDGED, KNOCK_EVENT, STOP_EVENT
 from asm_gym.detection.base import Floats
+from asm_gym.detection.channel_columns import columns_where
 from asm_gym.detection.detector import GAINS
 from asm_gym.spec import Channel, StreamSpec
 
@@ -31,7 +31,7 @@ KNOCKED_S = 1.0  # duration of its excuse [s]
 NEAR_STOP = 0.03  # a joint is at its stop from so far before it [rad]
 PAST_STOP = 0.1  # to so far past it [rad]
 # Largest joint speed [rad/s]: a joint farther from its stop in the row before is not at it now.
-FASTEST = 5.0
+FASTEST_JOINT = 5.0
 MOVING = 0.01  # speed of a sliding finger [m/s]
 MOVED_S = 0.1  # duration of its excuse [s]
 EXCUSED = 10.0  # divisor of surprise at a knock or a stop
@@ -96,16 +96,16 @@ class BenignEvents:
     """
 
     def __init__(self, spec: StreamSpec) -> None:
-        wrist = _columns(spec, lambda channel: channel.name.endswith("wrist_force_peak"))
+        wrist = columns_where(spec, lambda channel: channel.name.endswith("wrist_force_peak"))
         if not wrist.size:
-            wrist = _columns(spec, lambda channel: channel.name.endswith("wrist_force"))
+            wrist = columns_where(spec, lambda channel: channel.name.endswith("wrist_force"))
         stops = [stop for channel in spec.channels for stop in channel.stops]
         self.senses = EventSenses(
             wrist=wrist,
-            fingers=_columns(spec, _is_finger_speed),
-            joints=_columns(spec, lambda channel: bool(channel.stops)),
+            fingers=columns_where(spec, _is_finger_speed),
+            joints=columns_where(spec, lambda channel: bool(channel.stops)),
             stops=np.array(stops, np.float64).reshape(-1, 2),
-            closing=NEAR_STOP + FASTEST * spec.dt,
+            closing=NEAR_STOP + FASTEST_JOINT * spec.dt,
             knock_rows=max(1, round(KNOCKED_S / spec.dt)) + FADING,
             slide_rows=max(1, round(MOVED_S / spec.dt)),
         )
@@ -133,11 +133,6 @@ class BenignEvents:
             state, judged = self.step(state, row[None])
             divisors.append(judged["divisor"][0])
         return np.array(divisors)
-
-
-def _columns(spec: StreamSpec, selects: Callable[[Channel], bool]) -> NDArray[np.intp]:
-    """Return the columns (N,) of the channels that ``selects`` is true of."""
-    return np.flatnonzero([selects(channel) for channel in spec.channels for _ in channel.labels])
 
 
 def _is_finger_speed(channel: Channel) -> bool:

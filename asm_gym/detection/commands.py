@@ -28,42 +28,34 @@ def hands_of(spec: StreamSpec) -> NDArray[np.intp]:
     """Return (H, 2, 3) the columns of place and velocity of each hand of a stream."""
     hands = []
     columns = np.arange(spec.size)
-    for name in spec.slices:
-        velocity = f"{name.removesuffix('position')}velocity"
-        if name.endswith("hand_position") and velocity in spec.slices:
-            names = (name, velocity)
-            hands.append([columns[spec.slices[name]] for name in names])
+    for position, place in spec.slices.items():
+        velocity = f"{position.removesuffix('position')}velocity"
+        if position.endswith("hand_position") and velocity in spec.slices:
+            hands.append([columns[place], columns[spec.slices[velocity]]])
     return np.array(hands, np.intp).reshape(-1, 2, 3)
 
 
 def learned_motion(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float64]:
     """Return M (3 H + A, 3 H) of streams (T, D)."""
-    velocities = hands_of(spec)[:, 1].ravel()
+    columns = hands_of(spec)[:, 1].ravel()
     inputs = []
-    following = []
+    velocities = []
     for stream in streams:
-        before = stream[:-1, velocities]
-        inputs.append(np.hstack([before, stream[1:, spec.motor]]))
-        following.append(stream[1:, velocities])
-    solution = np.linalg.lstsq(
-        np.concatenate(inputs),
-        np.concatenate(following),
-        rcond=None,
-    )[0]
-    return np.asarray(solution, np.float64)
+        before = stream[:-1, columns]
+        commands = stream[1:, spec.motor]
+        inputs.append(np.hstack([before, commands]))
+        velocities.append(stream[1:, columns])
+    solution = np.linalg.lstsq(np.concatenate(inputs), np.concatenate(velocities), rcond=None)
+    return np.asarray(solution[0], np.float64)
 
 
 def healthy_commands(streams: Sequence[Floats], spec: StreamSpec) -> NDArray[np.float32]:
     """Return (3, A) the least, the most, and the greatest change in a row of what healthy streams (T, D) commanded."""
     commands = [stream[:, spec.motor] for stream in streams]
-    changes = np.concatenate([np.diff(episode, axis=0) for episode in commands])
     every = np.concatenate(commands)
-    limits = [
-        every.min(axis=0),
-        every.max(axis=0),
-        np.abs(changes).max(axis=0, initial=0.0),
-    ]
-    return np.stack(limits)
+    steps = np.concatenate([np.diff(episode, axis=0) for episode in commands])
+    greatest_step = np.abs(steps).max(axis=0, initial=0.0)
+    return np.stack([every.min(axis=0), every.max(axis=0), greatest_step])
 
 
 def command_limits(commands: Floats) -> NDArray[np.float64]:
@@ -78,17 +70,19 @@ def command_limits(commands: Floats) -> NDArray[np.float64]:
 
 
 def out_of_range(commands: Floats, before: Floats, action: Floats) -> str:
-    """Return what of an action no healthy one was: ``PLACE``, out of range, or ``PACE``, too large a step.
+    """Return how an action differs from all healthy ones: ``PLACE``, out of range, ``PACE``, too large a step, or "".
 
     Args:
         commands: (3, A) of healthy policies.
         before: (A,) the action before; a number that is not finite allows any step.
         action: (A,).
     """
-    least, most, step = command_limits(commands)
-    now = action[: step.size]
-    if (now < least).any() or (now > most).any():
+    least, most, largest_step = command_limits(commands)
+    size = len(least)
+    command = action[:size]
+    if (command < least).any() or (command > most).any():
         return PLACE
-    if (np.abs(now - before[: step.size]) > step).any():
+    step = np.abs(command - before[:size])
+    if (step > largest_step).any():
         return PACE
     return ""

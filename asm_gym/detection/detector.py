@@ -42,18 +42,18 @@ from asm_gym.memory.learning import Synapse, cosine_decay, shuffled
 
 GAINS = (0.8, 0.2, 0.05)
 BOUND = 100.0
-FAINTEST = 1e-9  # smallest s whose logarithm is taken
-LEAST = math.log(TINY)
+LEAST_POOLED = 1e-9  # smallest s whose logarithm is taken
+LOG_TINY = math.log(TINY)
 NEGLIGIBLE = -50.0  # logarithm of a share that vanishes beside 1 in double precision
-USUAL = 0.95  # τ
+USUAL_QUANTILE = 0.95  # τ
 MOST_ROWS = 60_000  # largest number of rows, evenly spaced, that teach what is usual in a context
-UPDATES = 1000  # largest number of batches
-PASSES = 12  # largest number of passes
-FEWEST = 40  # smallest number of batches
-BATCH = 512
-RATE = 1e-2
-STEPS_PER_NUMBER = 8  # with fewer nominal rows for each number of a context, nothing is learned
-EXTREME = 0.005  # share of nominal rows below l, and above h
+MOST_UPDATES = 1000  # largest number of batches
+MOST_PASSES = 12  # largest number of passes
+FEWEST_UPDATES = 40  # smallest number of batches
+HABITUATION_BATCH = 512
+HABITUATION_RATE = 1e-2
+ROWS_PER_NUMBER = 8  # with fewer nominal rows for each number of a context, nothing is learned
+EXTREME_SHARE = 0.005  # share of nominal rows below l, and above h
 
 
 class Detector(NamedTuple):
@@ -103,7 +103,7 @@ class Detector(NamedTuple):
     ) -> Detector:
         """Return the detector that knows what is usual in each context of nominal episodes; the same for too few."""
         rows = sum(len(run.errors) for run in runs)
-        if rows < STEPS_PER_NUMBER * (len(self.context_quantile) - 1):
+        if rows < ROWS_PER_NUMBER * (len(self.context_quantile) - 1):
             return self
         stride = -(-rows // MOST_ROWS)
         contexts = []
@@ -112,7 +112,7 @@ class Detector(NamedTuple):
             strengths, running = self.strengths(run)
             pooled, _ = pool(self.ratios(strengths))
             context = np.hstack([run.contexts, running])
-            level = np.log(np.maximum(pooled, FAINTEST))
+            level = np.log(np.maximum(pooled, LEAST_POOLED))
             contexts.append(context[::stride].astype(np.float32))
             levels.append(level[::stride])
         quantile, limits = usual_levels(contexts, levels, rng)
@@ -152,20 +152,13 @@ class Detector(NamedTuple):
         context = (len(self.context_quantile) - 1) // 2
         return Evidence.start(batch, gains, errors, context)
 
-    def step(
-        self,
-        evidence: Evidence,
-        errors: Array,
-        context: Array,
-    ) -> tuple[Evidence, Floats]:
-        """Return the new evidence, and each error's share (B, X) of the value; ``context`` is (B, C)."""
+    def step(self, evidence: Evidence, output: ModelOutput) -> tuple[Evidence, Floats]:
+        """Return the evidence after a row of B streams, and each error's share (B, X) of the value."""
+        errors = np.asarray(output.errors, np.float64)
+        contexts = np.asarray(output.contexts, np.float64)
         after = self.start(len(errors))
         shares = np.empty(errors.shape)
-        output = ModelOutput(
-            errors=np.asarray(errors, np.float64),
-            contexts=np.asarray(context, np.float64),
-        )
-        step_evidence(self, evidence, after, output, shares)
+        step_evidence(self, evidence, after, ModelOutput(errors, contexts), shares)
         return after, shares
 
     def strengths(self, run: ModelOutput) -> tuple[Floats, Floats]:
@@ -220,7 +213,7 @@ def write_ratios(
     ratios: Any,
 ) -> float:
     """Write log r (G, X) = κ log(v/q) after so many rows; return the largest."""
-    greatest = LEAST
+    greatest = LOG_TINY
     for g in range(len(detector.gains)):
         ceiling = detector.ceiling[g]
         tail = detector.tail[g]
@@ -280,9 +273,9 @@ def usual_levels(
     level = np.concatenate(levels)
     weights = habituate(context, level, rng)[:-1]
     drive = context @ weights
-    limits = np.quantile(drive, (EXTREME, 1.0 - EXTREME))
+    limits = np.quantile(drive, (EXTREME_SHARE, 1.0 - EXTREME_SHARE))
     limited = np.clip(drive, limits[0], limits[1])
-    bias = np.quantile(level - limited, USUAL)
+    bias = np.quantile(level - limited, USUAL_QUANTILE)
     quantile = np.append(weights, bias)
     return quantile.astype(np.float64), limits + bias
 
@@ -293,16 +286,16 @@ def habituate(
     rng: np.random.Generator,
 ) -> NDArray[np.float32]:
     """Return w, then b (C + 1,), from contexts (N, C) and log s (N,) of nominal rows."""
-    usual = np.quantile(level, USUAL)
+    usual = np.quantile(level, USUAL_QUANTILE)
     weights = Synapse(np.zeros(context.shape[1], np.float32))
     bias = Synapse(np.array([usual], np.float32))
-    updates = max(FEWEST, min(UPDATES, PASSES * len(level) // BATCH))
-    batches = shuffled(len(level), BATCH, rng)
+    updates = max(FEWEST_UPDATES, min(MOST_UPDATES, MOST_PASSES * len(level) // HABITUATION_BATCH))
+    batches = shuffled(len(level), HABITUATION_BATCH, rng)
     for n, rows in zip(range(updates), batches, strict=False):
-        rate = cosine_decay(RATE, n / updates)
+        rate = cosine_decay(HABITUATION_RATE, n / updates)
         inputs = context[rows]
         below = level[rows] < inputs @ weights.W + bias.W
-        pull = (USUAL - below).astype(np.float32)
+        pull = (USUAL_QUANTILE - below).astype(np.float32)
         weights.learn(pull @ inputs / np.float32(len(rows)), rate)
         bias.learn(pull.mean(keepdims=True), rate)
     return np.concatenate([weights.W, bias.W])

@@ -37,7 +37,7 @@ HOURS_QUANTILE = 0.98  # share of their episodes
 FEWEST_EPISODES = 100  # that such a quantile needs
 TAIL_PRIOR_COUNT = 10
 """Maxima beyond q after which a number's own tail counts as much as the tail common to all."""
-SMALLEST = 1e-9  # lower bound of q
+LEAST_CEILING = 1e-9  # lower bound of q
 LEAST_SHARE = 1e-3
 """The same as a share of the median q, for numbers that never erred in a few episodes."""
 
@@ -177,5 +177,5 @@ def worst_case(maxima: Array, tail_index: float = TAIL_INDEX) -> tuple[Floats, F
 
 def ceilings(maxima: Array, quantile: float) -> Floats:
     """Return q (…): a quantile of the maxima of N nominal episodes (N, …)."""
-    ceiling = np.maximum(np.quantile(maxima, quantile, axis=0), SMALLEST)
+    ceiling = np.maximum(np.quantile(maxima, quantile, axis=0), LEAST_CEILING)
     return np.maximum(ceiling, LEAST_SHARE * np.median(ceiling))

@@ -106,16 +106,16 @@ class EvidenceDetection:
         arrays["repetition"] = count_repetitions(streams, self.spec.noise[senses] > 0)
         return self.restore(arrays)
 
-    def with_ceilings(self, maxima: Array, anew: bool) -> EvidenceDetection:
-        """Return a copy with q from the largest v (N, G, X) in healthy episodes, and κ ``anew`` by a smaller ξ_0."""
+    def with_ceilings(self, maxima: Array, is_first: bool) -> EvidenceDetection:
+        """Return a copy with q from the largest v (N, G, X) in healthy episodes.
+
+        The first time, κ changes to that of a smaller ξ_0.
+        """
         tail = self.learned_["tail"]
-        if anew:
+        if is_first:
             tail = tail * (HOURS_TAIL_INDEX / self.tail_index)
-        learned = {
-            **self.learned_,
-            "ceiling": ceilings(maxima, HOURS_QUANTILE),
-            "tail": np.minimum(tail, 1.0),
-        }
+        ceiling = ceilings(maxima, HOURS_QUANTILE)
+        learned = {**self.learned_, "ceiling": ceiling, "tail": np.minimum(tail, 1.0)}
         return copy.copy(self).restore(learned)
 
     def restore(self, learned: Arrays) -> Self:
@@ -130,16 +130,12 @@ class EvidenceDetection:
     def _detector_of(self, learned: Arrays) -> Detector:
         """Return the detector of learned arrays. Raises ValueError where they do not fit."""
         arrays = {name: np.array(learned[name], np.float64) for name in self.arrays[:-1]}
-        gains = len(self.gains)
         errors = len(arrays["whitening"])
-        shapes = {
-            "whitening": (errors, errors),
-            "ceiling": (gains, errors),
-            "tail": (gains, errors),
-        }
-        check_shapes(arrays, shapes)
+        each = (len(self.gains), errors)
+        check_shapes(arrays, {"whitening": (errors, errors), "ceiling": each, "tail": each})
         for name, most in (("ceiling", math.inf), ("tail", 1.0)):
-            if not ((arrays[name] > 0.0) & (arrays[name] <= most)).all():
+            array = arrays[name]
+            if not ((array > 0.0) & (array <= most)).all():
                 raise ValueError(f"the {name} of evidence must be in (0, {most:g}]")
 
         detector = Detector(**arrays, gains=np.array(self.gains), bound=self.bound)
@@ -197,20 +193,18 @@ class EvidenceDetection:
         self, state: EvidenceState, output: ModelOutput, rows: Floats, place: Place
     ) -> tuple[EvidenceState, Floats]:
         """Return the new state, and each number's share (B, D) of the surprise at the next rows (B, D)."""
-        senses = self.spec.sensory
         weights = self.fitted_repetition
-        evidence, parts = self.fitted_detector.step(state.evidence, output.errors, output.contexts)
-        repetition = state.repetition.followed_by(rows[:, senses], weights.steps, weights.most)
-        shares = place(parts)
+        evidence, error_shares = self.fitted_detector.step(state.evidence, output)
+        repetition = state.repetition.followed_by(rows, weights)
+        shares = place(error_shares)
         for share, unlikely in zip(shares, repetition.unlikely, strict=True):
             pool_repetitions(weights, unlikely, share)
         return EvidenceState(evidence=evidence, repetition=repetition), shares
 
     def reset(self, state: EvidenceState) -> EvidenceState:
         """Return the state without its evidence; its number of rows and its context are kept."""
-        vector = np.zeros_like(state.evidence.vector)
-        unlikely = np.zeros_like(state.repetition.unlikely)
+        evidence, repetition = state
         return EvidenceState(
-            evidence=state.evidence._replace(vector=vector),
-            repetition=state.repetition._replace(unlikely=unlikely),
+            evidence=evidence._replace(vector=np.zeros_like(evidence.vector)),
+            repetition=repetition._replace(unlikely=np.zeros_like(repetition.unlikely)),
         )

@@ -22,14 +22,14 @@ Floats = NDArray[np.float64]
 
 CELL_SIZE = np.array([0.04, 0.04, 0.02])  # edges of a cell of the map along x, y and z [m]
 AXES = 6  # of a twist
-DOWN = 8  # of the 12 directions, along each axis and then against each: against z
+DOWNWARDS = 8  # of the 12 directions, along each axis and then against each: against z
 
 # A hand may be commanded so many times as fast as healthy ones: about 0.8 of it is reached.
 ABOVE_HEALTHY = 1.25
 ABOVE_HEALTHY_DOWN = 1.05  # the same downwards
-SLACK = np.array([0.03, 0.03, 0.03, 0.15, 0.15, 0.15])  # and by so much faster [m/s], [rad/s]
+SPEED_SLACK = np.array([0.03, 0.03, 0.03, 0.15, 0.15, 0.15])  # and by so much faster [m/s], [rad/s]
 DOWN_SLACK = 0.03  # downwards as fast as this, whatever healthy hands did [m/s]
-STILL = 1e-9  # no speed is divided by less [m/s]
+LEAST_SPEED = 1e-9  # no speed is divided by less [m/s]
 
 
 class SpeedLimit(NamedTuple):
@@ -70,11 +70,11 @@ def healthy_share(limit: SpeedLimit, arm: int, place: Floats, twist: Floats) -> 
         direction = axis
         if twist[axis] <= 0.0:
             direction += AXES
-        speed = ABOVE_HEALTHY * fastest[direction] + SLACK[axis]
-        share = min(share, speed / max(abs(twist[axis]), STILL))
+        speed = ABOVE_HEALTHY * fastest[direction] + SPEED_SLACK[axis]
+        share = min(share, speed / max(abs(twist[axis]), LEAST_SPEED))
 
-    down = max(ABOVE_HEALTHY_DOWN * fastest[DOWN], DOWN_SLACK)
-    return min(share, min(down, limit.hand_speed) / max(-twist[2], STILL))
+    down = max(ABOVE_HEALTHY_DOWN * fastest[DOWNWARDS], DOWN_SLACK)
+    return min(share, min(down, limit.hand_speed) / max(-twist[2], LEAST_SPEED))
 
 
 @compiled
@@ -96,8 +96,8 @@ def allowed_share(
         speed: of the hand's fastest point [m/s].
         momentum: of the arm along its hand's motion [N s]; 0 where it is not known.
     """
-    share = limit.hand_speed / max(speed, STILL)
+    share = limit.hand_speed / max(speed, LEAST_SPEED)
     if limit.grid.size == 0:
         return share
-    share = min(share, limit.momentum / max(momentum, STILL))
+    share = min(share, limit.momentum / max(momentum, LEAST_SPEED))
     return max(share, healthy_share(limit, arm, place, twist))

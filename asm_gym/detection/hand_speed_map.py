@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from asm_gym.data.episode import Episode
-from asm_gym.detection.hand_speed import AXES, CELL_SIZE, DOWN, Floats, cell_near
+from asm_gym.detection.hand_speed import AXES, CELL_SIZE, DOWNWARDS, Floats, cell_near
 from asm_gym.spec import StreamSpec
 
 AnyFloats = NDArray[np.floating[Any]]
 
 # Columns of a map's cells.
 ARM_AND_PLACE = slice(0, 4)  # the arm, and the cell's place along x, y and z in cells
-FASTEST = slice(4, 16)
+FASTEST_COLUMNS = slice(4, 16)
 """Greatest speed along each axis of the twist, then against each [m/s], [rad/s]."""
 
 FARTHEST_CELL = 100  # hands that are more cells away from the origin are not learned of
@@ -44,7 +44,7 @@ class HandSpeedMap:
     """How fast healthy hands went, by place and direction.
 
     Args:
-        cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST``. The greatest counts where a place is given twice.
+        cells: (N, 16) see ``ARM_AND_PLACE`` and ``FASTEST_COLUMNS``. The greatest counts where a place is given twice.
         momentum: limit of an arm's momentum along its hand's motion, where no healthy hand was [N s].
 
     Raises:
@@ -62,7 +62,7 @@ class HandSpeedMap:
     ) -> None:
         if not _are_cells(cells):
             raise ValueError(
-                f"pace must be rows of {FASTEST.stop} numbers, "
+                f"pace must be rows of {FASTEST_COLUMNS.stop} numbers, "
                 f"places within {FARTHEST_CELL} cells, got {cells.shape}"
             )
         self.cells = cells
@@ -74,12 +74,12 @@ class HandSpeedMap:
         shape = np.add(offsets.max(axis=0), (1, 2, 2, 2))
         grid = np.zeros((*shape, 2 * AXES), np.float32)
         at = tuple(offsets.T)
-        np.maximum.at(grid, at, cells[:, FASTEST])
+        np.maximum.at(grid, at, cells[:, FASTEST_COLUMNS])
 
         # A hand may go as fast as others beside its cell; downwards, only as others at its height.
-        downward = grid[..., DOWN]
+        downward = grid[..., DOWNWARDS]
         self.grid = maximum_filter(grid, (1, 3, 3, 3, 1))
-        self.grid[..., DOWN] = maximum_filter(downward, (1, 3, 3, 1))
+        self.grid[..., DOWNWARDS] = maximum_filter(downward, (1, 3, 3, 1))
 
     @classmethod
     def of(
@@ -114,18 +114,13 @@ class HandSpeedMap:
     def learned(streams: Sequence[AnyFloats], spec: StreamSpec) -> NDArray[np.float32] | None:
         """Return the cells (N, 16) of healthy streams (T, D); None where these do not tell how hands move."""
         cells = []
-        columns = np.arange(spec.size)
-        hands = [name for name in spec.slices if name.endswith("hand_position")]
-        for arm, position in enumerate(hands):
+        positions = [name for name in spec.slices if name.endswith("hand_position")]
+        for arm, position in enumerate(positions):
             hand = position.removesuffix("position")
-            names = (
-                position,
-                f"{hand}velocity",
-                f"{hand}angular_velocity",
-            )
+            names = (position, f"{hand}velocity", f"{hand}angular_velocity")
             if spec.slices.keys() >= set(names):
-                parts = [columns[spec.slices[name]] for name in names]
-                rows = _motions(streams, np.concatenate(parts))
+                columns = np.hstack([np.arange(spec.size)[spec.slices[name]] for name in names])
+                rows = _motions(streams, columns)
                 cells.append(_cells_of(arm, rows, len(streams)))
         if not cells:
             return None
@@ -144,7 +139,7 @@ class HandSpeedMap:
 
 
 def _are_cells(cells: AnyFloats) -> bool:
-    if cells.ndim != 2 or cells.shape[1] != FASTEST.stop or cells.size == 0:
+    if cells.ndim != 2 or cells.shape[1] != FASTEST_COLUMNS.stop or cells.size == 0:
         return False
     near = np.abs(cells[:, ARM_AND_PLACE]) <= FARTHEST_CELL
     arms_and_speeds = np.delete(cells, (1, 2, 3), axis=1)
@@ -154,21 +149,16 @@ def _are_cells(cells: AnyFloats) -> bool:
 
 def _motions(streams: Sequence[AnyFloats], columns: NDArray[np.intp]) -> Floats:
     """Return (T, 10) the rows of all streams: index of the episode, place in cells (3,), twist (6,)."""
-    motions = [
-        np.insert(
-            np.asarray(stream[:, columns], np.float64),
-            0,
-            episode,
-            axis=1,
-        )
-        for episode, stream in enumerate(streams)
-    ]
+    motions = []
+    for episode, stream in enumerate(streams):
+        motion = np.asarray(stream[:, columns], np.float64)
+        motions.append(np.insert(motion, 0, episode, axis=1))
     rows = np.concatenate(motions)
     places = rows[:, 1:4] / CELL_SIZE
     rows[:, 1:4] = np.floor(places)
-    near = np.abs(places) < FARTHEST_CELL
-    known = np.isfinite(rows).all(axis=1)
-    return rows[known & near.all(axis=1)]
+    is_near = (np.abs(places) < FARTHEST_CELL).all(axis=1)
+    is_known = np.isfinite(rows).all(axis=1)
+    return rows[is_known & is_near]
 
 
 def _cells_of(
@@ -181,19 +171,15 @@ def _cells_of(
     visits, visit_of = np.unique(rows[:, :4], axis=0, return_inverse=True)
     twists = rows[:, 4:]
     fastest = np.zeros((len(visits), 2 * AXES))
-    directions = np.hstack((twists, -twists))
-    np.maximum.at(fastest, visit_of.ravel(), directions)
+    np.maximum.at(fastest, visit_of.ravel(), np.hstack((twists, -twists)))
 
     cells = []
     visited = visits[:, 1:]
     for place in np.unique(visited, axis=0):
         here = np.all(visited == place, axis=1)
         ascending = np.sort(fastest[here], axis=0)
-        fastest_here = FASTEST_EPISODES * len(ascending)
-        odd = ODD_EPISODES * episodes
-        kept = len(ascending) - int(fastest_here + odd)
+        left_out = FASTEST_EPISODES * len(ascending) + ODD_EPISODES * episodes
+        kept = len(ascending) - int(left_out)
         if kept > 0:
-            speeds = ascending[kept - 1]
-            cell = np.hstack((arm, place, speeds))
-            cells.append(cell)
-    return np.reshape(cells, (-1, FASTEST.stop))
+            cells.append(np.hstack((arm, place, ascending[kept - 1])))
+    return np.reshape(cells, (-1, FASTEST_COLUMNS.stop))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
 
-HAND = 9  # how many numbers say where a hand is
+HAND_SIZE = 9  # how many numbers say where a hand is
 ORIGIN = np.zeros(3)
 
 
@@ -33,7 +33,7 @@ class Chain(NamedTuple):
 
     def at(self, angles: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(9,) the hand by the angles (J,) [rad]."""
-        place = np.empty(HAND)
+        place = np.empty(HAND_SIZE)
         exact = np.asarray(angles, np.float64)
         hand_at(exact, self.axes, self.anchors, self.hand, place)
         return place
@@ -49,7 +49,7 @@ def hand_at(
 ) -> None:
     """Write ``place`` (9,), see ``Chain.at``."""
     vectors = place.reshape((3, 3))
-    for i in range(HAND):
+    for i in range(HAND_SIZE):
         place[i] = hand[i // 3, i % 3]
     for j in range(len(angles) - 1, -1, -1):
         axis = axes[j]

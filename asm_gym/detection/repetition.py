@@ -26,7 +26,7 @@ from asm_gym.detection.base import Floats
 from asm_gym.detection.evidence import POWER, TAIL_INDEX, TINY, scale, total
 from asm_gym.readings import noise_of, resolution
 
-STUCK = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
+STUCK_PROBABILITY = 0.9  # ρ; below 1, as a loose cable lets a reading through now and then
 REPETITION_OFFSET = 12.0
 """One in 160,000, which among a hundred senses happens once in some thousand rows."""
 RARER = 3.0  # by which n_0 lies above it, or above the largest n of nominal episodes
@@ -79,21 +79,9 @@ class Repetition(NamedTuple):
             unlikely=np.zeros(shape),
         )
 
-    def followed_by(
-        self,
-        rows: Floats,
-        steps: Floats,
-        most: Floats,
-    ) -> Repetition:
-        """Return the state after rows (B, X), by ``evidence_steps`` and an upper bound of n (X,)."""
-        columns = np.arange(len(most))
-        weights = RepetitionWeights(
-            columns=columns,
-            steps=steps,
-            most=most,
-            offset=most,
-        )
-        after = Repetition.start(len(rows), len(most))
+    def followed_by(self, rows: Floats, weights: RepetitionWeights) -> Repetition:
+        """Return the state after rows (B, D)."""
+        after = Repetition.start(len(rows), len(weights.columns))
         step_repetition(weights, self, after, rows)
         return after
 
@@ -105,49 +93,43 @@ def count_repetitions(streams: Sequence[Stream], noisy: NDArray[np.bool_]) -> Fl
         streams: the senses (T, X) in nominal episodes.
         noisy: (X,) those with declared noise.
     """
-    chances = np.zeros((2, len(noisy)))  # after a change, and after a repetition
-    repeats = np.zeros((2, len(noisy)))
+    senses = len(noisy)
+    rows = np.zeros((2, senses))  # after a change, and after a repetition
+    repetitions = np.zeros((2, senses))
     for stream in streams:
-        again = stream[1:] == stream[:-1]
-        before = again[:-1]
-        groups = (~before, before)
-        for repeated, group in enumerate(groups):
-            chances[repeated] += group.sum(axis=0)
-            repeats[repeated] += (again[1:] & group).sum(axis=0)
+        is_repeated = stream[1:] == stream[:-1]
+        now = is_repeated[1:]
+        before = is_repeated[:-1]
+        rows += [(~before).sum(axis=0), before.sum(axis=0)]
+        repetitions += [(now & ~before).sum(axis=0), (now & before).sum(axis=0)]
 
-    first = (repeats[0] + 0.5) / (chances[0] + 1.0)
+    after_change = (repetitions[0] + 0.5) / (rows[0] + 1.0)
     # Rest comes by the episode: where n of them never rested, the next may.
-    first = np.maximum(first, 1.0 / (RESTLESS * len(streams)))
+    after_change = np.maximum(after_change, 1.0 / (RESTLESS * len(streams)))
     # As rare after a repetition as after a change, unless seen to be otherwise.
-    later = (repeats[1] + first) / (chances[1] + 1.0)
-    p = np.array([first, later])
+    after_repetition = (repetitions[1] + after_change) / (rows[1] + 1.0)
 
-    watched = repeats.sum(axis=0) == 0
+    is_watched = repetitions.sum(axis=0) == 0
     if noisy.any():
-        restless = later < RESTS
-        watched = noisy & ~stands_still(streams) & restless
-    surprise = np.where(watched, -np.log(p), 0.0)
-    offset = largest_offset(streams, surprise)
-    return np.vstack([surprise, offset])
+        is_watched = noisy & ~stands_still(streams) & (after_repetition < RESTS)
+    p = np.array([after_change, after_repetition])
+    surprise = np.where(is_watched, -np.log(p), 0.0)
+    return np.vstack([surprise, largest_offset(streams, surprise)])
 
 
 def stands_still(streams: Sequence[Stream]) -> NDArray[np.bool_]:
     """Return the senses (X,) that repeat themselves at rest, judged by nominal episodes (T, X)."""
     ends = np.cumsum([len(stream) for stream in streams])
-    last = int(np.searchsorted(ends, MOST_READ))
-    enough = streams[: last + 1]
-    still = []
-    for i in range(streams[0].shape[1]):
-        readings = [stream[:, i] for stream in enough]
-        still.append(_stands_still(readings))
-    return np.array(still)
+    enough = streams[: int(np.searchsorted(ends, MOST_READ)) + 1]
+    senses = range(streams[0].shape[1])
+    return np.array([_stands_still([stream[:, i] for stream in enough]) for i in senses])
 
 
 def _stands_still(readings: Sequence[Stream]) -> bool:
     """Return whether one sense's noise, in episodes (T,), is too small to change its reading."""
-    steps = [resolution(episode) for episode in readings]
-    known = [step for step in steps if step]
-    if not known or len(known) < len(steps) / 2:
+    resolutions = [resolution(episode) for episode in readings]
+    known = [step for step in resolutions if step]
+    if not known or len(known) < len(readings) / 2:
         return False
     noise = np.median([noise_of(episode) for episode in readings])
     return bool(noise < UNMOVED * float(np.median(known)))
@@ -156,31 +138,34 @@ def _stands_still(readings: Sequence[Stream]) -> bool:
 def largest_offset(streams: Sequence[Stream], surprise: Floats) -> Floats:
     """Return n_0 - 3 (X,): the largest n in nominal episodes (T, X), at least 12; ``surprise`` is -log p (2, X)."""
     senses = surprise.shape[1]
-    steps = evidence_steps(surprise)
     offset = np.full(senses, REPETITION_OFFSET)
-
-    ordered = sorted(streams, key=len, reverse=True)
-    state = Repetition.start(len(ordered), senses)
-    for t in range(len(ordered[0])):
-        rows = [stream[t] for stream in ordered if t < len(stream)]
-        going_on = Repetition._make(part[: len(rows)] for part in state)
-        state = going_on.followed_by(
-            np.array(rows, np.float64),
-            steps,
-            most=np.full(senses, np.inf),
-        )
+    weights = RepetitionWeights(
+        columns=np.arange(senses),
+        steps=evidence_steps(surprise),
+        most=np.full(senses, np.inf),
+        offset=offset,
+    )
+    longest_first = sorted(streams, key=len, reverse=True)
+    state = Repetition.start(len(streams), senses)
+    for t in range(len(longest_first[0])):
+        rows = [stream[t] for stream in longest_first if t < len(stream)]
+        running = Repetition._make(part[: len(rows)] for part in state)
+        state = running.followed_by(np.array(rows, np.float64), weights)
         offset = np.maximum(offset, state.unlikely.max(axis=0))
     return offset
 
 
 def evidence_steps(surprise: Floats) -> Floats:
-    """Return (2, 2, X) from -log p (2, X): what a change and a repetition add to n, after a change and a repetition."""
+    """Return what a row adds to n (2, 2, X), from -log p (2, X).
+
+    The first axis is whether the reading before was a repetition, the second whether this one is.
+    """
     p = np.exp(-surprise)
     with np.errstate(divide="ignore"):
-        changed = (1.0 - STUCK) / (1.0 - p)
-        steps = np.log([changed, STUCK / p])  # (now, before, X)
-    watched = np.where(p < STUCK, steps, 0.0)
-    return np.ascontiguousarray(watched.swapaxes(0, 1))
+        by_change = (1.0 - STUCK_PROBABILITY) / (1.0 - p)
+        steps = np.log([by_change, STUCK_PROBABILITY / p])  # (now, before, X)
+    of_watched = np.where(p < STUCK_PROBABILITY, steps, 0.0)
+    return np.ascontiguousarray(of_watched.swapaxes(0, 1))
 
 
 @compiled
@@ -204,8 +189,8 @@ def step_repetition(
 @compiled
 def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -> None:
     """Pool shares (D,) of a surprise s with the ratios r (X,) of senses that are stuck: (s^p + Σ_i r_i^p)^(1/p)."""
-    value = total(share)
-    greatest = max(value, TINY)
+    surprise = total(share)
+    greatest = max(surprise, TINY)
     ratios = np.zeros(len(unlikely))
     for i in range(len(ratios)):
         if unlikely[i] > 0:
@@ -213,16 +198,16 @@ def pool_repetitions(repetition: RepetitionWeights, unlikely: Any, share: Any) -
             ratios[i] = np.exp(TAIL_INDEX * beyond)
             greatest = max(greatest, ratios[i])
 
-    own = (value / greatest) ** POWER
-    powers = own
+    of_surprise = (surprise / greatest) ** POWER
+    powers = of_surprise
     for i in range(len(ratios)):
         ratios[i] = (ratios[i] / greatest) ** POWER
         powers += ratios[i]
-    if not powers > own:
+    if not powers > of_surprise:
         return
     pooled = greatest * powers ** (1.0 / POWER)
     pooled /= max(powers, TINY)
-    scale(share, pooled * own / max(value, TINY))
+    scale(share, pooled * of_surprise / max(surprise, TINY))
     for i in range(len(ratios)):
         column = repetition.columns[i]
         share[column] += pooled * ratios[i]

@@ -21,7 +21,7 @@ from asm_gym.detection.evidence import whitening
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number
 
-WINDOW = 5  # rows of the moving mean
+AVERAGED_ROWS = 5  # rows of the moving mean
 
 
 class Squares:
@@ -77,12 +77,12 @@ class Mahalanobis(Squares):
 
 
 class MovingMean(Squares):
-    """Squared errors, averaged over the last few rows: the state (B, WINDOW, X), NaN before the first row."""
+    """Squared errors, averaged over the last few rows: the state (B, AVERAGED_ROWS, X), NaN before the first row."""
 
     name = "moving_mean"
 
     def start(self, batch: int, errors: int) -> NDArray[np.float64]:
-        return np.full((batch, WINDOW, errors), np.nan)
+        return np.full((batch, AVERAGED_ROWS, errors), np.nan)
 
     def attribute_step(
         self, state: State, output: ModelOutput, rows: Array, place: Place

@@ -80,7 +80,7 @@ class Actions:
         action = np.zeros(self.size, np.float32)
         first = 0
         for a, part in enumerate(self._simulation.moves):
-            joints = int(self._simulation.arms[a].joints)
+            joints = int(self._simulation.arms[a].joint_count)
             action[part] = self._turning(a, turns[first : first + joints])
             first += joints
         return action

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from asm_gym.detection.kinematics import Chain
-from asm_gym.envs.commands import scaling_of
+from asm_gym.envs.controller_inputs import scaling_of
 from asm_gym.envs.mujoco_views import (
     ARM,
     HAND_POSE,
@@ -79,15 +79,15 @@ def describe_inputs(arm: Arm, model: mujoco.MjModel, controller: Any, part: slic
     size = part.stop - part.start
     if controller.name not in SLOWED or size > JOINTS:
         return
-    arm.first = part.start
-    arm.inputs = size
+    arm.first_input = part.start
+    arm.input_count = size
     arm.scaling[:, :size] = scaling_of(controller, size)
     if controller.input_type != "delta":
         return
 
     # A controller asked for a change again and again reaches a velocity of Kp/Kd times the change.
     gains = controller.kp / controller.kd
-    arm.speeds[:size] = gains[:size] * unit_change(controller)
+    arm.input_speeds[:size] = gains[:size] * unit_change(controller)
     if controller.name == "JOINT_POSITION":
         arm.changes = JOINT_ANGLES
     else:
@@ -99,7 +99,7 @@ def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
     """Write where in MuJoCo's arrays an arm's joints, motors, bodies, site and sensors are."""
     robot, name = part
     joints = len(robot._ref_joint_pos_indexes)
-    arm.joints = joints
+    arm.joint_count = joints
     arm.qpos[:joints] = robot._ref_joint_pos_indexes
     arm.dofs[:joints] = robot._ref_joint_vel_indexes
     arm.motors[:joints] = robot._ref_actuators_indexes_dict[name]
@@ -112,7 +112,7 @@ def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
     hand = model.body(robot.robot_model.eef_name[name]).id
     _fill(arm.bodies, own[model.body_weldid[own] != 0])
     _fill(arm.links, _links(model, hand))
-    _fill(arm.tree, _carried_dofs(model, robot))
+    _fill(arm.tree_dofs, _carried_dofs(model, robot))
 
     sensors = robot.gripper[name].important_sensors
     arm.wrench = model.sensor(sensors["force_ee"]).adr[0]
@@ -134,16 +134,16 @@ def _fill_settings(arm: Arm, model: mujoco.MjModel, controller: Any) -> None:
     arm.kp[:gains] = controller.kp
     arm.kd[:gains] = controller.kd
     if controller.name == "OSC_POSE":
-        arm.kind = OSC_POSE
-        arm.rest[: arm.joints] = controller.initial_joint
+        arm.controller = OSC_POSE
+        arm.rest_angles[: arm.joint_count] = controller.initial_joint
         arm.frame = _base_site(model, controller)
         return
 
-    arm.kind = JOINT_POSITION
-    arm.compensate = controller.use_torque_compensation
-    arm.limits[:] = [-np.inf, np.inf]
+    arm.controller = JOINT_POSITION
+    arm.compensates_dynamics = controller.use_torque_compensation
+    arm.set_point_limits[:] = [-np.inf, np.inf]
     if controller.position_limits is not None:
-        arm.limits[: arm.joints] = np.transpose(controller.position_limits)
+        arm.set_point_limits[: arm.joint_count] = np.transpose(controller.position_limits)
 
 
 def _base_site(model: mujoco.MjModel, controller: Any) -> int:

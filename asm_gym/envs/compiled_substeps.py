@@ -20,8 +20,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, compiled, inner
-from asm_gym.envs.commands import within
 from asm_gym.envs.control import HELD, control, length, read_arm, set_goal, slow_down
+from asm_gym.envs.controller_inputs import within
 from asm_gym.envs.mujoco_views import (
     FELT,
     JOINTS,
@@ -98,10 +98,10 @@ def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Flo
 def read_torques(views: Views, nominal: NominalViews, arm: Arm, row: Floats) -> None:
     """Add the external torques of an arm's joints to a row of 0, and write those of its motors."""
     t = 0
-    while arm.tree[t] >= 0:
-        add_inertia(views, nominal, arm, arm.tree[t], row)
+    while arm.tree_dofs[t] >= 0:
+        add_inertia(views, nominal, arm, arm.tree_dofs[t], row)
         t += 1
-    for i in range(arm.joints):
+    for i in range(arm.joint_count):
         dof = arm.dofs[i]
         unknown_damping = views.dof_damping[dof] - nominal.damping[dof]
         damped = views.qfrc_passive[dof] + unknown_damping * views.qvel[dof]
@@ -115,7 +115,7 @@ def add_inertia(views: Views, nominal: NominalViews, arm: Arm, i: int, row: Floa
     first = views.M_rowadr[i]
     for at in range(first + views.M_rownnz[i] - 1, first - 1, -1):
         j = views.M_colind[at]
-        for r in range(arm.joints):
+        for r in range(arm.joint_count):
             if arm.dofs[r] == i:
                 row[r] += nominal.mass[at] * views.qacc[j]
             elif arm.dofs[r] == j:
@@ -174,8 +174,8 @@ def feel(goals: Goals, limits: SubstepLimits, k: int, samples: Floats) -> None:
     status = limits.status[0]
     status.substeps += 1
     if status.armed:
-        limits.load[0] = largest_load(limits.most, k, samples, limits.load[0])
-    if status.passed_after > 0 or limits.load[0] <= 1.0:
+        limits.load_share[0] = largest_load(limits.load_limits, k, samples, limits.load_share[0])
+    if status.passed_after > 0 or limits.load_share[0] <= 1.0:
         return
     status.passed_after = status.substeps
     if status.stops:
@@ -200,7 +200,7 @@ def brake_beneath(
             control(views, nominal, arms[a], goals[a], work)
         else:
             read_arm(views, nominal, arms[a], work)
-            limits.status[0].braked += slow_down(views, arms[a], limits.speed[a], work)
+            limits.status[0].braked += slow_down(views, arms[a], limits.speed_limits[a], work)
 
 
 @partial(compiled, nogil=True)
@@ -227,7 +227,7 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
                 set_goal(views, arm, goal, action, work)
             control(views, nominal, arm, goal, work)
             if goal.held == 0:
-                limits.status[0].braked += slow_down(views, arm, limits.speed[a], work)
+                limits.status[0].braked += slow_down(views, arm, limits.speed_limits[a], work)
         _step2(views.model, views.data)
         # the place for all that is measured in every substep
         sample(views, nominal, arms, k, samples)

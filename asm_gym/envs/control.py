@@ -20,12 +20,13 @@ tuples of arrays are inlined: each call would pass hundreds of numbers.
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import numpy as np
 
 from asm_gym.compilation import inner
-from asm_gym.envs.commands import rotation, scaled, within
+from asm_gym.envs.controller_inputs import rotation, scaled, within
 from asm_gym.envs.mujoco_views import (
     JOINT_POSITION,
     Arm,
@@ -36,9 +37,11 @@ from asm_gym.envs.mujoco_views import (
     Work,
 )
 
-HOLD_STIFFNESS = 400.0  # Kp of an arm that is held [1/s²]; Kd is 2 √Kp
+HOLD_STIFFNESS = 400.0  # Kp of an arm that is held [1/s²]
+HOLD_DAMPING = 2.0 * math.sqrt(HOLD_STIFFNESS)  # its Kd [1/s]
 YIELDS_AT = 60.0  # Y: force at the hand from which a held arm at rest gives way [N]
-POSTURE_STIFFNESS = 10.0  # Kp of the posture of spare joints [1/s²]; Kd is 2 √Kp
+POSTURE_STIFFNESS = 10.0  # Kp of the posture of spare joints [1/s²]
+POSTURE_DAMPING = 2.0 * math.sqrt(POSTURE_STIFFNESS)  # its Kd [1/s]
 
 # States of ``Goal.held``; 0 is free.
 HELD = 1  # to be held from the next substep on
@@ -58,20 +61,22 @@ def cholesky(M: Floats, n: int, L: Floats) -> None:
     A row that depends on those before it, or is not finite, becomes 0 in L.
     """
     for i in range(n):
+        row = L[i]
         for j in range(i):
-            s = M[i, j]
+            earlier = L[j]
+            entry = M[i, j]
             for k in range(j):
-                s -= L[i, k] * L[j, k]
-            L[i, j] = divided(s, L[j, j])
+                entry -= row[k] * earlier[k]
+            row[j] = divided(entry, earlier[j])
 
-        s = M[i, i]
+        square = M[i, i]
         for k in range(i):
-            s -= L[i, k] * L[i, k]
-        if s > 0.0:
-            L[i, i] = np.sqrt(s)
+            square -= row[k] * row[k]
+        if square > 0.0:
+            row[i] = np.sqrt(square)
         else:
             for k in range(i + 1):
-                L[i, k] = 0.0
+                row[k] = 0.0
 
 
 @inner
@@ -83,57 +88,50 @@ def divided(number: float, pivot: float) -> float:
 
 
 @inner
-def forward(L: Floats, n: int, B: Floats, r: int) -> None:
-    """b ← L⁻¹ b, where b is row ``r`` of B; 0 where a row of L is."""
+def forward(L: Floats, n: int, b: Floats) -> None:
+    """b ← L⁻¹ b (n,); 0 where a row of L is."""
     for i in range(n):
-        s = B[r, i]
+        row = L[i]
+        entry = b[i]
         for k in range(i):
-            s -= L[i, k] * B[r, k]
-        B[r, i] = divided(s, L[i, i])
+            entry -= row[k] * b[k]
+        b[i] = divided(entry, row[i])
 
 
 @inner
-def solve(M: Floats, n: int, L: Floats, B: Floats, r: int) -> None:
-    """b ← M⁻¹ b, where b is row ``r`` of B, and L is scratch.
+def solve(M: Floats, n: int, L: Floats, b: Floats) -> None:
+    """b ← M⁻¹ b (n,), where L is scratch.
 
     Where M is singular, the numbers of rows that depend on those before them become 0.
     """
     cholesky(M, n, L)
-    forward(L, n, B, r)
+    forward(L, n, b)
     for i in range(n - 1, -1, -1):
-        s = B[r, i]
+        entry = b[i]
         for k in range(i + 1, n):
-            s -= L[k, i] * B[r, k]
-        B[r, i] = divided(s, L[i, i])
+            entry -= L[k, i] * b[k]
+        b[i] = divided(entry, L[i, i])
 
 
 @inner
-def multiply(M: Floats, n: int, x: Floats, out: Floats) -> None:
-    """Write M x of the first n rows and columns into out."""
+def multiply(M: Floats, n: int, x: Floats, product: Floats) -> None:
+    """Write M x of the first n rows and columns into ``product``."""
     for i in range(n):
-        out[i] = 0.0
+        row = M[i]
+        product[i] = 0.0
         for j in range(n):
-            out[i] += M[i, j] * x[j]
+            product[i] += row[j] * x[j]
 
 
 @inner
-def rotate(R: Floats, frame: Floats, out: Floats) -> None:
-    """Write the product of two rotations (3, 3) into out."""
+def rotate(R: Floats, frame: Floats, product: Floats) -> None:
+    """Write the product of two rotations (3, 3) into ``product``."""
     for i in range(3):
         for j in range(3):
-            out[i, j] = 0.0
+            entry = 0.0
             for k in range(3):
-                out[i, j] += R[i, k] * frame[k, j]
-
-
-@inner
-def rotate_back(R: Floats, frame: Floats, out: Floats) -> None:
-    """Write Rᵀ times another rotation (3, 3) into out."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = 0.0
-            for k in range(3):
-                out[i, j] += R[k, i] * frame[k, j]
+                entry += R[i, k] * frame[k, j]
+            product[i, j] = entry
 
 
 @inner
@@ -149,204 +147,249 @@ def read_frame(orientations: Floats, site: int, frame: Floats) -> None:
 @partial(inner, inlined=True)
 def set_goal(views: Views, arm: Arm, goal: Goal, action: Floats, work: Work) -> None:
     """Move the set-point of an arm as the action asks, from where the arm is now."""
-    for i in range(arm.inputs):
-        work.p[i] = scaled(action[arm.first + i], arm.scaling, i)
-    if arm.kind == JOINT_POSITION:
-        for i in range(arm.joints):
-            angle = views.qpos[arm.qpos[i]] + work.p[i]
-            goal.joints[i] = within(angle, arm.limits[i, 0], arm.limits[i, 1])
+    change = work.displacement
+    for i in range(arm.input_count):
+        number = arm.first_input + i
+        change[i] = scaled(action[number], arm.scaling, i)
+    if arm.controller == JOINT_POSITION:
+        for i in range(arm.joint_count):
+            angle = views.qpos[arm.qpos[i]] + change[i]
+            lowest = arm.set_point_limits[i, 0]
+            highest = arm.set_point_limits[i, 1]
+            goal.joints[i] = within(angle, lowest, highest)
     else:
         set_pose(views, arm, goal, work)
 
 
 @partial(inner, inlined=True)
 def set_pose(views: Views, arm: Arm, goal: Goal, work: Work) -> None:
-    """Move the hand's set-point by the change p (6,) in the frame of actions; M, L, A and G are scratch."""
-    hand = work.M
-    base = work.L
-    turn = work.G
-    read_frame(views.site_xmat, arm.site, hand)
+    """Move the hand's set-point by ``work.displacement``, the position's and the turn's, in the frame of actions."""
+    change = work.displacement
+    base = work.rotations[0]
+    hand = work.rotations[1]
+    turn = work.rotations[2]
+    hand_in_base = work.rotations[3]
+    turned_in_base = work.rotations[1]  # once the hand's own is not needed any more
     read_frame(views.site_xmat, arm.frame, base)
-    rotation(work.p[3:], turn)
+    read_frame(views.site_xmat, arm.site, hand)
+    rotation(change[3:], turn)
+    position = views.site_xpos[arm.site]
     for i in range(3):
-        goal.position[i] = views.site_xpos[arm.site, i]
+        goal.position[i] = position[i]
         for j in range(3):
-            goal.position[i] += base[i, j] * work.p[j]
+            goal.position[i] += base[i, j] * change[j]
 
-    # R turn Rᵀ hand, where R is the orientation of the base.
-    rotate_back(base, hand, work.A)
-    rotate(turn, work.A, hand)
-    rotate(base, hand, goal.orientation)
+    rotate(base.T, hand, hand_in_base)
+    rotate(turn, hand_in_base, turned_in_base)
+    rotate(base, turned_in_base, goal.orientation)
 
 
 @partial(inner, inlined=True)
 def read_arm(views: Views, nominal: NominalViews, arm: Arm, work: Work) -> None:
-    """Write the state of an arm and its dynamics, as the robot knows itself: q, v, M, h and J of ``Work``."""
-    x = views.site_xpos[arm.site, 0] - views.subtree_com[arm.root, 0]
-    y = views.site_xpos[arm.site, 1] - views.subtree_com[arm.root, 1]
-    z = views.site_xpos[arm.site, 2] - views.subtree_com[arm.root, 2]
-    J = work.J
-    for i in range(arm.joints):
+    """Write the state of an arm and its dynamics, as the robot knows itself.
+
+    These are angles, velocities, mass, bias and Jacobian of ``work``.
+    """
+    hand = views.site_xpos[arm.site]
+    origin = views.subtree_com[arm.root]
+    jacobian = work.jacobian
+    for i in range(arm.joint_count):
         dof = arm.dofs[i]
-        work.q[i] = views.qpos[arm.qpos[i]]
-        work.v[i] = views.qvel[dof]
-        work.h[i] = nominal.bias[dof]
-        read_mass(views, nominal, arm, i, work.M)
-        for r in range(3):
-            J[3 + r, i] = views.cdof[dof, r]
-        J[0, i] = views.cdof[dof, 3] + J[4, i] * z - J[5, i] * y
-        J[1, i] = views.cdof[dof, 4] + J[5, i] * x - J[3, i] * z
-        J[2, i] = views.cdof[dof, 5] + J[3, i] * y - J[4, i] * x
+        work.angles[i] = views.qpos[arm.qpos[i]]
+        work.velocities[i] = views.qvel[dof]
+        work.bias[i] = nominal.bias[dof]
+        read_mass(views, nominal, arm, i, work.mass)
+        motion = views.cdof[dof]
+        x, y, z = velocity_at(motion, hand, origin)
+        jacobian[0, i] = x
+        jacobian[1, i] = y
+        jacobian[2, i] = z
+        for axis in range(3):
+            jacobian[3 + axis, i] = motion[axis]
+
+
+@inner
+def velocity_at(motion: Floats, place: Floats, origin: Floats) -> tuple[float, float, float]:
+    """Return the velocity of a body's point at a place (3,).
+
+    ``motion`` (6,) is the body's angular velocity, then its linear velocity at an origin (3,).
+    """
+    x = place[0] - origin[0]
+    y = place[1] - origin[1]
+    z = place[2] - origin[2]
+    return (
+        motion[3] + motion[1] * z - motion[2] * y,
+        motion[4] + motion[2] * x - motion[0] * z,
+        motion[5] + motion[0] * y - motion[1] * x,
+    )
 
 
 @partial(inner, inlined=True)
-def read_mass(views: Views, nominal: NominalViews, arm: Arm, i: int, M: Floats) -> None:
+def read_mass(views: Views, nominal: NominalViews, arm: Arm, i: int, mass: Floats) -> None:
     """Write row and column ``i`` of an arm's mass matrix, up to the diagonal."""
     dof = arm.dofs[i]
     first = views.M_rowadr[dof]
+    last = first + views.M_rownnz[dof] - 1
     column = i
-    for at in range(first + views.M_rownnz[dof] - 1, first - 1, -1):
-        while column >= 0 and arm.dofs[column] > views.M_colind[at]:
+    for at in range(last, first - 1, -1):
+        other = views.M_colind[at]
+        while column >= 0 and arm.dofs[column] > other:
             column -= 1
-        if column >= 0 and arm.dofs[column] == views.M_colind[at]:
-            M[i, column] = nominal.mass[at]
-            M[column, i] = nominal.mass[at]
+        if column >= 0 and arm.dofs[column] == other:
+            mass[i, column] = nominal.mass[at]
+            mass[column, i] = nominal.mass[at]
 
 
 @partial(inner, inlined=True)
 def osc_torques(work: Work, n: int) -> None:
-    """Write the torques of operational space control into tau.
+    """Write the torques of operational space control of n joints into ``work.torques``.
 
-    Of ``work``: mass matrix M (n, n), bias h (n,), Jacobian J (6, n), the torque that keeps the posture, tau (n,), and
-    the acceleration wanted of the hand, Kp e - Kd v, as the first row of F (2, 6).
+    Taken from ``work``: mass M, bias h, Jacobian J; the torques p that keep the posture, in ``torques``; and the
+    acceleration wanted of the hand, Kp e - Kd v, in ``force``.
     """
-    J = work.J
-    A = work.A
-    G = work.G
-    F = work.F
+    jacobian = work.jacobian
+    weighted = work.weighted
+    products = work.products
+    force = work.force
+    posture_force = work.posture_force
     for i in range(n):
-        A[6, i] = work.tau[i]
+        weighted[6, i] = work.torques[i]
         for r in range(6):
-            A[r, i] = J[r, i]
+            weighted[r, i] = jacobian[r, i]
 
-    # J M⁻¹ Jᵀ, and below it J M⁻¹ p.
-    cholesky(work.M, n, work.L)
+    # Λ⁻¹ = J M⁻¹ Jᵀ, and below it J M⁻¹ p.
+    cholesky(work.mass, n, work.factor)
     for r in range(7):
-        forward(work.L, n, A, r)  # J L⁻ᵀ, then p L⁻ᵀ
-    inner_products(A, 7, n, G)
+        forward(work.factor, n, weighted[r])  # J L⁻ᵀ, then p L⁻ᵀ
+    inner_products(weighted, 7, n, products)
     for r in range(6):
-        F[1, r] = G[6, r]
+        posture_force[r] = products[6, r]
+    solve(products, 6, work.factor, posture_force)  # Λ J M⁻¹ p
 
-    solve(G, 6, work.L, F, 1)
-    for r in range(3):  # the force comes of linear and angular motion, each by itself
+    # The force comes of linear and angular motion, each by itself.
+    for r in range(3):
         for c in range(3):
-            G[3 + r, c] = 0.0
-    solve(G, 6, work.L, F, 0)
+            products[3 + r, c] = 0.0
+    solve(products, 6, work.factor, force)  # [Λx Fx; Λr Fr]
 
     for i in range(n):
-        work.tau[i] += work.h[i]
+        torque = work.torques[i] + work.bias[i]
         for r in range(6):
-            work.tau[i] += J[r, i] * (F[0, r] - F[1, r])
+            torque += jacobian[r, i] * (force[r] - posture_force[r])
+        work.torques[i] = torque
 
 
 @inner
-def inner_products(A: Floats, rows: int, n: int, G: Floats) -> None:
-    """Write the inner product of rows r and c <= r of A (rows, n) into G[r, c]."""
+def inner_products(A: Floats, rows: int, n: int, products: Floats) -> None:
+    """Write the inner product of rows r and c <= r of A (rows, n) into products[r, c]."""
     for r in range(rows):
         for c in range(r + 1):
-            G[r, c] = 0.0
+            entry = 0.0
             for i in range(n):
-                G[r, c] += A[r, i] * A[c, i]
+                entry += A[r, i] * A[c, i]
+            products[r, c] = entry
 
 
 @partial(inner, inlined=True)
 def brake(arm: Arm, goal: Goal, work: Work) -> None:
-    """Write the torques that hold an arm at its anchor, which follows what presses too hard, into tau."""
-    n = arm.joints
+    """Write the torques that hold an arm at its anchor, which gives way to what presses too hard."""
+    n = arm.joint_count
+    if goal.held == HELD:
+        for i in range(n):
+            goal.anchor[i] = work.angles[i]
+
     fastest = 0.0
     for i in range(n):
-        if goal.held == HELD:
-            goal.anchor[i] = work.q[i]
-        work.p[i] = goal.anchor[i] - work.q[i]
-        fastest = max(fastest, abs(work.v[i]))
+        work.displacement[i] = goal.anchor[i] - work.angles[i]
+        fastest = max(fastest, abs(work.velocities[i]))
     if fastest < RESTING:
         goal.held = YIELDING
     elif goal.held == HELD:
         goal.held = BRAKING
 
-    multiply(work.M, n, work.p, work.tau)
     if goal.held == YIELDING:
+        multiply(work.mass, n, work.displacement, work.torques)
         for i in range(n):
             give_way(goal, work, i)
-    # Spring and damping share the mass matrix.
     for i in range(n):
-        work.p[i] = HOLD_STIFFNESS * work.p[i] - 2.0 * np.sqrt(HOLD_STIFFNESS) * work.v[i]
-    multiply(work.M, n, work.p, work.tau)
-    for i in range(n):
-        work.tau[i] += work.h[i]
+        spring = HOLD_STIFFNESS * work.displacement[i]
+        work.acceleration[i] = spring - HOLD_DAMPING * work.velocities[i]
+    accelerate(work, n)
 
 
 @partial(inner, inlined=True)
 def give_way(goal: Goal, work: Work, i: int) -> None:
-    """Move the anchor of joint ``i`` to where its spring takes no more than its share of ``YIELDS_AT``."""
-    x = work.J[0, i]
-    y = work.J[1, i]
-    z = work.J[2, i]
-    most = YIELDS_AT * (np.sqrt(x**2 + y**2 + z**2) + YIELD_LEVER)
-    spring = HOLD_STIFFNESS * abs(work.tau[i])
+    """Move the anchor of joint ``i`` to where its spring takes no more than its share of ``YIELDS_AT``.
+
+    ``work.torques`` are those of a spring of stiffness 1.
+    """
+    x = work.jacobian[0, i]
+    y = work.jacobian[1, i]
+    z = work.jacobian[2, i]
+    lever = np.sqrt(x**2 + y**2 + z**2)
+    most = YIELDS_AT * (lever + YIELD_LEVER)
+    spring = HOLD_STIFFNESS * abs(work.torques[i])
     if spring > most:
-        work.p[i] *= most / spring
-        goal.anchor[i] = work.q[i] + work.p[i]
+        work.displacement[i] *= most / spring
+        goal.anchor[i] = work.angles[i] + work.displacement[i]
 
 
 @partial(inner, inlined=True)
-def track(views: Views, arm: Arm, goal: Goal, work: Work) -> None:
-    """Write the torques of an arm's controller into tau."""
-    if arm.kind == JOINT_POSITION:
-        track_joints(arm, goal, work)
-    else:
-        track_pose(views, arm, goal, work)
+def accelerate(work: Work, n: int) -> None:
+    """Write the torques M q̈ + h that give n joints the wanted acceleration q̈."""
+    multiply(work.mass, n, work.acceleration, work.torques)
+    for i in range(n):
+        work.torques[i] += work.bias[i]
 
 
 @partial(inner, inlined=True)
 def track_joints(arm: Arm, goal: Goal, work: Work) -> None:
-    """Write the torques of joint position control into tau."""
-    n = arm.joints
+    """Write the torques of joint position control."""
+    n = arm.joint_count
     for i in range(n):
-        error = goal.joints[i] - work.q[i]
-        work.p[i] = arm.kp[i] * error - arm.kd[i] * work.v[i]
-        work.tau[i] = work.p[i]
-    if arm.compensate:
-        multiply(work.M, n, work.p, work.tau)
-        for i in range(n):
-            work.tau[i] += work.h[i]
+        error = goal.joints[i] - work.angles[i]
+        wanted = arm.kp[i] * error - arm.kd[i] * work.velocities[i]
+        work.acceleration[i] = wanted
+        work.torques[i] = wanted
+    if arm.compensates_dynamics:
+        accelerate(work, n)
 
 
 @partial(inner, inlined=True)
 def track_pose(views: Views, arm: Arm, goal: Goal, work: Work) -> None:
-    """Write the torques of operational space control into tau."""
-    n = arm.joints
+    """Write the torques of operational space control."""
+    n = arm.joint_count
     for i in range(n):
-        error = arm.rest[i] - work.q[i]
-        work.p[i] = POSTURE_STIFFNESS * error - 2.0 * np.sqrt(POSTURE_STIFFNESS) * work.v[i]
-    multiply(work.M, n, work.p, work.tau)
+        error = arm.rest_angles[i] - work.angles[i]
+        spring = POSTURE_STIFFNESS * error
+        work.acceleration[i] = spring - POSTURE_DAMPING * work.velocities[i]
+    multiply(work.mass, n, work.acceleration, work.torques)
 
-    error = work.F[0]
+    read_pose_error(views, arm, goal, work.force)
+    for r in range(6):
+        motion = work.jacobian[r]
+        velocity = 0.0
+        for i in range(n):
+            velocity += motion[i] * work.velocities[i]
+        work.force[r] = arm.kp[r] * work.force[r] - arm.kd[r] * velocity
+    osc_torques(work, n)
+
+
+@partial(inner, inlined=True)
+def read_pose_error(views: Views, arm: Arm, goal: Goal, error: Floats) -> None:
+    """Write the way (6,) from the hand's pose to its set-point: position [m], then orientation [rad]."""
+    position = views.site_xpos[arm.site]
+    hand = views.site_xmat[arm.site]
+    wanted = goal.orientation
     for i in range(3):
-        error[i] = goal.position[i] - views.site_xpos[arm.site, i]
+        error[i] = goal.position[i] - position[i]
         j = (i + 1) % 3
         k = (i + 2) % 3
         turn = 0.0
         for c in range(3):
-            turn += views.site_xmat[arm.site, 3 * j + c] * goal.orientation[k, c]
-            turn -= views.site_xmat[arm.site, 3 * k + c] * goal.orientation[j, c]
+            turn += hand[3 * j + c] * wanted[k, c]
+            turn -= hand[3 * k + c] * wanted[j, c]
         error[3 + i] = 0.5 * turn
-    for r in range(6):
-        velocity = 0.0
-        for i in range(n):
-            velocity += work.J[r, i] * work.v[i]
-        error[r] = arm.kp[r] * error[r] - arm.kd[r] * velocity
-    osc_torques(work, n)
 
 
 @partial(inner, inlined=True)
@@ -358,21 +401,18 @@ def fastest_point(views: Views, arm: Arm) -> float:
     n = 1
     while arm.links[n] >= 0:
         link = arm.links[n]
-        fastest = max(fastest, point_speed(views.cvel[link], views.xpos[link], origin))
+        speed = point_speed(views.cvel[link], views.xpos[link], origin)
+        fastest = max(fastest, speed)
         n += 1
     return fastest
 
 
 @inner
-def point_speed(velocity: Floats, place: Floats, origin: Floats) -> float:
-    """Return how fast the furthest point about a place (3,) may go, by its body's velocity (6,) at an origin (3,)."""
-    x = place[0] - origin[0]
-    y = place[1] - origin[1]
-    z = place[2] - origin[2]
-    vx = velocity[3] + velocity[1] * z - velocity[2] * y
-    vy = velocity[4] + velocity[2] * x - velocity[0] * z
-    vz = velocity[5] + velocity[0] * y - velocity[1] * x
-    return np.sqrt(vx * vx + vy * vy + vz * vz) + REACHES * length(velocity[:3])
+def point_speed(motion: Floats, place: Floats, origin: Floats) -> float:
+    """Return how fast the furthest point about a place (3,) may go [m/s]; see ``velocity_at``."""
+    x, y, z = velocity_at(motion, place, origin)
+    speed = np.sqrt(x * x + y * y + z * z)
+    return speed + REACHES * length(motion[:3])
 
 
 @inner
@@ -385,40 +425,46 @@ def length(vector: Floats) -> float:
 
 
 @partial(inner, inlined=True)
-def slow_down(views: Views, arm: Arm, limit: float, work: Work) -> bool:
-    """Brake an arm, of which M and v are known, along its own motion while its fastest point passes its limit [m/s].
+def slow_down(views: Views, arm: Arm, speed_limit: float, work: Work) -> bool:
+    """Brake an arm along its own motion while its fastest point passes its limit [m/s].
 
-    Return whether it does.
+    Mass and velocities of ``work`` are those of the arm.
+
+    Returns:
+        Whether the arm is braked.
     """
-    if limit == np.inf:
+    if speed_limit == np.inf:
         return False
     speed = fastest_point(views, arm)
-    if not speed > limit:
+    if not speed > speed_limit:
         return False
 
-    for i in range(arm.joints):
-        work.p[i] = SLOWING * (1.0 - limit / speed) * work.v[i]
-    multiply(work.M, arm.joints, work.p, work.tau)
-    for i in range(arm.joints):
+    excess = 1.0 - speed_limit / speed
+    for i in range(arm.joint_count):
+        work.acceleration[i] = SLOWING * excess * work.velocities[i]
+    multiply(work.mass, arm.joint_count, work.acceleration, work.torques)
+    for i in range(arm.joint_count):
         motor = arm.motors[i]
-        command(views, motor, views.ctrl[motor] - work.tau[i])
+        command(views, motor, views.ctrl[motor] - work.torques[i])
     return True
 
 
 @partial(inner, inlined=True)
 def command(views: Views, motor: int, torque: float) -> None:
     """Command a motor, as far as it goes."""
-    bounds = views.actuator_ctrlrange
-    views.ctrl[motor] = within(torque, bounds[motor, 0], bounds[motor, 1])
+    bounds = views.actuator_ctrlrange[motor]
+    views.ctrl[motor] = within(torque, bounds[0], bounds[1])
 
 
 @partial(inner, inlined=True)
 def control(views: Views, nominal: NominalViews, arm: Arm, goal: Goal, work: Work) -> None:
-    """Command the motors of an arm."""
+    """Command the motors of an arm by its controller, or hold it."""
     read_arm(views, nominal, arm, work)
     if goal.held:
         brake(arm, goal, work)
+    elif arm.controller == JOINT_POSITION:
+        track_joints(arm, goal, work)
     else:
-        track(views, arm, goal, work)
-    for i in range(arm.joints):
-        command(views, arm.motors[i], work.tau[i])
+        track_pose(views, arm, goal, work)
+    for i in range(arm.joint_count):
+        command(views, arm.motors[i], work.torques[i])

@@ -78,8 +78,8 @@ class NominalViews(NamedTuple):
 
 ARM = np.dtype(
     [
-        ("joints", np.int64),  # how many it has
-        ("qpos", np.int64, JOINTS),  # their places in MuJoCo's arrays
+        ("joint_count", np.int64),
+        ("qpos", np.int64, JOINTS),  # the joints' places in MuJoCo's arrays
         ("dofs", np.int64, JOINTS),
         ("motors", np.int64, JOINTS),
         ("site", np.int64),  # between the fingers
@@ -89,18 +89,18 @@ ARM = np.dtype(
         ("wrench", np.int64),  # where the wrist's force and torque begin in sensordata
         ("bodies", np.int64, MOST_BODIES),  # whose contacts count; then -1
         ("links", np.int64, MOST_BODIES),  # bodies from the hand to the base; then -1
-        ("tree", np.int64, MOST_BODIES),  # dofs of the arm and all that hangs on it; then -1
-        ("kind", np.int64),  # OSC_POSE or JOINT_POSITION
+        ("tree_dofs", np.int64, MOST_BODIES),  # dofs of the arm and all that hangs on it; then -1
+        ("controller", np.int64),  # OSC_POSE or JOINT_POSITION
         ("kp", np.float64, JOINTS),
         ("kd", np.float64, JOINTS),
-        ("compensate", np.int64),  # 1 for joint control that knows the arm's dynamics
-        ("rest", np.float64, JOINTS),  # the posture that spare joints tend to [rad]
-        ("limits", np.float64, (JOINTS, 2)),  # of the joint set-point [rad]
-        ("first", np.int64),  # where the arm's part of the action begins
-        ("inputs", np.int64),  # how many numbers it has
-        ("scaling", np.float64, (5, JOINTS)),  # of them; see ``commands``
-        ("changes", np.int64),  # what they change: UNKNOWN_CHANGE, JOINT_ANGLES or HAND_POSE
-        ("speeds", np.float64, JOINTS),  # that a lasting input of 1 leads to [m/s], [rad/s]
+        ("compensates_dynamics", np.int64),  # 1 for joint control that knows the arm's dynamics
+        ("rest_angles", np.float64, JOINTS),  # the posture that spare joints tend to [rad]
+        ("set_point_limits", np.float64, (JOINTS, 2)),  # least and most of each joint [rad]
+        ("first_input", np.int64),  # where the arm's part of the action begins
+        ("input_count", np.int64),  # how many numbers it has
+        ("scaling", np.float64, (5, JOINTS)),  # of the inputs; see ``controller_inputs``
+        ("changes", np.int64),  # what the inputs change: UNKNOWN_CHANGE, JOINT_ANGLES or HAND_POSE
+        ("input_speeds", np.float64, JOINTS),  # that a lasting input of 1 leads to [m/s], [rad/s]
     ]
 )
 """One arm: its places in the arrays, and its controller's settings."""
@@ -128,36 +128,42 @@ def records(count: int, kind: np.dtype[np.void]) -> Any:
 
 
 class Work(NamedTuple):
-    """What control computes of one arm, overwritten for the next."""
+    """What control computes of one arm, overwritten for the next; letters are those of ``control``."""
 
-    M: Floats  # (JOINTS, JOINTS) mass matrix
-    L: Floats  # (JOINTS, JOINTS) a Cholesky factor
-    A: Floats  # (JOINTS, JOINTS)
-    G: Floats  # (JOINTS, JOINTS)
-    J: Floats  # (6, JOINTS) Jacobian of the hand: linear, then angular velocity
-    F: Floats  # (2, 6)
-    h: Floats  # (JOINTS,) bias
-    q: Floats  # (JOINTS,) angles
-    v: Floats  # (JOINTS,) velocities
-    p: Floats  # (JOINTS,)
-    tau: Floats  # (JOINTS,) torques
+    angles: Floats  # (JOINTS,) q
+    velocities: Floats  # (JOINTS,) q̇
+    mass: Floats  # (JOINTS, JOINTS) M
+    bias: Floats  # (JOINTS,) h
+    jacobian: Floats  # (6, JOINTS) J of the hand: linear, then angular velocity
+    displacement: Floats  # (JOINTS,) of a set-point from the arm
+    acceleration: Floats  # (JOINTS,) wanted of the joints
+    force: Floats  # (6,) wanted acceleration of the hand, then F
+    posture_force: Floats  # (6,) Λ J M⁻¹ p
+    torques: Floats  # (JOINTS,) τ
+    factor: Floats  # (JOINTS, JOINTS) L, a Cholesky factor
+    weighted: Floats  # (JOINTS, JOINTS) J L⁻ᵀ, and below it p L⁻ᵀ
+    products: Floats  # (JOINTS, JOINTS) J M⁻¹ Jᵀ, and below it J M⁻¹ p
+    rotations: Floats  # (4, 3, 3) frames on the way to a set-point
 
     @classmethod
     def empty(cls) -> Work:
         """Return arrays to write into."""
         square = (JOINTS, JOINTS)
         return cls(
-            M=np.zeros(square),
-            L=np.zeros(square),
-            A=np.zeros(square),
-            G=np.zeros(square),
-            J=np.zeros((6, JOINTS)),
-            F=np.zeros((2, 6)),
-            h=np.zeros(JOINTS),
-            q=np.zeros(JOINTS),
-            v=np.zeros(JOINTS),
-            p=np.zeros(JOINTS),
-            tau=np.zeros(JOINTS),
+            angles=np.zeros(JOINTS),
+            velocities=np.zeros(JOINTS),
+            mass=np.zeros(square),
+            bias=np.zeros(JOINTS),
+            jacobian=np.zeros((6, JOINTS)),
+            displacement=np.zeros(JOINTS),
+            acceleration=np.zeros(JOINTS),
+            force=np.zeros(6),
+            posture_force=np.zeros(6),
+            torques=np.zeros(JOINTS),
+            factor=np.zeros(square),
+            weighted=np.zeros(square),
+            products=np.zeros(square),
+            rotations=np.zeros((4, 3, 3)),
         )
 
 
@@ -176,7 +182,9 @@ STATUS = np.dtype(
 class SubstepLimits(NamedTuple):
     """Limits of the arms' load in every substep of a control step; changed in place."""
 
-    most: Floats  # (A, FELT) [N m], [N]; infinite for none
-    load: Floats  # (1,) the largest share of a limit that was reached since the control step began
+    load_limits: Floats  # (A, FELT) [N m], [N]; infinite for none
+    load_share: (
+        Floats  # (1,) the largest share of a limit that was reached since the control step began
+    )
     status: Any  # (1,) of STATUS
-    speed: Floats  # (A,) of an arm's fastest point, beyond which it is slowed down [m/s]
+    speed_limits: Floats  # (A,) of an arm's fastest point, beyond which it is slowed down [m/s]

@@ -14,8 +14,8 @@ from asm_gym.compilation import Bound, bind, must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, controller_of, describe, describe_inputs, is_compilable
-from asm_gym.envs.commands import Gripper
 from asm_gym.envs.control import HELD
+from asm_gym.envs.controller_inputs import Gripper
 from asm_gym.envs.mujoco_views import (
     FELT,
     GOAL,
@@ -56,10 +56,10 @@ class Simulation:
         self.speed_limits = np.full(n, np.inf)
         """(A,) speed of the fastest point of an arm, from which on it is slowed down [m/s]."""
         self._limits = SubstepLimits(
-            most=np.full((n, FELT), np.inf),
-            load=np.zeros(1),
+            load_limits=np.full((n, FELT), np.inf),
+            load_share=np.zeros(1),
             status=records(1, STATUS),
-            speed=self.speed_limits,
+            speed_limits=self.speed_limits,
         )
         self.proprioception = Proprioception(self.parts, self.views, self.data)
         self.contact_force = 0.0
@@ -118,11 +118,12 @@ class Simulation:
 
     def _forget_limits(self) -> None:
         self.speed_limits[:] = np.inf
+        self._limits.load_share[:] = 0.0
         self._limits.status[:] = 0
         self._limits_set: ContactLimits | None = None
         # Arm, and column of a sample, of each number that limits apply to.
         columns = np.arange(FELT)
-        is_limited = (columns >= JOINTS) | (columns < self.arms.joints[:, None])
+        is_limited = (columns >= JOINTS) | (columns < self.arms.joint_count[:, None])
         self._limited = np.nonzero(is_limited)
 
     def begin(self, limits: ContactLimits | None = None, limited: Sequence[Channel] = ()) -> None:
@@ -131,12 +132,12 @@ class Simulation:
         self._row_began = 0
         self._force_before = 0.0
         self._pressed = self.load > 1.0
-        self._limits.load[0] = 0.0
+        self._limits.load_share[0] = 0.0
         self._limits.status[:] = 0
         if limits is None:
             return
         if limits is not self._limits_set:
-            self._limits.most[self._limited] = limits.most(limited)
+            self._limits.load_limits[self._limited] = limits.most(limited)
             self._limits_set = limits
         self._limits.status.armed = True
         self._limits.status.stops = limits.stays
@@ -228,7 +229,7 @@ class Simulation:
     @property
     def load(self) -> float:
         """The largest share of a contact limit that was reached in the control step; infinite for NaN."""
-        return float(self._limits.load[0])
+        return float(self._limits.load_share[0])
 
     @property
     def braked(self) -> float:

@@ -131,9 +131,9 @@ def read_asked(
     twist = motions.twists[ASKED]
     for axis in range(6):
         twist[axis] = 0.0
-    for i in range(arm.inputs):
-        number = arm.first + i
-        speed = arm.speeds[i] * (action[number] - rest[number])
+    for i in range(arm.input_count):
+        number = arm.first_input + i
+        speed = arm.input_speeds[i] * (action[number] - rest[number])
         if arm.changes == JOINT_ANGLES:
             add_joint(motions.jacobian, arm.dofs[i], speed, twist)
         else:
@@ -146,7 +146,7 @@ def read_present(views: Views, arm: Arm, motions: Motions) -> None:
     twist = motions.twists[PRESENT]
     for axis in range(6):
         twist[axis] = 0.0
-    for i in range(arm.joints):
+    for i in range(arm.joint_count):
         dof = arm.dofs[i]
         add_joint(motions.jacobian, dof, views.qvel[dof], twist)
 
@@ -201,8 +201,8 @@ def is_beside_base(views: Views, arm: Arm) -> bool:
 @partial(inner, inlined=True)
 def scale_part(arm: Arm, share: np.float32, rest: Action, action: Action) -> None:
     """Leave a share of an arm's part of an action, in place."""
-    first = arm.first
-    for number in range(first, first + arm.inputs):
+    first = arm.first_input
+    for number in range(first, first + arm.input_count):
         asked = action[number] - rest[number]
         action[number] = rest[number] + share * asked
 

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from asm_gym.data.alarm_reasons import TOGETHER_S, blamed, reason
+from asm_gym.data.bridging import bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.episode import spans
 from asm_gym.data.logs import Log
-from asm_gym.data.timing import TOGETHER_S, blamed, bridged, reason
 from asm_gym.detection.alarm_rule import rows_excused
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 

@@ -40,11 +40,12 @@ def milliseconds(delay: float, otherwise: str = "missed") -> str:
 def _delays(m: DetectionMetrics) -> str:
     if not m.faulty:
         return ""
-    late = f">{1e3 * m.window_s:.0f}"
-    return ", ".join(milliseconds(delay, late) for delay in m.delays)
+    missed = f">{1e3 * m.window_s:.0f}"
+    return ", ".join(milliseconds(delay, missed) for delay in m.delays)
 
 
-def _before_and_after(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetrics], str]:
+def _by_response(measure: Callable[[Outcomes], str]) -> Callable[[DetectionMetrics], str]:
+    """Return a cell of a measure under each response: the policy alone → the override."""
     return lambda m: " → ".join(map(measure, m.outcomes))
 
 
@@ -54,12 +55,12 @@ CONDITION_COLUMNS: dict[str, Callable[[DetectionMetrics], str]] = {
     "\ndetected": lambda m: str(m.detected.k) if m.detected.n else "",
     "delay [ms]\nmedian, 95 %": _delays,
     "false\nalarms": lambda m: str(metrics.false_alarms(m.watched).k),
-    "tasks\nsolved": _before_and_after(lambda o: str(o.success.k)),
-    "of these\nunsafe": _before_and_after(lambda o: str(o.unsafe.k)),
-    "median\ntime [s]": _before_and_after(lambda o: f"{o.time:.1f}"),
-    "peak\nforce [N]": _before_and_after(lambda o: f"{o.peak_force:.1f}"),
+    "tasks\nsolved": _by_response(lambda o: str(o.success.k)),
+    "of these\nunsafe": _by_response(lambda o: str(o.unsafe.k)),
+    "median\ntime [s]": _by_response(lambda o: f"{o.time:.1f}"),
+    "peak\nforce [N]": _by_response(lambda o: f"{o.peak_force:.1f}"),
 }
-"""One monitor by condition: detection with the policy alone; solved and force: alone → with the response."""
+"""One monitor by condition: detection is measured with the policy alone."""
 
 
 def headline(rows: Sequence[DetectionMetrics]) -> str:
@@ -77,19 +78,21 @@ def headline(rows: Sequence[DetectionMetrics]) -> str:
 
 def monitor_columns(promises: Sequence[AlarmRate]) -> dict[str, Callable[[DetectionMetrics], str]]:
     """Return the columns of monitors side by side."""
-    return {
+    columns: dict[str, Callable[[DetectionMetrics], str]] = {
         "Monitor": lambda m: m.name,
         "AUROC, same steps": _auroc,
-        **{f"Found at {_rate(promise)}": partial(_found, promise=promise) for promise in promises},
-        "Median delay [ms]": lambda m: milliseconds(m.delays.median_ms),
-        "False alarms": _false_alarms,
-        "Alarms/h": lambda m: metrics.hourly_alarms(m.nominal).text,
-        "Right channel": lambda m: percent(metrics.attribution_accuracy(m.faulty)),
     }
+    for promise in promises:
+        columns[f"Found at {_rate(promise)}"] = partial(_found, promise)
+    columns["Median delay [ms]"] = lambda m: milliseconds(m.delays.median_ms)
+    columns["False alarms"] = _false_alarms
+    columns["Alarms/h"] = lambda m: metrics.hourly_alarms(m.nominal).text
+    columns["Right channel"] = lambda m: percent(metrics.attribution_accuracy(m.faulty))
+    return columns
 
 
 def _rate(promise: AlarmRate) -> str:
-    """Format such as ``1 %`` or ``10/h``."""
+    """Format as ``1 %`` or ``10/h``."""
     if promise.per == HOUR:
         return f"{promise.rate:g}/h"
     return f"{100 * promise.rate:g} %"
@@ -100,7 +103,7 @@ def _auroc(m: DetectionMetrics) -> str:
     return f"{auroc.value:.3f} ({auroc.low:.3f}–{auroc.high:.3f})"
 
 
-def _found(m: DetectionMetrics, promise: AlarmRate) -> str:
+def _found(promise: AlarmRate, m: DetectionMetrics) -> str:
     share = m.found.get(promise)
     if share is None:
         if promise.per == HOUR:
@@ -150,9 +153,12 @@ def brief_monitors_table(result: BenchmarkResult) -> Table:
     """Return the chief columns without their intervals, narrow enough for a terminal."""
     table = monitors_table(result)
     shown = (*BRIEF, f"Found at {_rate(result.promise)}")
-    headings = [heading for heading in table.headings if heading in shown]
-    columns = [table.headings.index(heading) for heading in headings]
-    rows = [[str(row[n]).partition(" (")[0] for n in columns] for row in table.rows]
+    columns = [n for n, heading in enumerate(table.headings) if heading in shown]
+    rows = []
+    for row in table.rows:
+        cells = [str(row[n]) for n in columns]
+        rows.append([cell.partition(" (")[0] for cell in cells])
+    headings = [table.headings[n] for n in columns]
     return Table(f"found within {result.window_s:g} s of the onset", headings, rows)
 
 
@@ -165,8 +171,11 @@ def kinds_table(result: BenchmarkResult) -> Table:
             name = f"({name})"
         observers: list[Bound | DetectionMetrics] = [result.bound([kind])]
         observers += [monitor.only([kind]) for monitor in result.monitors.values()]
-        cells = [f"{o.auroc:.2f} / {percent(o.found.get(result.promise))}" for o in observers]
-        rows.append((name, *cells))
+        row = [name]
+        for observer in observers:
+            found = percent(observer.found.get(result.promise))
+            row.append(f"{observer.auroc:.2f} / {found}")
+        rows.append(tuple(row))
     return Table(
         f"AUROC / faults found at a false-alarm rate of {100 * result.rate:g} %. In brackets: no "
         "observer could detect it.",
@@ -176,7 +185,8 @@ def kinds_table(result: BenchmarkResult) -> Table:
 
 
 def _in_words(kind: Kind) -> str:
-    return " ".join(kind).strip().replace("_", " ")
+    kind_and_severity = " ".join(kind).strip()
+    return kind_and_severity.replace("_", " ")
 
 
 def lead_table(result: BenchmarkResult) -> Table:
@@ -228,13 +238,14 @@ def _lead(difference: Estimate, scale: float, digits: int) -> str:
 def kept_table(result: BenchmarkResult) -> Table:
     """Return the false alarms in nominal test episodes, beside the promise of each threshold."""
     monitors = list(result.monitors.values())
-    every = {promise for m in monitors for promise in m.calibration.thresholds}
-    by_episode = sorted(promise for promise in every if promise.per == EPISODE)
-    by_hour = sorted((promise for promise in every if promise.per == HOUR), reverse=True)
+    promises = {promise for m in monitors for promise in m.calibration.thresholds}
+    by_episode = sorted(promise for promise in promises if promise.per == EPISODE)
+    by_hour = sorted((promise for promise in promises if promise.per == HOUR), reverse=True)
 
     nominal = monitors[0].nominal
     hours = sum(len(trace) * trace.dt for trace in nominal) / 3600
-    unsafe = Share.of([trace.outcome.unsafe for trace in nominal if trace.outcome.success])
+    solved = [trace.outcome for trace in nominal if trace.outcome.success]
+    unsafe = Share.of([outcome.unsafe for outcome in solved])
     caption = (
         f"False alarms in {len(nominal)} nominal test episodes of {hours:.2f} hours, by the "
         "promise of the threshold; 95 % intervals (Wilson, Poisson). Broken: less likely than 1 in "
@@ -261,14 +272,14 @@ def _kept(promise: AlarmRate, m: DetectionMetrics) -> str:
     threshold = m.calibration.thresholds.get(promise)
     if threshold is None:
         return ""
-    judged = [trace.at(threshold) for trace in m.nominal]
+    nominal = [trace.at(threshold) for trace in m.nominal]
     if promise.per == HOUR:
-        return kept_rate(metrics.hourly_alarms(judged), promise.rate)
-    return _kept_share(metrics.false_alarms(judged), m.calibration, threshold)
+        return kept_rate(metrics.hourly_alarms(nominal), promise.rate)
+    return _kept_share(metrics.false_alarms(nominal), m.calibration, threshold)
 
 
 def kept_rate(rate: Rate, promised: float) -> str:
-    """Format the alarms per hour, and say whether the promise was broken."""
+    """Format the alarms per hour, and say if the promise was broken."""
     low, _ = rate.interval
     if low > promised:
         return f"{rate.text}, broken"
@@ -276,53 +287,59 @@ def kept_rate(rate: Rate, promised: float) -> str:
 
 
 def _kept_share(share: Share, calibration: Calibration, threshold: float) -> str:
-    """Format the share of episodes with an alarm, and say whether the threshold broke its promise.
+    """Format the share of episodes with an alarm, and say if the threshold broke its promise.
 
-    ``beyond`` of n calibration maxima exceed the threshold. The share of fresh ones that exceed it is itself drawn,
-    from Beta(beyond + 1, n - beyond), so their count is beta-binomial.
+    ``over`` of n calibration maxima exceed the threshold. The share of fresh ones that exceed it is itself drawn, from
+    Beta(over + 1, n - over), so their count is beta-binomial.
     """
     low, high = share.interval
     text = f"{100 * share.value:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
     n = len(calibration.maxima)
-    beyond = int((calibration.maxima > threshold).sum())
-    if not share.n or beyond >= n:
+    over = int((calibration.maxima > threshold).sum())
+    if not share.n or over >= n:
         return text
-    if stats.betabinom.sf(share.k - 1, share.n, beyond + 1, n - beyond) < UNLIKELY:
+    at_least_so_many = stats.betabinom.sf(share.k - 1, share.n, over + 1, n - over)
+    if at_least_so_many < UNLIKELY:
         return f"{text}, broken"
     return text
 
 
 def splits_table(result: BenchmarkResult) -> Table:
-    """Return what each promise comes to over random halves of the nominal episodes.
-
-    It is set on one half, and kept on the other.
-    """
+    """Return false alarms and faults found, where one random half of the nominal episodes sets the threshold."""
     caption = (
         f"False alarms that came, and faults found within {1e3 * result.window_s:.0f} ms, where "
         f"{SPLITS} random halves of the nominal episodes for calibration and test set the "
         "threshold and the other halves count: mean ± SD."
     )
     promises = list(result.on_visible[0].calibration.thresholds)
-    return _by_promise(caption, promises, _over_own_splits, result.on_visible)
+    return _by_promise(caption, promises, _over_splits_of_nominal, result.on_visible)
 
 
-def _over_own_splits(promise: AlarmRate, m: DetectionMetrics) -> str:
+def _over_splits_of_nominal(promise: AlarmRate, m: DetectionMetrics) -> str:
     """Return ``over_splits`` of the nominal episodes for calibration and test."""
     surprises = [trace.surprise for trace in m.nominal]
     if promise.per == EPISODE:
         peaks = [surprise.max() for surprise in surprises]
         maxima = np.concatenate([m.calibration.maxima, peaks])
-        return over_splits(m, Blocks(maxima, np.ones(len(maxima))), promise)
+        one_each = np.ones(len(maxima))
+        return over_splits(m, Blocks(maxima, one_each), promise)
     blocks = Blocks.of(surprises, m.nominal[0].dt)
-    known = m.calibration.blocks
-    if known is not None:
-        maxima = np.concatenate([known.maxima, blocks.maxima])
-        blocks = Blocks(maxima, np.concatenate([known.hours, blocks.hours]))
+    calibration = m.calibration.blocks
+    if calibration is not None:
+        maxima = np.concatenate([calibration.maxima, blocks.maxima])
+        hours = np.concatenate([calibration.hours, blocks.hours])
+        blocks = Blocks(maxima, hours)
     return over_splits(m, blocks, promise)
 
 
 def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
-    """Return the false alarms that came, and faults found, where random halves of ``units`` set the threshold."""
+    """Return false alarms and faults found, mean ± SD over random halves of ``units`` that set the threshold.
+
+    Args:
+        m: the faults.
+        units: the largest surprise in each episode, which has 1 "hour", or in each block of time.
+        promise: of false alarms, by the episode or by the hour.
+    """
     rng = np.random.default_rng(0)
     windows = Windows(m.faulty, m.window_s)
     size = len(units.maxima)
@@ -331,12 +348,13 @@ def over_splits(m: DetectionMetrics, units: Blocks, promise: AlarmRate) -> str:
     for _ in range(SPLITS):
         half = np.zeros(size, bool)
         half[rng.permutation(size)[: size // 2]] = True
-        own = Blocks(units.maxima[half], units.hours[half])
+        calibration = Blocks(units.maxima[half], units.hours[half])
         try:
-            threshold = promise.threshold(own.maxima, own)
+            threshold = promise.threshold(calibration.maxima, calibration)
         except ValueError:  # too few
             return ""
-        alarms.append((units.maxima[~half] > threshold).sum() / units.hours[~half].sum())
+        false_alarms = (units.maxima[~half] > threshold).sum()
+        alarms.append(false_alarms / units.hours[~half].sum())
         found.append(windows.detected(threshold).mean())
 
     detected = f"{100 * np.mean(found):.1f} ± {100 * np.std(found):.1f} % found"

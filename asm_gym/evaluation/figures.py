@@ -24,7 +24,7 @@ from asm_gym.data.column_behaviour import is_constant
 from asm_gym.data.episode import spans
 from asm_gym.data.inspection import Inspection
 from asm_gym.data.log_column import LogColumn
-from asm_gym.data.tables import is_numeric
+from asm_gym.data.table_layout import is_numeric
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.statistics import Floats
 from asm_gym.files import written_whole
@@ -86,8 +86,9 @@ def save(fig: Figure, path: str | Path) -> Path:
 def look(i: int) -> tuple[str, Any, str]:
     """Return colour, line style and marker of the i-th curve."""
     n = len(_COLOURS)
-    turn = (i + i // n) % n  # the next combination after each round of colours
-    return _COLOURS[i % n], _LINES[turn], _MARKERS[turn]
+    rounds = i // n
+    style = (i + rounds) % n  # after each round of colours, other combinations
+    return _COLOURS[i % n], _LINES[style], _MARKERS[style]
 
 
 def surprise_figure(traces: Sequence[ScoredEpisode]) -> Figure:
@@ -114,7 +115,7 @@ def _surprise_legend(traces: Sequence[ScoredEpisode]) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=BLACK, linewidth=1, linestyle=DASHED, label="threshold")
     ]
-    if any(t.onset is not None or (t.fault is not None and t.fault.any()) for t in traces):
+    if any(map(_has_fault, traces)):
         handles.append(Patch(color=ORANGE, alpha=0.3, label="fault active"))
     handles.append(Line2D([], [], **_ALARM_BAR, label="in alarm"))
     if any(trace.missing.any() for trace in traces):
@@ -122,9 +123,18 @@ def _surprise_legend(traces: Sequence[ScoredEpisode]) -> list[Line2D | Patch]:
     return handles
 
 
+def _has_fault(trace: ScoredEpisode) -> bool:
+    if trace.onset is not None:
+        return True
+    return trace.fault is not None and bool(trace.fault.any())
+
+
 def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
-    _shade(ax, trace.dt * np.array(spans(trace.missing)), GREY, alpha=0.5)
-    ax.plot(_times(trace), np.clip(trace.surprise, *_limits([trace])), color=BLUE, linewidth=1.5)
+    missing = trace.dt * np.array(spans(trace.missing))
+    _shade(ax, missing, GREY, alpha=0.5)
+    floor, ceiling = _limits([trace])
+    surprise = np.clip(trace.surprise, floor, ceiling)
+    ax.plot(_times(trace), surprise, color=BLUE, linewidth=1.5)
     ax.axhline(trace.threshold, color=BLACK, linewidth=1, linestyle=DASHED)
     _shade_fault(ax, trace)
     title = trace.condition
@@ -136,8 +146,8 @@ def _surprise_panel(ax: Axes, trace: ScoredEpisode) -> None:
             title += ": missed"
         else:
             title += f": alarm {1e3 * trace.delay:.0f} ms after the onset"
-    for ends in _alarm_times(trace):
-        ax.plot(ends, [0.96, 0.96], **_ALARM_BAR, transform=ax.get_xaxis_transform())
+    for begin_and_end in _alarm_times(trace):
+        ax.plot(begin_and_end, [0.96, 0.96], **_ALARM_BAR, transform=ax.get_xaxis_transform())
     ax.set_title(title)
     ax.grid(axis="y")
 
@@ -146,15 +156,17 @@ def stream_figure(trace: ScoredEpisode, top: int = 4) -> Figure:
     """Draw the ``top`` channels that surprised most, faults and alarms shaded; raise ValueError without a stream."""
     if trace.stream is None or trace.attribution is None:
         raise ValueError("this trace was kept without its stream")
-    shares = np.nan_to_num(trace.attribution[trace.onset or 0 :], posinf=1e30)
-    channels = np.argsort(-shares.max(axis=0), kind="stable")[:top]
+    since_onset = trace.attribution[trace.onset or 0 :]
+    largest = np.nan_to_num(since_onset, posinf=1e30).max(axis=0)  # (D,)
+    channels = np.argsort(-largest, kind="stable")[:top]
     with figure(height=1.0 + 1.15 * len(channels)) as fig:
         axes = fig.subplots(len(channels), sharex=True, squeeze=False)[:, 0]
         for ax, channel in zip(axes, channels, strict=True):
             _shade_fault(ax, trace)
             _shade(ax, _alarm_times(trace), VERMILLION, alpha=0.2)
             sensed = trace.stream[:, channel]
-            ax.plot(_times(trace), np.where(np.isfinite(sensed), sensed, np.nan), color=BLUE)
+            finite = np.where(np.isfinite(sensed), sensed, np.nan)
+            ax.plot(_times(trace), finite, color=BLUE)
             ax.set_title(trace.channels[channel])
         axes[-1].set_xlabel("time [s]")
         handles = [
@@ -178,7 +190,8 @@ def _alarm_times(trace: ScoredEpisode) -> Floats:
 
 def _shade_fault(ax: Axes, trace: ScoredEpisode) -> None:
     if trace.fault is not None:
-        _shade(ax, trace.dt * np.array(spans(trace.fault)), ORANGE, alpha=0.3)
+        times = trace.dt * np.array(spans(trace.fault))
+        _shade(ax, times, ORANGE, alpha=0.3)
 
 
 def _shade(ax: Axes, times: Floats, color: str, alpha: float) -> None:
@@ -219,9 +232,9 @@ def log_figure(inspection: Inspection) -> Figure:
         title += f"; {len(columns) - MOST_PANELS} more channels are in the table"
         del columns[MOST_PANELS:]
 
-    down = math.ceil(max(len(columns), 1) / ACROSS)
-    with figure(height=0.7 + 1.25 * down, width=11.0) as fig:
-        panels = fig.subplots(down, ACROSS, squeeze=False).ravel()
+    rows = math.ceil(max(len(columns), 1) / ACROSS)
+    with figure(height=0.7 + 1.25 * rows, width=11.0) as fig:
+        panels = fig.subplots(rows, ACROSS, squeeze=False).ravel()
         for ax, (column, values) in zip(panels, columns, strict=False):
             _column_panel(ax, inspection, column, values)
         for ax in panels:
@@ -230,7 +243,10 @@ def log_figure(inspection: Inspection) -> Figure:
         for ax in panels[len(columns) :]:
             ax.set_visible(False)
         fig.suptitle(title, fontsize=10)
-        fig.supxlabel("time [s]" if inspection.rate else "row", fontsize=9)
+        label = "row"
+        if inspection.rate:
+            label = "time [s]"
+        fig.supxlabel(label, fontsize=9)
     return fig
 
 
@@ -240,9 +256,11 @@ def _column_panel(
     """Draw the values (T,) of a column over time."""
     every = max(1, len(values) // MOST_POINTS)
     times = inspection.times[::every]
-    shown = values[::every].astype(np.float64)
-    after_gap = np.searchsorted(times, inspection.gaps[:, 1])  # no line is drawn across a gap
-    times = np.insert(times, after_gap, np.nan)
+    drawn = values[::every].astype(np.float64)
+    # A NaN after each gap breaks the line.
+    after_gap = np.searchsorted(times, inspection.gaps[:, 1])
+    times_with_breaks = np.insert(times, after_gap, np.nan)
+    values_with_breaks = np.insert(drawn, after_gap, np.nan)
     name = column.name
     if len(name) >= LONGEST_NAME:
         name = "…" + name[1 - LONGEST_NAME :]
@@ -254,11 +272,11 @@ def _column_panel(
         title += ", never moves"
         colour = GREY
 
-    ax.plot(times, np.insert(shown, after_gap, np.nan), color=colour, linewidth=0.7)
+    ax.plot(times_with_breaks, values_with_breaks, color=colour, linewidth=0.7)
     _shade(ax, inspection.gaps[:MOST_GAPS], ORANGE, alpha=0.35)
-    lost = ~np.isfinite(values)
-    if lost.any():
-        bottom = np.full(lost.sum(), np.nanmin(shown, initial=0.0))
-        ax.plot(inspection.times[lost], bottom, "|", color=ORANGE, markersize=4)
+    is_lost = ~np.isfinite(values)
+    if is_lost.any():
+        bottom = np.full(is_lost.sum(), np.nanmin(drawn, initial=0.0))
+        ax.plot(inspection.times[is_lost], bottom, "|", color=ORANGE, markersize=4)
     ax.set_title(title)
     ax.margins(x=0)

@@ -40,10 +40,11 @@ class Delays(NamedTuple):
         """Summarise one delay per fault [ms], ``inf`` for a miss."""
         if not len(delays_ms):
             return cls()
-        # observed values: between a number and a miss there is nothing to interpolate
-        late = np.sort(delays_ms)
-        median, p95 = (float(late[math.ceil(q * len(late)) - 1]) for q in (0.5, 0.95))
-        return cls(median, p95)
+        # Observed values: between a number and a miss there is nothing to interpolate.
+        in_order = np.sort(delays_ms)
+        median = in_order[math.ceil(0.5 * len(in_order)) - 1]
+        p95 = in_order[math.ceil(0.95 * len(in_order)) - 1]
+        return cls(float(median), float(p95))
 
 
 def delays_ms(traces: Sequence[ScoredEpisode], window_s: float) -> NDArray[np.float64]:

@@ -69,9 +69,10 @@ class Wins:
         shape = (len(faulty), len(nominal))
         self.won = np.zeros(shape)  # (F, N) 1 where a fault surprised more, ½ in ties
         self.comparable = np.zeros(shape)  # (F, N) 1 where both have a row in the window
-        names = [(t.kind, t.severity) for t in faulty]
-        kinds = list(dict.fromkeys(names))
-        self.kind = np.array([kinds.index(name) for name in names], int)  # (F,)
+        kind_of_fault = [(t.kind, t.severity) for t in faulty]
+        kinds = list(dict.fromkeys(kind_of_fault))
+        numbers = [kinds.index(kind) for kind in kind_of_fault]
+        self.kind = np.array(numbers, int)  # (F,)
 
         for row, trace in enumerate(faulty):
             steps = trace.window(window_s)
@@ -81,25 +82,30 @@ class Wins:
             for column, other in enumerate(nominal):
                 if other.task != trace.task or len(other) <= steps.start:
                     continue
-                theirs = other.surprise[steps].max()
-                self.won[row, column] = 0.5 * (float(peak > theirs) + float(peak >= theirs))
+                nominal_peak = other.surprise[steps].max()
                 self.comparable[row, column] = 1.0
+                if peak > nominal_peak:
+                    self.won[row, column] = 1.0
+                elif peak == nominal_peak:
+                    self.won[row, column] = 0.5
 
     def auroc(self) -> float:
         """Return the mean over kinds of fault; NaN where nothing can be compared."""
         faulty, nominal = self.won.shape
         return self.weighted_auroc(np.ones(faulty), np.ones(nominal))
 
-    def weighted_auroc(self, own: Floats, theirs: Floats) -> float:
+    def weighted_auroc(self, fault_weights: Floats, nominal_weights: Floats) -> float:
         """Return the same, with faults (F,) and nominal episodes (N,) counted so many times."""
-        others = self.comparable @ theirs  # (F,)
-        counted = np.where(others > 0, own, 0.0)
-        each = (self.won @ theirs) / np.maximum(others, 1.0)
-        total = np.bincount(self.kind, counted * each)
-        drawn = np.bincount(self.kind, counted)
-        if not drawn.any():
+        compared = self.comparable @ nominal_weights  # (F,) episodes
+        weights = np.where(compared > 0, fault_weights, 0.0)
+        share_won = (self.won @ nominal_weights) / np.maximum(compared, 1.0)
+        sum_by_kind = np.bincount(self.kind, weights * share_won)
+        weight_by_kind = np.bincount(self.kind, weights)
+        is_drawn = weight_by_kind > 0
+        if not is_drawn.any():
             return math.nan
-        return float((total[drawn > 0] / drawn[drawn > 0]).mean())
+        auroc_by_kind = sum_by_kind[is_drawn] / weight_by_kind[is_drawn]
+        return float(auroc_by_kind.mean())
 
 
 class Windows:
@@ -110,9 +116,10 @@ class Windows:
         self._surprise = np.full((len(faulty), longest + 1), -math.inf)  # (F, W + 1)
         for row, trace in zip(self._surprise, faulty, strict=True):
             steps = trace.window(window_s)
-            before = max(steps.start - 1, 0)
-            values = trace.surprise[before : steps.stop]
-            row[before - steps.start + 1 :][: len(values)] = values
+            first = max(steps.start - 1, 0)
+            values = trace.surprise[first : steps.stop]
+            column = first - (steps.start - 1)  # 1 where no step is before the window
+            row[column : column + len(values)] = values
 
     def detected(self, threshold: float) -> NDArray[np.bool_]:
         """Return (F,) which faults are detected at a threshold."""
@@ -128,27 +135,33 @@ def resample(
     seed: int = 0,
     draws: int = DRAWS,
 ) -> Draws:
-    """Resample the results of one monitor; twins share task and seed, and monitors of the same ``seed`` are paired."""
+    """Resample the results of one monitor.
+
+    A scene is a task and a seed, which a fault shares with its twin. Monitors are paired by the same ``seed``.
+    """
     rng = np.random.default_rng(seed)
     scenes = sorted({(t.task, t.seed) for t in (*nominal, *faulty)})
-    index = {scene: n for n, scene in enumerate(scenes)}
-    scene_of_fault = np.array([index[t.task, t.seed] for t in faulty], int)  # (F,)
-    scene_of_nominal = np.array([index[t.task, t.seed] for t in nominal], int)  # (N,)
+    number = {scene: n for n, scene in enumerate(scenes)}
+    scene_of_fault = np.array([number[t.task, t.seed] for t in faulty], int)  # (F,)
+    scene_of_nominal = np.array([number[t.task, t.seed] for t in nominal], int)  # (N,)
     tasks = np.array([task for task, _ in scenes])
-    scenes_of_tasks = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
+    scenes_by_task = [np.flatnonzero(tasks == task) for task in dict.fromkeys(tasks)]
 
     wins = Wins(faulty, nominal, window_s)
     windows = Windows(faulty, window_s)
     auroc = np.full(draws, math.nan)
     found: dict[AlarmRate, Floats] = {}
     for draw in range(draws):
-        weights = np.zeros(len(scenes))  # how often each scene was drawn
-        for own in scenes_of_tasks:
-            np.add.at(weights, rng.choice(own, len(own)), 1.0)
-        times = weights[scene_of_fault]  # (F,)
-        auroc[draw] = wins.weighted_auroc(times, weights[scene_of_nominal])
+        times_drawn = np.zeros(len(scenes))
+        for scenes_of_task in scenes_by_task:
+            drawn = rng.choice(scenes_of_task, len(scenes_of_task))
+            np.add.at(times_drawn, drawn, 1.0)
+        fault_weights = times_drawn[scene_of_fault]  # (F,)
+        nominal_weights = times_drawn[scene_of_nominal]  # (N,)
+        auroc[draw] = wins.weighted_auroc(fault_weights, nominal_weights)
         for promise, threshold in calibration.resampled(rng).items():
             shares = found.setdefault(promise, np.full(draws, math.nan))
-            if times.any():
-                shares[draw] = windows.detected(threshold) @ times / times.sum()
+            if fault_weights.any():
+                is_detected = windows.detected(threshold)
+                shares[draw] = is_detected @ fault_weights / fault_weights.sum()
     return Draws(auroc=auroc, found=found)

@@ -164,13 +164,15 @@ def code_digest() -> str:
 
 
 def fitted(folder: Path, name: str, recordings: Sequence[Episode], seed: int) -> CalibratedMonitor:
-    """Return the monitor fitted on these episodes; kept in the folder by episodes, settings and code."""
+    """Return the monitor fitted on these episodes; the folder keeps it by its settings, code and episodes."""
     model = name.removesuffix(EVIDENCE)
     monitor = make_monitor(name, recordings[0].spec, seed=seed)
-    files = sorted(str(r.labelled.path) for r in recordings)
-    learned = (model, __version__, monitor.get_params(), files)
-    digest = hashlib.sha256(json.dumps(learned, default=str).encode()).hexdigest()[:12]
-    path = folder / "monitors" / f"{model}-{digest}-{code_digest()}.asm"
+    settings = json.dumps((model, __version__, monitor.get_params()), default=str)
+    digest = hashlib.sha256(settings.encode())
+    for recording in recordings:
+        digest.update(str(recording.stream.shape).encode())
+        digest.update(recording.stream.tobytes())
+    path = folder / "monitors" / f"{model}-{digest.hexdigest()[:12]}-{code_digest()}.asm"
     with suppress(FileNotFoundError, ValueError):  # a damaged one is fitted anew
         return monitor_class(name).load(path)
     path.parent.mkdir(parents=True, exist_ok=True)

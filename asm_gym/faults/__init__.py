@@ -13,12 +13,12 @@ from asm_gym.faults.actuator import GripperOpens as GripperOpens
 from asm_gym.faults.actuator import JointFriction as JointFriction
 from asm_gym.faults.actuator import WeakGripper as WeakGripper
 from asm_gym.faults.actuator import WeakJoint as WeakJoint
-from asm_gym.faults.base import Fault as Fault
 from asm_gym.faults.body import CablePull as CablePull
 from asm_gym.faults.body import Collision as Collision
 from asm_gym.faults.body import HeldByPerson as HeldByPerson
 from asm_gym.faults.body import Payload as Payload
 from asm_gym.faults.body import Push as Push
+from asm_gym.faults.fault import Fault as Fault
 from asm_gym.faults.object import Heavy as Heavy
 from asm_gym.faults.object import Missing as Missing
 from asm_gym.faults.object import ObjectMass as ObjectMass

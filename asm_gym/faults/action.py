@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.faults.base import LONGEST, Clock, HookedFault, Interface, delayed, within
+from asm_gym.faults.fault import LONGEST, Clock, HookedFault, Interface, delayed, within
 from asm_gym.validation import check_number
 
 Action = NDArray[np.float32]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import (
+from asm_gym.faults.fault import (
     Clock,
     Edit,
     EditingFault,

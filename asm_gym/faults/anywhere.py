@@ -16,7 +16,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
 from asm_gym.faults import action, sensor
-from asm_gym.faults.base import Fault, Interface, graded
+from asm_gym.faults.fault import Fault, Interface, graded
 from asm_gym.faults.suite import SEVERITIES
 from asm_gym.spec import MOTOR, StreamSpec, flat
 from asm_gym.stream_source import StreamSource

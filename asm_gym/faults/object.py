@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
-from asm_gym.faults.base import (
+from asm_gym.faults.fault import (
     Clock,
     Edit,
     EditingFault,

@@ -15,7 +15,7 @@ from gymnasium.spaces import flatdim
 from asm_gym.envs.arms import prefix_of
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import action, actuator, body, object, sensor
-from asm_gym.faults.base import Fault, Vector3, graded
+from asm_gym.faults.fault import Fault, Vector3, graded
 from asm_gym.registries import Registry, target
 from asm_gym.validation import check_choice
 

@@ -13,12 +13,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.guard.options import ReleaseRule
 from asm_gym.guard.responses import GOING_ON, Response
-from asm_gym.guard.robot_table import ENDED, POLICY, REFLEX, TRIAL, RobotTable
+from asm_gym.guard.robot_table import ENDED, POLICY, REFLEX, TRIAL, Mask, RobotTable
 from asm_gym.guard.row_evidence import RowEvidence
 
 LOG = logging.getLogger("asm_gym.safety")
@@ -26,7 +25,8 @@ LOG = logging.getLogger("asm_gym.safety")
 RELEASE_BELOW = 0.8  # share of the threshold that surprise must be under before a reflex hands back
 MOST_DOUBLINGS = 16  # of the time that a contact must have been gone for
 
-MOSTLY_AFTER = 200  # rows under the policy after which it is said that most of them alarm
+# Rows under the policy after which it is said that most of them alarm.
+MOSTLY_AFTER = 200
 
 MOSTLY = (
     "{} of the first {} rows under this policy alarm: something is wrong all the time, or the "
@@ -35,26 +35,30 @@ MOSTLY = (
     "monitor.fit(episodes, warm_start=True).calibrate(others, 0.05)"
 )
 
-Mask = NDArray[np.bool_]
-
 
 class Situation(NamedTuple):
     """All that a row tells the table of transitions."""
 
-    alarm: bool = (
-        False  # surprise is over the threshold, or something failed, is missing or presses
-    )
-    presses: bool = False  # a contact limit was passed within the step
-    spent: bool = False  # the arm has pressed too often, or with too much impulse, in this episode
-    goes_on: bool = False  # the response lets the policy act
-    stops: bool = False  # the response ends the episode, and has been held for long enough
-    overdue: bool = False  # the reflex has acted for as long as it may
-    calm: bool = False  # surprise has been low for long enough, and nothing touches
-    free: bool = False  # the contact has been gone for long enough, and nothing presses
-    waited: bool = (
-        False  # held for long enough for a trial, nothing presses, and no sense tells of a contact
-    )
-    settled: bool = False  # the trial has gone well for long enough
+    alarm: bool = False
+    """Surprise is over the threshold, or something failed, is missing or presses."""
+    presses: bool = False
+    """A contact limit was passed within the step."""
+    spent: bool = False
+    """The arm has pressed too often, or with too much impulse, in this episode."""
+    goes_on: bool = False
+    """The response lets the policy act."""
+    stops: bool = False
+    """The response ends the episode, and has been held for long enough."""
+    overdue: bool = False
+    """The reflex has acted for as long as it may."""
+    calm: bool = False
+    """Surprise has been low for long enough, and nothing touches."""
+    free: bool = False
+    """The contact has been gone for long enough, and nothing presses."""
+    waited: bool = False
+    """Held for long enough for a trial, nothing presses, and no sense tells of a contact."""
+    settled: bool = False
+    """The trial has gone well for long enough."""
 
 
 class Transition(NamedTuple):
@@ -120,13 +124,12 @@ def following(state: int, situation: Situation) -> Transition | None:
 class Decision(NamedTuple):
     """What a row of one robot has led to."""
 
-    transition: str = (
-        ""  # the name in ``TRANSITIONS``, or the response under which the policy goes on
-    )
-    takes_over: bool = False  # the reflex acts from now on
-    acted_on: bool = (
-        False  # the surprise has had its consequence: its evidence is not to be counted again
-    )
+    transition: str = ""
+    """The name in ``TRANSITIONS``, or the response under which the policy goes on."""
+    takes_over: bool = False
+    """The reflex acts from now on."""
+    acted_on: bool = False
+    """The surprise has had its consequence: its evidence is not to be counted again."""
 
 
 class Arbiter:

@@ -16,14 +16,16 @@ from asm_gym.guard.arbiter import Arbiter
 from asm_gym.guard.observer import joined
 from asm_gym.guard.reflexes import FeltMotion, Motion
 from asm_gym.guard.robot_facts import RobotFacts
-from asm_gym.guard.robot_table import REFLEX, RobotTable
-from asm_gym.policies.base import Policy
+from asm_gym.guard.robot_table import REFLEX, Floats32, Mask, RobotTable
 from asm_gym.policies.hold import Hold, HoldingActions
+from asm_gym.policies.policy import Policy
 from asm_gym.validation import as_float32, short_repr
 
-Floats32 = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Observe = Callable[[int], Any]  # returns the observation of a robot
+Observe = Callable[[int], Any]
+"""Returns the observation of a robot."""
+
+# Rows of the limits (5, A) of actions.
+LOW, HIGH, LEAST_EXECUTED, MOST_EXECUTED, GREATEST_STEP = range(5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,14 +72,14 @@ class Commander:
         self._arbiter = arbiter
         self._warn = warn
         self._reacts = motion is not None or bool(policies)
-        self.holding = (
-            HoldingActions(facts.count, facts.meaning, facts.rest)
-            if motion is None
-            else motion.holding
-        )
+        if motion is None:
+            self.holding = HoldingActions(facts.count, facts.meaning, facts.rest)
+        else:
+            self.holding = motion.holding
         self._limits = _limits(facts, commands)  # (5, A)
-        self._proposed = np.full((facts.count, facts.rest.size), np.nan, np.float32)  # last
-        self._executed = np.zeros((facts.count, facts.rest.size), np.float32)  # last
+        shape = facts.count, facts.rest.size
+        self._proposed = np.full(shape, np.nan, np.float32)  # in the last step
+        self._executed = np.zeros(shape, np.float32)  # in the last step
         self._nobody = np.zeros(facts.count, bool)  # never written to
         self._policy_states: dict[int, Any] = {}  # of policies that act in an override
         self.begin(~self._nobody)
@@ -132,21 +134,24 @@ class Commander:
     ) -> Command:
         """Return what is to be done where a robot is overridden or idle; ``executed`` is written to."""
         records = self._records
-        records["refused"] &= ~idle
+        facts = self._facts
+        refused = records["refused"] & ~idle
+        records["refused"] = refused
         records["out_of_range"] &= ~idle
         brakes = np.zeros(len(proposed), bool)
-        overridden = ((records["state"] == REFLEX) | records["refused"]) & ~idle
-        executed[idle] = np.clip(np.nan_to_num(self._facts.rest), self._facts.low, self._facts.high)
+        overridden = (records["state"] == REFLEX) & ~idle | refused
+        executed[idle] = np.clip(np.nan_to_num(facts.rest), facts.low, facts.high)
         failures: dict[int, str] = {}
         for robot in np.flatnonzero(overridden).tolist():
             refusal = ""
-            if records["refused"][robot]:
+            if refused[robot]:
                 refusal = self._refuse(robot, proposed[robot])
-            motion, failure = self._react(robot, reflexes[robot], observe)
+            motion, reflex_failure = self._react(robot, reflexes[robot], observe)
             executed[robot] = motion.action
             brakes[robot] = motion.brakes
-            if reason := joined(refusal, failure):
-                failures[robot] = reason
+            failure = joined(refusal, reflex_failure)
+            if failure:
+                failures[robot] = failure
         self._executed = executed.copy()
         return Command(executed, brakes, overridden, failures)
 
@@ -169,7 +174,7 @@ class Commander:
         failure = ""
         try:
             if self._reacts:
-                motion = self._asked(robot, reflex, observe)
+                motion = self._reflex_motion(robot, reflex, observe)
             action = np.array(as_float32(motion.action)).reshape(-1)
             if action.shape != facts.rest.shape or not np.isfinite(action).all():
                 raise ValueError(
@@ -186,7 +191,7 @@ class Commander:
             action[facts.grip] = np.where(np.isfinite(grip), grip, action[facts.grip])
         return motion._replace(action=np.clip(action, facts.low, facts.high)), failure
 
-    def _asked(self, robot: int, reflex: str, observe: Observe) -> Motion:
+    def _reflex_motion(self, robot: int, reflex: str, observe: Observe) -> Motion:
         """Return what the reflex of a name, or the user's own policy, does."""
         if self._motion is not None:
             return self._motion.move(robot, reflex)
@@ -195,9 +200,10 @@ class Commander:
         state = self._policy_states.get(robot)
         if fresh and isinstance(policy, Hold):  # any other policy starts as in a new episode
             state = policy.begin(self.holding.executed[robot].copy())
-        action, self._policy_states[robot] = policy.predict(
+        action, state = policy.predict(
             observe(robot), state=state, episode_start=np.array([fresh]), deterministic=True
         )
+        self._policy_states[robot] = state
         return Motion(action, keeps_grip=False)
 
 
@@ -206,13 +212,12 @@ def _limits(facts: RobotFacts, commands: NDArray[np.floating[Any]] | None) -> Fl
 
     Numbers with bounds may be anything within them; others stay near healthy ``commands`` (3, A).
     """
-    limits = np.stack(
-        [facts.low, facts.high, facts.low, facts.high, np.full_like(facts.low, np.inf)]
-    )
+    any_step = np.full_like(facts.low, np.inf)
+    limits = np.stack([facts.low, facts.high, facts.low, facts.high, any_step])
     if commands is None or commands.shape[1] != facts.rest.size:
         return limits
     is_unbounded = ~(np.isfinite(facts.low) & np.isfinite(facts.high))
-    limits[2:, is_unbounded] = command_limits(commands)[:, is_unbounded]
+    limits[LEAST_EXECUTED:, is_unbounded] = command_limits(commands)[:, is_unbounded]
     return limits.astype(np.float32)
 
 
@@ -233,12 +238,12 @@ def clip_actions(
     Returns:
         Whether any robot is overridden, refused or idle.
     """
-    more = False
+    unusual = False
     for n in range(len(robots)):
         robot = robots[n]
         usable = clip_action(robot, proposed[n], before[n], limits, executed[n])
-        more = more or not usable or robot.state == REFLEX or idle[n]
-    return more
+        unusual = unusual or not usable or robot.state == REFLEX or idle[n]
+    return unusual
 
 
 @inner
@@ -247,11 +252,12 @@ def clip_action(robot: Any, proposed: Any, before: Any, limits: Any, executed: A
     finite = True
     absurd = False
     for i in range(len(proposed)):
-        executed[i] = min(max(proposed[i], limits[0, i]), limits[1, i])
+        executed[i] = min(max(proposed[i], limits[LOW, i]), limits[HIGH, i])
         finite = finite and np.isfinite(proposed[i])
-        absurd = absurd or executed[i] < limits[2, i] or executed[i] > limits[3, i]
-        absurd = absurd or np.abs(executed[i] - before[i]) > limits[4, i]
-    acts = robot.state != REFLEX
-    robot.out_of_range = acts and finite and absurd
-    robot.refused = acts and (absurd or not finite)
+        absurd = absurd or executed[i] < limits[LEAST_EXECUTED, i]
+        absurd = absurd or executed[i] > limits[MOST_EXECUTED, i]
+        absurd = absurd or np.abs(executed[i] - before[i]) > limits[GREATEST_STEP, i]
+    policy_acts = robot.state != REFLEX
+    robot.out_of_range = policy_acts and finite and absurd
+    robot.refused = policy_acts and (absurd or not finite)
     return finite and not absurd

@@ -20,9 +20,8 @@ from asm_gym.guard.robot_facts import columns_ending
 from asm_gym.guard.robot_table import MOST_WRISTS
 from asm_gym.spec import Channel, StreamSpec
 
-FREE_FORCE = (
-    40.0  # force that healthy motion of many tasks comes to; impulse is counted beyond it [N]
-)
+# Force that healthy motion of many tasks comes to; impulse is counted beyond it [N].
+FREE_FORCE = 40.0
 LEVER = 0.5  # how far from a joint's axis an arm is touched, about [m]
 
 LEANS_S = 0.5
@@ -61,17 +60,15 @@ def contact_columns(felt: Sequence[Channel], spec: StreamSpec) -> ContactColumns
     Raises:
         ValueError: more wrists than the table of robots weighs.
     """
-    wrists = [
-        columns_ending(channels, "wrist_force", 3).reshape(-1, 3)
-        for channels in (felt, spec.channels)
-    ]
-    most = max(len(columns) for columns in wrists)
+    felt_wrists = columns_ending(felt, "wrist_force", 3).reshape(-1, 3)
+    wrists = columns_ending(spec.channels, "wrist_force", 3).reshape(-1, 3)
+    most = max(len(felt_wrists), len(wrists))
     if most > MOST_WRISTS:
         raise ValueError(f"a robot may have {MOST_WRISTS} channels of a wrist's force, got {most}")
     return ContactColumns(
-        felt_wrists=wrists[0],
+        felt_wrists=felt_wrists,
         felt_torques=columns_ending(felt, "external_torque"),
-        wrists=wrists[1],
+        wrists=wrists,
         torques=columns_ending(spec.channels, "external_torque"),
         hands=columns_ending(spec.channels, "hand_velocity", 3).reshape(-1, 3),
     )
@@ -126,13 +123,15 @@ def measure_contact(
     robot.contact_force = contact_force(robot, row, load[2:], columns, WEIGHED_S / dt)
     robot.hand_speed = fastest_hand(row, columns.hands)
 
+    force = robot.contact_force
     excess = 0.0
-    if np.isfinite(robot.contact_force):
-        excess = max(robot.contact_force - FREE_FORCE, 0.0)
+    if np.isfinite(force):
+        excess = max(force - FREE_FORCE, 0.0)
     robot.pressed_impulse += excess * dt
     lean(robot, excess, dt)
 
-    leans = robot.leaning_time > LEANS_S / (1.0 + SOONER * robot.strikes)
+    longest = LEANS_S / (1.0 + SOONER * robot.strikes)
+    leans = robot.leaning_time > longest
     passed = robot.load > 1.0 or np.isfinite(robot.limit_passed_s)
     robot.presses = passed or leans or robot.pressed_impulse > most_impulse
 
@@ -174,15 +173,17 @@ def wrist_force(numbers: Any, wrists: Any, weighed: Any, steps: float) -> float:
         return np.nan
     largest = 0.0
     for w in range(len(wrists)):
-        x = float(numbers[wrists[w, 0]])
-        y = float(numbers[wrists[w, 1]])
-        z = float(numbers[wrists[w, 2]])
-        weight = weighed[w].force
+        columns = wrists[w]
+        hand = weighed[w]
+        weight = hand.force
+        x = float(numbers[columns[0]])
+        y = float(numbers[columns[1]])
+        z = float(numbers[columns[2]])
         if x * x + y * y + z * z < HEAVIEST * HEAVIEST:
-            weighed[w].steps = min(weighed[w].steps + 1.0, steps)
-            weight[0] += (x - weight[0]) / weighed[w].steps
-            weight[1] += (y - weight[1]) / weighed[w].steps
-            weight[2] += (z - weight[2]) / weighed[w].steps
+            hand.steps = min(hand.steps + 1.0, steps)
+            weight[0] += (x - weight[0]) / hand.steps
+            weight[1] += (y - weight[1]) / hand.steps
+            weight[2] += (z - weight[2]) / hand.steps
         largest = np.maximum(largest, norm(x - weight[0], y - weight[1], z - weight[2]))
     return largest
 
@@ -205,8 +206,11 @@ def fastest_hand(row: Any, hands: Any) -> float:
         return np.nan
     largest = 0.0
     for h in range(len(hands)):
-        speed = norm(float(row[hands[h, 0]]), float(row[hands[h, 1]]), float(row[hands[h, 2]]))
-        largest = np.maximum(largest, speed)
+        columns = hands[h]
+        x = float(row[columns[0]])
+        y = float(row[columns[1]])
+        z = float(row[columns[2]])
+        largest = np.maximum(largest, norm(x, y, z))
     return largest
 
 

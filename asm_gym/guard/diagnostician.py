@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.contact_estimator import ContactEstimator
 from asm_gym.guard.contact_state import FREE_FORCE
-from asm_gym.guard.recent_rows import Floats32
 from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Response
 from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
+from asm_gym.guard.robot_table import POLICY, Floats32, Mask
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
 from asm_gym.spec import StreamSpec
@@ -99,11 +99,16 @@ class Diagnostician:
         self.incidents: dict[int, Incident] = {}
         self.rows = WINDOW + self._blocked_rows
 
-    def begin(self, robot: int) -> None:
-        """Begin a new episode of a robot."""
+    def begin(self, which: Mask) -> None:
+        """Begin new episodes of the robots of ``which`` (n,)."""
+        for robot in np.flatnonzero(which).tolist():
+            self.close(robot)
+
+    def close(self, robot: int) -> None:
+        """Close the incident of a robot: what comes next has a cause of its own."""
         self.incidents.pop(robot, None)
 
-    def watch(self, evidence: RowEvidence, policy_acts: bool) -> Response:
+    def watch(self, evidence: RowEvidence) -> Response:
         """Return what is known of a robot's last row, which is no alarm."""
         incident = self.incidents.get(evidence.index)
         if incident is None:
@@ -111,8 +116,9 @@ class Diagnostician:
         touched = self._touched(incident, evidence.rows)
         incident.rows += 1
         incident.calm_rows += 1
+        policy_acts = evidence.robot.state == POLICY
         if incident.calm_rows > CALM_S / self._dt and (incident.first_row or policy_acts):
-            self.begin(evidence.index)
+            self.close(evidence.index)
             return NO_RESPONSE
         return NO_RESPONSE._replace(touched=touched)
 

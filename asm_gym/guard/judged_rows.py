@@ -1,4 +1,4 @@
-"""A healthy row in one compiled call, from what was sensed to what is decided.
+"""Judge the rows of n robots: healthy ones in one compiled call, the others in steps.
 
     rows (n, D), loads (n, 2 + F)
        └► validate_rows ► observe_rows ► measure_contacts ► apply_alarm_rule ► record_motion
@@ -9,24 +9,72 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.compilation import compiled, inner
-from asm_gym.detection.alarm_rule import KNOCK_EVENT, benign_event, over_threshold
+from asm_gym.blas import one_thread_for
+from asm_gym.compilation import bind, compiled, inner
+from asm_gym.detection.alarm_rule import JUDGED, KNOCK_EVENT, benign_event, over_threshold
+from asm_gym.guard.alarm_terms import AlarmTerms
 from asm_gym.guard.arbiter import MOSTLY_AFTER
-from asm_gym.guard.contact_state import ContactColumns, measure_contacts
+from asm_gym.guard.contact_state import ContactColumns, contact_columns, measure_contacts
+from asm_gym.guard.hand_check import Contradiction
+from asm_gym.guard.observer import Observer, merged
 from asm_gym.guard.recent_rows import RowArrays
 from asm_gym.guard.reflexes import MotionArrays, record_motion
-from asm_gym.guard.robot_table import POLICY, REFLEX
-from asm_gym.guard.row_validation import validate_rows
+from asm_gym.guard.report import Outcome
+from asm_gym.guard.robot_facts import RobotFacts
+from asm_gym.guard.robot_table import POLICY, REFLEX, Floats32, Mask, RobotTable
+from asm_gym.guard.row_validation import RowValidator, ValidatedRows, validate_rows
+from asm_gym.monitors import Surprise
 from asm_gym.monitors.row_kernel import observe_rows
 
-# in the place of how many robots there are to decide about: the rows are to be repaired first
+# In the place of how many robots there are to decide about: the rows are to be repaired first.
 STOPPED = -1
+
+
+@dataclass(slots=True)
+class JudgedRow:
+    """A row of each of n robots, from what was sensed to what was decided; mappings are by robot."""
+
+    robots: NDArray[Any]
+    """(n,) records of ``ROBOT``."""
+    rows: Floats32
+    """(n, D) as they were sensed, with NaN for stale senses; once judged, as they are believed."""
+    load: NDArray[np.float64]
+    """(n, 2 + F), see ``no_load``."""
+    executed: Floats32
+    """(n, A) in the step of the row."""
+    ends_step: bool
+    attribution: NDArray[np.float64]
+    """(n, D)."""
+    eventful: bool = False
+    """There is something to say of the row: a part failed, or there is something to decide."""
+    failures: Mapping[int, str] = field(default_factory=dict)
+    """What failed, which is an alarm."""
+    harmless_failures: Mapping[int, str] = field(default_factory=dict)
+    """What failed without a consequence."""
+    lost: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    """The numbers that are not finite."""
+    contradictions: Mapping[int, Contradiction] = field(default_factory=dict)
+    terms: Mapping[str, Mask] = field(default_factory=dict)
+    """(n,) where each alarm term holds, by its name."""
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+    def fail(self, failures: Mapping[int, str]) -> None:
+        """Note what failed in the row: the surprise of those robots, where they are active, is infinite."""
+        active = self.robots["active"]
+        failures = {robot: failure for robot, failure in failures.items() if active[robot]}
+        if failures:
+            self.failures = merged(self.failures, failures)
+            self.robots["failed"][list(failures)] = True
+            self.eventful = True
 
 
 class GuardArrays(NamedTuple):
@@ -41,6 +89,121 @@ class GuardArrays(NamedTuple):
     judged: NDArray[Any]  # (n,) of ``JUDGED``, written with each row
     dt: float  # period of the rows [s]
     most_impulse: float  # that an arm may press with in an episode [N s]
+
+
+class RowJudge:
+    """Judges rows of n robots, and marks the robots about which there is something to decide.
+
+    Args:
+        facts: what is known of the robots.
+        table: their records.
+        validator: completes senses and compares hands with joints.
+        observer: asks the monitor for surprise.
+        terms: alarm terms, of which the user's own are asked at every row.
+        motion: what reflexes need of rows and actions.
+        most_impulse: that an arm may press with in an episode [N s].
+
+    Attributes:
+        surprises: (n,) records of ``JUDGED`` of the newest rows.
+    """
+
+    def __init__(
+        self,
+        facts: RobotFacts,
+        table: RobotTable,
+        validator: RowValidator,
+        observer: Observer,
+        terms: AlarmTerms,
+        motion: MotionArrays,
+        most_impulse: float,
+    ) -> None:
+        self._table = table
+        self._validator = validator
+        self._observer = observer
+        self._terms = terms
+        self.surprises: NDArray[Any] = np.zeros(facts.count, JUDGED)
+        self._arrays = GuardArrays(
+            robots=table.records,
+            recent=validator.recent.arrays,
+            hand_geometry=validator.hands.geometry,
+            hand_state=validator.hands.state,
+            contact_columns=contact_columns(facts.felt_channels, table.spec),
+            motion=motion,
+            judged=self.surprises,
+            dt=table.spec.dt,
+            most_impulse=float(most_impulse),
+        )
+        self._bound = bind(self._arrays)
+
+    def judge(self, row: JudgedRow) -> int:
+        """Judge a row; return how many robots there are to decide about."""
+        memory = None
+        if not (self._validator.repairs or self._terms.of_user):
+            memory = self._observer.compiled_step()
+        if memory is None:
+            return self._judge_in_steps(row, self._validator.validate(row.rows))
+
+        to_decide = self._judge_in_one_call(row, memory)
+        if to_decide == STOPPED:
+            return self._judge_in_steps(row, self._validator.repair(row.rows))
+        return to_decide
+
+    def _judge_in_one_call(self, row: JudgedRow, memory: Any) -> int:
+        """Judge a row by one compiled call; return how many robots there are to decide about, or ``STOPPED``."""
+        start = time.perf_counter()
+        with one_thread_for(len(row.rows)):
+            to_decide = judge_rows(
+                self._bound, memory, row.rows, row.load, row.executed, row.attribution
+            )
+        if to_decide != STOPPED:
+            self._observer.stepped(memory, time.perf_counter() - start)
+        return to_decide
+
+    def _judge_in_steps(self, row: JudgedRow, validated: ValidatedRows) -> int:
+        """Judge a validated row by the functions that ``judge_rows`` is made of.
+
+        Python takes part: a monitor that is not compiled, a sense that is completed, or a user's alarm term.
+
+        Returns:
+            How many robots there are to decide about.
+        """
+        arrays = self._arrays
+        robots = row.robots
+        repairs = self._validator.repairs
+        row.rows = validated.rows
+        row.lost = validated.lost
+        row.contradictions = validated.contradictions
+        row.eventful = row.eventful or bool(row.lost or repairs)
+        row.fail(validated.failures)
+        row.fail(self._observer.observe(row.rows, self.surprises, row.attribution))
+        self._leave_out_repaired(row)
+        measure_contacts(
+            robots, row.rows, row.load, arrays.contact_columns, arrays.dt, arrays.most_impulse
+        )
+        if self._terms.of_user:
+            failure = self._terms.ask_users(self._table)
+            robots["must_decide"] |= self._terms.any_of_user()
+            if failure:
+                row.fail(dict.fromkeys(range(len(robots)), failure))
+        robots["must_decide"][list(repairs)] = True
+        to_decide = apply_alarm_rule(robots, self.surprises, row.attribution)
+        record_motion(robots, row.rows, row.executed, arrays.motion)
+        return int(to_decide)
+
+    def _leave_out_repaired(self, row: JudgedRow) -> None:
+        """Leave out of the surprise what is completed, or changes from what was."""
+        for robot, repair in self._validator.repairs.items():
+            own = slice(robot, robot + 1)
+            judged = self.surprises[own]
+            surprise = Surprise(
+                judged["surprise"], row.attribution[own], raw=judged["raw_surprise"]
+            )
+            surprise = surprise.without(repair.unjudged)
+            if repair.settling and robot not in row.failures:
+                surprise = surprise.silenced(np.ones(1, bool))
+            judged["surprise"] = surprise.value
+            judged["raw_surprise"] = surprise.raw
+            row.attribution[own] = surprise.attribution
 
 
 @partial(compiled, calls=("memory", "detection", "monitors", "."))

@@ -14,7 +14,7 @@ ALARM = "alarm"
 NOTE = "note"
 SUMMARY = "summary"
 
-# Reasons of alarms, beside those of ``asm_gym.data.timing``.
+# Reasons of alarms, beside those of ``asm_gym.data.alarm_reasons``.
 DIED = "source died"
 UNREADABLE = "unreadable"
 CLOCK = "clock"
@@ -37,9 +37,8 @@ class LiveEvent:
     thresholds: float | None = None  # surprise over its threshold; infinite for missing numbers
     latency_ms: float | None = None  # from the arrival of the row to the alarm [ms]
     stamp: float | None = None  # of the row, by the robot's own clock [s]
-    date: str = (
-        ""  # wall clock, ISO 8601: when it happened, or by a clock of dates; empty if unknown
-    )
+    # Wall clock, ISO 8601: when it happened, or by a clock of dates; empty if unknown.
+    date: str = ""
     log: str = ""  # the recording; empty of a live source
 
     def __str__(self) -> str:

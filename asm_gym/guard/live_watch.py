@@ -21,9 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.alarm_reasons import LATE, SURPRISING, TOGETHER_S, blamed, reason
+from asm_gym.data.bridging import Bridge
 from asm_gym.data.rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.timing import LATE, SURPRISING, TOGETHER_S, Bridge, blamed, reason
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.guard import Guard

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound
-from asm_gym.guard.robot_table import Mask
+from asm_gym.guard.robot_table import Floats32, Mask
 from asm_gym.monitors import ExpectsActions, ForgetsEvidence, Monitor, NeuralASM, Surprise
 from asm_gym.monitors.row_kernel import RowKernel, unwritten
-
-Floats32 = NDArray[np.float32]
 
 
 class Observer:
@@ -39,6 +37,7 @@ class Observer:
         self._size = monitor.spec.size
         # Asked once: isinstance on a protocol takes longer than most of what follows.
         self._forgets = monitor if isinstance(monitor, ForgetsEvidence) else None
+        self._neural = monitor if isinstance(monitor, NeuralASM) else None
         self._expects: ExpectsActions | None = None
         if recalls:
             if not isinstance(monitor, ExpectsActions) or not monitor.spec.motor.size:
@@ -47,22 +46,21 @@ class Observer:
                     f"recall needs a memory that predicts actions, and {kind} does not"
                 )
             self._expects = monitor
-        self._neural = monitor if isinstance(monitor, NeuralASM) else None
         self._steps: list[_CompiledStep] = []  # the last two, which take turns
         self.latency = 0.0
         self.expected: Floats32 | None = None
         self.begin(np.ones(count, bool))
-        if (
-            self._neural is not None
-        ):  # what a row needs is loaded now, and not within the first step
-            self._neural.observe(self._initial, np.zeros((count, self._size), np.float32))
+        if self._neural is not None:
+            # What a row needs is loaded now, and not within the first step.
+            zeros = np.zeros((count, self._size), np.float32)
+            self._neural.observe(self._initial, zeros)
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes in the streams of ``which`` (n,)."""
         if which.all():
             self._initial = self._monitor.initial_state(batch=self._count)
             self._state = self._initial
-            self._before = self._initial
+            self._state_before = self._initial
         elif which.any():
             self._state = choose(which, self._initial, self._state)
 
@@ -75,28 +73,28 @@ class Observer:
         kernel = self._neural.compiled_row()
         if kernel is None:
             return None
+        spare = self._spare()
         for step in self._steps:
-            if step.kernel is kernel and step.state is self._state and step.new is self._spare():
+            if step.kernel is kernel and step.state is self._state and step.new is spare:
                 return step.bound
-        new = self._spare()
-        if new is None:
-            new = unwritten(self._state)
-        step = _CompiledStep(kernel, self._state, new)
+        if spare is None:
+            spare = unwritten(self._state)
+        step = _CompiledStep(kernel, self._state, spare)
         self._steps = [*self._steps[-1:], step]
         return step.bound
 
     def stepped(self, bound: Bound, seconds: float) -> None:
         """Take up the state that compiled code has written, in so many seconds."""
         step = next(step for step in self._steps if step.bound is bound)
-        self._before = self._state
+        self._state_before = self._state
         self._state = step.new
         self.latency = seconds
 
     def _spare(self) -> Any:
         """Return a state that may be written to; None where there is none."""
-        if self._before is self._initial or self._before is self._state:
+        if self._state_before is self._initial or self._state_before is self._state:
             return None
-        return self._before
+        return self._state_before
 
     # ------------------------------------------------------------------ a row of any monitor
 
@@ -112,12 +110,12 @@ class Observer:
         """
         start = time.perf_counter()
         spare = self._spare()
-        self._before = self._state
+        self._state_before = self._state
         try:
             if self._neural is None:
-                state, surprise = self._monitor.observe(self._before, rows)
+                state, surprise = self._monitor.observe(self._state_before, rows)
             else:
-                state, surprise = self._neural.observe(self._before, rows, spare)
+                state, surprise = self._neural.observe(self._state_before, rows, spare)
             self._write(surprise, judged, attribution)
             if self._expects is not None:
                 self.expected = self._expected_actions(self._expects, state)
@@ -132,7 +130,7 @@ class Observer:
     def amend(self, rows: Floats32) -> None:
         """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
         with suppress(Exception):  # the state stays as it is: the next row is judged from there
-            self._state, _ = self._monitor.observe(self._before, rows)
+            self._state, _ = self._monitor.observe(self._state_before, rows)
 
     def forget(self, acted_on: Mask) -> str:
         """Let the evidence begin anew in the streams of ``acted_on`` (n,); return what failed."""
@@ -155,16 +153,15 @@ class Observer:
 
     def _write(self, surprise: Surprise, judged: Any, attribution: Any) -> None:
         """Write a surprise, whose arrays may be buffers that the monitor uses again."""
-        value = np.asarray(surprise.value, np.float64)
+        values = np.asarray(surprise.value, np.float64)
         shares = np.asarray(surprise.attribution, np.float64)
-        wanted = (self._count,), (self._count, self._size)
-        if (value.shape, shares.shape) != wanted:
+        if values.shape != judged.shape or shares.shape != attribution.shape:
             raise ValueError(
-                f"a surprise must have values of shape {wanted[0]} and attributions of shape "
-                f"{wanted[1]}, got {value.shape} and {shares.shape}"
+                f"a surprise must have values of shape {judged.shape} and attributions of shape "
+                f"{attribution.shape}, got {values.shape} and {shares.shape}"
             )
-        judged["surprise"] = value
-        judged["raw_surprise"] = value
+        judged["surprise"] = values
+        judged["raw_surprise"] = values
         judged["excuse"] = 0
         if surprise.raw is not None and surprise.excuse is not None:
             judged["raw_surprise"] = surprise.raw
@@ -194,6 +191,15 @@ def joined(*failures: str) -> str:
     return "; ".join(dict.fromkeys(filter(None, failures)))
 
 
+def merged(*reports: Mapping[int, str]) -> dict[int, str]:
+    """Return what failed by robot, from several reports of that."""
+    failures: dict[int, str] = {}
+    for report in reports:
+        for robot, failure in report.items():
+            failures[robot] = joined(failures.get(robot, ""), failure)
+    return failures
+
+
 def choose(mask: Mask, new: Any, old: Any) -> Any:
     """Return a monitor's state with ``new`` where ``mask`` (n,) holds, ``old`` elsewhere.
 
@@ -201,10 +207,11 @@ def choose(mask: Mask, new: Any, old: Any) -> Any:
         new, old: arrays whose first axis is n, or named tuples of such, nested or not.
     """
     if isinstance(old, tuple):
-        parts = [choose(mask, n, o) for n, o in zip(new, old, strict=True)]
+        parts = [choose(mask, *pair) for pair in zip(new, old, strict=True)]
         return getattr(old, "_make", tuple)(parts)
     if not isinstance(old, np.ndarray) or len(old) != len(mask):
         raise TypeError(
             f"a monitor's state must be arrays whose first axis is {len(mask)} long, got {old!r}"
         )
-    return np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    along_the_first_axis = mask.reshape(-1, *[1] * (old.ndim - 1))
+    return np.where(along_the_first_axis, new, old)

@@ -12,7 +12,7 @@ from asm_gym.detection.adaptive import AdaptiveThreshold
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.guard.reflexes import GRADED, REFLEXES
 from asm_gym.guard.responses import responses_from
-from asm_gym.policies.base import Policy
+from asm_gym.policies.policy import Policy
 from asm_gym.validation import check_flag, check_number, short_repr
 
 ON_ALARM = ("monitor", *REFLEXES, GRADED, "terminate")  # names that ``on_alarm`` takes

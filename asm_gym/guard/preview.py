@@ -19,7 +19,7 @@ from asm_gym.detection.commands import PACE, PLACE, hands_of, out_of_range
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.guard.recent_rows import Floats32
+from asm_gym.guard.robot_table import Floats32
 from asm_gym.validation import as_float32
 
 NO_ACTION = "no action"  # a number of it is not finite

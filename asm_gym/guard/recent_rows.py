@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import inner
+from asm_gym.guard.robot_table import Floats32, Mask
 from asm_gym.spec import StreamSpec
 
 IMPOSSIBLE = 40.0  # once in e⁴⁰ rows
 LEAST_CHANCE = 1e-6  # of a sense without resolution, whose numbers are of single precision
 MOST_CHANCE = 0.5  # senses that repeat more often tell nothing
 MOST_REPEAT = 0.5  # share of the senses with noise
-
-Mask = NDArray[np.bool_]
-Floats32 = NDArray[np.float32]
 
 
 class RowArrays(NamedTuple):
@@ -47,7 +45,8 @@ class RecentRows:
 
     def __init__(self, count: int, spec: StreamSpec, kept: int) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            chance = np.clip(spec.resolution / (2 * np.sqrt(np.pi) * spec.noise), LEAST_CHANCE, 1.0)
+            chance = spec.resolution / (2 * np.sqrt(np.pi) * spec.noise)
+        chance = np.clip(chance, LEAST_CHANCE, 1.0)
         noisy = (spec.noise > 0) & (chance < MOST_CHANCE)
         noisy[spec.motor] = False
         self._kept = kept
@@ -66,7 +65,8 @@ class RecentRows:
     def last(self, robot: int, count: int) -> Floats32:
         """Return (T, D) the last rows of a robot, ``count`` of them or as many as are kept, the newest last."""
         end = int(self.arrays.end[0])
-        return self.arrays.rows[robot, end - min(count, self._kept, end) : end]
+        length = min(count, self._kept, end)
+        return self.arrays.rows[robot, end - length : end]
 
     def replace_last(self, robot: int, row: Floats32) -> None:
         """Keep another row (D,) of a robot in the place of its newest."""
@@ -77,31 +77,35 @@ class RecentRows:
 def make_room(recent: Any) -> int:
     """Return where the next rows are kept; the newest half moves to the beginning where there is no room left."""
     rows = recent.rows
-    kept = rows.shape[1] // 2
-    if recent.end[0] == rows.shape[1]:
-        for n in range(len(rows)):
+    robots, size, columns = rows.shape
+    kept = size // 2
+    place = recent.end[0]
+    if place == size:
+        for n in range(robots):
             for k in range(kept):
-                for i in range(rows.shape[2]):
+                for i in range(columns):
                     rows[n, k, i] = rows[n, kept + k, i]
-        recent.end[0] = kept
-    recent.end[0] += 1
-    return recent.end[0] - 1
+        place = kept
+    recent.end[0] = place + 1
+    return place
 
 
 @inner
 def leave_out_stale(row: Any, recent: Any, robot: int) -> None:
     """Write NaN into a row (D,) in the place of the senses that are stale."""
     noisy = recent.noisy
-    readings = recent.readings[robot]
+    last = recent.readings[robot]
     repeated = 0
     unlikely = 0.0
     for k in range(len(noisy)):
-        if row[noisy[k]] == readings[k]:
+        if row[noisy[k]] == last[k]:
             repeated += 1
             unlikely += recent.unlikely[k]
-    stale = unlikely > IMPOSSIBLE and repeated > MOST_REPEAT * len(noisy)
+    most_repeat = repeated > MOST_REPEAT * len(noisy)
+    is_stale = most_repeat and unlikely > IMPOSSIBLE
     for k in range(len(noisy)):
-        reading = row[noisy[k]]
-        if stale and reading == readings[k]:
-            row[noisy[k]] = np.nan
-        readings[k] = reading
+        column = noisy[k]
+        reading = row[column]
+        if is_stale and reading == last[k]:
+            row[column] = np.nan
+        last[k] = reading

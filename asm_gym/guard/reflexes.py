@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled, inner
-from asm_gym.guard.robot_facts import RobotFacts, columns_ending
+from asm_gym.guard.robot_facts import NO_COLUMNS, RobotFacts, columns_ending
+from asm_gym.guard.robot_table import Floats32, Mask
 from asm_gym.policies.hold import HoldingActions
 from asm_gym.spec import StreamSpec
 
@@ -28,15 +29,50 @@ PATH = 10  # how many actions a retreat undoes
 COMPLIANCE = 0.05  # how far a joint gives way in a second [rad / (N m s)]
 TOLERATED = 4.0  # external torque that no joint gives way to under "graded" [N m]
 TOLERATED_ALONE = 2.0  # and under "comply" [N m]
-USUAL_GAIN = 0.1  # weight of the newest step in the external torque that is taken to be usual
+USUAL_GAIN = 0.1  # weight of the newest step in the usual external torque
 
 
 class Motion(NamedTuple):
     """What a reflex does next."""
 
-    action: NDArray[np.float32]  # (A,) not to be written to
+    action: Floats32  # (A,) not to be written to
     brakes: bool = False  # the robot stays, whatever the action is
     keeps_grip: bool = True  # the grippers are commanded as before the override
+
+
+class MotionArrays(NamedTuple):
+    """What reflexes need of rows and actions; compiled code writes it."""
+
+    torque_columns: NDArray[np.intp]
+    """(J,) of the external torques in the stream."""
+    torque: NDArray[np.float64]
+    """(n, J) external torque now [N m]."""
+    usual_torque: NDArray[np.float64]
+    """(n, J) external torque while the policy acts [N m]."""
+    path: Floats32
+    """(n, PATH, A) the policy's last actions, the newest last."""
+    path_steps: NDArray[np.int64]
+    """(n,) how many of them there are."""
+
+    @classmethod
+    def empty(
+        cls, count: int, torque_columns: NDArray[np.intp] = NO_COLUMNS, path: int = 0, size: int = 0
+    ) -> Self:
+        """Return the arrays of robots that have felt and done nothing.
+
+        Args:
+            count: n.
+            torque_columns: (J,) of the external torques; none where no reflex depends on them.
+            path: how many actions are kept; 0 where no reflex depends on them.
+            size: A, of an action.
+        """
+        return cls(
+            torque_columns=torque_columns,
+            torque=np.zeros((count, len(torque_columns))),
+            usual_torque=np.zeros((count, len(torque_columns))),
+            path=np.zeros((count, path, size), np.float32),
+            path_steps=np.zeros(count, np.int64),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,15 +80,14 @@ class FeltMotion:
     """What n robots feel, did, and are expected to do; its arrays are written to."""
 
     robots: RobotFacts
-    possible: frozenset[str]  # names of reflexes that the guard may ask for and the robots can do
-    tolerated: float  # external torque that no joint gives way to [N m]
+    possible: frozenset[str]
+    """Names of reflexes that the guard may ask for and the robots can do."""
+    tolerated: float
+    """External torque that no joint gives way to [N m]."""
     holding: HoldingActions
-    torque_columns: NDArray[np.intp]  # (J,) of the external torques in the stream
-    torque: NDArray[np.float64]  # (n, J) external torque now [N m]
-    usual_torque: NDArray[np.float64]  # (n, J) external torque while the policy acts [N m]
-    path: NDArray[np.float32]  # (n, PATH, A) the policy's last actions, the newest last
-    path_steps: NDArray[np.int64]  # (n,) how many of them there are
-    expected: NDArray[np.float32]  # (n, A) the action that the memory expects next; NaN: unknown
+    arrays: MotionArrays
+    expected: Floats32
+    """(n, A) the action that the memory expects next; NaN where unknown."""
 
     @classmethod
     def of(cls, robots: RobotFacts, spec: StreamSpec, on_alarm: str) -> Self:
@@ -83,30 +118,23 @@ class FeltMotion:
 
         count = robots.count
         size = robots.rest.size
-        torque = np.zeros((count, len(torque_columns)))
+        arrays = MotionArrays.empty(count)
+        if not possible <= {"hold", "recall"}:  # which depend on nothing that was felt or done
+            arrays = MotionArrays.empty(count, torque_columns, PATH, size)
         return cls(
             robots=robots,
             possible=frozenset(possible),
             tolerated=tolerated,
             holding=HoldingActions(count, robots.meaning, robots.rest),
-            torque_columns=torque_columns,
-            torque=torque,
-            usual_torque=torque.copy(),
-            path=np.zeros((count, PATH, size), np.float32),
-            path_steps=np.zeros(count, np.int64),
+            arrays=arrays,
             expected=np.zeros((count, size), np.float32),
         )
 
-    @property
-    def feels(self) -> bool:
-        """Whether a possible reflex depends on what was felt and done."""
-        return not self.possible <= {"hold", "recall"}
-
-    def begin(self, which: NDArray[np.bool_]) -> None:
+    def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
-        self.torque[which] = 0.0
-        self.usual_torque[which] = 0.0
-        self.path_steps[which] = 0
+        self.arrays.torque[which] = 0.0
+        self.arrays.usual_torque[which] = 0.0
+        self.arrays.path_steps[which] = 0
         self.expected[which] = np.nan
 
     def move(self, robot: int, name: str) -> Motion:
@@ -126,13 +154,13 @@ def retract(motion: FeltMotion, robot: int) -> Motion:
 
     Under a controller of changes, the negative of an action undoes it.
     """
-    if not motion.path_steps[robot]:
+    if not motion.arrays.path_steps[robot]:
         return hold(motion, robot)
 
-    path = motion.path[robot]
+    path = motion.arrays.path[robot]
     undone = -path[-1]
     path[1:] = path[:-1]
-    motion.path_steps[robot] -= 1
+    motion.arrays.path_steps[robot] -= 1
     return Motion(undone)
 
 
@@ -140,7 +168,7 @@ def comply(motion: FeltMotion, robot: int) -> Motion:
     """Give way along the external torque beyond the usual, as a damper would."""
     robots = motion.robots
     assert robots.turning_action is not None
-    torque = motion.torque[robot] - motion.usual_torque[robot]
+    torque = motion.arrays.torque[robot] - motion.arrays.usual_torque[robot]
     beyond = np.sign(torque) * np.maximum(np.abs(torque) - motion.tolerated, 0.0)
     return Motion(robots.turning_action(robot, COMPLIANCE * robots.dt * beyond))
 
@@ -160,36 +188,6 @@ REFLEXES: dict[str, Callable[[FeltMotion, int], Motion]] = {
     "recall": recall,
 }
 """Reflexes by name."""
-
-
-class MotionArrays(NamedTuple):
-    """What compiled code keeps of ``FeltMotion``."""
-
-    torque_columns: NDArray[np.intp]  # (J,)
-    torque: NDArray[np.float64]  # (n, J)
-    usual_torque: NDArray[np.float64]  # (n, J)
-    path: NDArray[np.float32]  # (n, PATH, A)
-    path_steps: NDArray[np.int64]  # (n,)
-
-
-def motion_arrays(motion: FeltMotion | None, facts: RobotFacts) -> MotionArrays:
-    """Return the arrays of ``motion``; empty ones where no reflex depends on what was felt and done."""
-    if motion is not None and motion.feels:
-        return MotionArrays(
-            torque_columns=motion.torque_columns,
-            torque=motion.torque,
-            usual_torque=motion.usual_torque,
-            path=motion.path,
-            path_steps=motion.path_steps,
-        )
-    nothing = np.zeros((facts.count, 0))
-    return MotionArrays(
-        torque_columns=np.zeros(0, np.intp),
-        torque=nothing,
-        usual_torque=nothing,
-        path=np.zeros((facts.count, 0, 0), np.float32),
-        path_steps=np.zeros(facts.count, np.int64),
-    )
 
 
 @compiled

@@ -8,24 +8,23 @@ second.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.hand_speed import Floats
 from asm_gym.guard.hand_check import HandCheck
-from asm_gym.guard.robot_table import Mask
+from asm_gym.guard.robot_facts import NO_COLUMNS
+from asm_gym.guard.robot_table import Floats32, Mask
 from asm_gym.memory.completion import Completion
 
 WELL_AFTER_S = 1.0  # a sense is well again once it has said what was expected for so long [s]
 WELL_WITHIN = 4.0  # standard deviations of the completion's own error that this may be off
-UNTOLD = (
-    0.5  # no other sense tells of one whose completion leaves more than this share of its spread
-)
-TRUST_S = (
-    1.0  # how long a sense that no other sense tells of is completed, by its last good value [s]
-)
+# No other sense tells of one whose completion leaves more than this share of its spread.
+UNTOLD = 0.5
+# For so long a sense that no other sense tells of is completed, by its last good value [s].
+TRUST_S = 1.0
 LONGEST_S = 20.0  # no sense is completed for longer than this [s]
 # Where more than this share of the senses is missing, what is left tells too little of them.
 MOST_MISSING = 0.5
@@ -41,32 +40,46 @@ class MissingSensor:
     well: int = 0  # rows, one after the other, in which it has said what was expected
 
 
-@dataclass(eq=False)
 class Repair:
-    """Keeps the rows of one robot well, from the first row on in which a sense is not believed."""
+    """Keeps the rows of one robot well, from the first row on in which a sense is not believed.
 
-    completion: Completion  # completes senses from others
-    robot: int  # which of those that ``hands`` know
-    before: Floats | None  # (D,) the row before, repaired; None where there is none
-    read: Mask  # (D,) which columns the policy reads, of whose completion something depends
-    # Tell of missing angles better than the memory, and which senses not to believe again yet.
-    hands: Sequence[HandCheck]
-    # Rows until the monitor has seen nothing but repaired rows of a sense that was found at fault.
-    settling: int = 0
-    _sensors: dict[str, MissingSensor] = field(default_factory=dict)
-    _unchecked: int = 0  # rows in which something was completed that no other sense tells of
+    Args:
+        completion: completes senses from others.
+        robot: its index in ``hands``.
+        before: (D,) the row before, repaired; None where there is none.
+        observed: (D,) which columns the policy reads, of whose completion something depends.
+        hands: tell of missing angles better than the memory, and which senses not to believe again yet.
 
-    def __post_init__(self) -> None:
-        spec = self.completion.spec
-        self._spec = spec
+    Attributes:
+        missing: (D,) which columns are completed.
+        settling: rows until the monitor has seen nothing but repaired rows of a sense that was found at fault.
+    """
+
+    def __init__(
+        self,
+        completion: Completion,
+        robot: int,
+        before: Floats | None,
+        observed: Mask,
+        hands: Sequence[HandCheck],
+    ) -> None:
+        self._completion = completion
+        self._robot = robot
+        self._observed = observed
+        self._hands = hands
+        self._spec = completion.spec
+        self._senses = completion.senses
         # Rows in which changes are taken from what was not yet repaired.
-        self._settle = 2 * self.completion.senses.lag + 1
-        self.missing = np.zeros(spec.size, bool)  # which columns are completed
+        self._settling_rows = 2 * completion.senses.lag + 1
+        self._sensors: dict[str, MissingSensor] = {}
+        self.missing = np.zeros(self._spec.size, bool)
+        self.settling = 0
         # (D,) rows until its changes are those of the sense again
-        self._returned = np.zeros(spec.size, np.int64)
-        # (D,) the last row before something was missing
-        self._good = self.completion.senses.mean if self.before is None else self.before
-        self._raw = self._good  # (D,) the newest, as it was sensed
+        self._returned = np.zeros(self._spec.size, np.int64)
+        self._unchecked = 0  # rows in which something was completed that no other sense tells of
+        self._before = before  # (D,) the row before, repaired
+        self._raw = before if before is not None else self._senses.mean  # (D,) newest, as sensed
+        self._good = self._raw  # (D,) the last row before something was missing
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,8 +92,7 @@ class Repair:
         if self.missing[self._spec.sensory].mean() > MOST_MISSING:
             return False
         oldest = max((sensor.age for sensor in self._sensors.values()), default=0)
-        dt = self._spec.dt
-        return self._unchecked <= round(TRUST_S / dt) and oldest <= round(LONGEST_S / dt)
+        return self._unchecked <= self._rows_in(TRUST_S) and oldest <= self._rows_in(LONGEST_S)
 
     @property
     def over(self) -> bool:
@@ -93,9 +105,9 @@ class Repair:
         """(D,) the numbers that surprise nobody: they are missing, or their changes are those from completed ones."""
         return self.missing | (self._returned > 0)
 
-    def next(self, row: NDArray[np.float32]) -> NDArray[np.float32]:
+    def next(self, row: Floats32) -> Floats32:
         """Return the next row (D,) as it should be."""
-        self._raw_before = self._raw
+        raw_before = self._raw
         self._raw = row.astype(np.float64)
         self.settling = max(0, self.settling - 1)
         self._returned = np.maximum(self._returned - 1, 0)
@@ -108,31 +120,31 @@ class Repair:
             self._complete(silent, silent=True)
         repaired = self._repaired()
         if self._sensors:
-            self._believe_again(repaired)
+            self._believe_again(repaired, raw_before)
         if not self.missing.any():
             self._good = self._raw
-        self.before = repaired
+        self._before = repaired
         return repaired.astype(np.float32)
 
-    def suspect(self, columns: NDArray[np.intp]) -> NDArray[np.float32] | None:
+    def suspect(self, columns: NDArray[np.intp]) -> Floats32 | None:
         """Return the last row (D,) with the sensors of ``columns`` completed too; None where that leaves nothing."""
         wanted = self.missing.copy()
         wanted[columns] = True
         if wanted[self._spec.sensory].all() or np.array_equal(wanted, self.missing):
             return None
         self._complete(wanted, silent=False)
-        self.settling = self._settle
-        self.before = self._repaired()
-        return self.before.astype(np.float32)
+        self.settling = self._settling_rows
+        self._before = self._repaired()
+        return self._before.astype(np.float32)
 
-    def _complete(
-        self,
-        columns: Mask,
-        silent: bool,
-    ) -> None:
+    def _rows_in(self, seconds: float) -> int:
+        """Return how many rows a time [s] takes."""
+        return round(seconds / self._spec.dt)
+
+    def _complete(self, columns: Mask, silent: bool) -> None:
         """Believe the sensors of ``columns`` (D,) no more."""
         # In an order that no hash decides, for reports are equal to the last bit.
-        for name, own in self.completion.sensors:
+        for name, own in self._completion.sensors:
             if columns[own].any():
                 known = self._sensors.get(name, MissingSensor(silent))
                 self._sensors[name] = MissingSensor(silent, age=known.age)
@@ -141,63 +153,73 @@ class Repair:
     def _choose_filling(self) -> None:
         """Take up which columns are missing, and how they are completed."""
         self.missing = np.zeros(self._spec.size, bool)
-        for name, own in self.completion.sensors:
+        for name, own in self._completion.sensors:
             self.missing[own] |= name in self._sensors
-        self._filling = self.completion.filling(self.missing)
-        spread = self.completion.senses.spread[self._filling.columns]
-        self._untold = self._filling.error > UNTOLD * spread  # (M,)
-        self._guessed = self._untold & self.read[self._filling.columns]  # (M,)
+        self._filling = self._completion.filling(self.missing)
+        columns = self._filling.columns  # (M,) that are missing
+        self._untold = self._filling.error > UNTOLD * self._senses.spread[columns]  # (M,)
+        self._guessed = self._untold & self._observed[columns]  # (M,)
 
     def _repaired(self) -> Floats:
         """Return the newest row (D,) with what is missing completed."""
         if not self._sensors:
             return self._raw
-        senses = self.completion.senses
+        before = self._before
+        if before is None:
+            before = self._raw
         columns = self._filling.columns
-        before = self._raw if self.before is None else self.before
-        lifted = self.completion.lift(np.stack([before, self._raw]))
-        value = self.completion.complete(self._filling, lifted)[-1]
-        value = np.where(self._guessed, self._good[columns], value)
-        mean = senses.mean[columns]
-        farthest = FARTHEST * senses.spread[columns]
+        lifted = self._completion.lift(np.stack([before, self._raw]))
+        completed = self._completion.complete(self._filling, lifted)[-1]
+        completed = np.where(self._guessed, self._good[columns], completed)
+        mean = self._senses.mean[columns]
+        farthest = FARTHEST * self._senses.spread[columns]
         repaired = self._raw.copy()
-        repaired[columns] = np.clip(value, mean - farthest, mean + farthest)
-        error = self.completion.error * senses.spread
-        for hand in self.hands:
-            repaired = hand.refine(self.robot, repaired, self.missing, error)
+        repaired[columns] = np.clip(completed, mean - farthest, mean + farthest)
+        error = self._completion.error * self._senses.spread
+        for hand in self._hands:
+            repaired = hand.refine(self._robot, repaired, self.missing, error)
         return repaired
 
-    def _believe_again(self, repaired: Floats) -> None:
-        """Count for how long each missing sensor has been well, and believe those that have been for long enough."""
-        self._unchecked = self._unchecked + 1 if self._guessed.any() else 0
-        fine, there = self._as_expected(repaired)
-        well_after = max(1, round(WELL_AFTER_S / self._spec.dt))
-        well = []
-        for name, columns in self.completion.sensors:
+    def _believe_again(self, repaired: Floats, raw_before: Floats) -> None:
+        """Count for how long each missing sensor has been well, and believe those that have been for long enough.
+
+        Args:
+            repaired: (D,) the newest row; the sensors that are believed again are written to it.
+            raw_before: (D,) the row before, as it was sensed.
+        """
+        self._unchecked += 1
+        if not self._guessed.any():
+            self._unchecked = 0
+        fine, likely = self._as_expected(repaired, raw_before)
+        well_after = max(1, self._rows_in(WELL_AFTER_S))
+        well = [NO_COLUMNS]
+        for name, columns in self._completion.sensors:
             if name not in self._sensors:
                 continue
             sensor = self._sensors[name]
             own = np.isin(self._filling.columns, columns)
-            sensor.well = sensor.well + 1 if fine[own].all() else 0
-            speaks = sensor.silent and there[own].all()
-            if sensor.well >= well_after or speaks:
+            sensor.well += 1
+            if not fine[own].all():
+                sensor.well = 0
+            speaks_again = sensor.silent and likely[own].all()
+            if sensor.well >= well_after or speaks_again:
                 del self._sensors[name]
                 well.append(columns)
-        if well:
-            believed = np.concatenate(well)
-            self._returned[believed] = self._settle
+        believed = np.concatenate(well)
+        if believed.size:
+            self._returned[believed] = self._settling_rows
             repaired[believed] = self._raw[believed]
             self._choose_filling()
 
-    def _as_expected(self, repaired: Floats) -> tuple[Mask, Mask]:
+    def _as_expected(self, repaired: Floats, raw_before: Floats) -> tuple[Mask, Mask]:
         """Return (M,) which missing numbers say what others tell of them, and which at least say something likely."""
         columns = self._filling.columns
         raw = self._raw[columns]
         # False for what is not finite
         close = np.abs(raw - repaired[columns]) <= WELL_WITHIN * self._filling.error
-        for hand in self.hands:
-            close &= ~hand.accused(self.robot)[columns]
-        repeats = (raw == self._raw_before[columns]) & (self._spec.noise[columns] > 0)
+        for hand in self._hands:
+            close &= ~hand.accused(self._robot)[columns]
+        repeats = (raw == raw_before[columns]) & (self._spec.noise[columns] > 0)
         fine = close & ~repeats & ~self._untold
-        there = np.isfinite(raw) & (close | self._untold)
-        return fine, there
+        likely = np.isfinite(raw) & (close | self._untold)
+        return fine, likely

@@ -13,9 +13,8 @@ LASTING = {"contact": 1.0, "actuator": 2.5}
 has been pressed for most of that time and has not turned. Where the policy goes on in spite of another cause, and the
 arm is pressed so and does not move, it is a lasting contact."""
 
-PRESSING = (
-    "pressing"  # the arm presses harder than healthy motion does, whatever the cause is taken for
-)
+PRESSING = "pressing"
+"""The arm presses harder than healthy motion does, whatever the cause is taken for."""
 
 CAUSES = (*FAMILIES, *(f"lasting {family}" for family in LASTING), PRESSING, f"lasting {PRESSING}")
 """What a table of responses says something about."""
@@ -49,15 +48,14 @@ it presses with no more than 40 N; else the robot holds."""
 class Response(NamedTuple):
     """What is to be done about a row of one robot."""
 
-    # One of ``RESPONSES``; empty where there is nothing to respond to, or the table is not asked.
     name: str
-    cause: dict[str, Any]  # as ``info["asm"]["cause"]`` says it
-    touched: bool | None = (
-        None  # the contact is still there; None: not known, or so long that it may never end
-    )
-    case: str = (
-        ""  # one of ``CAUSES``: the row of the table that was followed; empty where none was
-    )
+    """One of ``RESPONSES``; empty where there is nothing to respond to, or no table is followed."""
+    cause: dict[str, Any]
+    """As ``info["asm"]["cause"]`` says it."""
+    touched: bool | None = None
+    """The contact is still there; None: not known, or so long that it may never end."""
+    case: str = ""
+    """The row of the table that was followed, one of ``CAUSES``; empty where none was."""
 
     @property
     def why(self) -> str:

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice
 
+Mask = NDArray[np.bool_]
+Floats32 = NDArray[np.float32]
+
 MOST_WRISTS = 8  # wrists of a robot whose hands are weighed
 
 STATES = "policy", "trial", "reflex", "ended"
@@ -38,7 +41,7 @@ ROBOT = np.dtype(
         ("held", np.bool_),  # a reflex acted
         # there is something to decide, whatever surprise and contact are
         ("must_decide", np.bool_),
-        # Row validation (``recent_rows``, ``hand_check``)
+        # Row validation (``recent_rows``, ``hand_comparison``)
         ("episode_rows", np.int64),  # rows in this episode
         ("lost", np.bool_),  # a number is not finite
         ("contradicts", np.bool_),  # a hand is not where its joints say
@@ -89,8 +92,6 @@ ROBOT = np.dtype(
 
 KEPT = "threshold", "policy_rows", "policy_alarms"  # fields that an episode hands on to the next
 FINITE = "threshold", "pressed_impulse", "leaning_time"  # fields that are always finite numbers
-
-Mask = NDArray[np.bool_]
 
 
 class RobotTable:

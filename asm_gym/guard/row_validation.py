@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.compilation import compiled
-from asm_gym.guard.hand_check import Contradiction, HandChecks, compare_hands_of
-from asm_gym.guard.recent_rows import Floats32, RecentRows, leave_out_stale, make_room
+from asm_gym.guard.hand_check import Contradiction, HandChecks
+from asm_gym.guard.hand_comparison import compare_hands_of
+from asm_gym.guard.recent_rows import RecentRows, leave_out_stale, make_room
 from asm_gym.guard.repair import Repair
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
-from asm_gym.guard.robot_table import Mask, RobotTable
+from asm_gym.guard.robot_table import Floats32, Mask, RobotTable
 from asm_gym.memory.completion import Completion
 from asm_gym.spec import StreamSpec
 
@@ -56,7 +57,7 @@ class RowValidator:
     ) -> None:
         self._spec: StreamSpec = table.spec
         self._table = table
-        self._read = facts.observed
+        self._observed = facts.observed
         if completion is not None and facts.observed is None:
             completion = None
             # Completing what the monitor sees would hide a fault that the policy goes on to see.
@@ -84,7 +85,9 @@ class RowValidator:
         unusual = validate_rows(
             self._table.records, rows, self.recent.arrays, self.hands.geometry, self.hands.state
         )
-        return self.repair(rows) if unusual or self.repairs else ValidatedRows(rows)
+        if unusual or self.repairs:
+            return self.repair(rows)
+        return ValidatedRows(rows)
 
     def repair(self, rows: Floats32) -> ValidatedRows:
         """Return rows (n, D) that ``validate_rows`` has looked at, with what is missing or at fault completed."""
@@ -112,7 +115,7 @@ class RowValidator:
             repair = self.repairs.get(robot)
             if repair is None:
                 continue
-            validated[robot] = _next(repair, rows[robot])
+            validated[robot] = _repaired(repair, rows[robot])
             self.recent.replace_last(robot, validated[robot])
             if not repair.trusted:
                 names = ", ".join(repair.names)
@@ -123,11 +126,7 @@ class RowValidator:
         """Return (T, D) the last rows of a robot in this episode, the newest last."""
         return self.recent.last(robot, int(self._table.records["episode_rows"][robot]))
 
-    def suspect(
-        self,
-        robot: int,
-        columns: NDArray[np.intp],
-    ) -> bool:
+    def suspect(self, robot: int, columns: NDArray[np.intp]) -> bool:
         """Complete the sensors of ``columns`` from a robot's last row on; return whether that leaves any to go by."""
         if self._completion is None:
             return False
@@ -143,49 +142,39 @@ class RowValidator:
         """Return (D,) what is completed, or right by the hand and its joints: it explains no surprise."""
         explained = self._missing(robot)
         for hand in self.hands.arms:
-            explained = explained | hand.right(robot)
+            explained = explained | hand.consistent(robot)
         return explained
 
     def completed_names(self, robot: int) -> tuple[str, ...] | None:
         """Return the sensors of a robot that are completed; None where senses cannot be completed."""
         if self._completion is None:
             return None
-        repair = self.repairs.get(robot)
-        return () if repair is None else repair.names
+        if robot not in self.repairs:
+            return ()
+        return self.repairs[robot].names
 
     def drop_repairs(self) -> None:
         """Forget the repairs that are over."""
         self.repairs = {robot: repair for robot, repair in self.repairs.items() if not repair.over}
 
     def _missing(self, robot: int) -> Mask:
-        repair = self.repairs.get(robot)
-        return np.zeros(self._spec.size, bool) if repair is None else repair.missing
+        """Return (D,) what is completed of a robot."""
+        if robot not in self.repairs:
+            return np.zeros(self._spec.size, bool)
+        return self.repairs[robot].missing
 
-    def _new_repair(
-        self,
-        robot: int,
-        rows_before: int,
-    ) -> Repair:
+    def _new_repair(self, robot: int, rows_before: int) -> Repair:
         """Return a repair of a robot from its newest row on, or from the next where that is ``rows_before`` it."""
         assert self._completion is not None
-        assert self._read is not None
+        assert self._observed is not None
         last = self.last(robot)
         before = None
         if len(last) > rows_before:
             before = last[-1 - rows_before].astype(np.float64)
-        return Repair(
-            self._completion,
-            robot,
-            before,
-            self._read,
-            self.hands.arms,
-        )
+        return Repair(self._completion, robot, before, self._observed, self.hands.arms)
 
 
-def _next(
-    repair: Repair,
-    row: Floats32,
-) -> Floats32:
+def _repaired(repair: Repair, row: Floats32) -> Floats32:
     """Return a row (D,) with what is missing or at fault completed."""
     known = repair.names
     try:

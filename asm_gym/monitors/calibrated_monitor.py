@@ -23,7 +23,7 @@ from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.exceptions import NotFitted
 from asm_gym.monitors.calibration import (
     AlarmRate,
-    apart_for_ceilings,
+    ceiling_episodes,
     require_sight,
     with_ceilings,
 )
@@ -31,7 +31,7 @@ from asm_gym.monitors.monitor_files import read_monitor, threshold_below, write_
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows, surprise_of_stream
 from asm_gym.monitors.stream_model import (
     StreamModel,
-    error_places,
+    error_shares,
     model_outputs,
     parameter_names,
     require_arrays,
@@ -59,8 +59,8 @@ class CalibratedMonitor:
 
     Attributes:
         about: JSON values to save with it, such as its ``name``.
-        learned_from_, ceilings_from_: hashes of the episodes of ``fit``, and of those of ``calibrate`` that set
-            ceilings; None before, or without such.
+        learned_from_: hashes of the episodes of ``fit``; None before.
+        ceilings_from_: hashes of the episodes of ``calibrate`` that set ceilings; None before, or without such.
         threshold_: surprise above which a row is an alarm; None before ``calibrate``, as are the next two.
         maxima_: (n,) largest surprise in each calibration episode.
         blocks_: surprise in blocks of time, for promises by the hour (``detection.conformal``).
@@ -107,7 +107,7 @@ class CalibratedMonitor:
 
     @property
     def learned_(self) -> dict[str, NDArray[Any]]:
-        """All arrays that ``fit`` has found, by name; empty before."""
+        """All arrays that ``fit`` has learned, by name; empty before."""
         learned = dict(self.model.learned_)
         for detection in self.detections.values():
             learned |= detection.learned_
@@ -121,9 +121,10 @@ class CalibratedMonitor:
     def get_params(self) -> dict[str, Any]:
         """Return the hyperparameters by name, in one order whichever detection is in use."""
         params: dict[str, Any] = {}
-        for part in (self.model, *(self.detections[name] for name in sorted(self.detections))):
-            names = [name for name in parameter_names(type(part)) if name != "seed"]
-            params |= {name: getattr(part, name) for name in names}
+        detections = [self.detections[name] for name in sorted(self.detections)]
+        for part in (self.model, *detections):
+            names = parameter_names(type(part))
+            params |= {name: getattr(part, name) for name in names if name != "seed"}
         return params | {"seed": self.seed}
 
     @typed
@@ -173,9 +174,10 @@ class CalibratedMonitor:
         refuse_other_scales(episodes)
         new = self._copy()  # an interrupt leaves this one as it was
         new._learn(episodes, progress or (lambda done, total: None), warm_start)
-        new.about = about_episodes(episodes, with_actions=not warm_start)
+        about = about_episodes(episodes, with_actions=not warm_start)
         if warm_start:
-            new.about = {**self.about, "specialised_on": len(episodes), **new.about}
+            about = {**self.about, "specialised_on": len(episodes), **about}
+        new.about = about
         vars(self).update(vars(new))
         return self
 
@@ -202,21 +204,19 @@ class CalibratedMonitor:
         self._place_errors()
         nominal = Nominal(episodes, learned, held_out, self._nominal_outputs)
         for detection in self.detections.values():
-            taken = self.model.learned_.keys() & set(detection.arrays)
-            if taken:
-                raise ValueError(
-                    f"{self.model.kind} and {detection.name} both learn {', '.join(sorted(taken))}"
-                )
+            shared = self.model.learned_.keys() & set(detection.arrays)
+            if shared:
+                names = ", ".join(sorted(shared))
+                raise ValueError(f"{self.model.kind} and {detection.name} both learn {names}")
             detection.fit(nominal, rng)
         self.model.crossfitted = {}
 
     def _nominal_outputs(self, episodes: Sequence[Episode]) -> list[ModelOutput]:
-        """Return the model's outputs, with the cross-fitted errors of what it has learned."""
-        outputs = model_outputs(self.model, episodes)
-        for n, episode in enumerate(episodes):
-            if id(episode) in self.model.crossfitted:
-                errors = self.model.crossfitted[id(episode)]
-                outputs[n] = outputs[n]._replace(errors=errors)
+        """Return the model's outputs, with the cross-fitted errors of the episodes that it has learned."""
+        outputs = []
+        for episode, output in zip(episodes, model_outputs(self.model, episodes), strict=True):
+            errors = self.model.crossfitted.get(id(episode), output.errors)
+            outputs.append(output._replace(errors=errors))
         return outputs
 
     @typed
@@ -234,9 +234,9 @@ class CalibratedMonitor:
         the episodes' maxima may exceed the threshold, their tail is modelled, and
         ``promise.modelled`` is true.
 
-        With evidence detection, of 300 episodes or more a third (a tenth, if the rate needs more of
-        the others) tells how far each sense goes at its worst, and the others set the threshold.
-        Without that fewer faults are found.
+        With evidence detection and 300 episodes or more, a third of them (a tenth, if the rate needs
+        more of the others) sets ceilings: how far each sense goes at its worst. The others set the
+        threshold. Without ceilings fewer faults are found.
 
         Args:
             episodes: at least 99 for a rate of 0.01 and 19 for 0.05; or 10 hours for 0.1 alarms an
@@ -252,42 +252,46 @@ class CalibratedMonitor:
                 or one that is given twice.
         """
         self._require_fitted()
-        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
+        rate = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         check_nominal(episodes, self.spec, self.model.shortest)
         if each and len(each) != len(episodes):
             raise ValueError(
                 "each must name a group for each episode, "
                 f"got {len(each)} for {len(episodes)} episodes"
             )
-        asked.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
-        apart: set[int] = set()
-        if isinstance(self.detection, EvidenceDetection):
-            apart = apart_for_ceilings(episodes, asked, each)
-        check_fresh(episodes, self.learned_from_, None if apart else self.ceilings_from_)
-
+        rate.check_hours(sum(map(len, episodes)) * self.spec.dt / 3600)
         new = self._copy()
-        if apart:
-            chosen = [episodes[n] for n in sorted(apart)]
-            new.detection = with_ceilings(self, chosen)
-            new.detections[new.detection.name] = new.detection
-            new.ceilings_from_ = hashes_of(chosen)
-        fresh = [episode for n, episode in enumerate(episodes) if n not in apart]
-        groups = [group for n, group in enumerate(each) if n not in apart]
+        for_ceilings: set[int] = set()
+        if isinstance(self.detection, EvidenceDetection):
+            for_ceilings = ceiling_episodes(episodes, rate, each)
+        if for_ceilings:
+            check_fresh(episodes, self.learned_from_)
+            new._set_ceilings([episodes[n] for n in sorted(for_ceilings)])
+        else:
+            check_fresh(episodes, self.learned_from_, self.ceilings_from_)
 
-        new = new._balanced(fresh)
-        new._set_threshold(fresh, asked, groups)
+        for_threshold = [e for n, e in enumerate(episodes) if n not in for_ceilings]
+        groups = [group for n, group in enumerate(each) if n not in for_ceilings]
+        new = new._balanced(for_threshold)
+        new._set_threshold(for_threshold, rate, groups)
         new._keep_limits(episodes)
         vars(self).update(vars(new))
         return self
 
+    def _set_ceilings(self, episodes: Sequence[Episode]) -> None:
+        """Set the ceilings of the detection by healthy episodes."""
+        self.detection = with_ceilings(self, episodes)
+        self.detections[self.detection.name] = self.detection
+        self.ceilings_from_ = hashes_of(episodes)
+
     def _set_threshold(
-        self, episodes: Sequence[Episode], asked: AlarmRate, groups: Sequence[str]
+        self, episodes: Sequence[Episode], rate: AlarmRate, groups: Sequence[str]
     ) -> None:
-        """Set the threshold for a rate of alarms in fresh episodes, and in each of their groups."""
+        """Set the threshold for a rate of alarms in these episodes, and in each of their groups."""
         values = [surprise.value for surprise in self.score_episodes(episodes)]
-        self.threshold_ = asked.threshold_of(values, self.spec.dt, groups)
+        self.threshold_ = rate.threshold_of(values, self.spec.dt, groups)
         require_sight(self.detection, self.model.error_columns, self.spec, self.threshold_)
-        self.promised_ = asked.per
+        self.promised_ = rate.per
         self.maxima_ = np.array([value.max() for value in values])
         self.blocks_ = Blocks.of(values, self.spec.dt, groups)
 
@@ -311,10 +315,10 @@ class CalibratedMonitor:
         self, false_alarm_rate: float | None = None, *, false_alarms_per_hour: float | None = None
     ) -> float:
         """Return the threshold for another rate, from the episodes of ``calibrate``; raises as that does."""
-        asked = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
+        rate = AlarmRate.of(false_alarm_rate, false_alarms_per_hour)
         if self.maxima_ is None or self.blocks_ is None:
             raise self._lacking("calibration")
-        return asked.threshold(self.maxima_, self.blocks_)
+        return rate.threshold(self.maxima_, self.blocks_)
 
     @property
     def promise(self) -> Promise:
@@ -326,7 +330,7 @@ class CalibratedMonitor:
         return Promise.of(self.maxima_, self.threshold)
 
     def _balanced(self, episodes: Sequence[Episode]) -> Self:
-        """Return it, or a copy, with its parts weighted by what nominal episodes make of each."""
+        """Return it, or a copy whose parts are weighed against each other by nominal episodes."""
         return self
 
     @typed
@@ -350,11 +354,11 @@ class CalibratedMonitor:
         rows = checked_rows(state, stream, self.spec)
         model, output = self.model.predict(state.model, rows)
         detection, attribution = self.detection.attribute_step(
-            state.detection, output, rows, lambda shares: shares @ self._places
+            state.detection, output, rows, lambda shares: shares @ self._error_shares
         )
         finite = np.isfinite(rows)
-        broken = ~finite.all(axis=1)
-        attribution[broken] = np.where(finite[broken], 0.0, np.inf)
+        incomplete = ~finite.all(axis=1)
+        attribution[incomplete] = np.where(finite[incomplete], 0.0, np.inf)
         return MonitorState(model, detection), Surprise(attribution.sum(axis=1), attribution)
 
     @typed
@@ -375,10 +379,10 @@ class CalibratedMonitor:
         scores = [Surprise(np.zeros(0), np.zeros((0, self.spec.size)))] * len(episodes)
         with threadpool_limits(1):
             for group, steps in side_by_side(episodes, self.initial_state, self.observe):
-                for stream, number in enumerate(group):
-                    own = steps[: len(episodes[number])]
-                    if own:
-                        scores[number] = surprise_of_stream(own, stream)
+                for stream, index in enumerate(group):
+                    own_steps = steps[: len(episodes[index])]
+                    if own_steps:
+                        scores[index] = surprise_of_stream(own_steps, stream)
         return scores
 
     @typed
@@ -395,24 +399,25 @@ class CalibratedMonitor:
         Raises:
             ValueError: something is missing, or does not fit together.
         """
+        header = saved.header
         kept = read_monitor(saved)
-        self.with_learned(kept.learned, tuple(saved.header["skills"]))
+        self.with_learned(kept.learned, tuple(header["skills"]))
         vars(self).update(kept.attributes)
-        if saved.header["detection"] == self.detection.name:
-            self.threshold_ = threshold_below(saved.header["threshold"], self.detection.reach)
+        if header["detection"] == self.detection.name:
+            self.threshold_ = threshold_below(header["threshold"], self.detection.reach)
             vars(self).update(kept.calibration)
         return self
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
         """Take over the arrays that ``learned_`` gave, without a threshold, and return it."""
         require_arrays(arrays, self.detection.arrays)
-        of_detections = {n for detection in self.detections.values() for n in detection.arrays}
-        of_model = {n: a for n, a in arrays.items() if n not in of_detections}
-        self.model.restore(of_model, skills)
-        self._place_errors()
+        self._uncalibrate()
+        of_model = dict(arrays)
         for detection in self.detections.values():
             if arrays.keys() >= set(detection.arrays):
-                detection.restore({n: arrays[n] for n in detection.arrays})
+                detection.restore({name: of_model.pop(name) for name in detection.arrays})
+        self.model.restore(of_model, skills)
+        self._place_errors()
         return self
 
     def _uncalibrate(self) -> None:
@@ -436,6 +441,7 @@ class CalibratedMonitor:
     def _copy(self) -> Self:
         """Return a copy that shares nothing that learning changes; learned arrays are never changed in place."""
         other = copy.copy(self)
+        other.about = copy.deepcopy(self.about)
         other.model = copy.copy(self.model)
         other.detections = {name: copy.copy(d) for name, d in self.detections.items()}
         other.detection = other.detections[self.detection.name]
@@ -446,5 +452,5 @@ class CalibratedMonitor:
             raise NotFitted(f"this {self._name}", "has learned nothing", "fit(episodes)")
 
     def _place_errors(self) -> None:
-        """Find the columns of errors, once the model knows them."""
-        self._places = error_places(self.model.error_columns, self.spec)
+        """Map errors to columns, once the model knows which columns it predicts."""
+        self._error_shares = error_shares(self.model.error_columns, self.spec)

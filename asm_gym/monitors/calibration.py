@@ -33,12 +33,10 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("asm_gym.monitors")
 
-ONE_IN = (
-    3,
-    10,
-)  # one in so many episodes sets ceilings, the first that leaves enough for the threshold
+# One in 3 episodes sets ceilings; one in 10 where else too few are left for the threshold.
+ONE_IN = (3, 10)
 # Episodes that ceilings are learned from at once: all rows of many hours would fill the memory.
-AT_ONCE = 400
+EPISODES_AT_ONCE = 400
 MOST_BLIND = 0.6  # largest share of the channels that a monitor may be blind to
 
 
@@ -95,14 +93,14 @@ class AlarmRate(NamedTuple):
     def threshold_of(self, values: Sequence[Array], dt: float, each: Sequence[str] = ()) -> float:
         """Return the threshold from the values (T,) of nominal episodes; with ``each``, the greatest of its groups."""
         maxima = np.array([value.max() for value in values])
-        threshold = self.threshold(maxima, Blocks.of(values, dt, each))
+        thresholds = [self.threshold(maxima, Blocks.of(values, dt, each))]
         for name in dict.fromkeys(each):
-            own = [value for value, group in zip(values, each, strict=True) if group == name]
+            own_values = [value for value, group in zip(values, each, strict=True) if group == name]
             try:
-                threshold = max(threshold, self.threshold_of(own, dt))
+                thresholds.append(self.threshold_of(own_values, dt))
             except ValueError as error:
                 raise ValueError(f"{name} by itself: {error}") from None
-        return threshold
+        return max(thresholds)
 
 
 def blind_to(
@@ -115,10 +113,11 @@ def blind_to(
     """
     if not hasattr(detection, "reach_of"):
         return []
-    own = np.flatnonzero(errors >= 0)
+    of_a_column = np.flatnonzero(errors >= 0)
+    columns = errors[of_a_column]
     reach = np.zeros(spec.size)
-    np.maximum.at(reach, errors[own], detection.reach_of(own))
-    return [spec.labels[i] for i in np.unique(errors[own]) if not reach[i] > threshold]
+    np.maximum.at(reach, columns, detection.reach_of(of_a_column))
+    return [spec.labels[i] for i in np.unique(columns) if not reach[i] > threshold]
 
 
 def require_sight(
@@ -133,26 +132,29 @@ def require_sight(
         "however strong: an episode to calibrate on is unlike those learned from, "
         "or a channel hardly moved in them: learn from more"
     )
-    if len(blind) > MOST_BLIND * len(np.unique(errors[errors >= 0])):
+    columns = np.unique(errors[errors >= 0])
+    if len(blind) > MOST_BLIND * len(columns):
         raise ValueError(message)
     LOG.warning(message)
 
 
-def apart_for_ceilings(
-    episodes: Sequence[Episode], asked: AlarmRate, each: Sequence[str] = ()
+def ceiling_episodes(
+    episodes: Sequence[Episode], rate: AlarmRate, each: Sequence[str] = ()
 ) -> set[int]:
-    """Return which nominal episodes are to set ceilings, and not the threshold.
+    """Return the indices of the nominal episodes that set ceilings; the others set the threshold.
 
-    One in so many of each group is. None are where they would be fewer than ``FEWEST_EPISODES``, or
-    the others too few for the rate that is asked for.
+    They are one in so many of each group. There are none where they would be fewer than
+    ``FEWEST_EPISODES``, or the others too few for the rate.
     """
     groups: defaultdict[str, list[int]] = defaultdict(list)
     for n, name in enumerate(each or [""] * len(episodes)):
         groups[name].append(n)
     for one_in in ONE_IN:
-        chosen = {n for own in groups.values() for n in own[::one_in]}
-        others = ([episodes[n] for n in own if n not in chosen] for own in groups.values())
-        if len(chosen) >= FEWEST_EPISODES and all(map(asked.possible, others)):
+        chosen: set[int] = set()
+        for group in groups.values():
+            chosen.update(group[::one_in])
+        others = [[episodes[n] for n in group if n not in chosen] for group in groups.values()]
+        if len(chosen) >= FEWEST_EPISODES and all(map(rate.possible, others)):
             return chosen
     if len(episodes) >= ONE_IN[0] * FEWEST_EPISODES:
         LOG.warning(
@@ -168,26 +170,28 @@ def with_ceilings(monitor: CalibratedMonitor, episodes: Sequence[Episode]) -> Ev
 
     Episodes that were learned from, babbling say, are not like hours of operation, and are predicted too well.
     """
-    assert isinstance(monitor.detection, EvidenceDetection)
+    detection = monitor.detection
+    assert isinstance(detection, EvidenceDetection)
+    maxima = []
     with threadpool_limits(1):
-        maxima = _worst_of(monitor, monitor.detection, episodes)
-    return monitor.detection.with_ceilings(maxima, anew=monitor.ceilings_from_ is None)
+        for first in range(0, len(episodes), EPISODES_AT_ONCE):
+            some = episodes[first : first + EPISODES_AT_ONCE]
+            maxima += _largest_strengths(monitor, detection, some)
+    return detection.with_ceilings(np.array(maxima), is_first=monitor.ceilings_from_ is None)
 
 
-def _worst_of(
+def _largest_strengths(
     monitor: CalibratedMonitor, detection: EvidenceDetection, episodes: Sequence[Episode]
-) -> NDArray[np.float64]:
-    """Return the largest v (N, G, X) in each of N episodes.
+) -> list[NDArray[np.float64]]:
+    """Return the largest v (G, X) in each episode.
 
     Surprise is v to a power of a half or less, so that v is divided by the square of what divides surprise.
     """
     excuses = getattr(monitor, "excuses_", None)
     maxima = []
-    for first in range(0, len(episodes), AT_ONCE):
-        part = episodes[first : first + AT_ONCE]
-        for episode, output in zip(part, model_outputs(monitor.model, part), strict=True):
-            strengths, _ = detection.fitted_detector.strengths(output)
-            if isinstance(excuses, BenignEvents):
-                strengths /= excuses.divisors(episode.stream)[:, None, None] ** 2
-            maxima.append(strengths.max(axis=0))
-    return np.array(maxima)
+    for episode, output in zip(episodes, model_outputs(monitor.model, episodes), strict=True):
+        strengths, _ = detection.fitted_detector.strengths(output)
+        if isinstance(excuses, BenignEvents):
+            strengths /= excuses.divisors(episode.stream)[:, None, None] ** 2
+        maxima.append(strengths.max(axis=0))
+    return maxima

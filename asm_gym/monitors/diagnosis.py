@@ -49,11 +49,11 @@ CLASSES = {
     "unknown": CauseClass("unknown", ()),
 }
 
-WINDOW = 3  # last rows that a diagnosis rests on
+DIAGNOSED_ROWS = 3  # last rows that a diagnosis rests on
 
 TORQUES = ("commanded", "measured", "external")
 
-KINDS = (
+HYPOTHESIS_KINDS = (
     "sensor",
     "force sensor",
     "commanded torque",
@@ -68,10 +68,10 @@ KINDS = (
 )
 """Of hypotheses: a sensor that measures no force, one that does, torques of one joint, …"""
 
-GROUPS = ("joint", "torque", "hand", "wrench", "gripper")
+JUDGED_GROUPS = ("joint", "torque", "hand", "wrench", "gripper")
 """Of channels, whose share of the surprise is evidence."""
 
-EVIDENCE = (*KINDS, "energy", "alone", *GROUPS)
+EVIDENCE_NAMES = (*HYPOTHESIS_KINDS, "energy", "alone", *JUDGED_GROUPS)
 """In order: how much the best hypothesis of each kind explains; the energy; the largest share of the surprise in one
 sensor, and the share in each group of channels."""
 
@@ -95,7 +95,7 @@ class Cause(NamedTuple):
 class Hypothesis(NamedTuple):
     """Columns of the stream that may be wrong together."""
 
-    evidence: str  # which of ``EVIDENCE`` it counts for
+    evidence: str  # which of ``EVIDENCE_NAMES`` it counts for
     part: str
     columns: NDArray[np.intp]
 
@@ -128,12 +128,13 @@ class Readout:
         return cls(**{field.name: np.array(saved[field.name]) for field in fields(cls)})
 
 
-def averaged(
+def updated_belief(
     belief: NDArray[np.float64], newest: NDArray[np.float64], diagnoses: int
 ) -> NDArray[np.float64]:
-    """Return the mean (F,) of all ``diagnoses`` of families so far, of which the newest counts a tenth at least.
+    """Return the mean probabilities of the families (F,) after so many diagnoses.
 
-    A belief that is sure stays: later rows are from places where a fault has brought the arm.
+    The newest counts a tenth at least. A belief that is sure stays: later rows are from places where a fault has
+    brought the arm.
     """
     if diagnoses > SETTLED_AFTER and belief.max() >= SETTLED:
         return belief
@@ -148,7 +149,7 @@ class Diagnosis:
     readout: Readout
 
     def __post_init__(self) -> None:
-        """Invert what there is to invert now: an alarm does not wait for it."""
+        """Invert matrices in advance: an alarm must not wait for it."""
         with ONE_THREAD:
             _ = self._freed
 
@@ -186,12 +187,12 @@ class Diagnosis:
         missing: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.float64], dict[str, Hypothesis]]:
         """Return the evidence (F,) in y (T, Y), and the best hypothesis of each kind; see ``__call__``."""
-        energy, rest = self._explained(lifted[-WINDOW:])
+        energy, rest = self._energies(lifted[-DIAGNOSED_ROWS:])
         total = energy.mean() + 1.0
-        explains = np.log(total / (np.maximum(rest.mean(axis=0), 0.0) + 1.0))
-        explained = dict.fromkeys(KINDS, 0.0)
+        left = np.maximum(rest.mean(axis=0), 0.0) + 1.0
+        explained = dict.fromkeys(HYPOTHESIS_KINDS, 0.0)
         best: dict[str, Hypothesis] = {}
-        for hypothesis, share in zip(self.hypotheses, explains, strict=True):
+        for hypothesis, share in zip(self.hypotheses, np.log(total / left), strict=True):
             kind = hypothesis.evidence
             if missing is not None and missing[hypothesis.columns].all():
                 continue
@@ -202,11 +203,11 @@ class Diagnosis:
         surprise = np.nan_to_num(attribution)
         shares = surprise / max(float(surprise.sum()), LEAST_SURPRISE)
         alone = max(float(shares[columns].sum()) for _, columns in self.completion.sensors)
-        groups = [float(shares[self._groups == group].sum()) for group in GROUPS]
-        energy_share = np.log(total / len(self.completion.covariance))
-        return np.array([*explained.values(), energy_share, alone, *groups]), best
+        groups = [float(shares[self._groups == group].sum()) for group in JUDGED_GROUPS]
+        relative_energy = np.log(total / len(self.completion.covariance))
+        return np.array([*explained.values(), relative_energy, alone, *groups]), best
 
-    def _explained(
+    def _energies(
         self, lifted: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return E (T,), and E_S of each hypothesis (T, H), for y (T, Y)."""
@@ -244,17 +245,18 @@ class Diagnosis:
         for name, probability in by_class.items():
             probabilities[CLASSES[name].family] += probability
         family = max(FAMILIES, key=lambda name: probabilities[name])
-        classes = [name for name, of_class in CLASSES.items() if of_class.family == family]
+        classes = [name for name in CLASSES if CLASSES[name].family == family]
         likeliest = max(classes, key=lambda name: (by_class[name], name))
 
         kinds = [kind for kind in CLASSES[likeliest].kinds if kind in best]
         part = ""
         columns = np.zeros(0, np.intp)
         if kinds:
-            named = best[max(kinds, key=lambda kind: evidence[EVIDENCE.index(kind)])]
-            part = named.part
+            explained = dict(zip(EVIDENCE_NAMES, evidence, strict=True))
+            hypothesis = best[max(kinds, key=lambda kind: explained[kind])]
+            part = hypothesis.part
             if family == "sensor":
-                columns = named.columns
+                columns = hypothesis.columns
         return Cause(family, part, probabilities[family], probabilities, columns)
 
     def _stuck(
@@ -266,8 +268,9 @@ class Diagnosis:
         name, columns = max(
             self.completion.sensors, key=lambda sensor: float(attribution[sensor[1]].sum())
         )
-        repeats = (np.ptp(rows[-REPEATS:], axis=0) == 0) & (self.completion.spec.noise > 0)
-        if not repeats[columns].any():
+        repeats = np.ptp(rows[-REPEATS:], axis=0) == 0
+        is_noisy = self.completion.spec.noise > 0
+        if not (repeats & is_noisy)[columns].any():
             return None
         certain = dict.fromkeys(FAMILIES, 0.0) | {"sensor": 1.0}
         return Cause("sensor", name, 1.0, certain, columns)

@@ -30,7 +30,7 @@ from asm_gym.validation import check_shapes
 
 
 class MemoryModel(ScaledModel):
-    """The temporal network, association, and what is learned on top of them: motor association and names of skills.
+    """The temporal network and association, and beside them a motor association and names of skills.
 
     Args:
         spec, hidden_size, association_size, dynamics: as of ``NeuralASM``.
@@ -70,27 +70,16 @@ class MemoryModel(ScaledModel):
         assert self.network_ is not None
         return self.network_
 
-    def _take(self, network: TemporalNetwork) -> None:
-        names: Arrays = {"W_K": np.zeros((0, 0)), "b_K": np.zeros(0)}
-        if self.skills_:
-            names = self.learned_
-        self.network_ = network
-        self.compiled_ = row_weights(network, self.senses_, names)
-
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        streams = [episode.stream for episode in episodes]
         lag = self.lag
-        senses = StreamScaler.fit(self.spec, streams, lag)
-        check_inputs(senses.inputs)
-        # Nothing came before the first ``lag`` rows, so that no change in them is known.
         trajectories = []
-        for stream in streams:
-            read = senses.read_episode(stream)
-            trajectories.append(
-                Trajectory(read.senses[::lag], read.commands[::lag], read.inputs[lag:])
-            )
+        for reading in self.read_nominal(episodes):
+            inputs = reading.inputs[lag:]  # before these no change is known
+            trajectories.append(Trajectory(reading.senses[::lag], reading.commands[::lag], inputs))
+        senses = self.senses_
+        check_inputs(senses.inputs)
         trained = train(
             trajectories,
             self._layout(senses),
@@ -100,66 +89,66 @@ class MemoryModel(ScaledModel):
             progress,
             dynamics=self.dynamics,
         )
-        learned = {**senses.arrays, "energy": trained.energy}
         self.crossfitted = {}
-        ends = np.cumsum([len(t.inputs) for t in trajectories])[:-1]
+        ends = np.cumsum([len(trajectory.inputs) for trajectory in trajectories])[:-1]
         for episode, errors in zip(episodes, np.split(trained.errors, ends), strict=True):
             errors[:lag] *= UNSURE
             unknown = np.zeros((lag, errors.shape[1]), errors.dtype)
             self.crossfitted[id(episode)] = np.vstack([unknown, errors])
+
         network = trained.network
-        completion = Completion.fit(senses, streams)
+        learned = {**senses.arrays, "energy": trained.energy}
+        learned |= network.weights._asdict()
+        learned |= network.association.named()
+        completion = Completion.fit(senses, [episode.stream for episode in episodes])
         if completion is not None:
             learned |= completion.named()
-        return self.restore({**learned, **network.weights._asdict(), **network.association.named()})
+        return self.restore(learned)
 
     def specialise(self, episodes: Sequence[Episode]) -> Self:
-        """Go on from what it knows: association learns what these episodes have of their own, all else stays.
+        """Let the association learn more from these episodes; all other weights stay.
 
         Names of skills and the motor association belong to the association as it was, and are forgotten.
         """
-        senses, lag = self.senses_, self.lag
-        inputs = np.concatenate([senses.read_episode(e.stream).inputs[lag:] for e in episodes])
-        now = specialise(self.network.association, inputs, self._layout(senses))
-        kept = {"mean", "spread", "change", "energy", *self.network.weights._fields}
-        return self.restore(
-            {**{n: a for n, a in self.learned_.items() if n in kept}, **now.named()}
-        )
+        readings = [self.senses_.read_episode(episode.stream) for episode in episodes]
+        inputs = np.concatenate([reading.inputs[self.lag :] for reading in readings])
+        network = self.network
+        association = specialise(network.association, inputs, self._layout(self.senses_))
+        learned = {**self.senses_.arrays, "energy": self.learned_["energy"]}
+        return self.restore({**learned, **network.weights._asdict(), **association.named()})
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         senses = StreamScaler.of(self.spec, learned, self.lag)
-        X, A = len(self.spec.sensory), len(self.spec.motor)
         units = len(learned["V"])
-        kept = dynamics_of(learned)
-        if kept != self.dynamics:
+        kept_dynamics = dynamics_of(learned)
+        if kept_dynamics != self.dynamics:
             raise ValueError(
-                f"this is a memory of dynamics={kept!r}, "
+                f"this is a memory of dynamics={kept_dynamics!r}, "
                 f"which cannot be loaded as {self.dynamics!r}"
             )
         dynamics = DYNAMICS[self.dynamics]
-        temporal = dynamics.shapes(self.hidden_size, senses.size, A)
-        shapes = temporal | association_shapes(senses.inputs, units, X)
+        of_network = dynamics.shapes(self.hidden_size, senses.size, len(self.spec.motor))
+        shapes = of_network | association_shapes(senses.inputs, units, len(self.spec.sensory))
         if not len(learned.get("R", ())):  # leverage was not learned, from few rows
             shapes["R"] = (0, senses.inputs)
         if skills:
-            shapes |= {"W_K": (len(skills), units + self.hidden_size), "b_K": (len(skills),)}
+            shapes["W_K"] = (len(skills), units + self.hidden_size)
+            shapes["b_K"] = (len(skills),)
         require_arrays(learned, shapes)
         check_shapes(learned, shapes)
         arrays = {name: np.ascontiguousarray(learned[name], np.float32) for name in shapes}
-        association = Association.from_named(arrays)
-        how = (
-            self.schedule.iterations,
-            self.schedule.prior_precision,
-            self.schedule.sensory_precision,
+        network = dynamics.network(
+            weights=dynamics.weights(**{name: arrays[name] for name in of_network}),
+            association=Association.from_named(arrays),
+            iterations=self.schedule.iterations,
+            prior_precision=self.schedule.prior_precision,
+            sensory_precision=self.schedule.sensory_precision,
         )
         super().restore(learned, skills)
         self.motor_ = Motor.found(learned, self.senses_)
         self.completion_ = Completion.found(learned, self.senses_)
-        self._take(
-            dynamics.network(
-                dynamics.weights(**{n: arrays[n] for n in temporal}), association, *how
-            )
-        )
+        self.network_ = network
+        self.compiled_ = row_weights(network, self.senses_, learned)
         return self
 
     def start(self, batch: int) -> MemoryState:
@@ -180,12 +169,14 @@ class MemoryModel(ScaledModel):
 
     def expected_action(self, state: MemoryState) -> NDArray[np.float32]:
         """Return the likely next command (B, A), by the motor association or else by the temporal network."""
-        if self.motor_ is not None:
-            return self.motor_.command(situation(self.senses_, state.history.before[:, -1]))
-        motor = self.spec.motor
         senses = self.senses_
-        action = self.network.run_on(state.traces).expected[:, senses.size :]
-        return (senses.mean[motor] + senses.spread[motor] * action).astype(np.float32)
+        if self.motor_ is not None:
+            last_rows = state.history.before[:, -1]
+            return self.motor_.command(situation(senses, last_rows))
+        expected = self.network.run_on(state.traces).expected
+        motor = self.spec.motor
+        action = senses.mean[motor] + senses.spread[motor] * expected[:, senses.size :]
+        return action.astype(np.float32)
 
     def _layout(self, senses: StreamScaler) -> ChangeLayout:
         """Return the layout of the inputs, with the hidden units of association for each group."""

@@ -1,4 +1,4 @@
-"""The Neural ASM as a policy: what the memory expects to be commanded next is what is commanded.
+"""The Neural ASM as a policy: it commands what its memory expects to be commanded next.
 
 row → memory: expect, infer → motor prediction â → action, grippers by evidence → env → row
 
@@ -6,8 +6,9 @@ A gripper changes its command once there is enough evidence for the other one,
 
     E_t = exp(-Δt/τ) E_{t-1} + Δt p_t,    E_t > θ:  the other command is given, and E = 0,
 
-where p_t is how surely the other command is expected, from 0 to 1. The prediction is a mean over what was shown in
-similar situations: by its sign alone a gripper would hold on for ever where one demonstration in five lets go.
+where p_t is the share of the way to the other command that is expected, from 0 to 1. The prediction is a mean over what
+was shown in similar situations: by its sign alone a gripper would hold on for ever where one demonstration in five lets
+go.
 
 Source: Usher and McClelland 2001 (Psychological Review 108(3)), without their mutual inhibition.
 """
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from asm_gym.control_period import control_period
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.surprise import State
-from asm_gym.policies.base import StatefulPolicy
+from asm_gym.policies.policy import StatefulPolicy
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed
 
@@ -33,11 +34,13 @@ FORGETTING_TIME = 1.6  # τ [s]
 CHANGE_AFTER = 0.15  # θ: time for which a command that is certain must be expected [s]
 
 
-class Grip(NamedTuple):
-    """Commands of G grippers; a value."""
+class GripperState(NamedTuple):
+    """State of G grippers; a value."""
 
-    high: NDArray[np.bool_]  # (G,) the upper end of the action's range is commanded, else the lower
-    evidence: NDArray[np.float64]  # (G,) E [s]
+    is_high: NDArray[
+        np.bool_
+    ]  # (G,) the upper end of the action's range is commanded, else the lower
+    evidence: NDArray[np.float64]  # (G,) E for the other end [s]
 
 
 class PolicyState(NamedTuple):
@@ -45,7 +48,7 @@ class PolicyState(NamedTuple):
 
     memory: State
     action: NDArray[np.float32]  # (A,) the last one
-    grip: Grip | None  # None before the first step
+    grippers: GripperState | None  # None before the first step
 
 
 class CommandReadout:
@@ -55,31 +58,37 @@ class CommandReadout:
         space: Any = env.action_space
         self._low = space.low
         self._high = space.high
-        self._grip = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
+        self._grippers = np.asarray(getattr(env.unwrapped, "gripper_actions", ()), dtype=int)
         self._dt = control_period(env)
         # However long a step lasts, one must not be enough for what is less likely than not.
         self._change_after = max(CHANGE_AFTER, 0.5 * self._dt)
 
     def __call__(
-        self, expected: NDArray[np.float32], before: Grip | None
-    ) -> tuple[NDArray[np.float32], Grip]:
-        """Return the action (A,) for expected commands (A,), and the grip to pass in next time; None at first."""
+        self, expected: NDArray[np.float32], before: GripperState | None
+    ) -> tuple[NDArray[np.float32], GripperState]:
+        """Return the action (A,) for expected commands (A,), and the grippers' state; ``before`` is None at first."""
         clipped = np.clip(np.nan_to_num(expected), self._low, self._high)
         action: NDArray[np.float32] = clipped.astype(np.float32)
-        low = self._low[self._grip]
-        high = self._high[self._grip]
+        low = self._low[self._grippers]
+        high = self._high[self._grippers]
+        height = (action[self._grippers] - low) / (high - low)  # (G,) 1 at the upper end
+        after = self._gripper_state(height.astype(np.float64), before)
+        action[self._grippers] = np.where(after.is_high, high, low)
+        return action, after
 
-        # (G,) 1 where the upper end is certain
-        share = ((action[self._grip] - low) / (high - low)).astype(np.float64)
+    def _gripper_state(
+        self, height: NDArray[np.float64], before: GripperState | None
+    ) -> GripperState:
+        """Return the state after expected commands (G,) from 0, the lower end, to 1, the upper."""
         if before is None:
-            before = Grip(share > 0.5, np.zeros(len(share)))
-        other = np.where(before.high, 1.0 - share, share)
+            before = GripperState(is_high=height > 0.5, evidence=np.zeros(len(height)))
+        for_other = np.where(before.is_high, 1.0 - height, height)
         decay = np.exp(-self._dt / FORGETTING_TIME)
-        evidence = decay * before.evidence + self._dt * other
+        evidence = decay * before.evidence + self._dt * for_other
         changes = evidence > self._change_after
-        grip = Grip(before.high ^ changes, np.where(changes, 0.0, evidence))
-        action[self._grip] = np.where(grip.high, high, low)
-        return action, grip
+        return GripperState(
+            is_high=before.is_high ^ changes, evidence=np.where(changes, 0.0, evidence)
+        )
 
 
 class NeuralASMPolicy(StatefulPolicy):
@@ -101,33 +110,33 @@ class NeuralASMPolicy(StatefulPolicy):
 
     @typed
     def __init__(self, memory: NeuralASM, env: gym.Env[Any, Any]) -> None:
-        _check_actions(memory.spec, env.action_space)
+        spec = memory.spec
+        _check_actions(spec, env.action_space)
         dt = control_period(env)
-        inner: Any = env.unwrapped
-        self._measuring_env: Any = None  # that measures a row by itself
-        if hasattr(inner, "measured_spec"):
-            self._measuring_env = inner
-            theirs = inner.measured_spec
-            if memory.spec.dt != dt:
+        robot: Any = env.unwrapped
+        self._measuring_env: Any = None  # None where the row is the observation and the last action
+        if hasattr(robot, "measured_spec"):
+            self._measuring_env = robot
+            measured = robot.measured_spec
+            if spec.dt != dt:
                 raise ValueError(
-                    f"the memory reads a row every {memory.spec.dt} s, "
-                    f"and is asked to act every {dt} s"
+                    f"the memory reads a row every {spec.dt} s, and is asked to act every {dt} s"
                 )
         else:
-            theirs = StreamSpec.from_spaces(env.observation_space, env.action_space, dt)
-        _check_fit(memory.spec, theirs)
+            measured = StreamSpec.from_spaces(env.observation_space, env.action_space, dt)
+        _check_fit(spec, measured)
 
-        shared = [name for name in memory.spec.slices if name in theirs.slices]
-        self._measured_columns = _columns_of(shared, theirs)
-        self._memory_columns = _columns_of(shared, memory.spec)
+        shared = [name for name in spec.slices if name in measured.slices]
+        self._measured_columns = _columns_of(shared, measured)
+        self._memory_columns = _columns_of(shared, spec)
         self.memory = memory
         self._readout = CommandReadout(env)
-        memory.initial_state()
+        memory.initial_state()  # refuses a memory that has learned nothing
 
     def begin(self, observation: Any) -> PolicyState:
         """Return the state before the first step."""
         action = np.zeros(len(self.memory.spec.motor), np.float32)
-        return PolicyState(self.memory.initial_state(), action, grip=None)
+        return PolicyState(self.memory.initial_state(), action, grippers=None)
 
     def act(
         self, observation: Any, state: PolicyState, deterministic: bool
@@ -140,14 +149,17 @@ class NeuralASMPolicy(StatefulPolicy):
         row = np.zeros((1, self.memory.spec.size), np.float32)
         row[0, self._memory_columns] = measured[self._measured_columns]
         memory, _ = self.memory.observe(state.memory, row)
-        action, grip = self._readout(self.memory.expected_action(memory)[0], state.grip)
-        return action, PolicyState(memory, action, grip)
+        expected = self.memory.expected_action(memory)[0]
+        action, grippers = self._readout(expected, state.grippers)
+        return action, PolicyState(memory, action, grippers)
 
 
 def _columns_of(channels: Sequence[str], spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of channels in a stream, in their order."""
-    every = np.arange(spec.size)
-    return np.concatenate([every[:0], *(every[spec.slices[name]] for name in channels)])
+    columns: list[int] = []
+    for name in channels:
+        columns += range(spec.size)[spec.slices[name]]
+    return np.array(columns, np.intp)
 
 
 def _check_actions(spec: StreamSpec, space: spaces.Space[Any]) -> None:
@@ -164,18 +176,18 @@ def _check_actions(spec: StreamSpec, space: spaces.Space[Any]) -> None:
         )
 
 
-def _check_fit(spec: StreamSpec, theirs: StreamSpec) -> None:
-    """Raise ValueError unless an environment that measures ``theirs`` has what a memory of ``spec`` reads.
+def _check_fit(spec: StreamSpec, measured: StreamSpec) -> None:
+    """Raise ValueError unless an environment measures what a memory of ``spec`` reads.
 
     Further channels, another order, and objects of other tasks do not matter.
     """
     objects = [channel.name for channel in spec.channels if channel.group == "object"]
     harmless = ("order: ", "dt: ", *(f"{name}: missing" for name in objects))
-    misfits = [line for line in spec.difference(theirs) if not line.startswith(harmless)]
-    lines = [line for line in misfits if not line.endswith(": new")]
-    if spec.source and theirs.source and spec.source != theirs.source:
-        lines.append(f"robot: {spec.source} against {theirs.source}")
-    if objects and not any(name in theirs.slices for name in objects):
-        lines.append(f"objects: {', '.join(objects)} are known, none of which is here")
-    if lines:
-        raise ValueError("the memory does not fit this environment:\n  " + "\n  ".join(lines))
+    differences = [line for line in spec.difference(measured) if not line.startswith(harmless)]
+    misfits = [line for line in differences if not line.endswith(": new")]
+    if spec.source and measured.source and spec.source != measured.source:
+        misfits.append(f"robot: {spec.source} against {measured.source}")
+    if objects and measured.slices.keys().isdisjoint(objects):
+        misfits.append(f"objects: {', '.join(objects)} are known, none of which is here")
+    if misfits:
+        raise ValueError("the memory does not fit this environment:\n  " + "\n  ".join(misfits))

@@ -20,7 +20,7 @@ from asm_gym.validation import check_choice, check_number
 
 BLOCKS = "nominal_blocks"
 MAXIMA = "nominal_maxima"
-PACE = "pace "  # begins the names of the speeds of hands in each task
+PACE_PREFIX = "pace "  # begins the names of the speeds of hands in each task
 
 OPTIONAL = {
     "learned_from_": "learned_from",
@@ -46,27 +46,29 @@ def read_monitor(saved: Checkpoint) -> SavedMonitor:
         KeyError, ValueError: something is missing, not declared, or out of range.
     """
     header = saved.header
+    shapes = header["shapes"]
     saved = saved._replace(arrays=dict(unpacked(saved.arrays)))
-    undeclared = sorted(set(saved.arrays) - set(header["shapes"]))
+    undeclared = sorted(saved.arrays.keys() - shapes.keys())
     if undeclared:
         raise ValueError(
             f"its header declares no {', '.join(undeclared)}: it is damaged or was written by an "
             "older version: make it anew with asm-gym fit or asm-gym babble"
         )
-    arrays = {name: saved.array(name, *shape) for name, shape in header["shapes"].items()}
+    arrays = {name: saved.array(name, *shape) for name, shape in shapes.items()}
 
     check_choice("promise", header["promised"], (EPISODE, HOUR))
-    calibration = {"maxima_": arrays.pop(MAXIMA, None), "promised_": header["promised"]}
+    calibration: dict[str, Any] = {"promised_": header["promised"]}
+    calibration["maxima_"] = arrays.pop(MAXIMA, None)
     calibration["blocks_"] = None
     if BLOCKS in arrays:
         calibration["blocks_"] = Blocks.restored(arrays.pop(BLOCKS))
 
     healthy = [check_number("healthy", value, low=0.0) for value in header["healthy"]]
-    tasks = [name for name in arrays if name.startswith(PACE)]
+    tasks = [name for name in arrays if name.startswith(PACE_PREFIX)]
     attributes: dict[str, Any] = {
         "about": dict(header["about"]),
         "healthy_": tuple(healthy),
-        "pace_": {name.removeprefix(PACE): arrays.pop(name) for name in tasks},
+        "pace_": {name.removeprefix(PACE_PREFIX): arrays.pop(name) for name in tasks},
     }
     for attribute, name in OPTIONAL.items():
         attributes[attribute] = arrays.pop(name, None)
@@ -89,7 +91,9 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
     """Write a checkpoint of a fitted ``CalibratedMonitor``."""
     arrays: dict[str, NDArray[Any]] = {}
     for name, array in monitor.learned_.items():
-        arrays[name] = array if array.dtype.kind == "f" else np.asarray(array, np.float64)
+        arrays[name] = array
+        if array.dtype.kind != "f":
+            arrays[name] = np.asarray(array, np.float64)
     if monitor.maxima_ is not None:
         arrays[MAXIMA] = monitor.maxima_
     if monitor.blocks_ is not None:
@@ -98,7 +102,7 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
         if getattr(monitor, attribute) is not None:
             arrays[name] = getattr(monitor, attribute)
     for task, cells in monitor.pace_.items():
-        arrays[PACE + task] = cells
+        arrays[PACE_PREFIX + task] = cells
 
     header = {
         "spec": monitor.spec.to_json(),
@@ -115,7 +119,7 @@ def write_monitor(path: str | Path, monitor: Any) -> None:
 
 
 def restored(path: str | Path, saved: Checkpoint, make: Callable[..., Any]) -> Any:
-    """Return a checkpoint's monitor, as ``make(spec, **hyperparameters)`` makes it; raise ValueError for a bad file."""
+    """Return a checkpoint's monitor, which ``make(spec, **hyperparameters)`` makes. Raises DamagedFile."""
     try:
         spec = StreamSpec.from_json(saved.header["spec"])
         return make(spec, **saved.header["hyperparameters"]).restore(saved)

@@ -31,6 +31,7 @@ from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
 from asm_gym.monitors.surprise import Progress, Surprise
+from asm_gym.monitors.torque.arm_features import ArmFeatures, judged_by_values
 from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
 from asm_gym.monitors.weight_packing import rounded
 from asm_gym.scaling import StreamScaler
@@ -112,7 +113,7 @@ class NeuralASM(CalibratedMonitor):
             "free_running_probability", free_running_probability, low=0.0, high=1.0
         )
         if values is None:
-            values = ValueJudge.suits(spec)
+            values = judged_by_values(spec)
         self.values = check_flag("values", values)
         self.excuses = check_flag("excuses", excuses)
         if urdf and not self.values:
@@ -120,7 +121,7 @@ class NeuralASM(CalibratedMonitor):
                 "a body model predicts torques, and values are not judged: "
                 "the stream has none, or values=False was given; leave urdf out"
             )
-        ValueJudge.check_body(spec, urdf)
+        ArmFeatures.of(spec, urdf)  # refuses a body model of another arm
         schedule = Schedule(**{name: self._param(name) for name in Schedule._fields})
         model = MemoryModel(spec, self.hidden_size, self.association_size, schedule, dynamics)
         of_evidence = {name: getattr(config, name) for name in OF_EVIDENCE}
@@ -194,10 +195,9 @@ class NeuralASM(CalibratedMonitor):
         out: MonitorState | None = None,
     ) -> tuple[MonitorState, Surprise]:
         """Observe as in ``CalibratedMonitor``; write the new state to ``out``, a state that is no longer needed."""
-        kernel = self._row_kernel()
-        if kernel is None:
-            self._require_fitted()
+        self._require_fitted()
         rows = checked_rows(state, stream, self.spec)
+        kernel = self._row_kernel()
         if kernel is None:
             new, surprise = super().observe(state, rows)
             new = new._replace(excuses=state.excuses)
@@ -208,14 +208,14 @@ class NeuralASM(CalibratedMonitor):
         if self.values_ is not None:
             values, surprise = self.values_.join(state.values, rows, surprise, divisor)
             new = new._replace(values=values)
-        if self.model.skills_:
+        if self.skills_:
             likeliest = new.model.skill.argmax(axis=1)
             surprise = surprise._replace(skill=np.array(self.skills_)[likeliest])
         return new, surprise
 
     def compiled_row(self) -> RowKernel | None:
         """Return the kernel that does all that ``observe`` does; None where Python takes part in a row."""
-        if self.values_ is not None or self.model.skills_:
+        if self.values_ is not None or self.skills_:
             return None
         return self._row_kernel()
 
@@ -233,7 +233,7 @@ class NeuralASM(CalibratedMonitor):
 
     def with_learned(self, arrays: Arrays, skills: tuple[str, ...] = ()) -> Self:
         super().with_learned(without_values(arrays), skills)
-        self.values_ = ValueJudge.found(self.spec, arrays, self.seed, self.urdf)
+        self.values_ = ValueJudge.restored(self.spec, arrays, self.seed, self.urdf)
         return self
 
     def _row_kernel(self) -> RowKernel | None:
@@ -250,7 +250,8 @@ class NeuralASM(CalibratedMonitor):
             return self
         other = self._copy()
         other.values_ = self.values_.of_changes_alone()
-        other.values_ = self.values_.balanced(other.score_episodes(episodes), episodes)
+        by_changes = other.score_episodes(episodes)
+        other.values_ = self.values_.balanced(by_changes, episodes)
         return other
 
     def _learn(self, episodes: Sequence[Episode], progress: Progress, warm_start: bool) -> None:

@@ -39,32 +39,27 @@ from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNet
 from asm_gym.memory.traces import Weights, carry, weight_shapes
 from asm_gym.monitors.monitor_state import MonitorState
 from asm_gym.monitors.surprise import Surprise
-from asm_gym.scaling import ScaledRows, StreamScaler, read_rows
+from asm_gym.scaling import RowScale, ScaledRows, StreamScaler, read_rows
 
 
 class RowWeights(NamedTuple):
-    """What a memory computes with; one kind of network has weights of zero, as its memory has the other."""
+    """The learned numbers of a memory, as compiled code reads them."""
 
-    traces: Weights
-    settling: SettlingWeights
+    traces: Weights  # of the temporal network; 0 where it settles
+    settling: SettlingWeights  # of the temporal network; 0 where it has traces
     settles: bool
     association: Association
     wiring: Wiring
-    W_K: NDArray[np.float32]
-    b_K: NDArray[np.float32]  # noqa: N815
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    change: NDArray[np.float64]
-    sensory: NDArray[np.intp]
-    motor: NDArray[np.intp]
-    slow: NDArray[np.intp]
+    W_K: NDArray[np.float32]  # (K, M + H) from units and context to the evidence for each skill
+    b_K: NDArray[np.float32]  # noqa: N815 (K,)
+    scale: RowScale
     inference: Inference
 
 
 def row_weights(
-    network: TemporalNetwork, scaler: StreamScaler, names: Mapping[str, NDArray[Any]]
+    network: TemporalNetwork, scaler: StreamScaler, learned: Mapping[str, NDArray[Any]]
 ) -> RowWeights:
-    """Return what a memory computes with; ``names`` are W_K and b_K, of no rows where no skill has a name."""
+    """Return the learned numbers of a memory; ``learned`` has W_K and b_K where skills have names."""
     traces: Any = map(np.zeros, weight_shapes(1, 1, 1).values())
     settling: Any = map(np.zeros, settling_shapes(1, 1, 1).values())
     settles = isinstance(network.weights, SettlingWeights)
@@ -78,14 +73,9 @@ def row_weights(
         settles=settles,
         association=Association._make(map(single, network.association)),
         wiring=Wiring.of(network.association, scaler),
-        W_K=single(names["W_K"]),
-        b_K=single(names["b_K"]),
-        mean=np.array(scaler.mean, np.float64),
-        spread=np.array(scaler.spread, np.float64),
-        change=np.array(scaler.change, np.float64),
-        sensory=scaler.spec.sensory.copy(),
-        motor=scaler.spec.motor.copy(),
-        slow=scaler.slow,
+        W_K=single(learned.get("W_K", np.zeros((0, 0)))),
+        b_K=single(learned.get("b_K", np.zeros(0))),
+        scale=scaler.row_scale,
         inference=network.inference,
     )
 
@@ -96,10 +86,10 @@ def single(array: NDArray[Any]) -> NDArray[np.float32]:
 
 
 class RowKernel:
-    """``observe`` of a memory under the detection of evidence, for the weights as they are.
+    """Observe rows by a memory under the detection of evidence; new weights need a new kernel.
 
     Args:
-        memory: what its model computes with.
+        memory: its learned numbers.
         detection: fitted.
         events: that excuse surprise; None where nothing is excused.
     """
@@ -114,15 +104,17 @@ class RowKernel:
         self._arguments = (memory, detection, events)
         self._memory = memory
         self._detector = detection.fitted_detector
-        self._excuses = events is not None
-        senses = NO_SENSES if events is None else events.senses
+        self._has_events = events is not None
+        senses = NO_SENSES
+        if events is not None:
+            senses = events.senses
         wants_context = bool(self._detector.context_quantile[:-1].any())
         self._learned = bind(
             memory, wants_context, self._detector, detection.fitted_repetition, senses
         )
 
     def is_of(self, memory: RowWeights, detection: EvidenceDetection) -> bool:
-        """Return whether the kernel computes with these weights, and with what a detection has learned."""
+        """Return whether the kernel computes with the learned numbers of this memory and this detection."""
         return self._memory is memory and self._detector is detection.detector_
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -134,7 +126,7 @@ class RowKernel:
 
         Args:
             state: before the rows.
-            new: to be written, a state of as many streams, whose arrays are other ones.
+            new: to be written, a state of as many streams, which shares no array with ``state``.
         """
         return bind_states(self._learned, *arrays_of(state), *arrays_of(new))
 
@@ -153,7 +145,7 @@ class RowKernel:
             observe_rows(self.bound(state, out), rows, judged, attribution)
 
         surprise = Surprise(judged["surprise"].copy(), attribution)
-        if self._excuses:
+        if self._has_events:
             raw = judged["raw_surprise"].copy()
             surprise = surprise._replace(raw=raw, excuse=judged["excuse"].copy())
         return out, surprise, judged["divisor"].copy()
@@ -162,16 +154,14 @@ class RowKernel:
 def expected_errors(
     memory: RowWeights, before: MemoryState, after: MemoryState, rows: NDArray[np.float64]
 ) -> Any:
-    """Return the errors (B, X) of rows (B, D), and write the memory's state: the first half of a row by itself."""
+    """Return the errors (B, X) of rows (B, D), and write the memory's state; nothing is judged."""
     learned = bind(memory, True, NO_DETECTOR, NO_REPETITION, NO_SENSES)
-    detection = EvidenceState(
-        evidence=NO_DETECTOR.start(len(rows)), repetition=Repetition.start(len(rows), 0)
-    )
-    events = EventState.start(len(rows), 0)
-    arrays = arrays_of(MonitorState(before, detection, events))
-    arrays += arrays_of(MonitorState(after, detection, events))
-    bound = bind_states(learned, *arrays)
-    return observe_rows(bound, rows, np.empty(len(rows), JUDGED), np.empty(rows.shape))
+    streams = len(rows)
+    detection = EvidenceState(NO_DETECTOR.start(streams), Repetition.start(streams, 0))
+    events = EventState.start(streams, 0)
+    states = [MonitorState(memory_state, detection, events) for memory_state in (before, after)]
+    bound = bind_states(learned, *arrays_of(states[0]), *arrays_of(states[1]))
+    return observe_rows(bound, rows, np.empty(streams, JUDGED), np.empty(rows.shape))
 
 
 def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
@@ -191,7 +181,7 @@ def arrays_of(state: MonitorState) -> list[NDArray[Any]]:
 
 @inner
 def state_of(arrays: Any) -> MonitorState:
-    """Return the state of so many arrays, see ``arrays_of``."""
+    """Return the state of fourteen arrays, in the order of ``arrays_of``."""
     traces, expected, skill = arrays[:3]
     history = RowHistory(arrays[3], arrays[4], arrays[5])
     evidence = Evidence(arrays[6], arrays[7], arrays[8])
@@ -206,9 +196,9 @@ def state_of(arrays: Any) -> MonitorState:
 
 @partial(compiled, calls=("memory", "detection", "."))
 def bind_states(learned: Bound, *arrays: Any) -> Bound:
-    """Return what was learned, a state, and a state that is to be written.
+    """Return what was learned, a state, and a state that is to be written, as one object.
 
-    ``arrays`` are those of both states. Numba takes longer to look through nested named tuples that
+    ``arrays`` are those of both states: Numba takes longer to look through nested named tuples that
     Python hands over than through arrays.
     """
     state = state_of(arrays[:14])
@@ -217,7 +207,7 @@ def bind_states(learned: Bound, *arrays: Any) -> Bound:
 
 
 def unwritten(state: Any) -> Any:
-    """Return a state of the same arrays, in whatever nesting, that are yet to be written."""
+    """Return an uninitialised state of the same nesting, shapes and types."""
     if isinstance(state, np.ndarray):
         return np.empty(state.shape, state.dtype)
     if not state:
@@ -280,48 +270,41 @@ def name_skills(weights: RowWeights, before: MemoryState, after: MemoryState, un
 
 @inner
 def copy(values: Any, to: Any) -> None:
-    """Copy values (N,); numba takes seconds to compile an assignment of rows, with its message about shapes."""
+    """Copy values (N,); an assignment of rows takes Numba seconds to compile, for its message about shapes."""
     for i in range(len(values)):
         to[i] = values[i]
 
 
 @inner
 def push(before: Any, newest: Any, after: Any) -> None:
-    """Write rows (l, D): those before without the oldest, and the newest (D,)."""
+    """Write the last rows (l, D): those before without the oldest, then the newest (D,)."""
     for k in range(1, len(before)):
         copy(before[k], after[k - 1])
     copy(newest, after[-1])
 
 
 @partial(inner, inlined=True)
-def read(weights: RowWeights, before: RowHistory, after: RowHistory, rows: Any) -> ScaledRows:
-    """Write the new history; return the rows (B, D) beside those that they are compared with."""
-    lag = before.before.shape[1]
-    last = np.empty_like(rows)
-    past = np.empty_like(rows)
-    for n in range(len(rows)):
-        steps = before.steps[n]
-        after.steps[n] = steps + 1
-        copy(rows[n], last[n])  # at first nothing moves
-        if steps >= lag:
-            copy(before.before[n, 0], last[n])
-        copy(last[n], past[n])
-        if steps >= 2 * lag:
-            copy(before.earlier[n, 0], past[n])
-        push(before.before[n], rows[n], after.before[n])
-        push(before.earlier[n], last[n], after.earlier[n])
+def read(weights: RowWeights, history: RowHistory, new: RowHistory, rows: Any) -> ScaledRows:
+    """Write the history after rows (B, D); return the rows, scaled, and their changes.
 
-    return read_rows(
-        rows=rows,
-        before=last,
-        earlier=past,
-        mean=weights.mean,
-        spread=weights.spread,
-        change=weights.change,
-        sensory=weights.sensory,
-        motor=weights.motor,
-        slow=weights.slow,
-    )
+    A row is compared with the one l rows before, and that with the one before it; at first nothing moves.
+    """
+    lag = history.before.shape[1]
+    before = np.empty_like(rows)
+    earlier = np.empty_like(rows)
+    for n in range(len(rows)):
+        steps = history.steps[n]
+        new.steps[n] = steps + 1
+        copy(rows[n], before[n])
+        if steps >= lag:
+            copy(history.before[n, 0], before[n])
+        copy(before[n], earlier[n])
+        if steps >= 2 * lag:
+            copy(history.earlier[n, 0], earlier[n])
+        push(history.before[n], rows[n], new.before[n])
+        push(history.earlier[n], before[n], new.earlier[n])
+
+    return read_rows(rows, before, earlier, weights.scale)
 
 
 @partial(inner, inlined=True)
@@ -332,15 +315,18 @@ def carry_on(
     reading: ScaledRows,
     wants_context: bool,
 ) -> None:
-    """Write traces and expected state, where the temporal network takes up the row, else those of before."""
+    """Write traces and expected state of every stream.
+
+    The temporal network takes up every l-th row of a stream; at the others both stay.
+    """
     steps = before.history.steps
     lag = before.history.before.shape[1]
-    due = False
+    any_due = False
     for n in range(len(steps)):
-        due = due or steps[n] % lag == 0
+        any_due = any_due or steps[n] % lag == 0
         copy(before.traces[n], after.traces[n])
         copy(before.expected[n], after.expected[n])
-    if due:
+    if any_due:
         expected, carried = follow(weights, before.traces, reading, wants_context)  # of all streams
         for n in range(len(steps)):
             if steps[n] % lag == 0:
@@ -377,7 +363,7 @@ def surprise_of_rows(
         repetition: what was learned of repetitions.
         unlikely: (B, X) n of ``repetition``.
         shares: (B, X) of the errors.
-        finite: (B, D) which numbers are; what is not is above all.
+        finite: (B, D) which numbers are finite; the surprise of the others is infinite.
         judged: (B,) of ``JUDGED``, with the divisors.
         attribution: (B, D), written.
     """
@@ -401,7 +387,9 @@ def surprise_of_rows(
 
 @inner
 def mark_missing(finite: Any, share: Any) -> None:
-    """Give all of the surprise, which is infinite, to the numbers that are not finite, if there are any."""
+    """Write an infinite share for numbers that are not finite, and 0 for the others, where there are such."""
     if not finite.all():
         for i in range(len(finite)):
-            share[i] = 0.0 if finite[i] else np.inf
+            share[i] = 0.0
+            if not finite[i]:
+                share[i] = np.inf

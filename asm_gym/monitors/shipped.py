@@ -8,17 +8,17 @@ from asm_gym.checkpoint import read_header
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice, typed
 
-SHIPPED = Path(__file__).resolve().parent.parent / "pretrained"
+SHIPPED_FOLDER = Path(__file__).resolve().parent.parent / "pretrained"
 """Their folder.
 
 :meta hide-value:
 """
-USUAL = 20  # rows of a stream a second where each control step has one [Hz]
+USUAL_HZ = 20  # rows of a stream a second where each control step has one [Hz]
 
 
 def pretrained() -> dict[str, Path]:
     """Return the file of each shipped memory, by name."""
-    return {path.stem: path for path in sorted(SHIPPED.glob("*.asm"))}
+    return {path.stem: path for path in sorted(SHIPPED_FOLDER.glob("*.asm"))}
 
 
 def pretrained_file(name: str) -> Path:
@@ -65,7 +65,7 @@ def pretrained_for(spec: StreamSpec, controller: str) -> str:
         )
     rate = round(1.0 / spec.dt)
     command = f"asm-gym babble --robot {spec.source or 'ROBOT'}"
-    if rate != USUAL:
+    if rate != USUAL_HZ:
         command += f" --stream-freq {rate}"
     body = f"{spec.source or 'an unnamed body'} at {1 / spec.dt:g} Hz"
     if controller:

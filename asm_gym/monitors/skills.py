@@ -41,16 +41,16 @@ def name_skills(memory: NeuralASM, episodes: Sequence[Episode]) -> NeuralASM:
     model = memory.model
     readings = [model.senses_.read_episode(episode.stream) for episode in episodes]
     inputs = np.concatenate([reading.inputs for reading in readings])
-    V = model.network.association.V
     rng = np.random.default_rng(memory.seed)
     with threadpool_limits(1):
         outputs = model_outputs(model, episodes)
-        states = np.concatenate([output.contexts for output in outputs])
+        contexts = np.concatenate([output.contexts for output in outputs])
 
-        def units(chosen: NDArray[np.intp]) -> NDArray[np.float32]:
-            return np.hstack([hidden_units(inputs[chosen], V), states[chosen]])
+        def units_of(some: NDArray[np.intp]) -> NDArray[np.float32]:
+            units = hidden_units(inputs[some], model.network.association.V)
+            return np.hstack([units, contexts[some]])
 
-        W_K, b_K = learn_readout(units, skills, len(known), rng)
+        W_K, b_K = learn_readout(units_of, skills, len(known), rng)
     model.restore({**model.learned_, "W_K": W_K, "b_K": b_K}, tuple(map(str, known)))
     return memory
 
@@ -70,13 +70,13 @@ def learn_to_act(memory: NeuralASM, episodes: Sequence[Episode], units: int = 51
     model = memory.model
     rng = np.random.default_rng(memory.seed)
     with threadpool_limits(1):
-        situations, commands = lessons(model.senses_, episodes)
+        situations, commands = next_commands(model.senses_, episodes)
         motor = learn_motor(situations, commands, units, rng)
     model.restore({**model.learned_, **motor.named()}, model.skills_)
     return memory
 
 
-def lessons(
+def next_commands(
     senses: StreamScaler, episodes: Sequence[Episode]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return situations (N, I), and the next command in each (N, A): of ``actions``, or else of the stream.
@@ -88,12 +88,13 @@ def lessons(
         raise ValueError(
             f"nothing is commanded in this stream; it has: {', '.join(senses.spec.slices)}"
         )
-    situations = [situation(senses, episode.stream[:-1]) for episode in episodes]
+    situations = []
     commands = []
     for episode in episodes:
         intended = episode.actions
         if len(intended) != len(episode):
             intended = episode.stream[:, motor]
+        situations.append(situation(senses, episode.stream[:-1]))
         commands.append(intended[1:].astype(np.float32))
     return np.concatenate(situations), np.concatenate(commands)
 

@@ -20,7 +20,7 @@ from asm_gym.monitors.surprise import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 
-AT_ONCE = 64  # episodes run side by side; with more the arrays no longer fit the cache
+SIDE_BY_SIDE = 64  # episodes that run together; with more the arrays no longer fit the cache
 
 
 class StreamModel:
@@ -71,7 +71,7 @@ class StreamModel:
 class ScaledModel(StreamModel):
     """Base class of models that read rows as the memory does: values, and their changes over ``lag`` rows."""
 
-    senses_: StreamScaler  # how it reads a row
+    senses_: StreamScaler  # reads rows
 
     def __init__(self, spec: StreamSpec, lag: int = 1) -> None:
         super().__init__(spec)
@@ -93,10 +93,7 @@ class ScaledModel(StreamModel):
 
 
 def require_arrays(learned: Arrays, names: Iterable[str]) -> None:
-    """Raise ValueError unless a file holds all arrays of these names.
-
-    The file may be of an earlier release.
-    """
+    """Raise ValueError unless a file, perhaps of an earlier release, holds all arrays of these names."""
     missing = [name for name in names if name not in learned]
     if missing:
         raise ValueError(
@@ -105,15 +102,17 @@ def require_arrays(learned: Arrays, names: Iterable[str]) -> None:
         )
 
 
-def error_places(columns: NDArray[np.intp], spec: StreamSpec) -> NDArray[np.float64]:
-    """Return the share of each error (X,) that each number of the stream has (X, D).
+def error_shares(columns: NDArray[np.intp], spec: StreamSpec) -> NDArray[np.float64]:
+    """Return the share (X, D) that each number of the stream has in each error.
 
     ``columns`` (X,) are those of the errors; -1 for an error that all senses share.
     """
     shares = np.zeros((len(columns), spec.size))
-    own = columns >= 0
-    shares[own, columns[own]] = 1.0
-    shares[np.ix_(~own, spec.sensory)] = 1.0 / len(spec.sensory)
+    for share, column in zip(shares, columns, strict=True):
+        if column >= 0:
+            share[column] = 1.0
+        else:
+            share[spec.sensory] = 1.0 / len(spec.sensory)
     return shares
 
 
@@ -146,9 +145,11 @@ def parameter_names(kind: Callable[..., Any]) -> tuple[str, ...]:
 
     Of a class with a ``config_class``, the fields of that stand for the argument ``config``.
     """
-    parameters = inspect.signature(kind).parameters
-    named = [name for name, p in parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
-    names = [name for name in named if name not in ("spec", "config")]
+    names = []
+    for name, parameter in inspect.signature(kind).parameters.items():
+        is_named = parameter.kind is parameter.POSITIONAL_OR_KEYWORD
+        if is_named and name not in ("spec", "config"):
+            names.append(name)
     return (*names, *_config_names(kind))
 
 
@@ -160,46 +161,49 @@ def _config_names(kind: Callable[..., Any]) -> list[str]:
 
 
 def made(kind: Callable[..., Any], spec: StreamSpec, parameters: Mapping[str, Any]) -> Any:
-    """Return what a class makes with some of its hyperparameters, by name. Raises TypeError for any other name."""
+    """Return an object of a class with these hyperparameters. Raises TypeError for a name that it does not take."""
     unknown = sorted(parameters.keys() - set(parameter_names(kind)))
     if unknown:
         raise TypeError(f"{kind.__name__} has no hyperparameter {', '.join(unknown)}")
-    own = dict(parameters)
+    arguments = dict(parameters)
     if hasattr(kind, "config_class"):
-        names = [name for name in _config_names(kind) if name in own]
-        own["config"] = kind.config_class(**{name: own.pop(name) for name in names})
-    return kind(spec, **own)
+        names = [name for name in _config_names(kind) if name in arguments]
+        config = {name: arguments.pop(name) for name in names}
+        arguments["config"] = kind.config_class(**config)
+    return kind(spec, **arguments)
 
 
 def model_outputs(model: StreamModel, episodes: Sequence[Episode]) -> list[ModelOutput]:
     """Return errors (T, X) and contexts (T, C) of each episode; raise ValueError where the model gives others."""
     outputs: dict[int, ModelOutput] = {}
-    for group, steps in side_by_side(episodes, model.start, partial(_predicted, model)):
-        for n, i in enumerate(group):
-            own = steps[: len(episodes[i])]
-            outputs[i] = ModelOutput(
-                errors=np.array([step.errors[n] for step in own]),
-                contexts=np.array([step.contexts[n] for step in own]),
+    predict = partial(_checked_prediction, model)
+    for group, steps in side_by_side(episodes, model.start, predict):
+        for stream, index in enumerate(group):
+            own_steps = steps[: len(episodes[index])]
+            outputs[index] = ModelOutput(
+                errors=np.array([step.errors[stream] for step in own_steps]),
+                contexts=np.array([step.contexts[stream] for step in own_steps]),
             )
-    return [outputs[i] for i in range(len(episodes))]
+    return [outputs[index] for index in range(len(episodes))]
 
 
-def _predicted(
+def _checked_prediction(
     model: StreamModel, state: State, rows: NDArray[np.float64]
 ) -> tuple[State, ModelOutput]:
+    """Return the model's ``predict``. Raises ValueError where it gives anything else."""
     result: Any = model.predict(state, rows)
     rule = f"predict of {model.kind} must give"
     is_pair = isinstance(result, tuple) and len(result) == 2
     if not is_pair or not isinstance(result[1], ModelOutput):
         raise ValueError(f"{rule} a state and a ModelOutput, got {type(result).__name__}")
-    output = result[1]
+    errors, contexts = result[1]
     shape = (len(rows), len(model.error_columns))
-    if np.shape(output.errors) != shape:
-        raise ValueError(f"{rule} errors {shape}, got {np.shape(output.errors)}")
-    if not np.isfinite(output.errors).all():
+    if np.shape(errors) != shape:
+        raise ValueError(f"{rule} errors {shape}, got {np.shape(errors)}")
+    if not np.isfinite(errors).all():
         raise ValueError(f"{rule} errors that are finite where the rows are")
-    if np.ndim(output.contexts) != 2 or len(output.contexts) != len(rows):
-        raise ValueError(f"{rule} contexts ({len(rows)}, C), got {np.shape(output.contexts)}")
+    if np.ndim(contexts) != 2 or len(contexts) != len(rows):
+        raise ValueError(f"{rule} contexts ({len(rows)}, C), got {np.shape(contexts)}")
     return result
 
 
@@ -208,19 +212,20 @@ def side_by_side(
     start: Callable[[int], State],
     advance: Callable[[State, NDArray[np.float64]], tuple[State, Any]],
 ) -> Iterator[tuple[list[int], list[Any]]]:
-    """Run many episodes together, the longest first; those that have ended are left out.
+    """Run many episodes together, the longest first, each until it ends.
 
     Yields, for each group of episodes, their indices and what ``advance`` returned beside the state in each step.
     """
-    order = sorted(range(len(episodes)), key=lambda i: -len(episodes[i]))
-    for first in range(0, len(order), AT_ONCE):
-        group = order[first : first + AT_ONCE]
-        streams = [episodes[i].stream for i in group]
+    longest_first = sorted(range(len(episodes)), key=lambda index: -len(episodes[index]))
+    for first in range(0, len(episodes), SIDE_BY_SIDE):
+        group = longest_first[first : first + SIDE_BY_SIDE]
+        streams = [episodes[index].stream for index in group]
         state = start(len(group))
         steps = []
         for t in range(len(streams[0])):
             rows = np.stack([stream[t] for stream in streams if t < len(stream)])
-            state, step = advance(first_of(state, len(rows)), rows.astype(np.float64))
+            running = first_of(state, len(rows))
+            state, step = advance(running, rows.astype(np.float64))
             steps.append(step)
         yield group, steps
 
@@ -229,7 +234,7 @@ def first_of(state: State, count: int) -> State:
     """Return the state of the first ``count`` streams."""
     if not isinstance(state, tuple):
         return state[:count]
-    return type(state)(*(first_of(s, count) for s in state))
+    return type(state)(*(first_of(part, count) for part in state))
 
 
 def batch_of(state: State) -> int:

@@ -46,8 +46,11 @@ class Surprise(NamedTuple):
 
     def of(self, stream: int) -> Surprise:
         """Return the surprise of one stream, as a batch of one."""
-        own = {name: a[stream : stream + 1] for name, a in self._asdict().items() if a is not None}
-        return Surprise(**own)
+        fields = {}
+        for name, array in self._asdict().items():
+            if array is not None:
+                fields[name] = array[stream : stream + 1]
+        return Surprise(**fields)
 
     @property
     def excused_by_event(self) -> dict[str, NDArray[np.float64]]:
@@ -73,17 +76,17 @@ class Surprise(NamedTuple):
         """Return what is left of it where the precision of ``columns`` (D,) is 0."""
         if not columns.any():
             return self
-        judged = np.isfinite(self.value) & (self.value > 0)
-        taken = self.attribution[judged][:, columns].sum(axis=1)
-        share = np.ones(len(self.value))
-        share[judged] = np.clip(1.0 - taken / self.value[judged], 0.0, 1.0)
+        has_share = np.isfinite(self.value) & (self.value > 0)
+        of_columns = self.attribution[has_share][:, columns].sum(axis=1)
+        left = np.ones(len(self.value))
+        left[has_share] = np.clip(1.0 - of_columns / self.value[has_share], 0.0, 1.0)
         rest = self._replace(
-            value=np.where(judged, share * self.value, self.value),
+            value=np.where(has_share, left * self.value, self.value),
             attribution=np.where(columns, 0.0, self.attribution),
         )
         if self.raw is None:
             return rest
-        return rest._replace(raw=np.where(judged, share * self.raw, self.raw))
+        return rest._replace(raw=np.where(has_share, left * self.raw, self.raw))
 
 
 class Monitor(Protocol):

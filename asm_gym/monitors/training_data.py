@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.action_identification import found_meaning
+from asm_gym.data.action_identification import identify_meaning
 from asm_gym.data.action_meaning import ACTIONS
 from asm_gym.data.episode import CONTROLLER, Episode
 from asm_gym.data.schema import LOG_SCHEMA
@@ -20,7 +20,7 @@ from asm_gym.spec import StreamSpec
 
 WILD = 1e6  # largest distance of a number from its channel's median, in ranges of the channel
 
-ALIKE = 1.0 - 1e-9  # correlation of copies
+COPY_CORRELATION = 1.0 - 1e-9  # least correlation of a channel and its copy
 MOST_NAMED = 6  # names that a message lists
 
 Hashes = NDArray[np.float64]  # one of each episode, of 52 bits, which a double holds exactly
@@ -38,29 +38,32 @@ def check_nominal(episodes: Sequence[Episode], spec: StreamSpec, shortest: int) 
             raise ValueError(
                 f"episode {n} must be at least {shortest} steps long, got {len(episode)}"
             )
-        for step, column in np.argwhere(~np.isfinite(episode.stream)):
-            value = episode.stream[step, column]
+        bad = np.argwhere(~np.isfinite(episode.stream))
+        if len(bad):
+            step, column = bad[0]
             raise ValueError(
-                f"episode {n}, step {step}, {spec.labels[column]} must be finite, got {value}"
+                f"episode {n}, step {step}, {spec.labels[column]} must be finite, "
+                f"got {episode.stream[step, column]}"
             )
-    if max(float(np.abs(episode.stream).max()) for episode in episodes) > WILD / 2:
-        _check_proportions(episodes, spec)
+    largest = max(float(np.abs(episode.stream).max()) for episode in episodes)
+    if largest > WILD / 2:
+        _check_outliers(episodes, spec)
 
 
-def _check_proportions(episodes: Sequence[Episode], spec: StreamSpec) -> None:
-    """Raise ValueError for a number out of all proportion.
-
-    Beside it, its channel would look constant.
-    """
+def _check_outliers(episodes: Sequence[Episode], spec: StreamSpec) -> None:
+    """Raise ValueError for a number so far off that its channel would look constant beside it."""
     rows = np.concatenate([episode.stream for episode in episodes]).astype(np.float64)
-    low, middle, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
-    reach = WILD * np.maximum(np.maximum(high - low, np.abs(middle)), 1.0)
+    low, median, high = np.quantile(rows, (0.01, 0.5, 0.99), axis=0)
+    size = np.maximum(high - low, np.abs(median))
+    farthest = WILD * np.maximum(size, 1.0)
     for n, episode in enumerate(episodes):
-        for step, column in np.argwhere(np.abs(episode.stream - middle) > reach):
-            value = episode.stream[step, column]
+        far = np.argwhere(np.abs(episode.stream - median) > farthest)
+        if len(far):
+            step, column = far[0]
             raise ValueError(
-                f"episode {n}, step {step}, {spec.labels[column]} is {value:g}, where 98 % of all "
-                f"lie between {low[column]:g} and {high[column]:g}: leave the episode out"
+                f"episode {n}, step {step}, {spec.labels[column]} is "
+                f"{episode.stream[step, column]:g}, where 98 % of all lie between "
+                f"{low[column]:g} and {high[column]:g}: leave the episode out"
             )
 
 
@@ -78,36 +81,43 @@ def with_held_out(
 def about_episodes(episodes: Sequence[Episode], with_actions: bool) -> dict[str, Any]:
     """Return the facts to save with a monitor: controller and schema that all share, and what actions mean."""
     about: dict[str, Any] = {}
+    first = episodes[0]
     for key in (CONTROLLER, LOG_SCHEMA):
-        first = episodes[0].info.get(key)
-        if first and all(episode.info.get(key) == first for episode in episodes):
-            about[key] = first
-    if with_actions and len(episodes[0].spec.motor):
-        about[ACTIONS] = found_meaning(episodes).to_json()
+        value = first.info.get(key)
+        if value and all(episode.info.get(key) == value for episode in episodes):
+            about[key] = value
+    if with_actions and len(first.spec.motor):
+        about[ACTIONS] = identify_meaning(episodes).to_json()
     return about
 
 
 def mute_channels(episodes: Sequence[Episode]) -> list[str]:
     """Say, a line each, which numbers of the stream never move, and which are copies of others."""
-    rows = np.concatenate([e.stream for e in episodes]).astype(np.float64)
+    rows = np.concatenate([episode.stream for episode in episodes]).astype(np.float64)
     labels = np.array(episodes[0].spec.labels)
     moves = np.ptp(rows, axis=0) > 0
     still = "never moves in these episodes: its motion will be an alarm"
     notes = [f"{label} {still}" for label in labels[~moves]]
+    if not moves.any():
+        return notes
+
     moving = labels[moves]
-    correlation = np.corrcoef(rows[:, moves], rowvar=False).reshape(len(moving), -1)
-    for column, own in enumerate(np.abs(correlation) > ALIKE):
-        first = np.argmax(own)
-        if first < column:
-            notes.append(f"{moving[column]} is a copy of {moving[first]}, and cannot check it")
+    correlation = np.corrcoef(rows[:, moves], rowvar=False)
+    is_copy = np.atleast_2d(np.abs(correlation) > COPY_CORRELATION)
+    for label, original in zip(moving, moving[is_copy.argmax(axis=1)], strict=True):
+        if label != original:
+            notes.append(f"{label} is a copy of {original}, and cannot check it")
     return notes
 
 
 def hashes_of(episodes: Sequence[Episode]) -> Hashes:
     """Return the hash (N,) of the rows of each episode."""
-    rows = (np.ascontiguousarray(e.stream, np.float32).tobytes() for e in episodes)
-    digests = (hashlib.blake2b(data, digest_size=8).digest() for data in rows)
-    return np.array([float(int.from_bytes(digest, "little") >> 12) for digest in digests])
+    hashes = []
+    for episode in episodes:
+        rows = np.ascontiguousarray(episode.stream, np.float32)
+        digest = hashlib.blake2b(rows.tobytes(), digest_size=8).digest()
+        hashes.append(int.from_bytes(digest, "little") >> 12)
+    return np.array(hashes, np.float64)
 
 
 def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
@@ -132,7 +142,7 @@ def check_fresh(episodes: Sequence[Episode], *learned: Hashes | None) -> None:
                 "or replace them"
             )
     _, first, group = np.unique(hashes, return_index=True, return_inverse=True)
-    original = first[group]  # (N,) number of the first episode with the same rows
+    original = first[group]  # (N,) index of the first episode with the same rows
     copies = np.flatnonzero(original != np.arange(len(hashes)))
     if len(copies):
         raise ValueError(

@@ -18,7 +18,7 @@ from asm_gym.detection.base import Arrays
 BITS = ".bits"  # ends of the names of packed arrays: k (P, Q), and s (P, 1)
 SCALE = ".scale"
 WEIGHTS = ("V", "U", "W_S", "W_C", "W_D", "W_F")  # of association and of the traces' network
-LARGEST = 127
+LARGEST_K = 127
 SCALE_BITS = 10
 ROUNDING = 1e-9  # of a quotient that should be whole
 
@@ -33,7 +33,7 @@ class PackedWeights(NamedTuple):
     def of(cls, W: NDArray[np.float32]) -> Self:
         """Round weights (P, Q)."""
         largest = np.abs(W).max(axis=1, keepdims=True).astype(np.float64)
-        fraction, exponent = np.frexp(largest / LARGEST)
+        fraction, exponent = np.frexp(largest / LARGEST_K)
         whole = np.ceil(np.ldexp(fraction, SCALE_BITS) - ROUNDING)
         scale = np.ldexp(whole, exponent - SCALE_BITS).astype(np.float32)
         k = np.rint(W / np.where(scale > 0, scale, np.float32(1)))

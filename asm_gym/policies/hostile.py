@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.base import Policy, StatefulPolicy
+from asm_gym.policies.policy import Policy, StatefulPolicy
 from asm_gym.policies.registry import make_policy
 
 BANG_STEPS = 10  # control steps for which a bang-bang policy goes on in one direction

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from asm_gym.checkpoint import read_checkpoint, write_checkpoint
 from asm_gym.exceptions import DamagedFile
-from asm_gym.policies.base import StatefulPolicy
+from asm_gym.policies.policy import StatefulPolicy
 from asm_gym.validation import check_numbers
 
 Array = NDArray[np.float32]

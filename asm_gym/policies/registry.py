@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import gymnasium as gym
 
-from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold
 from asm_gym.policies.network import NetworkPolicy
+from asm_gym.policies.policy import Policy
 from asm_gym.policies.scripted.door import DoorExpert
 from asm_gym.policies.scripted.lift import LiftExpert
 from asm_gym.policies.scripted.nut_assembly import NutAssemblyExpert

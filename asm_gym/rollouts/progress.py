@@ -22,23 +22,32 @@ EVERY_S = 10.0  # least time between two lines [s]
 
 
 @contextmanager
-def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Progress]:
-    """Show the progress of ``name`` while the block runs, by a function of (done, total); store its ``seconds``."""
-    start = printed = time.perf_counter()
+def stage(
+    name: str, console: Console, seconds: dict[str, float] | None = None
+) -> Iterator[Progress]:
+    """Show the progress of a stage while the block runs, which reports it by a function of (done, total).
+
+    Args:
+        name: of the stage.
+        console: to print to.
+        seconds: gets the duration of the stage by its name [s].
+    """
+    start = time.perf_counter()
+    last_print = start
     reached = ""
 
-    def say(text: str) -> None:
+    def print_line(text: str) -> None:
         if not console.is_terminal:
             line = f"{name}: {text}{time.perf_counter() - start:.0f} s"
             console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def note(done: int, total: int) -> None:
-        nonlocal printed, reached
+    def report(done: int, total: int) -> None:
+        nonlocal last_print, reached
         bars.update(bar, completed=done, total=total)
         reached = f"{done} of {total}, "
-        if time.perf_counter() - printed >= EVERY_S:
-            printed = time.perf_counter()
-            say(reached)
+        if time.perf_counter() - last_print >= EVERY_S:
+            last_print = time.perf_counter()
+            print_line(reached)
 
     columns = (
         SpinnerColumn(),
@@ -49,8 +58,9 @@ def stage(name: str, console: Console, seconds: dict[str, float]) -> Iterator[Pr
     )
     with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
         bar = bars.add_task(name, total=None)
-        yield note
+        yield report
         total = bars.tasks[bar].total or 1
         bars.update(bar, total=total, completed=total)
-    say(f"{reached}done in ")
-    seconds[name] = round(time.perf_counter() - start, 1)
+    print_line(f"{reached}done in ")
+    if seconds is not None:
+        seconds[name] = round(time.perf_counter() - start, 1)

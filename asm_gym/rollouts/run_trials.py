@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -42,23 +42,30 @@ from asm_gym.wrappers.faults import FaultInjection
 
 Item = TypeVar("Item")
 
-_LATEST: dict[str, tuple[str, Any]] = {}
-"""What this process made last, by name: the text of what it was made of, and the result."""
+
+class Cached(NamedTuple):
+    """A result that this process made last, and the text of its arguments."""
+
+    arguments: str
+    result: Any
 
 
-def _latest(name: str, key: object, make: Callable[[], Any]) -> Any:
-    """Return what was made last if it was made of the same; else make it."""
+_CACHE: dict[str, Cached] = {}  # by name
+
+
+def _cached(name: str, arguments: object, make: Callable[[], Any]) -> Any:
+    """Return the last result of this name if it was made of the same arguments; else make it."""
     with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-        text = repr(key)  # the caller's own lists, dicts and arrays may change
-    if name not in _LATEST or _LATEST[name][0] != text:
-        _LATEST.pop(name, None)  # two environments at a time would take twice the memory
-        _LATEST[name] = (text, make())
-    return _LATEST[name][1]
+        text = repr(arguments)  # the caller's own lists, dicts and arrays may change
+    if name not in _CACHE or _CACHE[name].arguments != text:
+        _CACHE.pop(name, None)  # two environments at a time would take twice the memory
+        _CACHE[name] = Cached(text, make())
+    return _CACHE[name].result
 
 
 def environment(env_id: str, settings: Settings = ()) -> gym.Env[Any, Any]:
     """Return this process's environment: making one costs as much as an episode, and a seeded reset restores it."""
-    return _latest("environment", (env_id, settings), lambda: gym.make(env_id, **dict(settings)))
+    return _cached("environment", (env_id, settings), lambda: gym.make(env_id, **dict(settings)))
 
 
 def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tuple[Fault, ...]:
@@ -73,7 +80,8 @@ def faults_in(trial: Trial, env: gym.Env[Any, Any], config: RolloutConfig) -> tu
     arm: Any = env.unwrapped
     onset = trial.begins(env)
     if not isinstance(arm, RobosuiteEnv):
-        sigma = _latest("sigmas", (trial.env_id, config), lambda: _sigmas(trial.env_id, config))
+        arguments = (trial.env_id, config)
+        sigma = _cached("sigmas", arguments, lambda: _sigmas(trial.env_id, config))
         interface = FaultyInterface(env)
         return faults_anywhere(trial.kind, interface, sigma, trial.severity, onset, trial.seed)
     if trial.kind != PASSING:
@@ -304,16 +312,23 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
     with staged(trial, config) as env:
         guarded = NeuralASMSafety(env, monitor, on_alarm=cast(OnAlarmName, trial.on_alarm))
         success = play(trial, config, guarded, infos.append)
-    asm = [info["asm"] for info in infos]
-    rows = len(asm[0]["surprises"])  # of each control step
+    reports = [info["asm"] for info in infos]  # of each control step
+    rows = len(reports[0]["surprises"])  # of each control step
     fault = np.repeat([bool(info.get("fault")) for info in infos], rows)
     onset = None
     if fault.any():
         onset = int(np.argmax(fault))
     time = math.nan
-    solved = [step for step, info in enumerate(infos) if info["success"]]
-    if solved:
-        time = (solved[0] + 1) * rows * monitor.spec.dt
+    solved_steps = [step for step, info in enumerate(infos) if info["success"]]
+    if solved_steps:
+        time = (solved_steps[0] + 1) * rows * monitor.spec.dt
+    forces = [info.get("contact_force", np.nan) for info in infos]
+    outcome = InterventionOutcome(
+        success=success,
+        contact_force=float(np.max(forces)),
+        overridden=any(info["overridden"] for info in infos),
+        time=time,
+    )
     trace = ScoredEpisode(
         kind=trial.kind,
         severity=trial.severity,
@@ -322,22 +337,18 @@ def watch(trial: Trial, config: RolloutConfig, memory: Path) -> ScoredEpisode:
         seed=trial.seed,
         dt=monitor.spec.dt,
         threshold=monitor.threshold,
-        surprise=np.concatenate([step["surprises"] for step in asm]),
+        surprise=np.concatenate([report["surprises"] for report in reports]),
         onset=onset,
-        outcome=InterventionOutcome(
-            success=success,
-            contact_force=float(np.max([info.get("contact_force", np.nan) for info in infos])),
-            overridden=any(info["overridden"] for info in infos),
-            time=time,
-        ),
+        outcome=outcome,
         fault=fault,
     )
-    # of the row of each control step that surprised most
-    attribution = np.repeat([list(step["attribution"].values()) for step in asm], rows, axis=0)
+    # A control step reports the shares of its most surprising row.
+    shares = [list(report["attribution"].values()) for report in reports]
+    attribution = np.repeat(shares, rows, axis=0)  # (T, D)
     return trace.attributed(attribution, monitor.spec.labels)
 
 
 def watch_pair(trial: Trial, config: RolloutConfig, memory: Path) -> list[ScoredEpisode]:
-    """Run one trial with the policy alone, and with its response."""
+    """Run one trial twice: with the policy alone, and with the trial's response."""
     alone = replace(trial, acting=POLICY_ALONE)
     return [watch(each, config, memory) for each in (alone, trial)]

@@ -13,23 +13,29 @@ MOST_EPISODES = 10**6
 
 def episode_seeds(seed: int, episodes: int, stage: int = 0) -> list[int]:
     """Return one seed per episode; lists of different ``stage`` have nothing in common."""
-    return _draw(seed, check_number("stage", stage, low=0, whole=True), episodes)
+    check_number("stage", stage, low=0, whole=True)
+    return _draw(seed, stage, episodes)
 
 
 def role_seeds(seed: int, task: str, role: str, episodes: int) -> list[int]:
     """Return one seed per episode; those of different tasks and roles have nothing in common."""
-    return _draw(seed, zlib.crc32(f"{task}/{role}".encode()), episodes)
+    name = f"{task}/{role}"
+    return _draw(seed, zlib.crc32(name.encode()), episodes)
 
 
 def draw_onset(seed: int, horizon: int) -> int:
     """Return when a fault begins in the episode of ``seed`` [steps]: after step 10, in the first half."""
-    latest = max(11, check_number("horizon", horizon, low=0, high=1e9, whole=True) // 2)
-    rng = np.random.default_rng([check_number("seed", seed, low=0, whole=True), 1])
+    check_number("horizon", horizon, low=0, high=1e9, whole=True)
+    check_number("seed", seed, low=0, whole=True)
+    rng = np.random.default_rng([seed, 1])
+    latest = max(11, int(horizon) // 2)
     return int(rng.integers(10, latest))
 
 
-def _draw(seed: int, which: int, episodes: int) -> list[int]:
+def _draw(seed: int, key: int, episodes: int) -> list[int]:
+    """Return one seed per episode; those of different ``key`` have nothing in common."""
     check_number("episodes", episodes, low=0, high=MOST_EPISODES, whole=True)
-    entropy = [check_number("seed", seed, low=0, whole=True), which]
-    drawn = np.random.SeedSequence(entropy).generate_state(episodes, np.uint32)
+    check_number("seed", seed, low=0, whole=True)
+    sequence = np.random.SeedSequence([seed, key])
+    drawn = sequence.generate_state(episodes, np.uint32)
     return (drawn // 2).tolist()

@@ -17,13 +17,12 @@ from rich.console import Console
 
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.detection.conformal import check_hours, check_per_hour
-from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.scoring import HEALTHY_ROLES
 from asm_gym.evaluation.tables import markdown
 from asm_gym.faults.suite import TEST, kinds_of, possible
 from asm_gym.files import write_text
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.shipped import USUAL
+from asm_gym.monitors.shipped import USUAL_HZ
 from asm_gym.policies.registry import EXPERTS, agents, trained_in
 from asm_gym.rollouts.detection_corpus import Corpus
 from asm_gym.rollouts.pretraining.body_evaluation import (
@@ -106,13 +105,13 @@ class Args(Options):
             raise ValueError("there must be at least one task to babble in")
         motions = sum(map(held_out, range(self.episodes)))
         steps = sum((motions + self.healthy(t)) * task_spec(t).horizon for t in self.shown)
-        check_hours(self.false_alarms_per_hour, steps / USUAL / 3600)
+        check_hours(self.false_alarms_per_hour, steps / USUAL_HZ / 3600)
 
     def healthy(self, task: str) -> int:
         """Return how many episodes of a task's expert are recorded to calibrate on."""
         if self.healthy_hours is None:
             return self.healthy_episodes
-        return math.ceil(3600 * USUAL * self.healthy_hours / task_spec(task).horizon)
+        return math.ceil(3600 * USUAL_HZ * self.healthy_hours / task_spec(task).horizon)
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -150,7 +149,7 @@ def record_motions(args: Args, console: Console) -> list[Episode]:
     """Record the training motions that are missing, and return all."""
     motions = curriculum(args.shown, args.episodes, args.seed, args.reaching)
     make = partial(record_motion, config=args.config, folder=args.out.resolve())
-    with stage("babbling", console, {}) as progress:
+    with stage("babbling", console) as progress:
         files = make_missing(
             make, motions, lambda motion: args.out / motion.path, args.workers, progress
         )
@@ -163,7 +162,7 @@ def record_hours(args: Args, console: Console) -> list[Episode]:
     for task in args.shown:
         seeds = role_seeds(HOURS_SEED, task, "hours", args.healthy(task))
         trials += nominal_trials(task_spec(task).id, "nominal", seeds)
-    with stage("healthy hours", console, {}) as progress:
+    with stage("healthy hours", console) as progress:
         files = record_missing(trials, args.config, args.out / "hours", args.workers, progress)
     hours = [load_episode(file) for file in files]
     if args.corpus is not None:
@@ -178,7 +177,7 @@ def pretrain(args: Args, console: Console) -> NeuralASM:
     motions = healthy(record_motions(args, console))
     hours = record_hours(args, console)
     arm: Any = environment(task_spec(args.shown[0]).id, args.config.settings).unwrapped
-    with stage("learning", console, {}) as progress:
+    with stage("learning", console) as progress:
         memory = learn_body(motions, arm.stream_spec, args.seed, progress)
     calibrate_body(memory, motions, hours, args.false_alarms_per_hour)
     name = args.robot.lower()
@@ -213,11 +212,11 @@ def evaluate(args: Args, memory: NeuralASM, console: Console) -> list[Scores]:
             kinds = [kind for kind in kinds_of((TEST,)) if possible(kind, arm)]
         trials = case.trials(args.exam_episodes, kinds, args.seed)
         folder = args.out / "exams" / case.policy
-        with stage(case.name, console, {}) as progress:
+        with stage(case.name, console) as progress:
             files = record_missing(trials, config, folder, args.workers, progress)
             recordings = [load_episode(file) for file in files]
             force = usual.setdefault(case.task, usual_force(recordings))
-            scores.append(evaluate_case(memory, case.name, recordings, WINDOW_S, force))
+            scores.append(evaluate_case(memory, case.name, recordings, force))
     return scores
 
 
@@ -240,8 +239,8 @@ def publish(args: Args, memory: NeuralASM, scores: Sequence[Scores], console: Co
     rates = [*(rate for rate in PROMISES if rate > own), own]
     thresholds = {rate: memory.threshold_at(false_alarms_per_hour=rate) for rate in rates}
     tables = [
-        scores_table(scores, memory, WINDOW_S),
-        promises_table(scores, thresholds, WINDOW_S),
+        scores_table(scores, memory),
+        promises_table(scores, thresholds),
     ]
     adapted = summary([each.adapted(own) for each in scores])
     result = f"{summary(scores)}\nWith an adaptive threshold: {adapted}"

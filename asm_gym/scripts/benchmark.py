@@ -41,7 +41,7 @@ from asm_gym.validation import check_number
 from asm_gym.wrappers import NeuralASMSafety, VectorNeuralASMSafety
 from asm_gym.wrappers.guarding import body_memory
 
-NAMES = ("monitor", "safety", "env")
+BENCHMARK_NAMES = ("monitor", "safety", "env")
 SECOND = 20  # control steps of a second
 NEVER = 1e300  # threshold at which no step is overridden
 PARTS = 10  # parts of a measurement; a ratio's spread is that of the ratios of their medians
@@ -52,7 +52,7 @@ Rivals = dict[str, Callable[[], Any]]
 class Args(Options):
     """Options of a benchmark."""
 
-    what: tuple[str, ...] = option(NAMES, least=1, known=NAMES, positional=True)
+    what: tuple[str, ...] = option(BENCHMARK_NAMES, least=1, known=BENCHMARK_NAMES, positional=True)
     """monitor: a call of observe(); safety: steps with and without the guard; env: against MuJoCo and robosuite."""
     task: str = option("Lift", check=env_id, metavar="TASK")
     """Task of the environments, with the Panda."""
@@ -86,13 +86,12 @@ def take_turns(
 
 def ratio(seconds: NDArray[np.float64], others: NDArray[np.float64]) -> Spread:
     """Return how many times as long a call takes as another: mean and spread over parts of the measurement."""
-    parts = min(PARTS, len(seconds))
-    ratios = [
-        np.median(own) / np.median(other)
-        for own, other in zip(
-            np.array_split(seconds, parts), np.array_split(others, parts), strict=True
-        )
-    ]
+    count = min(PARTS, len(seconds))
+    parts = np.array_split(seconds, count)
+    other_parts = np.array_split(others, count)
+    ratios = []
+    for part, other_part in zip(parts, other_parts, strict=True):
+        ratios.append(np.median(part) / np.median(other_part))
     return Spread.of(ratios)
 
 
@@ -128,9 +127,9 @@ def measure_monitor(args: Args, console: Console) -> Table:
     seconds[many] /= 64
     rows = []
     for name, own in seconds.items():
-        median, slow = np.quantile(own, (0.5, 0.99)) * 1e6
+        median_us, slow_us = np.quantile(own, (0.5, 0.99)) * 1e6
         against = f"{ratio(own, seconds[rival]).text(digits=2)}× {rival}"
-        rows.append((name, f"{median:.3g}", f"{slow:.3g}", against))
+        rows.append((name, f"{median_us:.3g}", f"{slow_us:.3g}", against))
     return Table("observe(), 256 hidden units, 60 channels", ("", "µs", "p99", "against"), rows)
 
 
@@ -160,7 +159,8 @@ def speeds(name: object, members: int, seconds: dict[str, NDArray[np.float64]]) 
     """Return a row: steps a second of all members together, and the first's as a share of each other's."""
     ours, *others = seconds.values()
     rates = [f"{SECOND * members / np.median(own):,.0f}" for own in seconds.values()]
-    return str(name), *rates, *(ratio(other, ours).text(digits=2) for other in others)
+    shares = [ratio(other, ours).text(digits=2) for other in others]
+    return str(name), *rates, *shares
 
 
 def observing_steps(env: Any, memory: NeuralASM, count: int) -> Callable[[Any], None]:
@@ -252,7 +252,10 @@ def physics_alone(
         recorded.append((states, np.array(controls), np.array(warm)))
     remaining = iter(recorded)
     threads = min(cores(), len(envs))
-    pool = Rollout(nthread=threads if threads > 1 else 0)
+    pool_threads = 0  # none beside this one
+    if threads > 1:
+        pool_threads = threads
+    pool = Rollout(nthread=pool_threads)
     buffers = [mujoco.MjData(models[0]) for _ in range(threads)]
 
     def second() -> None:

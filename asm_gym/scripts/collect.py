@@ -19,7 +19,7 @@ from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, versions
 from asm_gym.rollouts.run_trials import check, collect_to
 from asm_gym.rollouts.seeds import episode_seeds
-from asm_gym.rollouts.trial import RolloutConfig
+from asm_gym.rollouts.trial import RolloutConfig, task_in
 from asm_gym.scripts.command import Options, option, run
 from asm_gym.tasks import ROBOTS, TASKS, env_id
 
@@ -46,7 +46,8 @@ class Args(Options):
 
 def dataset_id(task: str, policy: str) -> str:
     """Return Minari's name of a dataset."""
-    name = env_id(task).rsplit(":", 1)[-1].rsplit("/", 1)[-1].rsplit("-v", 1)[0].lower()
+    without_module = env_id(task).rsplit(":", 1)[-1]
+    name = task_in(without_module).lower()
     return f"asm_gym/{name}-{Path(policy).stem}-v0"
 
 
@@ -60,12 +61,15 @@ def collect(args: Args, console: Console) -> None:
     check(task, config)
     claim = {"env_id": task, "policy": args.policy, "settings": settings, "seed": args.seed}
     with claimed(args.out, "collect.json", claim):
-        with stage("recording", console, {}) as progress:
+        with stage("recording", console) as progress:
             folder = args.out / "episodes"
             seeds = episode_seeds(args.seed, args.episodes)
             files = collect_to(folder, task, config, seeds, args.workers, progress)
         episodes = [load_episode(file) for file in files]
-        kept = [e for e in episodes if e.success or not args.only_successful]
+        successful = [episode for episode in episodes if episode.success]
+        kept = episodes
+        if args.only_successful:
+            kept = successful
         if not kept:
             raise ValueError(
                 f"none of {len(episodes)} episodes succeeded, so none is left for the dataset"
@@ -74,8 +78,7 @@ def collect(args: Args, console: Console) -> None:
         with closing(gym.make(task, **settings)) as env:
             dataset = write_dataset(args.out, name, kept, env, details)
     steps = sum(map(len, kept))
-    successful = sum(episode.success for episode in kept)
-    console.print(f"{len(kept)} episodes, {steps} steps, {successful} successful: {dataset}")
+    console.print(f"{len(kept)} episodes, {steps} steps, {len(successful)} successful: {dataset}")
     console.print(f"MINARI_DATASETS_PATH={args.out} lets minari.load_dataset({name!r}) find it")
 
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from rich.console import Console
@@ -22,7 +20,7 @@ from asm_gym.evaluation import figures
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import CONDITION_COLUMNS, headline
 from asm_gym.evaluation.metrics import by_condition, typical
-from asm_gym.evaluation.report import write_report
+from asm_gym.evaluation.report_page import write_report
 from asm_gym.evaluation.scored_episode import NOMINAL
 from asm_gym.evaluation.statistics import Share
 from asm_gym.evaluation.tables import tabulate
@@ -38,6 +36,7 @@ from asm_gym.scripts.command import Options, option, origin, run
 from asm_gym.tasks import TASKS, env_id
 
 PUSHED = "robot0_link5"  # link that is pushed
+RESPONSE = "graded"  # of the wrapper to an alarm, by its cause
 
 
 @dataclass(frozen=True)
@@ -46,10 +45,6 @@ class Args(Options):
 
     task: str = option("Lift", positional=True, check=env_id, known=TASKS, metavar="TASK")
     """Name of a task."""
-    on_alarm: Literal["graded", "hold", "terminate"] = option(
-        "graded", known=("graded", "hold", "terminate")
-    )
-    """Response of the wrapper to an alarm; graded depends on the cause."""
     workers: int = option(os.cpu_count() or 1, least=1)
     """Number of processes."""
     out: Path = option(Path("runs/demo"), metavar="FOLDER")
@@ -97,27 +92,24 @@ def faults(seed: int, episodes: int) -> dict[str, list[Fault]]:
 def trials(args: Args) -> list[Trial]:
     """Return every episode to test on."""
     env = env_id(args.task)
-    nominal = args.nominal_episodes
-    broken = faults(args.seed, args.faulty_episodes)
-    seeds = iter(episode_seeds(args.seed, nominal + len(broken) * args.faulty_episodes, stage=2))
-    trials = [
-        Trial(env, seed, NOMINAL, faults=(), acting=args.on_alarm)
-        for seed in islice(seeds, nominal)
+    cases: list[tuple[str, tuple[Fault, ...]]] = [(NOMINAL, ())] * args.nominal_episodes
+    for kind, own in faults(args.seed, args.faulty_episodes).items():
+        cases += [(kind, (fault,)) for fault in own]
+    seeds = episode_seeds(args.seed, len(cases), stage=2)
+    return [
+        Trial(env, seed, kind, faults=own, acting=RESPONSE)
+        for (kind, own), seed in zip(cases, seeds, strict=True)
     ]
-    for name, kind in broken.items():
-        for fault, seed in zip(kind, seeds, strict=False):
-            trials.append(Trial(env, seed, name, faults=(fault,), acting=args.on_alarm))
-    return trials
 
 
 def fit(args: Args, console: Console) -> tuple[Path, Share]:
     """Fit, calibrate and save a memory of the task; return its file and how often the expert succeeded."""
     env = env_id(args.task)
     count = args.fit_episodes + args.calibration_episodes
-    with stage("collecting nominal episodes", console, {}) as progress:
+    with stage("collecting nominal episodes", console) as progress:
         episodes = collect(env, "scripted", count, args.seed, args.workers, progress=progress)
     memory = NeuralASM(episodes[0].spec, epochs=args.epochs, seed=args.seed)
-    with stage("learning", console, {}) as progress:
+    with stage("learning", console) as progress:
         memory.fit(episodes[: args.fit_episodes], progress=progress)
     memory.calibrate(episodes[args.fit_episodes :], false_alarm_rate=FALSE_ALARM_RATE)
     file = args.out / f"{task_in(env).lower()}.asm"
@@ -130,16 +122,16 @@ def demonstrate(args: Args, console: Console) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     memory, expert = fit(args, console)
     work = partial(watch_pair, config=RolloutConfig(), memory=memory)
-    with stage("testing, policy alone and wrapped", console, {}) as progress:
+    with stage("testing, policy alone and wrapped", console) as progress:
         pairs = parallel_map(work, trials(args), args.workers, progress)
     traces = [trace for pair in pairs for trace in pair]
     rows = by_condition(traces, WINDOW_S)
-    title = f"Noticed while the policy acts alone; solved and force: alone → {args.on_alarm}"
+    title = f"Noticed while the policy acts alone; solved and force: alone → {RESPONSE}"
     table = tabulate(title, CONDITION_COLUMNS, rows)
     console.print("", table, "")
-    low, high = map(int, binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE))
+    low, high = binom.interval(0.95, args.nominal_episodes, FALSE_ALARM_RATE)
     result = (
-        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low} to {high} of "
+        f"{headline(rows)} At a false-alarm rate of {FALSE_ALARM_RATE:g}, {low:g} to {high:g} of "
         f"{args.nominal_episodes} nominal episodes raise an alarm by chance (95 %). The expert "
         f"succeeded in {expert.k} of {expert.n} episodes."
     )

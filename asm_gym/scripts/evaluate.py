@@ -19,7 +19,7 @@ from rich.console import Console
 from asm_gym.detection import conformal_episodes
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_S
 from asm_gym.evaluation.detection_tables import brief_monitors_table, kept_table, kinds_table
-from asm_gym.evaluation.report import publish
+from asm_gym.evaluation.report_page import publish
 from asm_gym.evaluation.scoring import benchmark
 from asm_gym.faults import anywhere
 from asm_gym.faults.suite import SEVERITIES, kinds_of

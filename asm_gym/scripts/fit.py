@@ -19,12 +19,12 @@ import numpy as np
 from rich.console import Console
 
 from asm_gym.data import selection
+from asm_gym.data.bridging import bridge_of, filled
 from asm_gym.data.episode import Episode
 from asm_gym.data.live import lines_from, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.selection import SHORTEST_S, normal_episodes, pieces
-from asm_gym.data.timing import bridge_of, filled
+from asm_gym.data.selection import SHORTEST_PART_S, normal_episodes, pieces
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
@@ -37,7 +37,7 @@ from asm_gym.monitors.torque.value_association import ValueAssociation
 from asm_gym.monitors.training_data import mute_channels
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import option, run
-from asm_gym.scripts.log_options import LogOptions, ended
+from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 from asm_gym.spec import MOTOR, StreamSpec
 from asm_gym.validation import check_number
 
@@ -115,27 +115,33 @@ def record_live(args: Args, say: Callable[[str], None]) -> Args:
     if file == args.out or str(args.data) == f"tail:{file}":
         raise ValueError(f"rows are kept in {file}, which is in use: give --out another name")
     lines = lines_from(str(args.data), sys.stdin, SILENCE_S)
-    seconds, ended = record(lines, file, args.minutes)
-    say(f"{ended}, kept in {file}")
-    split = args.split
-    if split is None:
+    seconds, how_it_ended = record(lines, file, args.minutes)
+    say(f"{how_it_ended}, kept in {file}")
+    piece_s = args.split
+    if piece_s is None:
         pieces_needed = 1.0
         if args.needed:
             pieces_needed = args.needed / CALIBRATION_SHARE + SPARE
-        split = min(PIECE_S, seconds / pieces_needed)
-    return replace(args, data=file, split=max(split, SHORTEST_S))
+        piece_s = min(PIECE_S, seconds / pieces_needed)
+    return replace(args, data=file, split=max(piece_s, SHORTEST_PART_S))
 
 
 def divide(
-    args: Args, logs: list[list[Episode]], in_time: bool
+    args: Args, stretches: list[list[Episode]], is_live: bool
 ) -> tuple[list[Episode], list[Episode]]:
     """Return episodes to learn from, and to calibrate on.
 
-    Raises ValueError where they are too few for the promise.
+    Args:
+        args: of the command.
+        stretches: the pieces of each stretch without a gap, in their order.
+        is_live: whether all are of one recording of a live source.
+
+    Raises:
+        ValueError: they are too few for the promise.
     """
-    by_episode = args.promise.per == EPISODE
-    if in_time or (args.split is not None and not by_episode):
-        fitting, calibration = selection.split_in_time(logs, CALIBRATION_SHARE)
+    by_hour = args.promise.per != EPISODE
+    if is_live or (by_hour and args.split is not None):
+        fitting, calibration = selection.split_in_time(stretches, CALIBRATION_SHARE)
         if len(calibration) < args.needed:
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to "
@@ -143,10 +149,9 @@ def divide(
                 "take a higher --false-alarm-rate"
             )
     else:
-        episodes = flat(logs)
         needed = args.needed or conformal_episodes(ANY_EPISODE)
         fitting, calibration = selection.split_at_random(
-            episodes, needed, CALIBRATION_SHARE, args.seed
+            flat(stretches), needed, CALIBRATION_SHARE, args.seed
         )
     args.promise.check_hours(hours_of(calibration))
     if args.quick:
@@ -155,23 +160,25 @@ def divide(
 
 
 def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episode], list[str]]:
-    """Return the parts between lost rows, short gaps filled, and what was done, a line each.
+    """Return the parts between lost rows, short gaps filled, and notes on what was done.
 
     Where parts are too few for the promise, logs are cut at short gaps too, as they would be without a bridge.
-    Raises ValueError where no part is left, and says which numbers are missing.
+
+    Raises:
+        ValueError: no part is left; the message says which numbers are missing.
     """
     dt = episodes[0].spec.dt
     seconds = bridge_of(args.bridge, dt)
     bridged = [replace(e, stream=filled(e.stream, dt, seconds)) for e in episodes]
     parts = [selection.complete_parts(e) for e in bridged]  # of each episode
     if args.split is None and len(flat(parts)) < args.needed / CALIBRATION_SHARE:
-        without_bridge = [selection.complete_parts(e) for e in episodes]
-        if len(flat(without_bridge)) > len(flat(parts)):
+        parts_without_bridge = [selection.complete_parts(e) for e in episodes]
+        if len(flat(parts_without_bridge)) > len(flat(parts)):
             bridged = episodes
-            parts = without_bridge
+            parts = parts_without_bridge
     if not flat(parts):
         raise ValueError(
-            f"no stretch of {SHORTEST_S:g} s is complete: rows that lack a number are "
+            f"no stretch of {SHORTEST_PART_S:g} s is complete: rows that lack a number are "
             f"{incomplete_columns(episodes)} of all; --ignore leaves such columns out, "
             "--bridge SECONDS fills longer gaps"
         )
@@ -182,25 +189,37 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
 def notes_on_gaps(
     args: Args, episodes: list[Episode], bridged: list[Episode], parts: list[list[Episode]]
 ) -> list[str]:
-    """Return how many rows were filled in ``episodes``, and where the ``bridged`` ones were cut into ``parts``."""
+    """Return notes: how many rows were filled, and how many episodes were cut.
+
+    Args:
+        args: of the command.
+        episodes: as they were read.
+        bridged: the same with short gaps filled.
+        parts: of each bridged episode, between its other gaps.
+    """
     seconds = bridge_of(args.bridge, episodes[0].spec.dt)
     notes = []
     filled_rows = 0
-    for episode, other in zip(episodes, bridged, strict=True):
-        is_filled = np.isnan(episode.stream) & ~np.isnan(other.stream)
+    cut_episodes = 0
+    cut_parts = 0
+    for before, after, own_parts in zip(episodes, bridged, parts, strict=True):
+        is_filled = np.isnan(before.stream) & ~np.isnan(after.stream)
         filled_rows += int(is_filled.any(axis=1).sum())
+        if not np.isfinite(after.stream).all():
+            cut_episodes += 1
+            cut_parts += len(own_parts)
     if filled_rows:
         notes.append(
             f"Filled {filled_rows} rows that lacked a number, in gaps of at most {seconds:.3g} s."
         )
-    cut = [own for own, e in zip(parts, bridged, strict=True) if not np.isfinite(e.stream).all()]
-    if cut:
+    if cut_episodes:
         note = (
-            f"Rows were lost: {len(cut)} of {len(parts)} episodes were cut there, "
-            f"into {len(flat(cut))} parts."
+            f"Rows were lost: {cut_episodes} of {len(episodes)} episodes were cut there, "
+            f"into {cut_parts} parts."
         )
-        if not args.bridge:
-            note += " --bridge 0.05 fills gaps up to 0.05 s."
+        if args.bridge is None:
+            longer = f"{2 * seconds:.3g}"
+            note += f" --bridge {longer} fills gaps up to {longer} s."
         notes.append(note)
     return notes
 
@@ -214,8 +233,8 @@ def incomplete_columns(episodes: list[Episode]) -> str:
     """Return the columns that lack the most numbers, and in how many rows."""
     missing = np.mean([np.isnan(e.stream).mean(axis=0) for e in episodes], axis=0)  # (D,)
     labels = episodes[0].spec.labels
-    worst = [k for k in np.argsort(-missing)[:MOST_COLUMNS] if missing[k]]
-    return ", ".join(f"{labels[k]} in {missing[k]:.0%}" for k in worst)
+    worst = np.argsort(-missing)[:MOST_COLUMNS]
+    return ", ".join(f"{labels[k]} in {missing[k]:.0%}" for k in worst if missing[k])
 
 
 def settings(args: Args) -> dict[str, Any]:
@@ -252,21 +271,21 @@ def notes_on_body(args: Args, monitor: CalibratedMonitor) -> Iterator[str]:
         model = monitor.values_.monitor.model
     if not isinstance(model, ValueAssociation):
         return
-    left = (
+    gain = (
         f"with it the squared error of held-out torques is {model.left_by_body:.2f} "
         "of that without it"
     )
-    if model.links is None:
+    if model.body is None:
         yield (
-            f"{args.urdf} is not used: {left}; "
+            f"{args.urdf} is not used: {gain}; "
             "check its masses, and that it names joints as the log does"
         )
         return
     joints = ", ".join(f"{label} for {joint}" for label, joint in model.joints)
     assigned = "by the best fit to the torques, as no column names a joint"
-    if model.links.by_name:
+    if model.body.by_name:
         assigned = "by name"
-    yield f"{args.urdf} is used: {left}; angles are assigned {assigned}: {joints}"
+    yield f"{args.urdf} is used: {gain}; angles are assigned {assigned}: {joints}"
 
 
 def hours_of(episodes: list[Episode]) -> float:
@@ -277,7 +296,7 @@ def hours_of(episodes: list[Episode]) -> float:
 def read(args: Args, console: Console) -> tuple[list[Episode], str]:
     """Return the normal episodes, and which others were left out; ValueError where there is none."""
     logs = read_logs(args.data, args.hints(args.action), args.given_schema())
-    with stage("reading", console, {}) as progress:
+    with stage("reading", console) as progress:
         episodes, counts = normal_episodes(logs, args.split is not None, progress)
     left_out = ", ".join(f"{count} {why}" for why, count in counts.items())
     if episodes:
@@ -293,32 +312,32 @@ def read(args: Args, console: Console) -> tuple[list[Episode], str]:
 def fit(args: Args, console: Console) -> int:
     """Read, learn, calibrate, save, and print a summary."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    live = live_source(str(args.data)) is not None
+    is_live = live_source(str(args.data)) is not None
     writable(args.out)
-    if live:
+    if is_live:
         args = record_live(args, say)
     start = time.perf_counter()
 
     with noted() as notes:
         episodes, left_out = read(args, console)
-    parts, of_gaps = parts_between_gaps(args, episodes)
-    logs = [[part] for part in parts]
+    parts, notes_on_parts = parts_between_gaps(args, episodes)
+    stretches = [[part] for part in parts]
     if args.split is not None:
-        logs = [pieces(part, args.split) for part in parts]
-    logs, repeats = selection.without_repeats(logs)
+        stretches = [pieces(part, args.split) for part in parts]
+    stretches, repeats = selection.without_repeats(stretches)
     if repeats:
-        of_gaps.append(f"Left out: {repeats} parts whose rows are those of another one.")
-    fitting, calibration = divide(args, logs, live)
+        notes_on_parts.append(f"Left out: {repeats} parts whose rows are those of another one.")
+    fitting, calibration = divide(args, stretches, is_live)
 
     spec = fitting[0].spec
-    with stage("learning", console, {}) as progress:
+    with stage("learning", console) as progress:
         monitor: Any = make_monitor(args.monitor, spec, **settings(args)).fit(fitting, progress)
         monitor.calibrate(calibration, **args.promise.named)
     monitor.save(args.out)
 
-    of_columns = notes_on_columns(args, spec)
-    of_body = notes_on_body(args, monitor)
-    for note in chain(notes, of_columns, of_body, mute_channels(fitting)):
+    on_columns = notes_on_columns(args, spec)
+    on_body = notes_on_body(args, monitor)
+    for note in chain(notes, on_columns, on_body, mute_channels(fitting)):
         say(f"Note: {note}.")
     rows = sum(map(len, fitting))
     say(
@@ -327,11 +346,11 @@ def fit(args: Args, console: Console) -> int:
     )
     if left_out:
         say(f"Left out: {left_out}.")
-    for line in chain(of_gaps, summary_of_threshold(args, monitor, len(calibration))):
+    for line in chain(notes_on_parts, summary_of_threshold(args, monitor, len(calibration))):
         say(line)
     seconds = time.perf_counter() - start
     say(f"Wrote {args.out} after {seconds:.0f} s. Next: asm-gym watch LOG --monitor {args.out}")
-    return ended(notes)
+    return exit_code_of_reading(notes)
 
 
 def summary_of_threshold(args: Args, monitor: Any, calibration: int) -> Iterator[str]:

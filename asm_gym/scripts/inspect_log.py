@@ -22,11 +22,12 @@ from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_file import write_schema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, recordings_in
-from asm_gym.data.tables import Columns
+from asm_gym.data.table_layout import Columns
 from asm_gym.evaluation import figures
 from asm_gym.scripts.command import BAD_NEWS, DONE, option, run
-from asm_gym.scripts.log_options import LogOptions, ended
+from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 
+DRAWN_LOGS = 3  # logs of a folder that are drawn; each other log gets one line
 FORMATS = {
     "from": "{:.4g}",
     "to": "{:.4g}",
@@ -45,8 +46,6 @@ class Args(LogOptions):
     """A file or a folder, as asm-gym fit reads it."""
     out: Path = option(Path("runs/inspect"), metavar="FOLDER")
     """Folder of the pictures."""
-    logs: int = option(3, least=1)
-    """Number of logs of a folder to draw; each other log gets one line."""
     schema: Path | None = option(None, metavar="FILE")
     """File to write the schema to, which says how the logs are read; edit it, and name it to fit and watch."""
 
@@ -69,32 +68,33 @@ class Recording:
 def inspect(args: Args, console: Console) -> int:
     """Read, print the table of the first log and a line of every other, and draw pictures."""
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
-    remarks: set[str] = set()  # that were said: what is alike in many logs is said once
-    trouble = False
+    printed: set[str] = set()  # remarks; one that holds for many logs is printed once
+    exit_code = DONE
     with noted() as notes:
         for number, recording in enumerate(recordings(args)):
             source = recording.source
-            log = inspect_log(
-                source.name, table_of_source(source), recording.schema, recording.problem
-            )
-            trouble = trouble or bool(log.trouble)
+            columns = columns_of(source)
+            log = inspect_log(source.name, columns, recording.schema, recording.problem)
+            if log.trouble:
+                exit_code = BAD_NEWS
             say(log.caption())
             if number == 0:
-                for line in table(log.facts()):
+                for line in lines_of_table(log.facts()):
                     say(line)
             for remark in log.remarks():
-                if remark not in remarks:
+                if remark not in printed:
                     say(f"- {remark}")
-            remarks.update(log.remarks())
-            if number < args.logs:
+            printed.update(log.remarks())
+            if number < DRAWN_LOGS:
                 picture = args.out / f"{picture_name(source)}.png"
-                say(f"Wrote {figures.save(figures.log_figure(log), picture)}")
+                figures.save(figures.log_figure(log), picture)
+                say(f"Wrote {picture}")
             if number == 0 and args.schema is not None:
                 write_schema(args.schema, recording.schema)
                 say(f"Wrote {args.schema}. Next: asm-gym fit {args.log} --schema {args.schema}")
     for note in notes:
         say(f"Note: {note}.")
-    return ended(notes, BAD_NEWS if trouble else DONE)
+    return exit_code_of_reading(notes, exit_code)
 
 
 def recordings(args: Args) -> Iterator[Recording]:
@@ -115,7 +115,7 @@ def recordings(args: Args) -> Iterator[Recording]:
             schema = replace(schema, rate=0.0)
     for source in sources:
         if source.episode is not None or schema is None:
-            own = infer_schema([table_of_source(source)], SchemaHints(channels=("*",)))
+            own = infer_schema([columns_of(source)], SchemaHints(channels=("*",)))
             yield Recording(source=source, schema=own)
             continue
         parts = recordings_in(source.columns, schema.clock)
@@ -129,32 +129,46 @@ def recordings(args: Args) -> Iterator[Recording]:
 
 def picture_name(source: Source) -> str:
     """Return the name of a recording's picture."""
-    name = source.name.replace(Path(source.file).suffix, "") if source.file else source.name
+    name = source.name
+    if source.file:
+        name = name.replace(Path(source.file).suffix, "")
     return name.replace(os.sep, "_") or "log"
 
 
-def table_of_source(source: Source) -> Columns:
-    """Return the columns of a recording; of an episode, its stream."""
+def columns_of(source: Source) -> Columns:
+    """Return the columns of a recording; of an episode, its time and stream."""
     if source.episode is None:
         return source.columns
-    stream, spec = source.episode.stream, source.episode.spec
-    rows = {label: stream[:, k] for k, label in enumerate(spec.labels)}
-    return {"time": np.arange(len(stream)) * spec.dt} | rows
+    stream = source.episode.stream
+    spec = source.episode.spec
+    columns: Columns = {"time": np.arange(len(stream)) * spec.dt}
+    for k, label in enumerate(spec.labels):
+        columns[label] = stream[:, k]
+    return columns
 
 
-def table(facts: list[dict[str, Any]]) -> list[str]:
-    """Return a line a column, however narrow the console: a table with borders would fold away what matters."""
-    headings = [h for h in facts[0] if any(row[h] for row in facts)] if facts else []
-    rows = [headings, *([_cell(heading, row[heading]) for heading in headings] for row in facts)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
+def lines_of_table(facts: list[dict[str, Any]]) -> list[str]:
+    """Return a line for each column of a log: plain text, as a table with borders folds in a narrow console."""
+    if not facts:
+        return []
+    headings = [heading for heading in facts[0] if any(fact[heading] for fact in facts)]
+    rows = [headings]
+    rows += [[_cell(heading, fact[heading]) for heading in headings] for fact in facts]
+    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        padded = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        lines.append("  ".join(padded).rstrip())
+    return lines
 
 
-def _cell(heading: str, fact: Any) -> str:
-    known = fact == fact and (fact or heading in ("from", "to"))  # words have no range: NaN
-    return FORMATS.get(heading, "{}").format(fact) if known else ""
+def _cell(heading: str, value: Any) -> str:
+    """Format a fact; empty for NaN, the range of words, and for what there is none of."""
+    is_nan = value != value
+    is_range = heading in ("from", "to")
+    if is_nan or not (value or is_range):
+        return ""
+    return FORMATS.get(heading, "{}").format(value)
 
 
 main = partial(run, "inspect", Args, inspect)

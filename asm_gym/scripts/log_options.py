@@ -62,6 +62,8 @@ class LogOptions(Checked):
         return read_schema(self.schema)
 
 
-def ended(notes: Sequence[str], code: int = DONE) -> int:
-    """Return the exit code of a command that read logs: ``REFUSED`` where a file of them could not be read."""
-    return REFUSED if any(UNREAD in line for line in notes) else code
+def exit_code_of_reading(notes: Sequence[str], otherwise: int = DONE) -> int:
+    """Return ``REFUSED`` where one of the readers' notes is of a file that could not be read, else ``otherwise``."""
+    if any(UNREAD in note for note in notes):
+        return REFUSED
+    return otherwise

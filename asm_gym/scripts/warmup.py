@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -36,32 +37,35 @@ class Args:
 
 def warm_up(args: Args, console: Console) -> None:
     """Compile memory and simulation in two processes (plain ones: the core has no loky), and print where it is kept."""
-    seconds: dict[str, float] = {}
+    start = time.perf_counter()
     with (
-        stage("compiling", console, seconds) as progress,
+        stage("compiling", console) as progress,
         ProcessPoolExecutor(2, get_context("spawn")) as processes,
     ):
-        for done, part in enumerate(as_completed(map(processes.submit, (_learn, _step))), 1):
+        parts = [processes.submit(_compile_memory), processes.submit(_compile_simulation)]
+        for done, part in enumerate(as_completed(parts), 1):
             part.result()
             progress(done, 3)
-        _step(NeuralASMSafety)
+        _compile_simulation(NeuralASMSafety)
         progress(3, 3)
+    seconds = time.perf_counter() - start
     where = kept_in(observe_rows) or "memory only"
-    console.print(
-        f"Compiled after {sum(seconds.values()):.0f} s; kept in {where}",
-        soft_wrap=True,
-        markup=False,
-    )
+    line = f"Compiled after {seconds:.0f} s; kept in {where}"
+    console.print(line, soft_wrap=True, markup=False)
 
 
-def _learn() -> None:
-    asm = NeuralASM.pretrained("panda")
+def _compile_memory() -> None:
+    """Observe, guard, fit and calibrate a little."""
+    memory = NeuralASM.pretrained("panda")
+    spec = memory.spec
     for batch in (1, 2):
-        asm.observe(asm.initial_state(batch), np.zeros((batch, asm.spec.size)))
-    guard = Guard(RobotFacts.unknown(asm.spec), asm, GuardOptions("monitor"))
+        memory.observe(memory.initial_state(batch), np.zeros((batch, spec.size)))
+    guard = Guard(RobotFacts.unknown(spec), memory, GuardOptions("monitor"))
     guard.begin()
-    nothing = np.zeros((1, asm.spec.motor.size), np.float32)
-    guard.judge(SensedRows(np.zeros((1, asm.spec.size), np.float32)), nothing)
+    row = np.zeros((1, spec.size), np.float32)
+    action = np.zeros((1, spec.motor.size), np.float32)
+    guard.judge(SensedRows(row), action)
+
     spec = StreamSpec((Channel("x", 3, group="joint"), Channel("u", 1, group="action")), dt=0.05)
     rng = np.random.default_rng(0)
     episodes = [Episode.from_stream(rng.normal(size=(30, 4)), spec) for _ in range(8)]
@@ -69,14 +73,19 @@ def _learn() -> None:
     small.calibrate(episodes[4:], false_alarm_rate=0.5)
 
 
-def _step(around: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] = lambda env: env) -> None:
-    if find_spec("robosuite"):
-        with around(gym.make("asm_gym/Lift-v0")) as env:
-            env.reset(seed=0)
-            arm: Any = env.unwrapped
-            arm.contact_limits = arm.contact_limits or ContactLimits()
-            for _ in range(3):
-                env.step(np.zeros(env.action_space.shape or (), np.float32))
+def _compile_simulation(
+    wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] = lambda env: env,
+) -> None:
+    """Take a few steps of an environment in this wrapper; by default in none."""
+    if find_spec("robosuite") is None:
+        return
+    with wrapper(gym.make("asm_gym/Lift-v0")) as env:
+        env.reset(seed=0)
+        arm: Any = env.unwrapped
+        arm.contact_limits = arm.contact_limits or ContactLimits()
+        action = np.zeros(env.action_space.shape or (), np.float32)
+        for _ in range(3):
+            env.step(action)
 
 
 main = partial(run, "warmup", Args, warm_up)

@@ -26,13 +26,14 @@ from typing import Any
 
 from rich.console import Console
 
+from asm_gym.data.alarm_reasons import SURPRISING
+from asm_gym.data.bridging import bridge_of, bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.dds_topics import publisher
 from asm_gym.data.live import lines_from, live_source
 from asm_gym.data.logs import Log, read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.schema import ORIGIN, LogSchema
-from asm_gym.data.timing import SURPRISING, bridge_of, bridged
+from asm_gym.data.schema import LOG_ORIGIN, LogSchema
 from asm_gym.evaluation import alarms as recorded
 from asm_gym.evaluation.alarms import HEADINGS, Alarm
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -53,14 +54,14 @@ from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import load_monitor
 from asm_gym.rollouts.progress import stage
 from asm_gym.scripts.command import BAD_NEWS, DONE, REFUSED, option, origin, run
-from asm_gym.scripts.log_options import LogOptions, ended
+from asm_gym.scripts.log_options import LogOptions, exit_code_of_reading
 from asm_gym.validation import check_number
 
 AT_ONCE = 64  # episodes scored side by side
 LIVE_ONLY = ("until_alarm", "hook", "topic", "watchdog", "policy")  # options
 RECORDED_ONLY = ("rate", "channels", "ignore", "label", "columns")
-KINDS = "a live source", "a recording"
-SHOWN_ROWS = 20  # alarms printed, missing data last; the file holds them all
+PRINTED = 20  # alarms of a recording; the file holds them all
+DRAWN_EPISODES = 4  # episodes in the report, the most surprising ones
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,30 +96,30 @@ class Args(LogOptions):
     """Process id of the policy; the watchdog treats its death as an alarm."""
     silence: float = option(2.0, check=partial(check_number, "silence", above=0), metavar="SECONDS")
     """Time without a row after which a live source counts as dead, which is an alarm."""
-    figures: int = option(4, least=1)
-    """Number of episodes to draw, the most surprising first."""
 
 
 @dataclass
 class Review:
-    """What was found in the recordings up to now."""
+    """Alarms in the recordings that were scored up to now."""
 
     alarms: list[Alarm] = field(default_factory=list)
-    worst: list[ScoredEpisode] = field(default_factory=list)  # the most surprising first
+    worst: list[ScoredEpisode] = field(
+        default_factory=list
+    )  # ``DRAWN_EPISODES``, the most surprising first
     episodes: int = 0
     excused: Counter[str] = field(default_factory=Counter)  # events that were no alarms
     bridged_rows: int = 0
 
-    def add(self, logs: Sequence[Log], monitor: Any, bridge: float, figures: int) -> None:
-        """Score some recordings, and keep the ``figures`` most surprising ones."""
+    def add(self, logs: Sequence[Log], monitor: Any, bridge: float) -> None:
+        """Score some recordings; gaps of at most ``bridge`` [s] are not judged."""
         for log, trace in zip(logs, recorded.traces_of(logs, monitor, bridge), strict=True):
             rows = bridged(log.episode.stream, monitor.spec.dt, bridge)
             self.bridged_rows += int(rows.sum())
-            self.alarms += recorded.alarms_of(trace, log.episode.info.get(ORIGIN))
+            self.alarms += recorded.alarms_of(trace, log.episode.info.get(LOG_ORIGIN))
             self.excused.update(recorded.excused_in(trace))
             self.worst.append(trace)
         self.worst.sort(key=lambda trace: -recorded.sensed_peak(trace))
-        del self.worst[figures:]
+        del self.worst[DRAWN_EPISODES:]
         self.episodes += len(logs)
 
     def summary(self) -> str:
@@ -131,37 +132,41 @@ class Review:
 
 def review(args: Args, monitor: Any, console: Console) -> int:
     """Score a recording, write its alarms and a report, and print the alarms."""
-    found = Review()
+    reviewed = Review()
     bridge = bridge_of(args.bridge, monitor.spec.dt)
     writable(args.out / "alarms.csv")
-    progress_to = Console(stderr=True) if args.json else console
-    with stage("watching", progress_to, {}) as progress, noted() as notes:
+    progress_console = console
+    if args.json:
+        progress_console = Console(stderr=True)
+    with stage("watching", progress_console) as progress, noted() as notes:
         logs = iter(read_logs(args.source, args.hints(), schema_of(args, monitor)))
         while group := list(islice(logs, AT_ONCE)):  # a folder may be larger than memory
-            found.add(group, monitor, bridge, args.figures)
-            progress(found.episodes, found.episodes)
+            reviewed.add(group, monitor, bridge)
+            progress(reviewed.episodes, reviewed.episodes)
 
     table = io.StringIO(newline="")
-    rows = [map(recorded.plain_cell, alarm.cells()) for alarm in found.alarms]
+    rows = [map(recorded.plain_cell, alarm.cells()) for alarm in reviewed.alarms]
     csv.writer(table).writerows([HEADINGS, *rows])
     write_text(args.out / "alarms.csv", table.getvalue())
-    written = publish(args, found)
+    written = publish(args, reviewed)
     say = partial(console.print, soft_wrap=True, highlight=False, markup=False)
     if args.json:
-        say_events(found, notes, say)
+        say_events(reviewed, notes, say)
     else:
-        say_table(found, notes, bridge, say)
+        say_table(reviewed, notes, bridge, say)
         say(written)
-    return ended(notes, BAD_NEWS if found.alarms else DONE)
+    if reviewed.alarms:
+        return exit_code_of_reading(notes, BAD_NEWS)
+    return exit_code_of_reading(notes)
 
 
-def say_events(found: Review, notes: Sequence[str], say: Callable[[str], None]) -> None:
+def say_events(reviewed: Review, notes: Sequence[str], say: Callable[[str], None]) -> None:
     """Print notes, alarms and the summary of recordings as JSON lines."""
     for line in notes:
         say(LiveEvent(kind=NOTE, time=0.0, text=line).to_json())
-    for alarm in found.alarms:
+    for alarm in reviewed.alarms:
         say(event_of(alarm).to_json())
-    say(LiveEvent(kind=SUMMARY, time=0.0, text=found.summary()).to_json())
+    say(LiveEvent(kind=SUMMARY, time=0.0, text=reviewed.summary()).to_json())
 
 
 def event_of(alarm: Alarm) -> LiveEvent:
@@ -183,26 +188,31 @@ def event_of(alarm: Alarm) -> LiveEvent:
 
 
 def say_table(
-    found: Review, notes: Sequence[str], bridge: float, say: Callable[[str], None]
+    reviewed: Review, notes: Sequence[str], bridge: float, say: Callable[[str], None]
 ) -> None:
     """Print notes, the summary and the largest alarms of recordings, missing data last."""
     for line in notes:
         say(f"Note: {line}.")
-    if found.bridged_rows:
+    if reviewed.bridged_rows:
         say(
-            f"Bridged {found.bridged_rows} rows that lack a number, in gaps of at most "
+            f"Bridged {reviewed.bridged_rows} rows that lack a number, in gaps of at most "
             f"{bridge:.3g} s: they are not judged."
         )
-    alarms = sorted(found.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
-    shown = [alarm.cells() for alarm in alarms[:SHOWN_ROWS]]
-    more = "" if len(shown) == len(alarms) else f"; the {SHOWN_ROWS} largest:"
-    say(found.summary() + more)
-    if not shown:
+    alarms = sorted(reviewed.alarms, key=lambda alarm: (alarm.why != SURPRISING, -alarm.excess))
+    printed = alarms[:PRINTED]
+    summary = reviewed.summary()
+    if len(printed) < len(alarms):
+        summary += f"; the {PRINTED} largest:"
+    say(summary)
+    if not printed:
         return
-    has_stamps = any(cells[6] for cells in shown)
-    width = max(len(cells[3]) for cells in shown)
-    for log, start, end, channel, why, excess, stamp, _ in [HEADINGS, *shown]:
-        clock = f"{stamp:>16}  " if has_stamps else ""
+    has_stamps = any(alarm.stamp is not None for alarm in printed)
+    width = max(len(alarm.channel) for alarm in printed)
+    for cells in (HEADINGS, *(alarm.cells() for alarm in printed)):
+        log, start, end, channel, why, excess, stamp, _ = cells
+        clock = ""
+        if has_stamps:
+            clock = f"{stamp:>16}  "
         say(f"{start:>10} {end:>10} {excess:>11}  {clock}{channel:<{width}}  {why:<12}  {log}")
 
 
@@ -219,43 +229,51 @@ def schema_of(args: Args, monitor: Any) -> LogSchema:
     return given
 
 
-def publish(args: Args, found: Review) -> str:
+def publish(args: Args, reviewed: Review) -> str:
     """Write a report with the most surprising episodes; return what was written, and what is missing for more."""
     try:
         with needed_for("the report"):
             from asm_gym.evaluation import figures
-            from asm_gym.evaluation.report import write_report
+            from asm_gym.evaluation.report_page import write_report
     except ImportError as error:
         return f"Wrote {args.out / 'alarms.csv'}; {error}"
-    over_time = "Surprise over time, the most surprising episode first (--figures sets how many)"
-    drawn = {
-        "surprise": figures.surprise_figure(found.worst),
-        "stream": figures.stream_figure(found.worst[0]),
-    }
-    for name, figure in drawn.items():
-        figures.save(figure, args.out / f"{name}.png")
+    surprise = figures.surprise_figure(reviewed.worst)
+    stream = figures.stream_figure(reviewed.worst[0])
+    figures.save(surprise, args.out / "surprise.png")
+    figures.save(stream, args.out / "stream.png")
     tables = []
-    if found.alarms:
-        tables = [Table("Alarms", HEADINGS, [alarm.cells() for alarm in found.alarms])]
+    if reviewed.alarms:
+        tables = [Table("Alarms", HEADINGS, [alarm.cells() for alarm in reviewed.alarms])]
+    report = args.out / "report.html"
     write_report(
-        args.out / "report.html",
-        f"asm-gym watch: {args.source}",
-        f"{found.summary()}, as {args.monitor} sees them.",
-        tables,
-        {over_time: drawn["surprise"], "What its most surprising channels sensed": drawn["stream"]},
+        report,
+        title=f"asm-gym watch: {args.source}",
+        intro=f"{reviewed.summary()}, as {args.monitor} sees them.",
+        tables=tables,
+        drawn={
+            "Surprise over time, the most surprising episode first": surprise,
+            "What its most surprising channels sensed": stream,
+        },
         details=origin(),
     )
-    return f"Wrote {args.out / 'report.html'} and alarms.csv"
+    return f"Wrote {report} and alarms.csv"
+
+
+def refuse_options(args: Args, names: Sequence[str], purpose: str, source: str) -> None:
+    """Raise ValueError where one of these options is given, for which the source is of the wrong kind."""
+    for name in names:
+        if getattr(args, name):
+            option_name = f"--{name.replace('_', '-')}"
+            raise ValueError(f"{option_name} {purpose}, and {args.source} is {source}")
 
 
 def watch(args: Args, console: Console) -> int:
     """Watch a recording or a live source."""
     live = live_source(args.source)
-    wrong, given, own = (RECORDED_ONLY, *KINDS[::-1]) if live else (LIVE_ONLY, *KINDS)
-    if said := [n for n in wrong if getattr(args, n)]:
-        raise ValueError(
-            f"--{said[0].replace('_', '-')} is for {given}, and {args.source} is {own}"
-        )
+    if live is None:
+        refuse_options(args, LIVE_ONLY, "is for a live source", "a recording")
+    else:
+        refuse_options(args, RECORDED_ONLY, "is for a recording", "a live source")
     monitor: Any = load_monitor(args.monitor)
     if monitor.threshold_ is None or not math.isfinite(monitor.threshold_):
         raise ValueError(f"{args.monitor} has no threshold: calibrate it, as asm-gym fit does")
@@ -270,15 +288,16 @@ def watch_live(args: Args, monitor: Any, console: Console, returns: bool) -> int
     reopen: Callable[[float], Iterator[str]] | None = None
     if returns:
         reopen = opened
-    lines = opened(max(args.wait, args.silence))
-    guarded = ""
+    first_silence_s = max(args.wait, args.silence)
+    lines = opened(first_silence_s)
     beat = None
     outlets = outlets_of(args, console)
     with _watchdog(args, monitor.spec.dt) as watchdog:
+        event = f"watching {args.source}"
         if watchdog is not None:
-            guarded = ", guarded by a watchdog"
+            event += ", guarded by a watchdog"
             beat = watchdog.beat
-        say_aside(f"watching {args.source}{guarded}")
+        say_aside(event)
         settings = WatchSettings(
             bridge_s=bridge_of(args.bridge, monitor.spec.dt),
             reopen=reopen,

@@ -28,8 +28,8 @@ from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarm
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
-from asm_gym.policies.base import Policy
 from asm_gym.policies.hold import Hold
+from asm_gym.policies.policy import Policy
 from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import layers
 from asm_gym.validation import as_float32, short_repr

@@ -21,11 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asm_gym.data.action_meaning import ActionMeans
+from asm_gym.data.alarm_reasons import blamed, reason
 from asm_gym.data.live_clock import ClockWentBack, Pace
-from asm_gym.data.timing import blamed, reason
 from asm_gym.detection.commands import command_limits
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.alarm_terms import FAILURE, OUT_OF_RANGE
@@ -34,6 +33,7 @@ from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarmName
 from asm_gym.guard.preview import Preview
 from asm_gym.guard.report import RowReport
+from asm_gym.guard.robot_table import Floats32
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
@@ -48,8 +48,6 @@ from asm_gym.wrappers.lerobot_arm import (
     servo_of,
 )
 from asm_gym.wrappers.servo_faults import ServoHistory
-
-Floats32 = NDArray[np.float32]
 
 _log = logging.getLogger("asm_gym.lerobot")
 
@@ -281,7 +279,7 @@ class LeRobotGuard(Adapter):
     def _check_rate(self) -> None:
         """Log that rows come at another rate than the memory reads."""
         try:
-            self._pace.lost(time.monotonic())
+            self._pace.rows_lost_before(time.monotonic())
         except ClockWentBack as error:
             self._pace = Pace(self._spec.dt)
             _log.warning("%s", error)

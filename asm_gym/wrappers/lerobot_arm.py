@@ -93,7 +93,7 @@ def meaning_of(
     """
     means = tuple(map(_usual_meaning, names))
     if action_means is not None:
-        means = ActionMeaning.told(action_means, len(names)).means
+        means = ActionMeaning.declared(action_means, len(names)).means
     column_by_label = {label: column for column, label in enumerate(labels)}
     return ActionMeaning(
         means=means,

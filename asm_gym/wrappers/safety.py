@@ -8,20 +8,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
 
 from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
 from asm_gym.guard.preview import Preview, checked_chunk
 from asm_gym.guard.report import AsmInfo, LazyInfo, RowReport, asm_info
+from asm_gym.guard.robot_table import Floats32
 from asm_gym.monitors import Monitor
 from asm_gym.policies.hold import HoldsItself, why_changed
 from asm_gym.stream_source import StepResult, StreamSource
 from asm_gym.validation import as_float32, short_repr
 from asm_gym.wrappers.guarding import Guarding, as_action, load_felt, sensed_row
-
-Floats32 = NDArray[np.float32]
 
 
 class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):

@@ -19,15 +19,13 @@ from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
 from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
-from asm_gym.guard.robot_table import Mask
+from asm_gym.guard.robot_table import Floats32, Mask
 from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import refuse_running_statistics
 from asm_gym.validation import as_float32
 from asm_gym.wrappers.env_attributes import EnvAttributes, askable
 from asm_gym.wrappers.guarding import Guarding, as_action, load_felt, sensed_row
-
-Floats32 = NDArray[np.float32]
 
 
 class VectorNeuralASMSafety(Guarding, VectorWrapper):

@@ -22,10 +22,9 @@ from asm_gym.memory.linear_association import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
 from asm_gym.monitors.surprise import Progress
+from asm_gym.monitors.torque.crossfitting import LEAST_REMAINDER
 from asm_gym.scaling import rows_apart
 from asm_gym.spec import StreamSpec
-
-LEAST_SPREAD = 1e-4  # of what is left of a standardised number
 
 
 class LinearAssociation(ScaledModel):
@@ -44,9 +43,10 @@ class LinearAssociation(ScaledModel):
         check_inputs(senses.inputs)
         inputs = np.concatenate([reading.inputs[self.lag :] for reading in readings])
         D = learn_linear(inputs, ChangeLayout.of(senses))
-        squares = (inputs[:, senses.changes] - inputs @ D.T) ** 2
-        remainder = np.maximum(np.sqrt(np.mean(squares, axis=0)), LEAST_SPREAD)
-        return self.restore({**senses.arrays, "D": D, "remainder": remainder})
+        rest = inputs[:, senses.changes] - inputs @ D.T
+        remainder = np.sqrt(np.mean(rest**2, axis=0))
+        learned = {"D": D, "remainder": np.maximum(remainder, LEAST_REMAINDER)}
+        return self.restore({**senses.arrays, **learned})
 
     def predict(
         self, state: RowHistory, rows: NDArray[np.float64]

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
+from asm_gym.detection.channel_columns import columns_where
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 
-LEAST_SPREAD = 1e-6  # of a channel [its unit]
+LEAST_CHANNEL_SPREAD = 1e-6  # of a channel [its unit]
 
 
 class FixedLimit(StreamModel):
@@ -37,13 +38,9 @@ class FixedLimit(StreamModel):
 
     def __init__(self, spec: StreamSpec) -> None:
         super().__init__(spec)
-        columns: list[int] = []
-        for name, place in spec.slices.items():
-            if name.endswith(self.channel):
-                columns += range(spec.size)[place]
-        if not columns:
+        self._columns = columns_where(spec, lambda channel: channel.name.endswith(self.channel))
+        if not len(self._columns):
             raise ValueError(f"this stream has no {self.channel}; it has: {', '.join(spec.slices)}")
-        self._columns = np.array(columns, np.intp)
 
     @property
     def error_columns(self) -> NDArray[np.intp]:
@@ -52,10 +49,11 @@ class FixedLimit(StreamModel):
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        rows = np.concatenate([e.stream for e in episodes])[:, self._columns].astype(float)
+        streams = np.concatenate([episode.stream for episode in episodes])
+        rows = streams[:, self._columns].astype(float)
         scale = np.ones(rows.shape[1])
         if self.scaled:
-            scale = np.maximum(rows.std(axis=0), LEAST_SPREAD)
+            scale = np.maximum(rows.std(axis=0), LEAST_CHANNEL_SPREAD)
         return self.restore({"limit_centre": rows.mean(axis=0), "limit_scale": scale})
 
     def start(self, batch: int) -> RowHistory:

@@ -19,13 +19,14 @@ from scipy.linalg import LinAlgError, solve_discrete_are
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.linear_association import check_inputs
+from asm_gym.monitors.baselines.fixed_limits import LEAST_CHANNEL_SPREAD
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
 from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
 LEAST_VARIANCE = 1e-4  # of w and v, standardised
-LEAST_SPREAD = 1e-6  # of a channel [its unit]
+
 
 Floats = NDArray[np.float64]
 
@@ -51,56 +52,65 @@ class Kalman(StreamModel):
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
         check_inputs(self.spec.size + 1)
-        sensed = [e.stream[:, self.spec.sensory].astype(np.float64) for e in episodes]
-        rows = np.concatenate(sensed)
-        mean = rows.mean(axis=0)
-        spread = np.maximum(rows.std(axis=0), LEAST_SPREAD)
-        states = [(x - mean) / spread for x in sensed]
+        sensory = self.spec.sensory
+        sensed = [episode.stream[:, sensory].astype(np.float64) for episode in episodes]
+        all_sensed = np.concatenate(sensed)
+        mean = all_sensed.mean(axis=0)
+        spread = np.maximum(all_sensed.std(axis=0), LEAST_CHANNEL_SPREAD)
+        states = [(rows - mean) / spread for rows in sensed]
 
-        before = np.concatenate([x[:-1] for x in states])  # (N, X)
-        after = np.concatenate([x[1:] for x in states])
-        commands = np.concatenate([e.stream[1:, self.spec.motor] for e in episodes])
-        inputs = np.hstack([before, commands.astype(np.float64), np.ones((len(after), 1))])
+        before = np.concatenate([rows[:-1] for rows in states])  # (N, X)
+        after = np.concatenate([rows[1:] for rows in states])
+        commands = np.concatenate([episode.stream[1:, self.spec.motor] for episode in episodes])
+        inputs = _inputs(before, commands.astype(np.float64))
         penalty = self.ridge * len(inputs) * np.eye(inputs.shape[1])
-        weights = np.linalg.solve(inputs.T @ inputs + penalty, inputs.T @ after)
+        gram = inputs.T @ inputs + penalty
+        weights = np.linalg.solve(gram, inputs.T @ after)
         residual = after - inputs @ weights
 
-        noise = self.spec.noise[self.spec.sensory] / spread
+        noise = self.spec.noise[sensory] / spread
         R = np.diag(np.maximum(noise**2, LEAST_VARIANCE))
-        P = _state_covariance(A=weights[: len(mean)].T, R=R, residual=residual)
+        A = weights[: len(sensory)].T
+        P = _state_covariance(A, R, residual)
         S = P + R
-        gain = np.linalg.solve(S.T, P.T).T
-        return self.restore(
-            {
-                "weights": weights,
-                "gain": gain,
-                "deviation": np.sqrt(np.diag(S)),
-                "mean": mean,
-                "spread": spread,
-            }
-        )
+        learned = {
+            "weights": weights,
+            "gain": np.linalg.solve(S.T, P.T).T,
+            "deviation": np.sqrt(np.diag(S)),
+            "mean": mean,
+            "spread": spread,
+        }
+        return self.restore(learned)
 
     def start(self, batch: int) -> KalmanState:
-        return KalmanState(np.zeros((batch, len(self.spec.sensory))), np.zeros(batch, np.int64))
+        estimate = np.zeros((batch, len(self.spec.sensory)))
+        return KalmanState(estimate, steps=np.zeros(batch, np.int64))
 
     def predict(self, state: KalmanState, rows: Floats) -> tuple[KalmanState, ModelOutput]:
         learned = self.learned_
         y = (rows[:, self.spec.sensory] - learned["mean"]) / learned["spread"]
-        commands = zero_unless_finite(rows[:, self.spec.motor])
-        inputs = np.hstack([state.estimate, commands, np.ones((len(rows), 1))])
-        begun = (state.steps > 0)[:, None]
-        expected = np.where(begun, inputs @ learned["weights"], zero_unless_finite(y))
+        inputs = _inputs(state.estimate, zero_unless_finite(rows[:, self.spec.motor]))
+        has_begun = state.steps[:, None] > 0
+        predicted = inputs @ learned["weights"]
+        expected = np.where(has_begun, predicted, zero_unless_finite(y))
         innovation = zero_unless_finite(y - expected)
         estimate = expected + innovation @ learned["gain"].T
         error = innovation / learned["deviation"]
         return KalmanState(estimate, state.steps + 1), ModelOutput(error, no_context(rows))
 
 
+def _inputs(state: Floats, commands: Floats) -> Floats:
+    """Return x_{t-1} (N, X), u_t (N, A) and 1 side by side."""
+    return np.hstack([state, commands, np.ones((len(state), 1))])
+
+
 def _state_covariance(A: Floats, R: Floats, residual: Floats) -> Floats:
     """Return P (X, X) of the predicted state, from the residuals (N, X) of regression."""
+    covariance = residual.T @ residual / len(residual)
     # A residual holds the new measurement's noise and, through A, that of the last.
-    excess = residual.T @ residual / len(residual) - R - A @ R @ A.T
-    values, vectors = np.linalg.eigh((excess + excess.T) / 2)
+    excess = covariance - R - A @ R @ A.T
+    symmetric = (excess + excess.T) / 2
+    values, vectors = np.linalg.eigh(symmetric)
     Q = (vectors * np.maximum(values, LEAST_VARIANCE)) @ vectors.T  # the nearest that is positive
     try:
         return solve_discrete_are(A.T, np.eye(len(A)), Q, R)

@@ -39,24 +39,24 @@ from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed
 
 EPOCHS = 200  # passes at most over whole episodes
-BATCH = 16  # episodes side by side
-FRESH = 5  # one in so many episodes is not trained on, but says when to stop
+EPISODES_IN_BATCH = 16  # episodes side by side
+ONE_IN_FRESH = 5  # one in so many episodes is not trained on, but says when to stop
 
-RATE = 1e-3  # first step size
+FIRST_RATE = 1e-3  # first step size
 PATIENCE = 5  # epochs without a gain after which the step size is cut
-SLOWER = 0.3  # share that it is cut to
-SLOWEST = 3e-5  # step size below which training has converged
+RATE_CUT = 0.3  # share that it is cut to
+FINAL_RATE = 3e-5  # step size below which training has converged
 
-LARGEST_ERROR = 20.0
+FULL_WEIGHT_ERROR = 20.0
 """Largest error in training, in standard deviations, that has its full weight; contacts would drown all else."""
 
 LOG_VARIANCE = (-12.0, 8.0)  # limits of what the GRU predicts
 
 LAYERS = 3  # hidden ones of the flow
-ROWS = 256  # of a batch of the flow
+ROWS_IN_BATCH = 256  # of a batch of the flow
 STAGES = 10  # steps of the flow
 # Where standardised numbers are cut off: such networks diverge far from what they have seen.
-FARTHEST = 30.0
+CLIPPED_AT = 30.0
 
 
 class TorchModel(ScaledModel):
@@ -120,32 +120,34 @@ def train_on_episodes(
     A fifth of the ``episodes`` is not trained on, none of fewer than five; ``loss`` is that of some, training or not.
     """
     order = rng.permutation(episodes).astype(np.intp)
-    kept = episodes // FRESH
+    kept = episodes // ONE_IN_FRESH
     trained = order[kept:]
     fresh = order[:kept] if kept else order
-    optimiser = torch.optim.Adam(module.parameters(), RATE)
+    optimiser = torch.optim.Adam(module.parameters(), FIRST_RATE)
     plateaus = torch.optim.lr_scheduler.ReduceLROnPlateau(
-        optimiser, factor=SLOWER, patience=PATIENCE
+        optimiser, factor=RATE_CUT, patience=PATIENCE
     )
     least = math.inf
     best = copy.deepcopy(module.state_dict())
     for epoch in range(EPOCHS):
         progress(epoch, EPOCHS)
         order = rng.permutation(trained)
-        for start in range(0, len(order), BATCH):
-            descend(loss(order[start : start + BATCH], True), optimiser)
+        for start in range(0, len(order), EPISODES_IN_BATCH):
+            descend(loss(order[start : start + EPISODES_IN_BATCH], True), optimiser)
         with torch.no_grad():
             now = float(loss(fresh, False))
         if now < least:
             least = now
             best = copy.deepcopy(module.state_dict())
         plateaus.step(now)
-        if optimiser.param_groups[0]["lr"] < SLOWEST:
+        if optimiser.param_groups[0]["lr"] < FINAL_RATE:
             break
     module.load_state_dict(best)
 
 
-def adam(module: nn.Module, updates: int, rate: float = RATE) -> tuple[torch.optim.Optimizer, Any]:
+def adam(
+    module: nn.Module, updates: int, rate: float = FIRST_RATE
+) -> tuple[torch.optim.Optimizer, Any]:
     """Return Adam and its cosine decay, the default of those who publish such models."""
     optimiser = torch.optim.Adam(module.parameters(), rate)
     return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
@@ -227,7 +229,7 @@ class GRU(TorchModel):
             mean, log_variance, _ = module(x)
             error = (changes - mean) * torch.exp(-0.5 * log_variance)
             huber = nn.functional.huber_loss(
-                error, torch.zeros_like(mean), reduction="none", delta=LARGEST_ERROR
+                error, torch.zeros_like(mean), reduction="none", delta=FULL_WEIGHT_ERROR
             )
             return ((huber + 0.5 * log_variance).mean(dim=-1) * real).sum() / real.sum()
 
@@ -285,7 +287,9 @@ class LogpZO(TorchModel):
     ) -> None:
         optimiser, schedule = adam(module, self.updates)
         rows = np.concatenate([_features(reading) for reading in readings])
-        for n, chosen in zip(range(self.updates), shuffled(len(rows), ROWS, rng), strict=False):
+        for n, chosen in zip(
+            range(self.updates), shuffled(len(rows), ROWS_IN_BATCH, rng), strict=False
+        ):
             progress(n, self.updates)
             x = torch.as_tensor(rows[chosen])
             noise = torch.randn_like(x)
@@ -307,4 +311,4 @@ class LogpZO(TorchModel):
 def _features(reading: ScaledRows) -> NDArray[np.float32]:
     """Return values, changes of slow channels, and the action (B, N)."""
     features = np.hstack([reading.senses, reading.commands[:, :-1]])
-    return np.clip(features, -FARTHEST, FARTHEST)
+    return np.clip(features, -CLIPPED_AT, CLIPPED_AT)

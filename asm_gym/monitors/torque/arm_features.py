@@ -11,43 +11,36 @@ the chain: a linear model can say neither without. Source: Stribeck friction smo
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import POSITION, SPEED, ratio
-from asm_gym.monitors.torque.body_model import BodyModel
+from asm_gym.data.names import POSITION_NAME, SPEED_NAME, ratio
+from asm_gym.detection.channel_columns import columns_where
+from asm_gym.monitors.torque.body_model import BodyModel, JointMotion
 from asm_gym.spec import StreamSpec
 
 Floats = NDArray[np.float64]
 
-FORCE = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
-COMMANDED = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
+TORQUE_NAME = re.compile(r"(.*[^a-z])?(efforts?|torques?|currents?|curr|tau|iq)([^a-z].*)?")
+COMMANDED_NAME = re.compile(r"(.*[^a-z])?(target|desired|computed)([^a-z].*)?")
 
 WIDTHS = (0.01, 0.1, 1.0)  # w, shares of a speed's spread
 MOST_ANGLES = 12  # of more angles no sines are taken: their products would be too many
 # Angles from the second on that are summed: shoulder, elbow and wrist often have parallel axes.
-CHAIN = 3
+LONGEST_SUM = 3
 
 
-class SensedRows(NamedTuple):
+class PhysicalRows(NamedTuple):
     """N rows of the X senses, in their own units."""
 
     values: Floats  # (N, X)
     changes: Floats  # (N, X) standardised
     spread: Floats  # (X,) of the values
     rate: Floats  # (X,) rate of a change of 1 [1/s]
-
-
-class JointMotion(NamedTuple):
-    """Motion of J joints in N rows."""
-
-    angle: Floats  # (N, J) [rad]
-    speed: Floats  # (N, J) [rad/s]
-    acceleration: Floats  # (N, J) [rad/s²]; 0 where speeds are changes of angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,31 +70,27 @@ class ArmFeatures:
         Raises:
             ValueError: the text ``urdf`` is no body model of the joints that are sensed.
         """
-        positions = named_columns(spec, POSITION)
-        moving = named_columns(spec, SPEED)
-        from_changes = not len(moving)
+        positions = named_columns(spec, POSITION_NAME)
+        speeds = named_columns(spec, SPEED_NAME)
+        from_changes = not len(speeds)
         if from_changes:
-            moving = positions
+            speeds = positions
         angles = positions
         if len(positions) > MOST_ANGLES:
             angles = positions[:0]
-        units = [channel.unit for channel in spec.channels for _ in channel.labels]
+        radians = [ratio(spec.units[i], "rad") or 1.0 for i in angles]
         body = None
         if urdf:
-            _check_joints(len(angles), len(moving))
+            _check_joints(len(angles), len(speeds))
             body = BodyModel.of(urdf, [spec.labels[i] for i in angles])
         return cls(
             senses=len(spec.sensory),
-            speeds=np.searchsorted(spec.sensory, moving),
+            speeds=np.searchsorted(spec.sensory, speeds),
             angles=np.searchsorted(spec.sensory, angles),
             from_changes=from_changes,
-            radians=np.array([ratio(units[i], "rad") or 1.0 for i in angles]),
+            radians=np.array(radians),
             body=body,
         )
-
-    def with_body(self, body: BodyModel) -> Self:
-        """Return the features by another body model, or by another order of its joints."""
-        return replace(self, body=body)
 
     @cached_property
     def sources(self) -> NDArray[np.bool_]:
@@ -109,47 +98,53 @@ class ArmFeatures:
         every_sense = np.arange(self.senses)
         of_speed = self.speeds[:, None] == every_sense  # (S, X)
         of_angle = self.angles[:, None] == every_sense  # (J, X)
-        friction = [of_speed] * len(WIDTHS)
+        parts = [of_speed] * len(WIDTHS)
         joints = len(self.angles)
-
         if self.body is not None:
-            weight = of_angle.any(axis=0)
-            motion = weight | of_speed.any(axis=0)
-            return np.vstack([*friction, *[weight] * joints, *[motion] * joints])
+            of_weight = of_angle.any(axis=0)
+            of_motion = of_weight | of_speed.any(axis=0)
+            parts += [of_weight] * joints + [of_motion] * joints
+            return np.vstack(parts)
 
-        single = np.vstack([of_angle, of_angle])
-        sums = [of_angle[1:end].any(axis=0) for end in range(3, min(joints, CHAIN + 1) + 1)]
+        of_single = np.vstack([of_angle, of_angle])
+        last = min(joints, LONGEST_SUM + 1)
+        of_sums = [of_angle[1:end].any(axis=0) for end in range(3, last + 1)]
         first, second = self._pairs
-        return np.vstack([*friction, single, *sums, *sums, single[first] | single[second]])
+        of_products = of_single[first] | of_single[second]
+        return np.vstack([*parts, of_single, *of_sums, *of_sums, of_products])
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """The sines and cosines of single angles that are multiplied (P,), (P,)."""
         return np.triu_indices(2 * len(self.angles))
 
-    def __call__(self, rows: SensedRows) -> Floats:
+    def __call__(self, rows: PhysicalRows) -> Floats:
         """Return the features (N, M) of rows."""
         if self.from_changes:
             speed = rows.changes[:, self.speeds]
         else:
             speed = rows.values[:, self.speeds] / rows.spread[self.speeds]
         parts = [np.tanh(speed / width) for width in WIDTHS]
-
         if self.body is not None:
-            motion = self.motion(rows)
-            parts += self.body.torques(motion.angle, motion.speed, motion.acceleration)
+            parts += self.body.torques(self.motion(rows))
         elif len(self.angles):
-            angle = rows.values[:, self.angles] * self.radians
-            single = np.hstack([np.sin(angle), np.cos(angle)])
-            sums = np.cumsum(angle[:, 1 : CHAIN + 1], axis=1)[:, 1:]
-            first, second = self._pairs
-            parts += [single, np.sin(sums), np.cos(sums), single[:, first] * single[:, second]]
+            parts += self._weight(rows.values[:, self.angles] * self.radians)
         return np.hstack(parts)
 
-    def motion(self, rows: SensedRows) -> JointMotion:
+    def _weight(self, angle: Floats) -> list[Floats]:
+        """Return sines and cosines of angles (N, J) [rad], of their sums, and products of the former."""
+        single = np.hstack([np.sin(angle), np.cos(angle)])
+        summed = angle[:, 1 : LONGEST_SUM + 1]
+        sums = np.cumsum(summed, axis=1)[:, 1:]
+        first, second = self._pairs
+        products = single[:, first] * single[:, second]
+        return [single, np.sin(sums), np.cos(sums), products]
+
+    def motion(self, rows: PhysicalRows) -> JointMotion:
         """Return the motion of the joints in rows."""
         angle = rows.values[:, self.angles] * self.radians
-        rate = (rows.changes * rows.rate)[:, self.speeds] * self.radians
+        rates = rows.changes * rows.rate
+        rate = rates[:, self.speeds] * self.radians
         if self.from_changes:
             return JointMotion(angle, speed=rate, acceleration=np.zeros_like(angle))
         speed = rows.values[:, self.speeds] * self.radians
@@ -168,21 +163,18 @@ def _check_joints(angles: int, speeds: int) -> None:
 
 def named_columns(spec: StreamSpec, pattern: re.Pattern[str]) -> NDArray[np.intp]:
     """Return the columns of senses whose channel's name matches."""
-    columns: list[int] = []
-    for name, place in spec.slices.items():
-        if pattern.fullmatch(name.lower()):
-            columns += range(spec.size)[place]
-    return spec.sensory[np.isin(spec.sensory, columns)]
+    columns = columns_where(spec, lambda channel: bool(pattern.fullmatch(channel.name.lower())))
+    return np.intersect1d(columns, spec.sensory)
 
 
-def forces(spec: StreamSpec) -> NDArray[np.intp]:
+def torque_columns(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of measured torques or currents, by their names."""
-    return np.setdiff1d(named_columns(spec, FORCE), named_columns(spec, COMMANDED))
+    return np.setdiff1d(named_columns(spec, TORQUE_NAME), named_columns(spec, COMMANDED_NAME))
 
 
-def motion(spec: StreamSpec) -> NDArray[np.intp]:
+def motion_columns(spec: StreamSpec) -> NDArray[np.intp]:
     """Return the columns of positions and speeds, by their names."""
-    return np.union1d(named_columns(spec, POSITION), named_columns(spec, SPEED))
+    return np.union1d(named_columns(spec, POSITION_NAME), named_columns(spec, SPEED_NAME))
 
 
 def judged_by_values(spec: StreamSpec) -> bool:
@@ -197,4 +189,4 @@ def judged_by_values(spec: StreamSpec) -> bool:
         channel.group == "wrench" or "external" in channel.name for channel in spec.channels
     )
     is_log = spec.source == "table"
-    return len(forces(spec)) > 0 and (is_log or not measures_contact)
+    return len(torque_columns(spec)) > 0 and (is_log or not measures_contact)

@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -26,14 +26,22 @@ from asm_gym.monitors.torque.urdf import parsed_urdf
 Floats = NDArray[np.float64]
 
 COMPARED_ROWS = 300  # rows by which orders of joints are compared
-LEAST_SPREAD = 1e-12  # of a speed, and least variance of a torque
+LEAST_VARIATION = 1e-12  # spread of a speed, and variance of a torque
 STEEPNESS = 10.0  # of the friction that orders of joints are compared with, in spreads of a speed
-SHORTER = 1e-3  # what each further word of a joint's name takes from its score
+WORD_PENALTY = 1e-3  # what each word of a joint's name takes from its score
 
-MOVING = ("revolute", "continuous", "prismatic")
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
 
 COMPILER = {"fusestatic": False, "balanceinertia": True, "boundmass": 1e-12, "boundinertia": 1e-12}
 """MuJoCo takes links without a mass as nearly massless, and mends a tensor that no body can have."""
+
+
+class JointMotion(NamedTuple):
+    """Motion of J joints in N rows."""
+
+    angle: Floats  # (N, J) [rad; m where a joint slides]
+    speed: Floats  # (N, J) [1/s of that]
+    acceleration: Floats  # (N, J) [1/s² of that]; 0 where speeds are changes of angles
 
 
 @dataclass(frozen=True)
@@ -62,52 +70,52 @@ class BodyModel:
             ValueError: it is no URDF, MuJoCo cannot read it, or it has fewer joints than there are labels.
         """
         root = parsed_urdf(urdf)
-        whole = _compiled(root)
-        columns = _columns_by_name(_joint_names(whole), labels)
+        all_joints = _compiled(root, _moving_joints(root))
+        columns = _columns_by_name(_joint_names(all_joints), labels)
         by_name = 2 * len(columns) > len(labels)
         if not by_name:
-            columns = _columns_by_chain(whole, len(labels))
+            columns = _columns_by_chain(all_joints, len(labels))
         model = _compiled(root, columns)
         names = _joint_names(model)
-        places = np.array([columns[name] for name in names], np.intp)
-        return cls(names=tuple(names), columns=places, by_name=by_name, model=model)
+        in_order = [columns[name] for name in names]
+        return cls(tuple(names), np.array(in_order, np.intp), by_name=by_name, model=model)
 
-    def in_best_order(self, q: Floats, speed: Floats, acceleration: Floats, torque: Floats) -> Self:
-        """Return it with the order of columns that explains measured torques (N, J) best: of the chain, or ABC."""
-        rows = np.linspace(0, len(q) - 1, min(len(q), COMPARED_ROWS)).astype(np.intp)
-        moving = speed[rows]
-        measured = torque[rows]
-        spread = np.maximum(moving.std(axis=0), LEAST_SPREAD)
-        friction = (moving, np.tanh(STEEPNESS * moving / spread), np.ones_like(moving))
-        variance = np.maximum(measured.var(axis=0), LEAST_SPREAD)
+    def in_best_order(self, motion: JointMotion, torque: Floats) -> Self:
+        """Return it with the order of columns that explains measured torques (N, J) best.
 
-        def unexplained(body: Self) -> float:
-            weight, motion = body.torques(q[rows], moving, acceleration[rows])
-            inputs = np.stack([weight, motion, *friction], axis=-1)  # (N, J, 5)
-            rest = measured - np.einsum("njk,jk->nj", inputs, joint_weights(inputs, measured))
-            return float((rest.var(axis=0) / variance).sum())
-
-        by_alphabet = replace(self, columns=np.argsort(np.argsort(self.names)))
-        return min(self, by_alphabet, key=unexplained)
-
-    def torques(self, q: Floats, speed: Floats, acceleration: Floats) -> tuple[Floats, Floats]:
-        """Return the torques (N, J) of weight and of motion [N m; N where a joint slides].
-
-        They are those of angles ``q`` (N, J) [rad or m], speeds [1/s of that] and accelerations [1/s² of that].
+        Columns are in the order of the chain, or in that of the alphabet.
         """
+        last = len(torque) - 1
+        rows = np.linspace(0, last, min(len(torque), COMPARED_ROWS)).astype(np.intp)
+        compared = JointMotion._make(part[rows] for part in motion)
+        alphabetical = replace(self, columns=np.argsort(np.argsort(self.names)))
+        return min(self, alphabetical, key=lambda body: body._unexplained(compared, torque[rows]))
+
+    def _unexplained(self, motion: JointMotion, torque: Floats) -> float:
+        """Return the share of each torque's variance that body and friction leave, summed over joints."""
+        spread = np.maximum(motion.speed.std(axis=0), LEAST_VARIATION)
+        friction = np.tanh(STEEPNESS * motion.speed / spread)
+        parts = [*self.torques(motion), motion.speed, friction, np.ones_like(friction)]
+        inputs = np.stack(parts, axis=-1)  # (N, J, 5)
+        rest = torque - explained_torque(inputs, joint_weights(inputs, torque))
+        variance = np.maximum(torque.var(axis=0), LEAST_VARIATION)
+        return float((rest.var(axis=0) / variance).sum())
+
+    def torques(self, motion: JointMotion) -> tuple[Floats, Floats]:
+        """Return the torques (N, J) of weight and of motion [N m; N where a joint slides]."""
         mujoco: Any = require("mujoco", what="a body model")
         data = mujoco.MjData(self.model)
-        weight = np.zeros(q.shape)
-        total = np.zeros(q.shape)
-        for n in range(len(q)):
-            data.qpos[:] = q[n, self.columns]
+        weight = np.zeros(motion.angle.shape)
+        total = np.zeros(motion.angle.shape)
+        for n in range(len(weight)):
+            data.qpos[:] = motion.angle[n, self.columns]
             data.qvel[:] = 0.0
             data.qacc[:] = 0.0
             mujoco.mj_inverse(self.model, data)
             weight[n, self.columns] = data.qfrc_inverse
 
-            data.qvel[:] = speed[n, self.columns]
-            data.qacc[:] = acceleration[n, self.columns]
+            data.qvel[:] = motion.speed[n, self.columns]
+            data.qacc[:] = motion.acceleration[n, self.columns]
             mujoco.mj_inverse(self.model, data)
             total[n, self.columns] = data.qfrc_inverse
         return weight, total - weight
@@ -115,33 +123,43 @@ class BodyModel:
 
 def joint_weights(inputs: Floats, torque: Floats) -> Floats:
     """Return the weights (J, K) that predict the torque (N, J) of each joint best from its inputs (N, J, K)."""
-    joints = range(torque.shape[1])
-    return np.array([np.linalg.lstsq(inputs[:, j], torque[:, j], rcond=None)[0] for j in joints])
+    weights = []
+    for joint, measured in enumerate(torque.T):
+        solution = np.linalg.lstsq(inputs[:, joint], measured, rcond=None)
+        weights.append(solution[0])
+    return np.array(weights)
 
 
-def _compiled(root: Element, asked: Container[str] | None = None) -> Any:
-    """Return MuJoCo's model, in which the joints that are asked for move, or all that can."""
+def explained_torque(inputs: Floats, weights: Floats) -> Floats:
+    """Return the torque (N, J) that weights (J, K) predict from the inputs (N, J, K) of each joint."""
+    return np.einsum("njk,jk->nj", inputs, weights)
+
+
+def _moving_joints(root: Element) -> list[str | None]:
+    """Return the names of the joints that move by themselves."""
+    joints = [joint for joint in root.findall("joint") if joint.find("mimic") is None]
+    return [joint.get("name") for joint in joints if joint.get("type") in MOVING_TYPES]
+
+
+def _compiled(root: Element, moving: Container[str | None]) -> Any:
+    """Return MuJoCo's model, in which the joints of these names move; the others are fixed."""
     mujoco: Any = require("mujoco", what="a body model")
-    moving = [joint.get("name") for joint in root.findall("joint") if _moves(joint)]
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         for name, value in COMPILER.items():
             setattr(spec.compiler, name, value)
         for joint in list(spec.joints):
-            if joint.name not in moving or (asked is not None and joint.name not in asked):
+            if joint.name not in moving:
                 spec.delete(joint)
         model = spec.compile()
     except ValueError as error:
         raise ValueError(f"the body cannot be read: {' '.join(str(error).split())}") from None
-    parts = (model.body_mass, model.body_inertia, model.body_pos)
-    if not all(np.isfinite(part).all() for part in parts):
-        raise ValueError("the body cannot be read: masses, inertias and positions must be finite")
+    for part in (model.body_mass, model.body_inertia, model.body_pos):
+        if not np.isfinite(part).all():
+            raise ValueError(
+                "the body cannot be read: masses, inertias and positions must be finite"
+            )
     return model
-
-
-def _moves(joint: Element) -> bool:
-    """Return whether a joint moves by itself."""
-    return joint.get("type") in MOVING and joint.find("mimic") is None
 
 
 def _joint_names(model: Any) -> list[str]:
@@ -149,22 +167,24 @@ def _joint_names(model: Any) -> list[str]:
 
 
 def _columns_by_name(names: Sequence[str], labels: Sequence[str]) -> dict[str, int]:
-    """Return the place of the label that means each joint, by the words that the two share.
+    """Return the index of the label that means each joint, by the words that the two share.
 
     A word counts the less, the more joints have it; a name that stands in a label as it is counts most. Of two that
     share as much with a label, as a joint of the arm and one of its fingers may, the shorter one is meant.
     """
     words = [_words(name) for name in names]
-    common = Counter(word for own in words for word in own)
+    joints_with = Counter(word for words_of_name in words for word in words_of_name)
     score = np.zeros((len(labels), len(names)))
     for k, label in enumerate(labels):
         for j, name in enumerate(names):
-            score[k, j] = sum(1.0 / common[word] for word in _words(label) & words[j])
-            score[k, j] += len(name) * (name in label) - SHORTER * len(words[j])
+            shared = _words(label) & words[j]
+            score[k, j] = sum(1.0 / joints_with[word] for word in shared)
+            score[k, j] += len(name) * (name in label) - WORD_PENALTY * len(words[j])
 
     columns = {}
     for k, j in zip(*linear_sum_assignment(-score), strict=True):
-        if score[k, j] > np.delete(score[k], j).max(initial=0.0):  # no other joint is meant as much
+        second_best = np.delete(score[k], j).max(initial=0.0)
+        if score[k, j] > second_best:
             columns[names[j]] = int(k)
     return columns
 
@@ -174,7 +194,7 @@ def _words(name: str) -> set[str]:
 
 
 def _columns_by_chain(model: Any, count: int) -> dict[str, int]:
-    """Return the place of each of the first joints of the longest chain.
+    """Return the index, from the base, of each of the first joints of the longest chain.
 
     Raises ValueError where they are too few.
     """
@@ -185,7 +205,7 @@ def _columns_by_chain(model: Any, count: int) -> dict[str, int]:
             f"{count} joints are sensed, and the body's longest chain has {len(chain)} that move: "
             f"name the columns as its joints are named ({', '.join(names) or 'it has none'})"
         )
-    return {names[joint]: place for place, joint in enumerate(chain)}
+    return {names[joint]: index for index, joint in enumerate(chain)}
 
 
 def _longest_chain(model: Any) -> list[int]:

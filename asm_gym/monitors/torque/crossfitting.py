@@ -21,19 +21,20 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]
 
-FOLDS = 5
-ALL_ROWS = FOLDS  # index of the equations of all rows, after those without each fold
-PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # λ, of standardised inputs
+CROSSFIT_FOLDS = 5
+ALL_ROWS = CROSSFIT_FOLDS  # index of the equations of all rows, after those without each fold
+RIDGE_PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # λ, of standardised inputs
 STIFFNESS = 1e-3  # λ_h
-LEAST_SPREAD = 1e-4  # of what is left of a standardised number
+LEAST_REMAINDER = 1e-4  # of what is left of a standardised number
 
 
 def folds_of(lengths: Sequence[int]) -> Places:
     """Return the fold (N,) of each row of episodes: whole episodes, or blocks where they are few."""
-    if len(lengths) >= FOLDS:
-        return np.repeat(np.arange(len(lengths)) % FOLDS, lengths)
+    if len(lengths) >= CROSSFIT_FOLDS:
+        return np.repeat(np.arange(len(lengths)) % CROSSFIT_FOLDS, lengths)
     rows = sum(lengths)
-    return np.arange(rows, dtype=np.intp) * FOLDS // max(rows, 1)
+    numbers = np.arange(rows, dtype=np.intp)
+    return numbers * CROSSFIT_FOLDS // max(rows, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +45,8 @@ class FoldEquations:
         inputs: Z (N, I).
         values: X (N, X), to be predicted.
         fold: (N,) of each row.
-        grams: ZᵀZ/N (FOLDS + 1, I, I).
-        products: ZᵀX/N (FOLDS + 1, I, X).
+        grams: ZᵀZ/N (CROSSFIT_FOLDS + 1, I, I).
+        products: ZᵀX/N (CROSSFIT_FOLDS + 1, I, X).
     """
 
     inputs: Floats
@@ -67,38 +68,53 @@ class FoldEquations:
 
     def weights(self, fold: int, used: Places, targets: Places, penalty: float) -> Floats:
         """Return the weights (U, M) of the inputs ``used`` (U,) for the values ``targets`` (M,)."""
-        gram = self.grams[fold][np.ix_(used, used)] + penalty * np.eye(len(used))
-        return np.linalg.solve(gram, self.products[fold][np.ix_(used, targets)])
+        gram = self.grams[fold][np.ix_(used, used)]
+        products = self.products[fold][np.ix_(used, targets)]
+        ridge = penalty * np.eye(len(used))
+        return np.linalg.solve(gram + ridge, products)
 
     def errors(self, used: Places, targets: Places, penalty: float) -> Floats:
         """Return the errors (N, M) in each row by the equations without its fold."""
         errors = self.values[:, targets].copy()
-        for f in range(FOLDS):
-            rows = self.fold == f
-            errors[rows] -= self.inputs[rows][:, used] @ self.weights(f, used, targets, penalty)
+        for fold in range(CROSSFIT_FOLDS):
+            rows = self.fold == fold
+            inputs = self.inputs[rows][:, used]
+            errors[rows] -= inputs @ self.weights(fold, used, targets, penalty)
         return errors
 
     def leverage(self, withheld: Places) -> Leverage:
         """Return the leverage of rows by all inputs but those ``withheld``."""
         size = self.inputs.shape[1]
         used = np.setdiff1d(np.arange(size), withheld)
-        inverses = [regular_inverse(gram[np.ix_(used, used)]) for gram in self.grams]
+        among_used = np.ix_(used, used)
+        inverses = [regular_inverse(gram[among_used]) for gram in self.grams]
         h = np.zeros(len(self.fold))
-        for f in range(FOLDS):
-            rows = self.fold == f
-            h[rows] = quadratic_form(self.inputs[rows][:, used], inverses[f])
+        for fold in range(CROSSFIT_FOLDS):
+            rows = self.fold == fold
+            inputs = self.inputs[rows][:, used]
+            h[rows] = quadratic_form(inputs, inverses[fold])
+
         usual = np.median(h)
         matrix = np.zeros((size, size))
-        matrix[np.ix_(used, used)] = inverses[ALL_ROWS] / usual
-        return Leverage(matrix=matrix, widening=np.sqrt(np.maximum(1.0, h / usual)))
+        matrix[among_used] = inverses[ALL_ROWS] / usual
+        widening = np.sqrt(np.maximum(1.0, h / usual))
+        return Leverage(matrix=matrix, widening=widening)
 
 
-def _mean_products(z: Floats, x: Floats, fold: Places) -> Floats:
-    """Return ZᵀX/N without the rows of each fold, and of all rows at last (FOLDS + 1, I, X)."""
-    rows = np.append(len(z) - np.bincount(fold, minlength=FOLDS), len(z))
-    each = np.array([z[fold == f].T @ x[fold == f] for f in range(FOLDS)])
-    total = each.sum(axis=0)
-    return np.array([*(total - each), total]) / np.maximum(rows, 1)[:, None, None]
+def _mean_products(inputs: Floats, values: Floats, fold: Places) -> Floats:
+    """Return ZᵀX/N without the rows of each fold, and of all rows at last (CROSSFIT_FOLDS + 1, I, X)."""
+    products_of_folds = []
+    for number in range(CROSSFIT_FOLDS):
+        rows = fold == number
+        products_of_folds.append(inputs[rows].T @ values[rows])
+    products = np.array(products_of_folds)
+    total = products.sum(axis=0)
+    others = total - products
+
+    all_rows = len(inputs)
+    other_rows = all_rows - np.bincount(fold, minlength=CROSSFIT_FOLDS)
+    counts = np.maximum(np.append(other_rows, all_rows), 1)
+    return np.array([*others, total]) / counts[:, None, None]
 
 
 class Leverage(NamedTuple):
@@ -110,16 +126,17 @@ class Leverage(NamedTuple):
 
 def regular_inverse(gram: Floats) -> Floats:
     """Return (ZᵀZ/N + λ_h)⁻¹ of ZᵀZ/N (I, I)."""
-    return np.linalg.inv(gram + STIFFNESS * np.eye(len(gram))).astype(np.float64)
+    stiffness = STIFFNESS * np.eye(len(gram))
+    return np.linalg.inv(gram + stiffness).astype(np.float64)
 
 
 def quadratic_form(z: Floats, matrix: Floats) -> Floats:
-    """Return zᵀ M z of each row (N,)."""
+    """Return zᵀ M z (N,) of the rows z (N, I)."""
     return ((z @ matrix) * z).sum(axis=1)
 
 
 class CrossFit:
-    """Weights of each value, and their cross-fitted errors.
+    """Weights of each value, and its cross-fitted errors.
 
     Args:
         equations: of the rows.
@@ -146,29 +163,30 @@ class CrossFit:
         self.weights = np.zeros((values, size))
         self.errors = np.zeros((rows, values))
         self.joint_alone = np.zeros(values)
-        for value, used in alone.items():
-            self._fit_alone(np.array([value]), used)
-        for group, own in enumerate(withheld):
-            used = np.setdiff1d(np.arange(size), own)
+        for value, joint_inputs in alone.items():
+            self._fit_alone(np.array([value]), joint_inputs)
+        for group, withheld_inputs in enumerate(withheld):
+            used = np.setdiff1d(np.arange(size), withheld_inputs)
             self._fit_group(np.flatnonzero(groups == group), used)
 
     def _fit_alone(self, value: Places, used: Places) -> None:
-        self.errors[:, value] = self.equations.errors(used, value, PENALTIES[0])
+        """Fit one value (1,) to the inputs of its own joint."""
+        penalty = RIDGE_PENALTIES[0]
+        self.errors[:, value] = self.equations.errors(used, value, penalty)
         self.joint_alone[value] = 1.0
-        weights = self.equations.weights(ALL_ROWS, used, value, PENALTIES[0])
+        weights = self.equations.weights(ALL_ROWS, used, value, penalty)
         self.weights[value, used] = weights[:, 0]
 
     def _fit_group(self, targets: Places, used: Places) -> None:
         """Fit a group by the penalty that leaves the least; a value stays alone where that leaves less."""
-        errors = np.array(
-            [self.equations.errors(used, targets, penalty) for penalty in PENALTIES]
-        )  # (P, N, M)
-        squares = (errors**2).sum(axis=1)  # (P, M)
+        errors = [self.equations.errors(used, targets, penalty) for penalty in RIDGE_PENALTIES]
+        squares = (np.array(errors) ** 2).sum(axis=1)  # (P, M)
         squares_alone = (self.errors[:, targets] ** 2).sum(axis=0)
-        to_beat = np.where(self.joint_alone[targets] > 0, squares_alone, np.inf)
-        better = squares.min(axis=0) < to_beat
-        for n, penalty in enumerate(PENALTIES):
-            chosen = np.flatnonzero(better & (squares.argmin(axis=0) == n))
+        is_alone = self.joint_alone[targets] > 0
+        improves = squares.min(axis=0) < np.where(is_alone, squares_alone, np.inf)
+        best = squares.argmin(axis=0)  # (M,) which penalty
+        for n, penalty in enumerate(RIDGE_PENALTIES):
+            chosen = np.flatnonzero(improves & (best == n))
             if not len(chosen):
                 continue
             values = targets[chosen]
@@ -181,5 +199,6 @@ class CrossFit:
     @property
     def R2(self) -> Floats:  # noqa: N802
         """(X,) share of each value's variance that is predicted in rows of other folds."""
-        variance = np.maximum(self.equations.values.var(axis=0), LEAST_SPREAD**2)
-        return 1.0 - (self.errors**2).mean(axis=0) / variance
+        variance = self.equations.values.var(axis=0)
+        unexplained = (self.errors**2).mean(axis=0)
+        return 1.0 - unexplained / np.maximum(variance, LEAST_REMAINDER**2)

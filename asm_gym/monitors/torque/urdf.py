@@ -9,10 +9,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-LARGEST = 10_000_000  # characters of a file: no arm has more
+LARGEST_FILE = 10_000_000  # characters of a file: no arm has more
 LEAST_MOMENT = 1e-12  # of inertia [kg m²]
 
-KEPT = {
+KEPT_PARTS = {
     "robot": ("link", "joint"),
     "joint": ("origin", "parent", "child", "axis", "mimic"),
     "link": ("inertial",),
@@ -31,7 +31,7 @@ def read_urdf(path: str | Path) -> str:
         ValueError: the file is no URDF.
     """
     with Path(path).open(encoding="utf-8", errors="replace") as file:
-        text = file.read(LARGEST)
+        text = file.read(LARGEST_FILE)
     try:
         return ElementTree.tostring(parsed_urdf(text), encoding="unicode")
     except ValueError as error:
@@ -62,7 +62,7 @@ def parsed_urdf(text: str) -> Element:
 def _pared(element: Element) -> Element:
     """Return a copy of an element with the parts that are kept."""
     copy = Element(element.tag, dict(element.attrib))
-    copy.extend(_pared(part) for part in element if part.tag in KEPT.get(element.tag, ()))
+    copy.extend(_pared(part) for part in element if part.tag in KEPT_PARTS.get(element.tag, ()))
     return copy
 
 

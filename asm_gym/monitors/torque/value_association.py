@@ -30,10 +30,16 @@ from asm_gym.memory.linear_association import check_inputs
 from asm_gym.memory.temporal import RowHistory
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next, require_arrays
 from asm_gym.monitors.surprise import Progress
-from asm_gym.monitors.torque.arm_features import WIDTHS, ArmFeatures, SensedRows, forces, motion
+from asm_gym.monitors.torque.arm_features import (
+    WIDTHS,
+    ArmFeatures,
+    PhysicalRows,
+    motion_columns,
+    torque_columns,
+)
 from asm_gym.monitors.torque.body_model import BodyModel
 from asm_gym.monitors.torque.crossfitting import (
-    LEAST_SPREAD,
+    LEAST_REMAINDER,
     CrossFit,
     FoldEquations,
     folds_of,
@@ -48,7 +54,9 @@ Places = NDArray[np.intp]
 
 ALIKE_S = 0.1  # time that errors are averaged over [s]
 PREDICTED = 0.5  # R² from which on a value is judged
-MOST_INPUTS = 1024  # with more inputs no leverage is computed: the matrices would be too large
+MOST_LEVERAGE_INPUTS = (
+    1024  # with more inputs no leverage is computed: the matrices would be too large
+)
 
 LEARNED = (
     "derived_mean",  # (M,) of the features φ
@@ -109,7 +117,7 @@ class ValueAssociation(ScaledModel):
         self._by_sines = ArmFeatures.of(spec)
         self._by_body = ArmFeatures.of(spec, urdf)
         self._features = self._by_body
-        self._torques = np.searchsorted(spec.sensory, forces(spec))
+        self._torques = np.searchsorted(spec.sensory, torque_columns(spec))
 
     @property
     def error_columns(self) -> Places:
@@ -118,59 +126,65 @@ class ValueAssociation(ScaledModel):
         return self.spec.sensory[self._judged]
 
     @property
-    def links(self) -> BodyModel | None:
+    def body(self) -> BodyModel | None:
         """The body model in use."""
         return self._features.body
 
     @property
     def joints(self) -> list[tuple[str, str]]:
         """The angles that a body model is told, and the joint that each is taken for."""
-        body = self.links
+        body = self.body
         if body is None:
             return []
-        labels = [self.spec.labels[self.spec.sensory[i]] for i in self._features.angles]
-        return [(labels[body.columns[k]], body.names[k]) for k in np.argsort(body.columns)]
+        joint_of = dict(zip(body.columns.tolist(), body.names, strict=True))
+        sensed = self.spec.sensory[self._features.angles]
+        return [(self.spec.labels[sensed[k]], joint_of[k]) for k in sorted(joint_of)]
 
     def fit(
         self, episodes: Sequence[Episode], rng: np.random.Generator, progress: Progress
     ) -> Self:
-        rows = self._regressors(rows_after(self.lag, self.read_nominal(episodes)))
+        rows = self._regression_rows(rows_after(self.lag, self.read_nominal(episodes)))
         lengths = [len(episode) - self.lag for episode in episodes]
         fit = self._best_fit(rows, folds_of(lengths))
-
-        judged = self.judged(fit.regression.R2)
+        regression = fit.regression
+        judged = self.judged(regression.R2)
         if not len(judged):
             judged = np.arange(len(self.spec.sensory))
         errors, leverages = self._weighed_errors(fit, judged)
-        episode_ends = np.cumsum(lengths)[:-1]
-        means = [averaged(part, self.window) for part in np.split(errors, episode_ends)]
-        largest = np.max([np.abs(mean).max(axis=0) for mean in means], axis=0)
-
-        columns = np.zeros(0)
+        columns: Places = np.zeros(0, np.intp)
         if fit.features.body is not None:
-            columns = fit.features.body.columns.astype(np.float64)
+            columns = fit.features.body.columns
         progress(1, 1)
         learned = {
             "derived_mean": fit.mean,
             "derived_spread": fit.spread,
-            "body": columns,
+            "body": columns.astype(np.float64),
             "judged_values": judged.astype(np.float64),
-            "R2_values": fit.regression.R2,
-            "D": fit.regression.weights[judged],
-            "joint_alone": fit.regression.joint_alone[judged],
-            "largest": np.maximum(largest, LEAST_SPREAD),
+            "R2_values": regression.R2,
+            "D": regression.weights[judged],
+            "joint_alone": regression.joint_alone[judged],
+            "largest": self._largest_mean(errors, lengths),
             "far": leverages,
         }
         return self.restore({**self.senses_.arrays, **learned})
+
+    def _largest_mean(self, errors: Floats, lengths: Sequence[int]) -> Floats:
+        """Return q (V,) of the errors (N, V) of episodes that are so long."""
+        episode_ends = np.cumsum(lengths)[:-1]
+        largest = np.full(errors.shape[1], LEAST_REMAINDER)
+        for episode in np.split(errors, episode_ends):
+            means = np.abs(running_mean(episode, self.window))
+            largest = np.maximum(largest, means.max(axis=0))
+        return largest
 
     def restore(self, learned: Arrays, skills: tuple[str, ...] = ()) -> Self:
         require_arrays(learned, LEARNED)
         self._judged = learned["judged_values"].astype(np.intp)
         self._features = self._by_sines
+        columns = learned["body"].astype(np.intp)
         body = self._by_body.body
-        if len(learned["body"]) and body is not None:
-            body = replace(body, columns=learned["body"].astype(np.intp))
-            self._features = self._by_body.with_body(body)
+        if len(columns) and body is not None:
+            self._features = replace(self._by_body, body=replace(body, columns=columns))
         return super().restore(learned, skills)
 
     def start(self, batch: int) -> AveragedErrors:
@@ -178,41 +192,46 @@ class ValueAssociation(ScaledModel):
         return AveragedErrors(super().start(batch), errors)
 
     def predict(self, state: AveragedErrors, rows: Floats) -> tuple[AveragedErrors, ModelOutput]:
+        learned = self.learned_
         history, reading, known = read_next(self.senses_, state.history, rows)
-        scaled = self._regressors(reading)
-        features = self._features(self._sensed(scaled))
-        features = (features - self.learned_["derived_mean"]) / self.learned_["derived_spread"]
-        inputs = inputs_of(scaled, features)
+        scaled = self._regression_rows(reading)
+        features = self._features(self._physical(scaled))
+        standardised = (features - learned["derived_mean"]) / learned["derived_spread"]
+        inputs = inputs_of(scaled, standardised)
 
-        expected = inputs @ self.learned_["D"].T
-        error = known * (scaled.values[:, self._judged] - expected) / self._widening(inputs)
+        expected = inputs @ learned["D"].T
+        rest = scaled.values[:, self._judged] - expected
+        error = known * rest / self._widening(inputs)
         errors = np.concatenate([state.errors[:, 1:], error[:, None]], axis=1)
-        mean = errors.mean(axis=1) / self.learned_["largest"]
+        mean = errors.mean(axis=1) / learned["largest"]
         return AveragedErrors(history, errors), ModelOutput(mean, no_context(rows))
 
     def judged(self, R2: Floats) -> Places:
         """Return which values are judged, by their cross-fitted R² (X,)."""
         judged = R2 > PREDICTED
-        moves = np.searchsorted(self.spec.sensory, motion(self.spec))
-        if len(self._torques) and len(moves):
-            judged[moves] = False
+        moving = np.searchsorted(self.spec.sensory, motion_columns(self.spec))
+        if len(self._torques) and len(moving):
+            judged[moving] = False
             judged[self._torques] = True
         return np.flatnonzero(judged)
 
-    def _regressors(self, reading: ScaledRows) -> RegressionRows:
-        senses = len(self.spec.sensory)
+    def _regression_rows(self, reading: ScaledRows) -> RegressionRows:
+        """Return rows as regression reads them."""
+        sensory = self.spec.sensory
+        values = reading.senses[:, : len(sensory)]
+        changes = reading.inputs[:, self.senses_.changes]
         return RegressionRows(
-            values=np.asarray(reading.senses[:, :senses], np.float64),
-            changes=np.asarray(reading.inputs[:, self.senses_.changes], np.float64),
-            before=np.asarray(reading.inputs[:, self.spec.sensory], np.float64),
-            commands=np.asarray(reading.commands, np.float64),
+            values=values.astype(np.float64),
+            changes=changes.astype(np.float64),
+            before=reading.inputs[:, sensory].astype(np.float64),
+            commands=reading.commands.astype(np.float64),
         )
 
-    def _sensed(self, rows: RegressionRows) -> SensedRows:
+    def _physical(self, rows: RegressionRows) -> PhysicalRows:
         """Return rows in the units of their senses."""
         sensory = self.spec.sensory
         spread = self.senses_.spread[sensory]
-        return SensedRows(
+        return PhysicalRows(
             values=rows.values * spread + self.senses_.mean[sensory],
             changes=rows.changes,
             spread=spread,
@@ -225,13 +244,16 @@ class ValueAssociation(ScaledModel):
         if not self.urdf:
             return by_sines
         by_body = self._fit_on(self._ordered_body(rows), rows, fold)
-        before = self._unexplained(by_sines)
-        self.left_by_body = float(self._unexplained(by_body) / max(before, LEAST_SPREAD))
-        return by_body if self.left_by_body < 1.0 else by_sines
+        left_by_sines = max(self._unexplained(by_sines), LEAST_REMAINDER)
+        self.left_by_body = self._unexplained(by_body) / left_by_sines
+        if self.left_by_body < 1.0:
+            return by_body
+        return by_sines
 
     def _unexplained(self, fit: FeatureFit) -> float:
-        """Return what is left of the torques, as a sum of shares."""
-        return float((1.0 - fit.regression.R2[self._torques]).sum())
+        """Return the share of each torque's variance that is left, summed over torques."""
+        shares = 1.0 - fit.regression.R2[self._torques]
+        return float(shares.sum())
 
     def _ordered_body(self, rows: RegressionRows) -> ArmFeatures:
         """Return the features by the body model, with its joints in the order that explains the torques best."""
@@ -240,23 +262,23 @@ class ValueAssociation(ScaledModel):
         assert body is not None
         if body.by_name or len(self._torques) != len(features.angles):
             return features
-        sensed = self._sensed(rows)
-        moved = features.motion(sensed)
-        torque = sensed.values[:, self._torques]
-        return features.with_body(
-            body.in_best_order(moved.angle, moved.speed, moved.acceleration, torque)
-        )
+        physical = self._physical(rows)
+        torque = physical.values[:, self._torques]
+        ordered = body.in_best_order(features.motion(physical), torque)
+        return replace(features, body=ordered)
 
     def _fit_on(self, features: ArmFeatures, rows: RegressionRows, fold: Places) -> FeatureFit:
-        derived = features(self._sensed(rows))
+        """Return the regression of rows on the features of an arm; ``fold`` is (N,)."""
+        derived = features(self._physical(rows))
         mean = derived.mean(axis=0)
-        spread = np.maximum(derived.std(axis=0), LEAST_SPREAD)
+        spread = np.maximum(derived.std(axis=0), LEAST_REMAINDER)
         inputs = inputs_of(rows, (derived - mean) / spread)
-        check_inputs(inputs.shape[1])
+        size = inputs.shape[1]
+        check_inputs(size)
         withheld = self._withheld(features)
         regression = CrossFit(
             FoldEquations.of(inputs, rows.values, fold),
-            alone=self._joint_inputs(features, inputs.shape[1]),
+            alone=self._joint_inputs(features, size),
             groups=self.senses_.groups,
             withheld=withheld,
         )
@@ -269,9 +291,11 @@ class ValueAssociation(ScaledModel):
         before = 2 * senses + np.arange(senses)  # a value is predicted from this row alone
         withheld = []
         for group in range(int(groups.max()) + 1):
-            own = np.flatnonzero(groups == group)
-            derived = 3 * senses + np.flatnonzero(features.sources[:, own].any(axis=1))
-            withheld.append(np.unique(np.concatenate([own, senses + own, before, derived])))
+            own_values = np.flatnonzero(groups == group)
+            own_changes = senses + own_values
+            from_own_values = features.sources[:, own_values].any(axis=1)
+            own_features = 3 * senses + np.flatnonzero(from_own_values)
+            withheld.append(np.hstack([own_values, own_changes, before, own_features]))
         return withheld
 
     def _joint_inputs(self, features: ArmFeatures, inputs: int) -> dict[int, Places]:
@@ -288,37 +312,39 @@ class ValueAssociation(ScaledModel):
             kinds += 2  # weight and motion
             if len(features.angles) != joints:
                 return {}
-        first = 3 * senses + joints * np.arange(kinds)  # of each kind of feature
+        of_first_joint = 3 * senses + joints * np.arange(kinds)
         commands = np.arange(inputs - len(self.spec.motor) - 1, inputs)
         speeds = features.speeds + senses * features.from_changes
-        return {
-            int(torque): np.concatenate([[speeds[n]], first + n, commands])
-            for n, torque in enumerate(self._torques)
-        }
+        own_inputs = {}
+        for joint, torque in enumerate(self._torques.tolist()):
+            own_inputs[torque] = np.hstack([speeds[joint], of_first_joint + joint, commands])
+        return own_inputs
 
     def _weighed_errors(self, fit: FeatureFit, judged: Places) -> tuple[Floats, Floats]:
         """Return cross-fitted errors (N, V), less where leverage is large, and the leverage (G, I, I) of each group."""
-        size = fit.regression.weights.shape[1]
-        errors = fit.regression.errors[:, judged]
-        groups = self.senses_.groups[judged]
-        if size > MOST_INPUTS:
+        regression = fit.regression
+        size = regression.weights.shape[1]
+        errors = regression.errors[:, judged]
+        if size > MOST_LEVERAGE_INPUTS:
             return errors, np.zeros((0, size, size))
+        groups = self.senses_.groups[judged]
+        by_groups = regression.joint_alone[judged] == 0
         matrices = []
         for group in np.unique(groups):
-            leverage = fit.regression.equations.leverage(fit.withheld[group])
+            leverage = regression.equations.leverage(fit.withheld[group])
             matrices.append(leverage.matrix)
-            by_group = (groups == group) & (fit.regression.joint_alone[judged] == 0)
-            errors[:, by_group] /= leverage.widening[:, None]
+            errors[:, by_groups & (groups == group)] /= leverage.widening[:, None]
         return errors, np.array(matrices)
 
     def _widening(self, inputs: Floats) -> Floats:
         """Return √max(1, h/h̃) (N, V) of judged values, for inputs (N, I)."""
         widening = np.ones((len(inputs), len(self._judged)))
         groups = self.senses_.groups[self._judged]
-        by_group = self.learned_["joint_alone"] == 0
+        by_groups = self.learned_["joint_alone"] == 0
+        # There are no matrices where the inputs are very many.
         for group, matrix in zip(np.unique(groups), self.learned_["far"], strict=False):
-            h = quadratic_form(inputs, matrix)
-            widening[:, by_group & (groups == group)] = np.sqrt(np.maximum(1.0, h))[:, None]
+            leverage = np.maximum(1.0, quadratic_form(inputs, matrix))
+            widening[:, by_groups & (groups == group)] = np.sqrt(leverage)[:, None]
         return widening
 
 
@@ -333,7 +359,8 @@ def inputs_of(rows: RegressionRows, features: Floats) -> Floats:
     return np.hstack([rows.values, rows.changes, rows.before, features, rows.commands])
 
 
-def averaged(errors: Floats, window: int) -> Floats:
-    """Return the mean (T, V) of the last rows of errors (T, V) of an episode; before the first they are 0."""
-    total = np.cumsum(np.vstack([np.zeros((window, errors.shape[1])), errors]), axis=0)
+def running_mean(errors: Floats, window: int) -> Floats:
+    """Return the mean (T, V) of the last ``window`` rows of errors (T, V); before the first they are 0."""
+    before = np.zeros((window, errors.shape[1]))
+    total = np.cumsum(np.vstack([before, errors]), axis=0)
     return (total[window:] - total[:-window]) / window

@@ -1,12 +1,12 @@
 """Values beside changes: a push that is held is explained by its own past for changes, and not by the other senses.
 
-    s = max(s_changes / √f, b s_values^p)   log b + p log s: as log s_changes in centre and spread of nominal maxima
+    s = max(s_changes / √f, b s_values^p)   b, p: log b + p log s_values has centre and spread of log s_changes
     f = max(1, (1 + τ h)/(1 + τ h̃))         h: leverage of a row, h̃ its median in the episodes learned from
     h = zᵀ (ZᵀZ + λ N)⁻¹ z                  z: inputs that changes are predicted from, and 1;  τ: rows of a tenth of a s
 
-``calibrate`` finds b and p, so that both are as likely to pass the one threshold: each has a threshold of its own so,
-and the promised rate is shared. A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each
-other are alike, so that those of a tenth of a second count as one.
+``calibrate`` finds b and p from the maxima of nominal episodes, so that both are as likely to pass the one threshold.
+A regression's error in a fresh row has the variance σ² (1 + h); rows that follow each other are alike, so that those of
+a tenth of a second count as one.
 """
 
 from __future__ import annotations
@@ -26,9 +26,12 @@ from asm_gym.detection.scores import Largest
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
 from asm_gym.monitors.stream_model import read_next, require_arrays
 from asm_gym.monitors.surprise import State, Surprise
-from asm_gym.monitors.torque.arm_features import ArmFeatures, judged_by_values
 from asm_gym.monitors.torque.crossfitting import quadratic_form, regular_inverse
-from asm_gym.monitors.torque.value_association import ALIKE_S, MOST_INPUTS, ValueAssociation
+from asm_gym.monitors.torque.value_association import (
+    ALIKE_S,
+    MOST_LEVERAGE_INPUTS,
+    ValueAssociation,
+)
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import StreamSpec
 
@@ -61,16 +64,6 @@ class ValueJudge:
     balance: float = 1.0
     power: float = 2.0
 
-    @staticmethod
-    def suits(spec: StreamSpec) -> bool:
-        """Return whether a memory of this stream judges values by default, see ``judged_by_values``."""
-        return judged_by_values(spec)
-
-    @staticmethod
-    def check_body(spec: StreamSpec, urdf: str) -> None:
-        """Raise ValueError unless the text of a body model fits the joints of a stream."""
-        ArmFeatures.of(spec, urdf)
-
     @classmethod
     def learned(cls, episodes: Sequence[Episode], seed: int, urdf: str = "") -> Self | None:
         """Fit it to nominal episodes; None where no value can be predicted. ``urdf`` is the text of a body model."""
@@ -79,24 +72,29 @@ class ValueJudge:
         model = _model(monitor)
         if not len(model.judged(monitor.learned_["R2_values"])):
             return None
-        if model.senses_.inputs > MOST_INPUTS:
+        if model.senses_.inputs > MOST_LEVERAGE_INPUTS:
             return cls(monitor, leverage=np.zeros((0, 0)))
 
         readings = [model.senses_.read_episode(episode.stream) for episode in episodes]
         z = np.concatenate([_with_one(reading.inputs) for reading in readings])
-        alike = ALIKE_S / spec.dt / len(z)  # τ / N
-        leverage = alike * regular_inverse(z.T @ z / len(z))
-        usual = 1.0 / (1.0 + float(np.median(quadratic_form(z, leverage))))
+        rows = len(z)
+        rows_as_one = ALIKE_S / spec.dt  # τ
+        leverage = rows_as_one / rows * regular_inverse(z.T @ z / rows)
+        median = float(np.median(quadratic_form(z, leverage)))
+        usual = 1.0 / (1.0 + median)
         return cls(monitor, leverage=usual * leverage, usual=usual)
 
     @classmethod
-    def found(cls, spec: StreamSpec, arrays: Arrays, seed: int, urdf: str = "") -> Self | None:
+    def restored(cls, spec: StreamSpec, arrays: Arrays, seed: int, urdf: str = "") -> Self | None:
         """Restore it from the arrays of a checkpoint; None where that has none of it.
 
         Raises:
             ValueError: something is missing, or does not fit.
         """
-        own = {n.removeprefix(PREFIX): a for n, a in arrays.items() if n.startswith(PREFIX)}
+        own = {}
+        for name, array in arrays.items():
+            if name.startswith(PREFIX):
+                own[name.removeprefix(PREFIX)] = array
         if not own:
             return None
         require_arrays(own, ("leverage", *SCALARS))
@@ -130,11 +128,12 @@ class ValueJudge:
         """
         by_changes = self._log_maxima(changes)
         by_values = self._log_maxima(self.monitor.score_episodes(episodes))
-        wanted = _variance(by_changes, PRIOR_SPREAD_OF_CHANGES)
-        given = _variance(by_values, PRIOR_SPREAD_OF_VALUES)
-        power = min(float(np.sqrt(wanted / given)), MOST_POWER)
-        balance = float(np.exp(np.median(by_changes) - power * np.median(by_values)))
-        return replace(self, balance=balance, power=power)
+        variance_of_changes = _variance(by_changes, PRIOR_SPREAD_OF_CHANGES)
+        variance_of_values = _variance(by_values, PRIOR_SPREAD_OF_VALUES)
+        ratio = np.sqrt(variance_of_changes / variance_of_values)
+        power = min(float(ratio), MOST_POWER)
+        log_balance = np.median(by_changes) - power * np.median(by_values)
+        return replace(self, balance=float(np.exp(log_balance)), power=power)
 
     def _log_maxima(self, scores: Sequence[Surprise]) -> Floats:
         """Return the logarithms (n,) of the maxima of blocks."""
@@ -156,26 +155,27 @@ class ValueJudge:
             changes: the surprise that changes make.
             divisor: (B,) by which knocks and stops excuse a surprise.
         """
-        root = self.spread(state, rows)
+        spread = self.spread(state, rows)
         new, values = self.monitor.observe(state, rows)
-        by_changes = changes.value / root
+        by_changes = changes.value / spread
         raw_by_values = self.balance * values.value**self.power
         by_values = raw_by_values / divisor
-        held = by_values > by_changes
+        values_count = by_values > by_changes
 
-        countable = np.isfinite(by_values) & (values.value > 0)
-        share = np.ones_like(by_values)
-        np.divide(by_values, values.value, out=share, where=countable)
-        attribution = np.where(
-            held[:, None],
-            share[:, None] * values.attribution,
-            changes.attribution / root[:, None],
-        )
+        has_share = np.isfinite(by_values) & (values.value > 0)
+        factor = np.ones_like(by_values)
+        np.divide(by_values, values.value, out=factor, where=has_share)
         joined = changes._replace(
-            value=np.where(held, by_values, by_changes), attribution=attribution
+            value=np.where(values_count, by_values, by_changes),
+            attribution=np.where(
+                values_count[:, None],
+                factor[:, None] * values.attribution,
+                changes.attribution / spread[:, None],
+            ),
         )
         if changes.raw is not None:
-            joined = joined._replace(raw=np.maximum(changes.raw / root, raw_by_values))
+            raw = np.maximum(changes.raw / spread, raw_by_values)
+            joined = joined._replace(raw=raw)
         return new, joined
 
     def spread(self, state: State, rows: Floats) -> Floats:
@@ -183,8 +183,9 @@ class ValueJudge:
         if not len(self.leverage):
             return np.ones(len(rows))
         _, reading, known = read_next(self._senses, state.model.history, rows)
-        f = self.usual + quadratic_form(_with_one(reading.inputs), self.leverage)
-        return np.sqrt(np.where(known[:, 0] > 0, np.maximum(1.0, f), 1.0))
+        leverage = quadratic_form(_with_one(reading.inputs), self.leverage)
+        f = np.maximum(1.0, self.usual + leverage)
+        return np.sqrt(np.where(known[:, 0] > 0, f, 1.0))
 
     @property
     def _senses(self) -> StreamScaler:
@@ -207,8 +208,9 @@ def _model(monitor: CalibratedMonitor) -> ValueAssociation:
 
 def _variance(logs: Floats, prior_spread: float) -> float:
     """Return the variance of logarithms (n,), with the prior's."""
-    total = len(logs) * np.var(logs) + PRIOR_COUNT * prior_spread**2
-    return float(total / (len(logs) + PRIOR_COUNT))
+    count = len(logs)
+    squares = count * np.var(logs) + PRIOR_COUNT * prior_spread**2
+    return float(squares / (count + PRIOR_COUNT))
 
 
 def _with_one(inputs: NDArray[np.float32]) -> Floats:

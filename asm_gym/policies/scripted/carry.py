@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import (
+from asm_gym.policies.scripted.expert import (
     CLOSE,
     OPEN,
     Expert,
@@ -23,11 +23,11 @@ from asm_gym.policies.scripted.geometry import (
     UP,
     Pose,
     Vector,
-    about_vertical,
     angle_between,
-    gripping,
+    command_towards,
     length,
-    move,
+    pointing_down,
+    rotation_about_vertical,
     wrapped,
     yaw,
 )
@@ -74,7 +74,7 @@ class CarryScene(Scene):
     @property
     def offset(self) -> Vector:
         """The way (3,) from the grip to the hand [m]."""
-        return self.hand.at - self.grip
+        return self.hand.position - self.grip
 
     @property
     def over(self) -> Vector:
@@ -84,23 +84,23 @@ class CarryScene(Scene):
     @property
     def aside(self) -> float:
         """Horizontal distance of the object from its place [m]."""
-        return length((self.thing.at - self.plan.place)[:2])
+        return length((self.thing.position - self.plan.place)[:2])
 
     @property
     def down(self) -> Vector:
         """Orientation (3, 3) of a hand that points down and keeps its direction."""
-        return gripping(self.hand.turned)
+        return pointing_down(self.hand.orientation)
 
     @property
     def grasping(self) -> Vector:
         """How (3, 3) to hold the hand for grasping."""
-        closing = self.thing.turned @ self.plan.closing
-        return gripping(self.hand.turned, closing, self.plan.turns)
+        closing = self.thing.orientation @ self.plan.closing
+        return pointing_down(self.hand.orientation, closing, self.plan.turns)
 
     @property
     def turn_to_fit(self) -> float:
         """The smallest turn about the vertical that gives the object a heading that fits [rad]."""
-        now = yaw(self.thing.turned[:, 0])
+        now = yaw(self.thing.orientation[:, 0])
         turns = [wrapped(heading - now) for heading in self.plan.headings]
         return float(min(turns, key=abs, default=0.0))
 
@@ -109,20 +109,20 @@ class CarryScene(Scene):
         target = self.grip + above
         # From afar, first high: the way may lead over a wall or another object.
         if length(self.offset[:2]) > 0.1:
-            target[2] = max(target[2], min(self.hand.at[2], target[2] + 0.1))
+            target[2] = max(target[2], min(self.hand.position[2], target[2] + 0.1))
         return self.move(target, self._turning(self.grasping), self.gain)
 
     def is_above(self) -> bool:
         aside = length(self.offset[:2] - self.state.spread[:2] * 0.3)
         is_above = aside < 0.02 and abs(self.offset[2] - self.plan.clearance) < 0.03
-        return is_above and angle_between(self.hand.turned, self.grasping) < 0.15
+        return is_above and angle_between(self.hand.orientation, self.grasping) < 0.15
 
     def descend(self) -> Vector:
         target = self.grip
         if self.is_careful:
-            target = target + over_first(self.hand.at, target)
+            target = target + over_first(self.hand.position, target)
         speed = self.state.speed * self.plan.haste
-        return move(self.hand, target, self._turning(self.grasping), speed, self.gain)
+        return command_towards(self.hand, target, self._turning(self.grasping), speed, self.gain)
 
     def is_around(self) -> bool:
         distance = length(self.offset)
@@ -140,15 +140,15 @@ class CarryScene(Scene):
 
     def lift(self) -> Vector:
         height = self.over[2] + 0.3 * self.state.spread[2]
-        target = np.array([*self.thing.at[:2], height])
-        return move(self._held, target, self.down, self.state.speed)
+        target = np.array([*self.thing.position[:2], height])
+        return command_towards(self._held, target, self.down, self.state.speed)
 
     def has_lost_it(self) -> bool:
         """Return whether the object fell; it may lie where it belongs."""
         return length(self.offset) > LOST
 
     def is_lifted(self) -> bool:
-        return self.thing.at[2] > self.over[2] - 0.03 or self.state.since > 60
+        return self.thing.position[2] > self.over[2] - 0.03 or self.state.since > 60
 
     def carry(self) -> Vector:
         return self._move_held(self.over, self.state.speed)
@@ -166,7 +166,7 @@ class CarryScene(Scene):
         if self.is_careful or self.plan.fit <= EXACT:
             # The further aside of its place an object is, the less it goes down.
             down = 0.025 * np.clip(1.5 - 0.5 * self.aside / self.plan.fit, 0.0, 1.0)
-            height = max(target[2], self.thing.at[2] - down)
+            height = max(target[2], self.thing.position[2] - down)
             target = np.array([*target[:2], height])
         return self._move_held(target, 0.6 * self.state.speed)
 
@@ -175,7 +175,7 @@ class CarryScene(Scene):
         return self.aside > self.plan.fit * share + 0.02
 
     def is_down(self) -> bool:
-        height = self.thing.at[2]
+        height = self.thing.position[2]
         bottom = self.plan.place[2]
         return height < bottom + 0.006 or (self.state.since > 50 and height < bottom + 0.03)
 
@@ -194,12 +194,12 @@ class CarryScene(Scene):
     @property
     def _held(self) -> Pose:
         """The hand as if it were where the object is that it holds."""
-        return self.hand._replace(at=self.thing.at)
+        return self.hand._replace(position=self.thing.position)
 
     def _move_held(self, target: Vector, speed: float) -> Vector:
         """Return the command (6,) of a hand whose object is to come to ``target`` (3,) and to fit its place."""
-        fitting = about_vertical(self.turn_to_fit) @ self.down
-        return move(self._held, target, self._turning(fitting), speed, self.gain)
+        fitting = rotation_about_vertical(self.turn_to_fit) @ self.down
+        return command_towards(self._held, target, self._turning(fitting), speed, self.gain)
 
     def _turning(self, target: Vector) -> Vector:
         """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops."""
@@ -207,7 +207,9 @@ class CarryScene(Scene):
         if abs(left) <= TURN_AT_ONCE:
             return target
         left = self.wrist - wrapped(self.wrist - left)
-        return about_vertical(float(np.clip(left, -TURN_AT_ONCE, TURN_AT_ONCE))) @ self.down
+        return (
+            rotation_about_vertical(float(np.clip(left, -TURN_AT_ONCE, TURN_AT_ONCE))) @ self.down
+        )
 
     phases: ClassVar = {
         REACH: Phase(reach, OPEN, {DESCEND: is_above}),
@@ -281,16 +283,16 @@ class CarryExpert(Expert):
         stops = self.inner.simulation.model.jnt_range[robot._ref_joint_indexes[-1]]
         most = stops[1] - ROOM
         now = self._wrist(observation)
-        along = now + yaw(hand.turned[:, 1]) - yaw(hand.at - base)
-        heading = yaw(thing.turned[:, 0])
+        along = now + yaw(hand.orientation[:, 1]) - yaw(hand.position - base)
+        heading = yaw(thing.orientation[:, 0])
 
         def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
             """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
             closing, wanted = choice
-            fitting = about_vertical(wanted - heading) @ thing.turned
+            fitting = rotation_about_vertical(wanted - heading) @ thing.orientation
             picked_at = thing.point(task.grip)
             placed_at = task.place + fitting @ task.grip
-            grasp = wrapped(along - yaw(thing.turned @ closing) + yaw(picked_at - base))
+            grasp = wrapped(along - yaw(thing.orientation @ closing) + yaw(picked_at - base))
             place = wrapped(along - yaw(fitting @ closing) + yaw(placed_at - base))
             beyond = max(abs(grasp) - most, abs(place) - most, 0.0)
             return beyond, abs(grasp - now) + abs(place - grasp)

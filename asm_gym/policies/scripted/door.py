@@ -7,8 +7,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import CLOSE, OPEN, Expert, Phase, Scene, State
-from asm_gym.policies.scripted.geometry import UP, Vector, about, angle_between, length
+from asm_gym.policies.scripted.expert import CLOSE, OPEN, Expert, Phase, Scene, State
+from asm_gym.policies.scripted.geometry import UP, Vector, angle_between, length, rotation_about
 
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
 TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
@@ -32,14 +32,14 @@ class Hardware(NamedTuple):
 
     def grip_at(self, turned: float, opened: float) -> Vector:
         """Return where (3,) to hold the handle, when it is pressed and the door is open by these angles [rad]."""
-        held = self.pivot + about(self.axis, turned) @ (self.grip - self.pivot)
-        return self.hinge + about(UP, opened) @ (held - self.hinge)
+        held = self.pivot + rotation_about(self.axis, turned) @ (self.grip - self.pivot)
+        return self.hinge + rotation_about(UP, opened) @ (held - self.hinge)
 
     def held(self, turned: float) -> Vector:
         """Return the hand (3, 3) on the handle of the closed door, its y axis down: else a joint meets its stop."""
         y = np.array([0.0, 0.0, -1.0])
         z = -self.normal
-        return about(self.axis, turned) @ np.column_stack([np.cross(y, z), y, z])
+        return rotation_about(self.axis, turned) @ np.column_stack([np.cross(y, z), y, z])
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class DoorScene(Scene):
     @property
     def offset(self) -> Vector:
         """The way (3,) from the handle to the hand [m]."""
-        return self.hand.at - self.grip
+        return self.hand.position - self.grip
 
     @property
     def distance(self) -> float:
@@ -66,15 +66,15 @@ class DoorScene(Scene):
 
     def facing(self, turned: float = 0.0) -> Vector:
         """Return the hand (3, 3) before the door, fingers above and below a handle ``turned`` so far [rad]."""
-        return about(UP, self.opened) @ self.plan.held(turned)
+        return rotation_about(UP, self.opened) @ self.plan.held(turned)
 
     def reach(self) -> Vector:
-        facing = _rolling(self.plan, self.hand.turned, self.facing())
+        facing = _rolling(self.plan, self.hand.orientation, self.facing())
         return self.move(self.grip + BEFORE * self.plan.normal, facing, GAIN)
 
     def is_before_handle(self) -> bool:
         off = length(self.offset - BEFORE * self.plan.normal)
-        return off < 0.02 and angle_between(self.hand.turned, self.facing()) < 0.15
+        return off < 0.02 and angle_between(self.hand.orientation, self.facing()) < 0.15
 
     def approach(self) -> Vector:
         return self.move(self.grip, self.facing(), GAIN)
@@ -173,7 +173,7 @@ def _rolling(hardware: Hardware, hand: Vector, facing: Vector) -> Vector:
     """Return where (3, 3) to turn first on the way to ``facing``, whose shortest way may lead any way round."""
     pressed = hardware.held(TURNED)
     left = _roll(hand, pressed) + _roll(pressed, facing)
-    return facing @ about(UP, left - np.clip(left, -ROLL_AT_ONCE, ROLL_AT_ONCE))
+    return facing @ rotation_about(UP, left - np.clip(left, -ROLL_AT_ONCE, ROLL_AT_ONCE))
 
 
 def _roll(hand: Vector, to: Vector) -> float:
@@ -182,6 +182,6 @@ def _roll(hand: Vector, to: Vector) -> float:
     sine = length(axis)
     tilt = np.eye(3)
     if sine > 1e-9:
-        tilt = about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))
+        tilt = rotation_about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))
     across = to.T @ tilt @ hand[:, 1]
     return float(np.arctan2(-across[0], across[1]))

@@ -11,20 +11,20 @@ Vector = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
 
 # What one unit of action moves the hand's set-point by, in robosuite's OSC_POSE.
-METRES = 0.05  # [m]
-RADIANS = 0.5  # [rad]
+UNIT_DISTANCE = 0.05  # [m]
+UNIT_TURN = 0.5  # [rad]
 FASTEST_TURN = 0.5  # of the hand, about each axis [action units]
 
 
 class Pose(NamedTuple):
     """Position and orientation of a hand or an object."""
 
-    at: Vector  # (3,) [m]
-    turned: Vector  # (3, 3)
+    position: Vector  # (3,) [m]
+    orientation: Vector  # (3, 3)
 
     def point(self, own: Vector) -> Vector:
         """Return a point (3,) of the object's own frame in the world."""
-        return self.at + self.turned @ own
+        return self.position + self.orientation @ own
 
 
 def length(vector: Vector) -> float:
@@ -32,7 +32,7 @@ def length(vector: Vector) -> float:
     return float(np.linalg.norm(vector))
 
 
-def rotation(columns: Vector) -> Vector:
+def rotation_from_columns(columns: Vector) -> Vector:
     """Return a rotation (3, 3) from its first two columns (6,), made orthonormal again after sensor noise."""
     x, y = columns.reshape(2, 3)
     x = x / length(x)
@@ -41,26 +41,37 @@ def rotation(columns: Vector) -> Vector:
     return np.column_stack([x, y, np.cross(x, y)])
 
 
-def matrix(quaternion: Vector) -> Vector:
+def rotation_from_quaternion(quaternion: Vector) -> Vector:
     """Return a rotation (3, 3) from a unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    xy = x * y
+    xz = x * z
+    yz = y * z
+    xw = x * w
+    yw = y * w
+    zw = z * w
+    first_row = [1 - 2 * (yy + zz), 2 * (xy - zw), 2 * (xz + yw)]
+    second_row = [2 * (xy + zw), 1 - 2 * (xx + zz), 2 * (yz - xw)]
+    third_row = [2 * (xz - yw), 2 * (yz + xw), 1 - 2 * (xx + yy)]
+    return np.array([first_row, second_row, third_row])
 
 
-def about(axis: Any, angle: float) -> Vector:
-    """Return the rotation (3, 3) about a unit ``axis`` by ``angle`` [rad] (Rodrigues)."""
+def rotation_about(axis: Any, angle: float) -> Vector:
+    """Return the rotation (3, 3) about a unit ``axis`` by ``angle`` [rad].
+
+    It is R = 1 + sin(angle) K + (1 - cos(angle)) K², where K v = axis × v (Rodrigues).
+    """
     x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # K @ v is axis × v
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine = np.sin(angle)
+    cosine = np.cos(angle)
+    return np.eye(3) + sine * K + (1 - cosine) * (K @ K)
 
 
-def about_vertical(angle: float) -> Vector:
+def rotation_about_vertical(angle: float) -> Vector:
     """Return the rotation (3, 3) about the vertical [rad]."""
     cosine = np.cos(angle)
     sine = np.sin(angle)
@@ -79,16 +90,18 @@ def wrapped(angle: float) -> float:
 
 def angle_between(a: Vector, b: Vector) -> float:
     """Return the angle between two orientations (3, 3) [rad]."""
-    return float(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0)))
+    cosine = (np.trace(a.T @ b) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def flattest_side(turned: Vector) -> Vector:
+def flattest_side(orientation: Vector) -> Vector:
     """Return the axis (3,) of an orientation (3, 3) that lies flattest."""
-    return turned[:, int(np.abs(turned[2]).argmin())]
+    slopes = np.abs(orientation[2])
+    return orientation[:, int(slopes.argmin())]
 
 
-def gripping(hand: Vector, closing: Vector | None = None, turns: float = np.pi) -> Vector:
-    """Return the orientation nearest ``hand`` (3, 3) for which the fingers point down.
+def pointing_down(hand: Vector, closing: Vector | None = None, turns: float = np.pi) -> Vector:
+    """Return the orientation nearest to the hand's for which the fingers point down.
 
     Args:
         hand: (3, 3) the orientation of the hand.
@@ -99,13 +112,16 @@ def gripping(hand: Vector, closing: Vector | None = None, turns: float = np.pi) 
     angle = yaw(hand[:, 1])
     if closing is not None:
         heading = yaw(closing)
-        angle = heading + np.round((angle - heading) / turns) * turns
+        whole_turns = np.round((angle - heading) / turns)
+        angle = heading + whole_turns * turns
     y = np.array([np.cos(angle), np.sin(angle), 0.0])
     z = np.array([0.0, 0.0, -1.0])
     return np.column_stack([np.cross(y, z), y, z])
 
 
-def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float = 1.0) -> Vector:
+def command_towards(
+    hand: Pose, position: Vector, orientation: Vector, speed: float, gain: float = 1.0
+) -> Vector:
     """Return the hand's command (6,) towards a pose [action units].
 
     The controller covers about a third of what it is asked for in one step, so a gain of 2 does
@@ -113,14 +129,15 @@ def move(hand: Pose, target: Vector, turned: Vector, speed: float, gain: float =
 
     Args:
         hand: the pose of the hand.
-        target: (3,) where it is to go [m].
-        turned: (3, 3) the orientation that it is to have.
+        position: (3,) where it is to go [m].
+        orientation: (3, 3) the orientation that it is to have.
         speed: at most, of its position [action units].
         gain: share of the way to its position to ask for in one step.
     """
-    step = gain * (target - hand.at) / METRES
-    norm = length(step)
-    if norm > speed:
-        step *= speed / norm
-    turn = 0.5 * np.cross(hand.turned, turned, axis=0).sum(axis=1) / RADIANS
-    return np.concatenate([step, np.clip(turn, -FASTEST_TURN, FASTEST_TURN)])
+    way = gain * (position - hand.position) / UNIT_DISTANCE
+    distance = length(way)
+    if distance > speed:
+        way *= speed / distance
+    turn = 0.5 * np.cross(hand.orientation, orientation, axis=0).sum(axis=1)
+    turn = np.clip(turn / UNIT_TURN, -FASTEST_TURN, FASTEST_TURN)
+    return np.concatenate([way, turn])

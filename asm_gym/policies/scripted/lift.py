@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from asm_gym.policies.scripted.base import (
+from asm_gym.policies.scripted.expert import (
     CLOSE,
     OPEN,
     Expert,
@@ -17,7 +17,14 @@ from asm_gym.policies.scripted.base import (
     has_settled,
     over_first,
 )
-from asm_gym.policies.scripted.geometry import UP, Pose, Vector, flattest_side, gripping, length
+from asm_gym.policies.scripted.geometry import (
+    UP,
+    Pose,
+    Vector,
+    flattest_side,
+    length,
+    pointing_down,
+)
 
 REACH, DESCEND, GRASP, LIFT = range(4)
 QUARTER_TURN = np.pi / 2  # after which a cube looks the same [rad]
@@ -42,18 +49,18 @@ class LiftScene(Scene):
     @property
     def offset(self) -> Vector:
         """(3,) of the hand from the cube [m]."""
-        return self.hand.at - self.cube.at
+        return self.hand.position - self.cube.position
 
     def reach(self) -> Vector:
-        return self._fit_sides(self.cube.at + self.plan.hover)
+        return self._fit_sides(self.cube.position + self.plan.hover)
 
     def is_above(self) -> bool:
         return length(self.offset - self.plan.hover) < 0.02
 
     def descend(self) -> Vector:
-        target = self.cube.at - self.plan.depth * UP
+        target = self.cube.position - self.plan.depth * UP
         if self.is_careful:
-            target = target + over_first(self.hand.at, self.cube.at)
+            target = target + over_first(self.hand.position, self.cube.position)
         return self._fit_sides(target)
 
     def is_around(self) -> bool:
@@ -61,21 +68,21 @@ class LiftScene(Scene):
         return abs(height) < 0.008 and length(self.offset[:2]) < 0.015
 
     def grasp(self) -> Vector:
-        return self.move(self.state.anchor, gripping(self.hand.turned))
+        return self.move(self.state.anchor, pointing_down(self.hand.orientation))
 
     def has_gripped(self) -> bool:
         return has_settled(self.fingers, self.state.since, usual=6)
 
     def lift(self) -> Vector:
-        return self.move(self.state.anchor + self.plan.goal, gripping(self.hand.turned))
+        return self.move(self.state.anchor + self.plan.goal, pointing_down(self.hand.orientation))
 
     def has_lost_it(self) -> bool:
         return length(self.offset) > 0.05
 
     def _fit_sides(self, target: Vector) -> Vector:
         """Return the command (6,) of a hand whose fingers are to fit the sides of the cube."""
-        side = flattest_side(self.cube.turned)
-        return self.move(target, gripping(self.hand.turned, side, QUARTER_TURN))
+        side = flattest_side(self.cube.orientation)
+        return self.move(target, pointing_down(self.hand.orientation, side, QUARTER_TURN))
 
     phases: ClassVar = {
         REACH: Phase(reach, OPEN, {DESCEND: is_above}),

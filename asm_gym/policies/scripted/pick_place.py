@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asm_gym.policies.scripted.carry import CarryExpert, CarryTask
-from asm_gym.policies.scripted.geometry import UP, Pose, Vector, about_vertical, length, matrix
+from asm_gym.policies.scripted.geometry import (
+    UP,
+    Pose,
+    Vector,
+    length,
+    rotation_about_vertical,
+    rotation_from_quaternion,
+)
 
 LOWEST_FINGERTIPS = (
     0.09  # above the bins' floor, so high the fingertips keep the palm off the walls' tops [m]
@@ -84,16 +91,16 @@ class PickPlaceExpert(CarryExpert):
     def _closing(self, name: str, thing: Pose, half: Vector, grip: float) -> Closing:
         """Return how to close on an object, of half this size (3,), that is held ``grip`` above its middle [m]."""
         env = self.robosuite
-        to_walls = env.bin_size[:2] / 2 - np.abs(thing.at[:2] - env.bin1_pos[:2])
-        palm = thing.at[2] + grip + PALM_HEIGHT
+        to_walls = env.bin_size[:2] / 2 - np.abs(thing.position[:2] - env.bin1_pos[:2])
+        palm = thing.position[2] + grip + PALM_HEIGHT
         if not self.is_careful and palm < env.bin1_pos[2] + WALL_HEIGHT:
-            return beside_walls(half, thing.turned, to_walls)
+            return beside_walls(half, thing.orientation, to_walls)
 
         # Of the narrow axes that one which lies furthest from the walls.
         axes = _narrow(half)
         if self.is_careful and name == "Can":
             axes += DIAGONALS
-        along = max(axes, key=lambda axis: _way_to_wall(thing.turned @ axis, to_walls))
+        along = max(axes, key=lambda axis: _way_to_wall(thing.orientation @ axis, to_walls))
         return Closing(along, room=SPARE)
 
     def _headings(self, place: Vector, closing: Vector) -> tuple[float, ...]:
@@ -148,7 +155,7 @@ class PickPlaceExpert(CarryExpert):
         body = model.body(f"{name}_main").id
         is_shape = (model.geom_bodyid == body) & (model.geom_group == 0)
         (geom,) = np.flatnonzero(is_shape)
-        turn = matrix(model.geom_quat[geom][[1, 2, 3, 0]])
+        turn = rotation_from_quaternion(model.geom_quat[geom][[1, 2, 3, 0]])
         return np.abs(turn) @ model.geom_aabb[geom, 3:]
 
 
@@ -165,7 +172,7 @@ def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> Closing:
     """
     axes = _narrow(half)
     for angle, axis in product(ASKEW, axes):
-        along = about_vertical(angle) @ axis
+        along = rotation_about_vertical(angle) @ axis
         room = _room(turned @ along, to_walls)
         if room >= SPARE:
             return Closing(along, room)

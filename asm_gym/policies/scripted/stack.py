@@ -22,22 +22,22 @@ class StackExpert(CarryExpert):
         """Return the red cube, until it lies on the green one."""
         red = self.read.pose(observation, "cubeA")
         green = self.read.pose(observation, "cubeB")
-        place = green.at + (HALF_RED + HALF_GREEN) * UP
-        side = flattest_side(red.turned)
+        place = green.position + (HALF_RED + HALF_GREEN) * UP
+        side = flattest_side(red.orientation)
         turns = np.pi / 2
         tolerance = 0.02  # [m]
         if self.is_careful:
             # A wide gripper would stand on the green cube with one finger.
             sides = (side, np.cross(UP, side))
-            side = min(sides, key=lambda across: abs(across @ (green.at - red.at)))
+            side = min(sides, key=lambda across: abs(across @ (green.position - red.position)))
             turns = np.pi
             tolerance = 0.025
-        if length(red.at - place) < tolerance:
+        if length(red.position - place) < tolerance:
             return None
         return CarryTask(
             name="cubeA",
             grip=np.zeros(3),
-            closing=red.turned.T @ side,
+            closing=red.orientation.T @ side,
             turns=turns,
             clearance=0.08,
             place=place,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.control_period import control_period
-from asm_gym.policies.base import StatefulPolicy
+from asm_gym.policies.policy import StatefulPolicy
 
 Floats = NDArray[np.float64]
 

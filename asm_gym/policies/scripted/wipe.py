@@ -8,8 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.policies.scripted.base import Expert, Phase, Scene, State
-from asm_gym.policies.scripted.geometry import UP, Vector, gripping, length
+from asm_gym.policies.scripted.expert import Expert, Phase, Scene, State
+from asm_gym.policies.scripted.geometry import UP, Vector, length, pointing_down
 
 REACH, LOWER, WIPE, REST = range(4)
 ACROSS = np.array([0.0, 1.0, 0.0])  # how the tool is held
@@ -37,17 +37,17 @@ class WipeScene(Scene):
     @property
     def level(self) -> Vector:
         """Orientation (3, 3) in which the tool lies flat on the table."""
-        return gripping(self.hand.turned, ACROSS)
+        return pointing_down(self.hand.orientation, ACROSS)
 
     @property
     def aside(self) -> float:
         """Horizontal distance of the tool from the first mark that is left [m]."""
-        return length((self.left[0] - self.hand.at)[:2])
+        return length((self.left[0] - self.hand.position)[:2])
 
     @property
     def height(self) -> float:
         """Height of the tool above the first mark that is left [m]."""
-        return float(self.hand.at[2] - self.left[0][2])
+        return float(self.hand.position[2] - self.left[0][2])
 
     def is_clean(self) -> bool:
         return not len(self.left)
@@ -84,7 +84,7 @@ class WipeScene(Scene):
 
         ``down`` replaces the vertical part [action units].
         """
-        target = np.array([*self.left[0][:2], self.hand.at[2]])
+        target = np.array([*self.left[0][:2], self.hand.position[2]])
         command = self.move(target, self.level, gain=2.0)
         command[2] = down
         return command

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import cycle, product
 from typing import NamedTuple, Protocol
 
@@ -14,6 +15,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import AdaptiveThreshold
 from asm_gym.detection.alarm_rule import KNOCK, STOP
 from asm_gym.evaluation.comparison import detectability_of, visible_kinds
+from asm_gym.evaluation.defaults import WINDOW_S
 from asm_gym.evaluation.detection_tables import kept_rate, milliseconds
 from asm_gym.evaluation.metrics import DetectionMetrics, false_alarms, hourly_alarms
 from asm_gym.evaluation.scored_episode import ScoredEpisode
@@ -26,7 +28,7 @@ from asm_gym.rollouts.trial import Trial, faulty_trial, nominal_trials
 from asm_gym.tasks import task as task_spec
 
 PROMISES = (10.0, 5.0, 3.0, 1.0)  # false alarms per hour that a threshold promises
-SEVERITIES = ("medium", "strong")  # of faults; mild ones are hardly detectable
+EVALUATED_SEVERITIES = ("medium", "strong")  # of faults; mild ones are hardly detectable
 MOST_IN_ALARM = 0.5  # of episodes, that an adaptive threshold may aim for
 SCENES = 12  # faults happen in the first so many scenes
 
@@ -53,7 +55,7 @@ class EvaluationCase(NamedTuple):
         task = task_spec(self.task)
         seeds = role_seeds(seed, self.task, "nominal", episodes)
         trials = nominal_trials(task.id, "nominal", seeds)
-        faults = product(kinds, SEVERITIES)
+        faults = product(kinds, EVALUATED_SEVERITIES)
         for (kind, severity), scene in zip(faults, cycle(seeds[:SCENES]), strict=False):
             trials.append(faulty_trial(task.id, kind, severity, scene, task.horizon))
         return trials
@@ -88,11 +90,13 @@ class Scores(NamedTuple):
         return Scores(self.name, solved, failed, metrics)
 
     def adapted(self, per_hour: float) -> Scores:
-        """Return the result under a threshold that follows the policy; faults are judged by its last value."""
+        """Return the result under an adaptive threshold that aims for so many alarms per hour."""
         if not self.solved:
             return self
-        share = min(per_hour * hourly_alarms(self.solved).hours / len(self.solved), MOST_IN_ALARM)
-        return self.under(AdaptiveThreshold(share).start(self.solved[0].threshold))
+        hours_of_episode = hourly_alarms(self.solved).hours / len(self.solved)
+        share_in_alarm = min(per_hour * hours_of_episode, MOST_IN_ALARM)
+        adaptive = AdaptiveThreshold(share_in_alarm)
+        return self.under(adaptive.start(self.solved[0].threshold))
 
     def under(self, running: MovingThreshold) -> Scores:
         """Return the result under a threshold that healthy episodes move; faults are judged by its last value."""
@@ -113,18 +117,32 @@ def usual_force(recordings: Sequence[Episode]) -> float:
     return float(np.median(known))
 
 
-def evaluate_case(
-    memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], window: float, usual: float
-) -> Scores:
-    """Score the nominal and faulty recordings of a case, detected within a ``window`` [s] of the onset.
+def seeds_with_crash(recordings: Sequence[Episode], expert_force: float) -> set[int]:
+    """Return the seeds of solved nominal episodes with a far greater force than the expert's usual one [N]."""
+    seeds = set()
+    for episode in recordings:
+        force = usual_force([episode])
+        if np.isfinite(force) and force > CRASH * expert_force:
+            seeds.add(episode.labelled.seed)
+    return seeds
 
-    ``usual`` is the usual greatest force of the task's expert [N]; that of an agent that often crashes is no reference.
+
+def evaluate_case(
+    memory: CalibratedMonitor, name: str, recordings: Sequence[Episode], expert_force: float
+) -> Scores:
+    """Score the nominal and faulty recordings of a case.
+
+    Args:
+        memory: with a threshold.
+        name: of the case.
+        recordings: of one policy in one task.
+        expert_force: usual greatest force of the task's expert [N]; an agent that often crashes is no reference.
     """
-    crashed = {e.labelled.seed for e in recordings if CRASH * usual < usual_force([e]) < np.inf}
+    crashed = seeds_with_crash(recordings, expert_force)
     nominal = [e for e in recordings if e.labelled.role == "nominal"]
     faulty = [e for e in recordings if e.labelled.role == "faulty"]
     faulty = [e for e in faulty if e.labelled.seed not in crashed]
-    is_visible = visible_kinds(detectability_of(nominal, faulty, window))
+    is_visible = visible_kinds(detectability_of(nominal, faulty, WINDOW_S))
 
     traces = traces_of(name, memory, recordings, memory.threshold)
     healthy = [trace for trace in traces if trace.onset is None]
@@ -132,12 +150,18 @@ def evaluate_case(
     failed = [trace for trace in healthy if not trace.outcome.success]
     faults = [t for t in traces if t.onset is not None and t.seed not in crashed]
     visible = [trace for trace in faults if is_visible[trace.kind, trace.severity]]
-    return Scores(name, solved, failed, DetectionMetrics(name, visible, solved, window))
+    return Scores(name, solved, failed, DetectionMetrics(name, visible, solved, WINDOW_S))
 
 
-def _where_faulty(cell: Callable[[DetectionMetrics], str]) -> Callable[[Scores], str]:
+def _where_faulty(cell_of: Callable[[DetectionMetrics], str]) -> Callable[[Scores], str]:
     """Return a cell of the metrics on faults; empty without any fault."""
-    return lambda scores: cell(scores.metrics) if scores.metrics.faulty else ""
+
+    def cell(scores: Scores) -> str:
+        if not scores.metrics.faulty:
+            return ""
+        return cell_of(scores.metrics)
+
+    return cell
 
 
 def _excused_per_hour(event: str) -> Callable[[Scores], str]:
@@ -151,6 +175,12 @@ def _excused_per_hour(event: str) -> Callable[[Scores], str]:
     return cell
 
 
+def _failed_with_alarm(scores: Scores) -> str:
+    if not scores.failed:
+        return ""
+    return count(false_alarms(scores.failed))
+
+
 def _found(metrics: DetectionMetrics) -> str:
     return f"{percent(metrics.detected)} of {metrics.detected.n}"
 
@@ -161,14 +191,14 @@ COLUMNS: dict[str, Callable[[Scores], str]] = {
     "faults/h": lambda scores: hourly_alarms(scores.solved).text,
     "knocks/h": _excused_per_hour(KNOCK),
     "stops/h": _excused_per_hour(STOP),
-    "failed, alarm": lambda scores: count(false_alarms(scores.failed)) if scores.failed else "",
+    "failed, alarm": _failed_with_alarm,
     "AUROC": _where_faulty(lambda metrics: f"{metrics.auroc:.3f}"),
     "found": _where_faulty(_found),
     "median [ms]": _where_faulty(lambda metrics: milliseconds(metrics.delays.median_ms)),
 }
 
 
-def scores_table(scores: Sequence[Scores], memory: CalibratedMonitor, window: float) -> Table:
+def scores_table(scores: Sequence[Scores], memory: CalibratedMonitor) -> Table:
     """Return a row for each case."""
     about = memory.about
     per_hour = about["false_alarms_per_hour"]
@@ -177,14 +207,17 @@ def scores_table(scores: Sequence[Scores], memory: CalibratedMonitor, window: fl
         f"threshold {memory.threshold:.3g} for {per_hour:g} false alarms per hour, from "
         f"{about['hours']:.2f} other hours. Alarms per hour of solved healthy episodes, with 95 % "
         "Poisson intervals; failed episodes with an alarm; visible faults of medium and strong "
-        f"severity, found within {window:g} s. Adaptive: under a threshold that follows each "
+        f"severity, found within {WINDOW_S:g} s. Adaptive: under a threshold that follows each "
         "policy, and for faults at its last value."
     )
-    own = tabulate(caption, COLUMNS, scores)
-    adaptive_columns = {f"{name}, adaptive": COLUMNS[name] for name in ("faults/h", "found")}
-    adaptive = tabulate(caption, adaptive_columns, [each.adapted(per_hour) for each in scores])
-    rows = [(*left, *right) for left, right in zip(own.rows, adaptive.rows, strict=True)]
-    return Table(caption, [*own.headings, *adaptive.headings], rows)
+    columns = dict(COLUMNS)
+    for name in ("faults/h", "found"):
+        columns[f"{name}, adaptive"] = partial(_adaptive_cell, COLUMNS[name], per_hour)
+    return tabulate(caption, columns, scores)
+
+
+def _adaptive_cell(cell: Callable[[Scores], str], per_hour: float, scores: Scores) -> str:
+    return cell(scores.adapted(per_hour))
 
 
 def all_episodes(
@@ -196,31 +229,37 @@ def all_episodes(
     return healthy, faulty
 
 
-def promises_table(
-    scores: Sequence[Scores], thresholds: Mapping[float, float], window: float
-) -> Table:
-    """Return a row for each promise.
+def promises_table(scores: Sequence[Scores], thresholds: Mapping[float, float]) -> Table:
+    """Return a row for each promise, with its threshold, the false alarms, and the faults found.
 
-    It has the threshold, the false alarms, and the faults found within ``window`` [s].
+    Args:
+        scores: of all cases.
+        thresholds: by the false alarms per hour that each promises.
     """
     healthy, faulty = all_episodes(scores)
-    severities = {f"{' and '.join(SEVERITIES)} found": SEVERITIES, "mild found": ("mild",)}
-    present = {trace.severity for trace in faulty}
-    severities = {name: own for name, own in severities.items() if present & set(own)}
+    severities = {
+        f"{' and '.join(EVALUATED_SEVERITIES)} found": EVALUATED_SEVERITIES,
+        "mild found": ("mild",),
+    }
+    for heading, names in list(severities.items()):
+        if not any(trace.severity in names for trace in faulty):
+            del severities[heading]
     rows = []
     for promised, threshold in thresholds.items():
         solved, faults = all_episodes([each.at(threshold) for each in scores])
-        row = [f"{promised:g}", f"{threshold:.3g}", kept_rate(hourly_alarms(solved), promised)]
-        row += [f"{hourly_alarms(solved, event).value:.1f}" for event in (KNOCK, STOP)]
-        for own in severities.values():
-            of_severity = [trace for trace in faults if trace.severity in own]
-            row.append(_found(DetectionMetrics("", of_severity, [], window)))
+        alarms = kept_rate(hourly_alarms(solved), promised)
+        knocks = hourly_alarms(solved, KNOCK).value
+        stops = hourly_alarms(solved, STOP).value
+        row = [f"{promised:g}", f"{threshold:.3g}", alarms, f"{knocks:.1f}", f"{stops:.1f}"]
+        for names in severities.values():
+            of_severity = [trace for trace in faults if trace.severity in names]
+            row.append(_found(DetectionMetrics("", of_severity, [], WINDOW_S)))
         rows.append(tuple(row))
     hours = hourly_alarms(healthy).hours
     caption = (
         f"By promise: alarms per hour in the {hours:.2f} healthy hours of these exams, with 95 % "
         "Poisson intervals; alarms within a minute count once. Broken: the interval lies above the "
-        f"promise. Found: faults that an ideal observer could see, within {window:g} s."
+        f"promise. Found: faults that an ideal observer could see, within {WINDOW_S:g} s."
     )
     headings = ("promised", "threshold", "false alarms", "knocks", "stops", *severities)
     return Table(caption, headings, rows)

@@ -30,9 +30,9 @@ from asm_gym.data.episode import save_episode
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.faults.object import ObjectMass, movable
 from asm_gym.policies import Policy, make_policy
-from asm_gym.policies.base import StatefulPolicy
-from asm_gym.policies.scripted.base import CLOSE, OPEN, ObservationReader, Style
-from asm_gym.policies.scripted.geometry import Vector, move
+from asm_gym.policies.policy import StatefulPolicy
+from asm_gym.policies.scripted.expert import CLOSE, OPEN, ObservationReader, Style
+from asm_gym.policies.scripted.geometry import Vector, command_towards
 from asm_gym.rollouts.pretraining.healthy import HELD_OUT, MOTION_KEY, held_out
 from asm_gym.rollouts.run_trials import environment, record_stream
 from asm_gym.rollouts.seeds import role_seeds
@@ -67,7 +67,7 @@ WEIGHT = (0.7, 1.4)  # factor of an object's mass
 PAUSE = Interruption(0.01, (5, 60))
 DRIFT = Interruption(0.015, (5, 60), (0.05, 1.0))
 PRESS = Interruption(0.04, (8, 40), (0.1, 0.6))
-HELD = 10  # steps for which an object is gripped before it is pressed
+STEPS_TO_GRIP = 10  # with a closed grip, after which an object counts as held
 LIMIT_CHANGES = 0.05  # probability per step that the limit of a hand's speed changes
 LIMITS = (0.05, 1.0)  # of a hand's speed [m/s]
 GRIP_CHANGES = 0.05  # probability per step of a disturbed motion that the grip's command changes
@@ -191,10 +191,10 @@ class MotionPolicy(StatefulPolicy):
         self._is_grip = np.zeros(len(self._noise), np.bool_)  # (A,)
         self._is_grip[list(getattr(self._arm, "gripper_actions", ()))] = True
         self._noisy_grip = bool(self._rng.random() < 0.5)
-        self._grasp = 1.0  # share of the guide's command of the grip
-        self._held = 0  # steps since the guide closed the grip
-        self._course = np.zeros_like(self._noise)  # (A,) action of an interruption
-        self._left = 0  # steps until the interruption ends
+        self._grip_share = 1.0  # of the guide's command of the grip
+        self._steps_gripped = 0  # since the guide closed the grip
+        self._interruption = np.zeros_like(self._noise)  # (A,) action
+        self._steps_left = 0  # of the interruption
 
     def begin(self, observation: Any) -> Any:
         if self._motion.limit:
@@ -212,49 +212,52 @@ class MotionPolicy(StatefulPolicy):
         motion = self._motion
         if self._limits.random() < motion.limit:
             self._limit_speed()
-        fresh = self._rng.standard_normal(self._noise.shape)
-        self._noise = motion.smoothness * self._noise + np.sqrt(1.0 - motion.smoothness**2) * fresh
+        rho = motion.smoothness
+        white = self._rng.standard_normal(self._noise.shape)
+        self._noise = rho * self._noise + np.sqrt(1.0 - rho**2) * white
         action = motion.noise * self._noise  # (A,)
         if self._guide is not None:
             guided, state = self._guide.predict(observation, state)
             if not self._noisy_grip:
                 action = np.where(self._is_grip, 0.0, action)
-            action = action + self._loosened(guided)
+            action = action + self._with_looser_grip(guided)
 
-        if self._left:
-            self._left -= 1
+        if self._steps_left:
+            self._steps_left -= 1
         else:
-            self._left = self._interrupt()
-        if self._left:  # it keeps its grip
-            action = np.where(self._is_grip, action, self._course)
+            self._steps_left = self._interrupt()
+        if self._steps_left:  # it keeps its grip
+            action = np.where(self._is_grip, action, self._interruption)
         return np.clip(action, -1.0, 1.0).astype(np.float32), state
 
-    def _loosened(self, guided: NDArray[Any]) -> NDArray[Any]:
+    def _with_looser_grip(self, guided: NDArray[Any]) -> NDArray[Any]:
         """Return the guide's action (A,) with a looser grip.
 
         Without a guide's grip, however loose, the memory would never learn what holding feels like.
         """
         if self._motion.noise and self._rng.random() < GRIP_CHANGES:
-            self._grasp = self._rng.uniform(LOOSEST, 1.0)
-        self._held += 1
-        if not (guided[self._is_grip] > 0.0).any():
-            self._held = 0
-        return np.where(self._is_grip, self._grasp, 1.0) * guided
+            self._grip_share = self._rng.uniform(LOOSEST, 1.0)
+        is_closing = guided[self._is_grip] > 0.0
+        self._steps_gripped += 1
+        if not is_closing.any():
+            self._steps_gripped = 0
+        return np.where(self._is_grip, self._grip_share, 1.0) * guided
 
     def _interrupt(self) -> int:
         """Return for how many steps the arm stops, drifts or presses from now on; 0 where the guide leads on."""
         rng = self._rng
         motion = self._motion
         if rng.random() < motion.pause:
-            self._course = np.zeros_like(self._noise)
+            self._interruption = np.zeros_like(self._noise)
             return int(rng.integers(*PAUSE.steps))
         if rng.random() < motion.drift:
             strength = log_uniform(rng, DRIFT.strength)
-            self._course = strength * rng.standard_normal(self._noise.shape)
+            self._interruption = strength * rng.standard_normal(self._noise.shape)
             return int(rng.integers(*DRIFT.steps))
-        if motion.press and self._held > HELD and rng.random() < motion.press:
+        holds = self._steps_gripped > STEPS_TO_GRIP
+        if motion.press and holds and rng.random() < motion.press:
             strength = log_uniform(rng, PRESS.strength)
-            self._course = strength * self._press_direction()
+            self._interruption = strength * self._press_direction()
             return int(rng.integers(*PRESS.steps))
         return 0
 
@@ -270,15 +273,15 @@ class MotionPolicy(StatefulPolicy):
         return direction / np.abs(direction).max()
 
 
-class Aim(NamedTuple):
-    """Where a hand began, and where it is going."""
+class Reach(NamedTuple):
+    """The place that a hand reaches for, and where it began."""
 
-    began: Vector  # (3,) [m]
-    upright: Vector  # (3, 3) its orientation then
-    place: Vector  # (3,) [m]
-    turned: Vector  # (3, 3)
-    grip: float  # as commanded
-    left: int  # steps until it gives up
+    first_position: Vector  # (3,) of the hand [m]
+    first_orientation: Vector  # (3, 3)
+    position: Vector  # (3,) to reach [m]
+    orientation: Vector  # (3, 3) to reach
+    grip: float  # command of the grip
+    steps_left: int  # until it gives up
 
 
 class ReachingPolicy(StatefulPolicy):
@@ -289,31 +292,32 @@ class ReachingPolicy(StatefulPolicy):
         self._rng = np.random.default_rng([seed, 2])
         self._speed = PACE * speed  # [action units]
 
-    def begin(self, observation: Any) -> Aim:
+    def begin(self, observation: Any) -> Reach:
         hand = self._read.hand(observation)
-        return self._next(hand.at, hand.turned)
+        return self._next_reach(hand.position, hand.orientation)
 
     def act(
-        self, observation: Any, state: Aim, deterministic: bool
-    ) -> tuple[NDArray[np.float32], Aim]:
+        self, observation: Any, state: Reach, deterministic: bool
+    ) -> tuple[NDArray[np.float32], Reach]:
         """Return the next action (7,)."""
         hand = self._read.hand(observation)
-        if not state.left or np.linalg.norm(state.place - hand.at) < ARRIVED:
-            state = self._next(state.began, state.upright)
-        motion = move(hand, state.place, state.turned, self._speed)
+        distance = np.linalg.norm(state.position - hand.position)
+        if not state.steps_left or distance < ARRIVED:
+            state = self._next_reach(state.first_position, state.first_orientation)
+        motion = command_towards(hand, state.position, state.orientation, self._speed)
         action = np.append(motion, state.grip)
-        return action.astype(np.float32), state._replace(left=state.left - 1)
+        return action.astype(np.float32), state._replace(steps_left=state.steps_left - 1)
 
-    def _next(self, began: Vector, upright: Vector) -> Aim:
-        place = began + self._rng.uniform(*AROUND)
-        turn = Rotation.from_rotvec(self._rng.uniform(-1.0, 1.0, 3) * TURNED).as_matrix()
-        return Aim(
-            began=began,
-            upright=upright,
-            place=place,
-            turned=turn @ upright,
+    def _next_reach(self, first_position: Vector, first_orientation: Vector) -> Reach:
+        position = first_position + self._rng.uniform(*AROUND)
+        turn = TURNED * self._rng.uniform(-1.0, 1.0, 3)  # rotation vector [rad]
+        return Reach(
+            first_position=first_position,
+            first_orientation=first_orientation,
+            position=position,
+            orientation=Rotation.from_rotvec(turn).as_matrix() @ first_orientation,
             grip=float(self._rng.choice([OPEN, CLOSE])),
-            left=GIVEN_UP,
+            steps_left=GIVEN_UP,
         )
 
 

@@ -1,6 +1,6 @@
 """Networks that act in closed loop in the tasks of ``workspace``.
 
-The network that settles is surprised where its own energy of a row, of a group of senses, passes a ceiling:
+The network that settles is surprised where the energy of a group of senses passes its ceiling:
 
     F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = max(W f(μ_t) + b, least)
 
@@ -37,11 +37,11 @@ MOTOR_UNITS = 256  # hidden units of the motor association
 
 
 class Reading(NamedTuple):
-    """What the network that settles makes of a row, or of T rows."""
+    """The network's state, error and energy at a row; of T rows, each with a first axis T."""
 
-    state: Floats  # (H,) or (T, H) f(μ)
-    error: Floats  # (N,) or (T, N) of senses, changes and commands, in σ
-    energy: Floats  # (G,) or (T, G) of ``GROUPS``, as multiples of their ceilings
+    state: Floats  # (H,) f(μ)
+    error: Floats  # (N,) of senses, changes and commands [σ]
+    energy: Floats  # (G,) of ``GROUPS`` [ceiling]
 
 
 class Settling:
@@ -70,15 +70,16 @@ class Settling:
         self.W = np.zeros((len(columns), network.hidden_size))
         self.bias = np.zeros(len(columns))
         self.least = np.zeros(len(columns))
-        readings = [self.felt(e.stream) for e in episodes]
+        readings = [self.read_stream(e.stream) for e in episodes]
         states = np.concatenate([reading.state for reading in readings])
         squares = np.concatenate([reading.error for reading in readings]) ** 2
         self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
-        ridge = Ridge(PRIOR).fit(states, np.log(squares + np.exp(self.least)))
-        ratios = squares / np.exp(ridge.predict(states))
-        ridge.intercept_ += np.log(np.mean(ratios, axis=0))
+        log_variance = np.log(squares + np.exp(self.least))
+        ridge = Ridge(PRIOR).fit(states, log_variance)
+        variance = np.exp(ridge.predict(states))
+        ratios = squares / variance
         self.W = ridge.coef_
-        self.bias = ridge.intercept_
+        self.bias = ridge.intercept_ + np.log(np.mean(ratios, axis=0))
 
     def begin(self) -> None:
         """Forget the past."""
@@ -88,22 +89,27 @@ class Settling:
 
     def read(self, row: Floats) -> Reading:
         """Read a row (D,), NaN where left out; nothing surprises in the first."""
-        is_first = not self.rows
         now = row[None]
-        self.rows = [now] * 3 if is_first else [*self.rows[1:], now]
-        earlier, before, _ = self.rows
+        is_first = not self.rows
+        if is_first:
+            self.rows = [now, now]
+        earlier, before = self.rows
+        self.rows = [before, now]
         scaled = self.reader.read(now, before, earlier)
         step = self.network.follow(self.c, scaled.commands, scaled.senses, scaled.seen)
         self.c = step.traces
-        left = np.hstack([scaled.senses, scaled.commands[:, :-1]]) - step.expected
-        left[:, : self.reader.size] *= scaled.seen
         state = np.tanh(step.mu[0])
-        sigma = np.exp(0.5 * np.maximum(self.W @ state + self.bias, self.least))
-        error = left[0] / sigma * (not is_first)
-        self.energy = self.energy + SMOOTH * (0.5 * self.members @ error**2 - self.energy)
+
+        difference = np.hstack([scaled.senses, scaled.commands[:, :-1]]) - step.expected
+        difference[:, : self.reader.size] *= scaled.seen
+        log_variance = np.maximum(self.W @ state + self.bias, self.least)
+        sigma = np.exp(0.5 * log_variance)
+        error = difference[0] / sigma * (not is_first)
+        energy_of_row = 0.5 * self.members @ error**2
+        self.energy = self.energy + SMOOTH * (energy_of_row - self.energy)
         return Reading(state, error, self.energy / self.ceilings)
 
-    def felt(self, stream: NDArray[Any]) -> Reading:
+    def read_stream(self, stream: NDArray[Any]) -> Reading:
         """Return the reading of all rows of a stream (T, D)."""
         self.begin()
         readings = [self.read(row) for row in np.asarray(stream, np.float64)]
@@ -130,7 +136,9 @@ class Recurrent:
     def read(self, row: Floats) -> None:
         """Read a row (D,)."""
         now = row[None]
-        before = now if self.before is None else self.before
+        before = self.before
+        if before is None:
+            before = now
         self.before = now
         scaled = self.reader.read(now, before, before)
         values = torch.from_numpy(np.hstack([scaled.senses, scaled.commands[:, :-1]]))
@@ -143,7 +151,7 @@ class Recurrent:
 
 
 class Associated:
-    """The motor association, which acts today."""
+    """The motor association of ``learn_to_act``."""
 
     def __init__(
         self, reader: StreamScaler, episodes: Sequence[Episode], rng: np.random.Generator

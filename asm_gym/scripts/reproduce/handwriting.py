@@ -33,21 +33,16 @@ NOISE = 0.02  # standard deviation of the pen's sensed position [cm]; letters ar
 MU = -1.75
 # variation of a stroke between writings: share of its length, and radians of its direction
 WOBBLE = 0.04
-# bounds of a stroke's columns in ``Letter``, without the time at which its turn comes
+# bounds of a stroke's columns in ``Letter``; of the onset, bounds of its delay
 LEAST_STROKE = (2.0, -math.pi, -2.5, -0.02, 0.25)
 MOST_STROKE = (5.0, math.pi, 2.5, 0.02, 0.4)
 STROKES = 4  # of a letter
-FIRST_ONSET = -0.05  # of the first stroke [s]
-ONSET_STEP = 0.19  # from the onset of a stroke to that of the next [s]
+FIRST_ONSET = -0.05  # mean onset of the first stroke [s]
+ONSET_STEP = 0.19  # mean time from the onset of a stroke to that of the next [s]
 FINE = 8  # samples of the velocity in a step, whose mean is commanded
-PEN = StreamSpec(
-    (
-        Channel("hand_position", 2, "cm", NOISE, "pen", ("x", "y")),
-        Channel("pen_command", 2, "cm/s", group=MOTOR, elements=("x", "y")),
-    ),
-    DT,
-    "pen",
-)
+POSITION = Channel("hand_position", 2, "cm", NOISE, "pen", ("x", "y"))
+COMMAND = Channel("pen_command", 2, "cm/s", group=MOTOR, elements=("x", "y"))
+PEN = StreamSpec((POSITION, COMMAND), DT, "pen")
 
 
 class Letter(NamedTuple):
@@ -69,9 +64,11 @@ def repertoire(count: int, rng: np.random.Generator) -> list[Letter]:
     """Return ``count`` letters drawn at random; ValueError for more than there are names."""
     check_letters(count)
     strokes = rng.uniform(LEAST_STROKE, MOST_STROKE, (count, STROKES, 5))
-    onsets = strokes[:, :, 3]
-    onsets[:] = ONSET_STEP * np.arange(STROKES) + onsets + FIRST_ONSET
-    return list(map(Letter, NAMES[:count], strokes))
+    delays = strokes[:, :, 3]
+    regular_onsets = ONSET_STEP * np.arange(STROKES)
+    strokes[:, :, 3] = regular_onsets + delays + FIRST_ONSET
+    names = NAMES[:count]
+    return list(map(Letter, names, strokes))
 
 
 def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -80,16 +77,19 @@ def velocity(letter: Letter, time: NDArray[np.float64]) -> NDArray[np.float64]:
     for length, direction, turn, onset, sigma in letter.strokes:
         since = np.maximum(time - onset, 1e-9)
         deviation = (np.log(since) - MU) / sigma
-        speed = length * np.exp(-0.5 * deviation**2) / (since * sigma * math.sqrt(2 * math.pi))
+        bell = length * np.exp(-0.5 * deviation**2)
+        area = since * sigma * math.sqrt(2 * math.pi)
+        speed = bell / area
         angle = direction + turn * 0.5 * (1 + erf(deviation / math.sqrt(2)))
-        total += speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        heading = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        total += speed[:, None] * heading
     return total
 
 
 def written(
     letter: Letter, rng: np.random.Generator, speed: float = 1.0, wobble: float = WOBBLE
 ) -> Episode:
-    """Write the letter once, ``speed`` times as fast as usual."""
+    """Write the letter once, ``speed`` times as fast as usual, with strokes that vary by ``wobble``."""
     strokes = letter.strokes.copy()
     changes = wobble * rng.standard_normal(strokes.shape)
     strokes[:, 0] *= 1 + changes[:, 0]
@@ -98,11 +98,15 @@ def written(
 
     # A command is the mean velocity of its step, so that the position is the integral.
     steps = round(STEPS / speed)
-    time = (np.arange(FINE * steps) + 0.5) * DT * speed / FINE
-    fine = velocity(Letter(letter.name, strokes), time)  # (FINE T, 2)
-    commands = speed * fine.reshape(steps, FINE, 2).mean(axis=1)  # (T, 2)
-    sensed = np.cumsum(commands, axis=0) * DT + NOISE * rng.standard_normal((steps, 2))
-    return Episode.from_stream(np.hstack([sensed, commands]), PEN, info={"skill": letter.name})
+    samples = np.arange(FINE * steps)
+    time = (samples + 0.5) * DT * speed / FINE
+    velocities = velocity(Letter(letter.name, strokes), time)
+    velocities_by_step = velocities.reshape(steps, FINE, 2)
+    commands = speed * velocities_by_step.mean(axis=1)  # (T, 2)
+    position = np.cumsum(commands, axis=0) * DT
+    sensed = position + NOISE * rng.standard_normal((steps, 2))
+    stream = np.hstack([sensed, commands])
+    return Episode.from_stream(stream, PEN, info={"skill": letter.name})
 
 
 def copybook(letters: Sequence[Letter], each: int, rng: np.random.Generator) -> list[Episode]:

@@ -45,11 +45,11 @@ GUARDS: dict[str, dict[str, Any] | None] = {
     "terminate": {"on_alarm": "terminate"},
 }
 """Settings of the wrapper by name; None for no wrapper."""
-TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")
+RAMMED_TASKS = ("Lift", "Stack", "Door", "PickPlaceCan", "NutAssemblySquare")
 """Tasks of hostile policies."""
-UNKNOWN = ("PickPlaceMilk", "NutAssemblyRound")
+UNMET_TASKS = ("PickPlaceMilk", "NutAssemblyRound")
 """Tasks that the Panda's memory has not met, with healthy policies alone."""
-ALL_TASKS = (*TASKS, *UNKNOWN)
+ALL_TASKS = (*RAMMED_TASKS, *UNMET_TASKS)
 HEALTHY = [
     *product(ALL_TASKS, ["scripted"]),
     ("Lift", "lift_sac"),
@@ -57,7 +57,7 @@ HEALTHY = [
     ("Door", "door_sac"),
 ]
 """Tasks and policies that do no harm on purpose."""
-FAULTS = {
+FAULT_SEVERITIES = {
     "frozen_encoder": "medium",
     "encoder_bias": "medium",
     "encoder_dropout": "medium",
@@ -124,16 +124,20 @@ class Case(NamedTuple):
     def memory(self) -> str:
         """Name of the shipped memory for the arm and the rate."""
         arm = str(self.config.robot).lower()
-        return arm if self.rate == CONTROL_RATE else f"{arm}_{self.rate}hz"
+        if self.rate == CONTROL_RATE:
+            return arm
+        return f"{arm}_{self.rate}hz"
 
     @property
     def key(self) -> Record:
         """Values of ``CASE``."""
-        slower = "" if self.speed == 1.0 else f", {self.speed:g} of full speed"
+        policy = self.policy
+        if self.speed != 1.0:
+            policy += f", {self.speed:g} of full speed"
         return {
             "kind": self.kind,
             "task": self.trial.task,
-            "policy": self.policy + slower,
+            "policy": policy,
             "fault": self.trial.kind,
             "robot": self.config.robot,
             "rate": self.rate,
@@ -149,7 +153,7 @@ class Case(NamedTuple):
 def cases(config: Config) -> list[tuple[Case, int]]:
     """Return every case and its number of episodes."""
     trials = {task: Trial(env_id(task), 0) for task in config.tasks}
-    rammed = [trials[task] for task in config.tasks if task not in UNKNOWN]
+    rammed = [trials[task] for task in config.tasks if task not in UNMET_TASKS]
     hostile = [Case("hostile", name, trial) for trial, name in product(rammed, HOSTILE)]
     slower = [
         Case("hostile", "down", trial, speed=speed) for trial, speed in product(rammed, SLOWER)
@@ -157,7 +161,7 @@ def cases(config: Config) -> list[tuple[Case, int]]:
     elsewhere = [case._replace(config=arm) for arm, case in product(ELSEWHERE, hostile)]
     healthy = [Case("healthy", policy, trials[task]) for task, policy in HEALTHY if task in trials]
     faulty = []
-    for case, (fault, severity) in product(healthy, FAULTS.items()):
+    for case, (fault, severity) in product(healthy, FAULT_SEVERITIES.items()):
         if case.trial.task in FAULTY_TASKS:
             trial = replace(case.trial, kind=fault, severity=severity)
             faulty.append(case._replace(kind="faulty", trial=trial))
@@ -178,57 +182,66 @@ def guarded(env: gym.Env[Any, Any], guard: str, case: Case) -> gym.Env[Any, Any]
 
 
 def episode(job: tuple[Case, str]) -> Record:
-    """Run one episode of a case under a guard; return what the arm felt, as the simulator knows it."""
+    """Run one episode of a case under a guard; return the simulator's contact forces, summed up, and the outcome."""
     case, guard = job
     seed = case.trial.seed
     arm: Any = environment(case.trial.env_id, case.config.settings).unwrapped
     infos: list[dict[str, Any]] = []
     forces: list[float] = []
 
-    def feel(substep: int) -> None:
+    def note_force(substep: int) -> None:
         forces.append(float(arm.simulation.contact_forces[-1]))
 
     with staged(case.trial, case.config) as env:
-        arm.substep_hooks.append(feel)
+        arm.substep_hooks.append(note_force)
         try:
-            success = rollout(guarded(env, guard, case), case.make_policy(env), seed, infos.append)
+            guarded_env = guarded(env, guard, case)
+            policy = case.make_policy(env)
+            success = rollout(guarded_env, policy, seed, infos.append)
         finally:
-            arm.substep_hooks.remove(feel)
+            arm.substep_hooks.remove(note_force)
     cost = np.array([info.get("cost", 0.0) for info in infos])
-    solved = np.flatnonzero([info["success"] for info in infos])
+    alarm_begins = np.diff(cost, prepend=0.0) > 0.0
+    solved_steps = np.flatnonzero([info["success"] for info in infos])
+    time = np.nan
+    if len(solved_steps):
+        time = (solved_steps[0] + 1) * arm.dt
     return {
         **case.key,
         "guard": guard,
         "seed": seed,
         "success": bool(success),
         **harm_of(np.array(forces)),
-        "time": (solved[0] + 1) * arm.dt if len(solved) else np.nan,
-        "alarms": int((np.diff(cost, prepend=0.0) > 0.0).sum()),
+        "time": time,
+        "alarms": int(alarm_begins.sum()),
         "cost": float(cost.sum()),
-        "held": sum(bool(info.get("overridden")) for info in infos),
+        "overridden": sum(bool(info.get("overridden")) for info in infos),
     }
 
 
 def harm_of(force: NDArray[np.float64]) -> Record:
     """Return the harm in a contact force (T,) [N] of physics substeps."""
     excess = np.maximum(force - EXCESS, 0.0)
-    over = excess > 0
-    start = int(over.argmax()) if over.any() else len(force)
-    first = force[start : start + round(FIRST_S * PHYSICS_FREQ)]
+    is_over = excess > 0
+    first_blow = 0.0
+    if is_over.any():
+        start = int(is_over.argmax())
+        stop = start + round(FIRST_S * PHYSICS_FREQ)
+        first_blow = float(force[start:stop].max())
     return {
         "harm": float(excess.sum() / PHYSICS_FREQ),
         "peak": float(force.max(initial=0.0)),
-        "first": float(first.max(initial=0.0)),
-        "over_s": float(over.sum() / PHYSICS_FREQ),
+        "first": first_blow,
+        "over_s": float(is_over.sum() / PHYSICS_FREQ),
     }
 
 
 def run(config: Config) -> kit.Findings:
     """Run every case on its own scenes, under every guard."""
     jobs = []
-    for again, (case, count) in product(config.repetitions, cases(config)):
-        for n, guard in product(range(count), config.guards):
-            trial = replace(case.trial, seed=10_000 * again + 1000 + n)
+    for repetition, (case, count) in product(config.repetitions, cases(config)):
+        for number, guard in product(range(count), config.guards):
+            trial = replace(case.trial, seed=10_000 * repetition + 1000 + number)
             jobs.append((case._replace(trial=trial), guard))
     records = kit.each("episodes", episode, jobs, config)
     frame = pd.DataFrame(records)
@@ -269,38 +282,50 @@ def guard_row(group: pd.DataFrame, guard: str) -> dict[str, str]:
     """Return the row of a guard, compared with the policy alone on the same scenes."""
     scenes = group.set_index([*CASE, "seed"])
     alone = scenes[scenes.guard == POLICY_ALONE]
-    mine = scenes[scenes.guard == guard]
+    guarded_ones = scenes[scenes.guard == guard]
+    row = {"": _name(group), "guard": guard} | harm_cells(guarded_ones, alone)
+    if (group.kind == "hostile").all():
+        row["cost"] = f"{guarded_ones.cost.mean():.1f}"
+        row[f"time over {EXCESS:g} N [s]"] = f"{guarded_ones.over_s.mean():.2f}"
+        row[f"cells that keep {100 * KEPT:.0f} %"] = cells_kept(group, guard)
+        gentle = (guarded_ones["first"] <= TRANSIENT).sum()
+        row[f"first blows of at most {TRANSIENT:g} N"] = f"{gentle} of {len(guarded_ones)}"
+        return row
+    return row | success_cells(guarded_ones, alone)
+
+
+def harm_cells(guarded_ones: pd.DataFrame, alone: pd.DataFrame) -> dict[str, str]:
+    """Return the cells of contact forces and alarms."""
     harm_alone = alone.harm.sum()
     kept_away = ""
     if harm_alone > 0:
-        kept_away = f"{100 * (1 - mine.harm.sum() / harm_alone):.1f} %"
-    row = {
-        "": _name(group),
-        "guard": guard,
-        "harm [N s]": f"{mine.harm.mean():.1f}",
+        share_left = guarded_ones.harm.sum() / harm_alone
+        kept_away = f"{100 * (1 - share_left):.1f} %"
+    first_blow = guarded_ones["first"]
+    return {
+        "harm [N s]": f"{guarded_ones.harm.mean():.1f}",
         "kept away": kept_away,
-        "first blow, mean and most [N]": f"{mine['first'].mean():.0f}, {mine['first'].max():.0f}",
-        "peak [N]": f"{mine.peak.max():.0f}",
-        "alarms": f"{mine.alarms.mean():.1f}",
+        "first blow, mean and most [N]": f"{first_blow.mean():.0f}, {first_blow.max():.0f}",
+        "peak [N]": f"{guarded_ones.peak.max():.0f}",
+        "alarms": f"{guarded_ones.alarms.mean():.1f}",
     }
-    if (group.kind == "hostile").all():
-        gentle = (mine["first"] <= TRANSIENT).sum()
-        return row | {
-            "cost": f"{mine.cost.mean():.1f}",
-            f"time over {EXCESS:g} N [s]": f"{mine.over_s.mean():.2f}",
-            f"cells that keep {100 * KEPT:.0f} %": cells_kept(group, guard),
-            f"first blows of at most {TRANSIENT:g} N": f"{gentle} of {len(mine)}",
-        }
-    paired = mine.join(alone.success.rename("alone"), how="inner")
-    lost = (paired.alone & ~paired.success).sum()
-    won = (paired.success & ~paired.alone).sum()
-    is_unsafe = (mine.peak > TRANSIENT) | (mine.over_s > LEANS_S) | (mine.held > 0)
-    beyond = f"of these beyond {TRANSIENT:g} N, {EXCESS:g} N for {LEANS_S:g} s, or overridden"
-    return row | {
-        "solved": f"{mine.success.sum()} of {len(mine)}",
+
+
+def success_cells(guarded_ones: pd.DataFrame, alone: pd.DataFrame) -> dict[str, str]:
+    """Return the cells of solved tasks, in pairs with the policy alone on the same scene."""
+    success = guarded_ones.success
+    pairs = guarded_ones.join(alone.success.rename("alone"), how="inner")
+    lost = (pairs.alone & ~pairs.success).sum()
+    won = (pairs.success & ~pairs.alone).sum()
+    is_hard = guarded_ones.peak > TRANSIENT
+    is_leaning = guarded_ones.over_s > LEANS_S
+    is_unsafe = is_hard | is_leaning | (guarded_ones.overridden > 0)
+    unsafe = f"of these beyond {TRANSIENT:g} N, {EXCESS:g} N for {LEANS_S:g} s, or overridden"
+    return {
+        "solved": f"{success.sum()} of {len(guarded_ones)}",
         "lost, won": f"-{lost} +{won}",
-        beyond: f"{(mine.success & is_unsafe).sum()}",
-        "median time to success [s]": f"{mine.time.median():.2f}",
+        unsafe: f"{(success & is_unsafe).sum()}",
+        "median time to success [s]": f"{guarded_ones.time.median():.2f}",
     }
 
 
@@ -310,7 +335,8 @@ def cells_kept(frame: pd.DataFrame, guard: str) -> str:
     if guard not in harm or POLICY_ALONE not in harm:
         return ""
     harm = harm[harm[POLICY_ALONE] > LITTLE]
-    return f"{(harm[guard] <= (1.0 - KEPT) * harm[POLICY_ALONE]).sum()} of {len(harm)}"
+    is_kept = harm[guard] <= (1.0 - KEPT) * harm[POLICY_ALONE]
+    return f"{is_kept.sum()} of {len(harm)}"
 
 
 def _name(group: pd.DataFrame) -> str:
@@ -331,16 +357,18 @@ def _name(group: pd.DataFrame) -> str:
 
 def frontier(frame: pd.DataFrame, guards: Sequence[str]) -> Figure:
     """Draw the harm of hostile policies against the time that healthy ones take, a point for each guard."""
-    times = frame[frame.kind == "healthy"].pivot_table(
-        "time", ["task", "policy"], "guard", "median", dropna=False
-    )
-    harm = frame[frame.kind == "hostile"].groupby("guard").harm.mean()
+    healthy = frame[frame.kind == "healthy"]
+    hostile = frame[frame.kind == "hostile"]
+    times = healthy.pivot_table("time", ["task", "policy"], "guard", "median", dropna=False)
+    harm = hostile.groupby("guard").harm.mean()
     with figure(height=3.5, width=6) as fig:
         ax = fig.subplots()
         for n, guard in enumerate(guards):
             colour, _, marker = look(n)
             slower = (times[guard] / times[POLICY_ALONE]).mean()
-            label = guard if np.isfinite(slower) else f"{guard}: solves nothing"
+            label = guard
+            if np.isnan(slower):
+                label = f"{guard}: solves nothing"
             ax.plot(slower, harm[guard], marker, color=colour, label=label)
         ax.set(
             yscale="log",

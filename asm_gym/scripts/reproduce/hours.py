@@ -60,38 +60,47 @@ class Config(kit.Config):
 
 
 def run(config: Config) -> Findings:
-    """Examine the memory, at its shipped thresholds, in every policy and task that it has not met."""
-    find = NeuralASM.load if config.memory.endswith(".asm") else NeuralASM.pretrained
-    memory = find(config.memory)
+    """Evaluate the memory, at its shipped thresholds, on every policy and task that it has not met."""
+    memory = load_memory(config.memory)
     corpus = Corpus.open(config.corpus)
-    exams = corpus.files[["policy", "task"]].drop_duplicates()
+    cases = corpus.files[["policy", "task"]].drop_duplicates()
     new: list[Scores] = []
     known: list[Scores] = []
-    with kit.stage("examining") as report:
-        for n, (policy, task) in enumerate(exams.itertuples(index=False)):
-            report(n, len(exams))
+    with kit.stage("evaluating") as report:
+        for n, (policy, task) in enumerate(cases.itertuples(index=False)):
+            report(n, len(cases))
             is_known = policy == EXPERT and task in memory.about["tasks"]
-            exam = EvaluationCase(task, policy, known=is_known)
-            own = corpus.episodes(policies=(policy,), tasks=(task,))
+            case = EvaluationCase(task, policy, known=is_known)
+            recordings = corpus.episodes(policies=(policy,), tasks=(task,))
             expert = corpus.episodes("nominal", policies=(EXPERT,), tasks=(task,))
-            usual = usual_force(expert[:EXPERT_EPISODES])
-            marks = evaluate_case(memory, exam.name, own, WINDOW_S, usual)
-            (known if is_known else new).append(marks)
+            expert_force = usual_force(expert[:EXPERT_EPISODES])
+            scores = evaluate_case(memory, case.name, recordings, expert_force)
+            if is_known:
+                known.append(scores)
+            else:
+                new.append(scores)
 
     thresholds = {rate: memory.threshold_at(false_alarms_per_hour=rate) for rate in PROMISES}
     records = []
-    for rate, marks in product(PROMISES, new):
-        alarms = hourly_alarms(marks.at(thresholds[rate]).solved)
+    for rate, scores in product(PROMISES, new):
+        alarms = hourly_alarms(scores.at(thresholds[rate]).solved)
         records.append(
-            {"promised": rate, "exam": marks.name, "alarms": alarms.k, "hours": alarms.hours}
+            {"promised": rate, "exam": scores.name, "alarms": alarms.k, "hours": alarms.hours}
         )
     tables = [
-        promises_table(new, thresholds, WINDOW_S),
-        scores_table(new, memory, WINDOW_S),
+        promises_table(new, thresholds),
+        scores_table(new, memory),
         rules_table(new, memory, thresholds),
         splits_table(new + known),
     ]
     return Findings(records, tables)
+
+
+def load_memory(name: str) -> NeuralASM:
+    """Return the memory in a file, or the shipped one of this name."""
+    if name.endswith(".asm"):
+        return NeuralASM.load(name)
+    return NeuralASM.pretrained(name)
 
 
 class EDetector:
@@ -108,58 +117,64 @@ class EDetector:
         # e(p) of an episode whose surprise 0, 1, … maxima reach
         self._e_values = (1 - p + p * np.log(p)) / (p * np.log(p) ** 2)
         self._maxima = np.sort(blocks.maxima)[::-1]
-        self._enough = n / blocks.total / rate
-        self._evidence = 0.0
+        self._critical = n / blocks.total / rate  # c
+        self._evidence = 0.0  # M
 
     @property
     def value(self) -> float:
         """The present threshold; infinite where no surprise would be evidence enough."""
-        ranks = int(((self._evidence + 1.0) * self._e_values >= self._enough).sum())
-        return float(self._maxima[ranks - 1]) if ranks else np.inf
+        evidence = (self._evidence + 1.0) * self._e_values
+        ranks_in_alarm = int((evidence >= self._critical).sum())
+        if not ranks_in_alarm:
+            return np.inf
+        return float(self._maxima[ranks_in_alarm - 1])
 
     def follow(self, largest: float) -> None:
         """Take an episode of this greatest surprise as evidence; an alarm ends all evidence."""
-        rank = min(int((self._maxima >= largest).sum()), len(self._maxima) - 1)
+        maxima_reached = int((self._maxima >= largest).sum())
+        rank = min(maxima_reached, len(self._maxima) - 1)
         self._evidence = (self._evidence + 1.0) * float(self._e_values[rank])
-        if self._evidence >= self._enough:
+        if self._evidence >= self._critical:
             self._evidence = 0.0
 
 
 def rules_table(
-    marks: Sequence[Scores], memory: NeuralASM, thresholds: Mapping[float, float]
+    scores: Sequence[Scores], memory: NeuralASM, thresholds: Mapping[float, float]
 ) -> Table:
     """Return a row for each promise and rule of alarm."""
     assert memory.blocks_ is not None
     rows = []
     for rate, threshold in thresholds.items():
-        hourly = [m.at(threshold) for m in marks]
-        rules = {
-            "hourly threshold": hourly,
-            "threshold that follows": [m.adapted(rate) for m in hourly],
-            "e-detector": [m.under(EDetector(memory.blocks_, rate)) for m in marks],
-        }
-        rows += [rule_row(rate, name, under_rule) for name, under_rule in rules.items()]
+        hourly = [each.at(threshold) for each in scores]
+        adaptive = [each.adapted(rate) for each in hourly]
+        detected = [each.under(EDetector(memory.blocks_, rate)) for each in scores]
+        rows.append(rule_row(rate, "hourly threshold", hourly))
+        rows.append(rule_row(rate, "threshold that follows", adaptive))
+        rows.append(rule_row(rate, "e-detector", detected))
     caption = "Three rules of alarm, under policies and tasks that the memory never met."
     return kit.table_of(caption, rows)
 
 
-def rule_row(rate: float, name: str, marks: Sequence[Scores]) -> dict[str, str]:
+def rule_row(rate: float, name: str, scores: Sequence[Scores]) -> dict[str, str]:
     """Return the row of a rule of alarm that promises a rate [1/h]."""
-    above = sum(hourly_alarms(m.solved).interval[0] > rate for m in marks)
-    healthy, faulty = all_episodes(marks)
+    above = 0
+    for each in scores:
+        low, _ = hourly_alarms(each.solved).interval
+        above += low > rate
+    healthy, faulty = all_episodes(scores)
     found = percent(DetectionMetrics("", faulty, [], WINDOW_S).detected)
     return {
         "promised": f"{rate:g}",
         "rule": name,
         "false alarms an hour": hourly_alarms(healthy).text,
-        "policies above it beyond chance": f"{above} of {len(marks)}",
+        "policies above it beyond chance": f"{above} of {len(scores)}",
         "faults found": f"{found} of {len(faulty)}",
     }
 
 
-def splits_table(marks: Sequence[Scores]) -> Table:
-    """Return what each promise comes to over random halves of all healthy hours, known tasks included."""
-    solved, faulty = all_episodes(marks)
+def splits_table(scores: Sequence[Scores]) -> Table:
+    """Return false alarms, where one random half of all healthy hours sets the threshold; known tasks included."""
+    solved, faulty = all_episodes(scores)
     units = Blocks.of([t.surprise for t in solved], solved[0].dt)
     metrics = DetectionMetrics("", faulty, [], WINDOW_S)
     caption = (

@@ -16,7 +16,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -126,7 +125,7 @@ def write(path: Path, findings: Findings, config: Any, seconds: float) -> list[s
 
 def stage(label: str) -> AbstractContextManager[Progress]:
     """Show the progress of a stage while the block runs; yields a function of (done, total)."""
-    return progress.stage(label, Console(), {})
+    return progress.stage(label, Console())
 
 
 def each(
@@ -148,7 +147,9 @@ def where(records: Records, **values: Any) -> pd.DataFrame:
     """Return the records with these values; a tuple stands for any of its values."""
     frame = pd.DataFrame(records)
     for name, value in values.items():
-        allowed = value if isinstance(value, tuple) else (value,)
+        allowed = (value,)
+        if isinstance(value, tuple):
+            allowed = value
         frame = frame[frame[name].isin(allowed)]
     return frame
 
@@ -157,12 +158,6 @@ def by_seed(records: Records, value: str, **values: Any) -> pd.Series[float]:
     """Return the mean of a value in each seed, over the records with these values."""
     chosen = where(records, **values).dropna(subset=[value])
     return chosen.astype({value: float}).groupby("seed")[value].mean()
-
-
-def over_seeds(records: Records, value: str, **values: Any) -> Spread:
-    """Return mean and spread of the means of each seed; NaN without records of these values."""
-    means = by_seed(records, value, **values)
-    return Spread(float(means.mean()), float(means.std()))
 
 
 # ------------------------------------------------------------------ tables and figures
@@ -177,7 +172,7 @@ def table_of(caption: str, rows: Sequence[Mapping[str, object]]) -> Table:
 def grid(
     caption: str, records: Records, value: str, rows: str, columns: str, digits: int = 2
 ) -> Table:
-    """Return a table of means over seeds.
+    """Return a table of means over seeds, with their standard deviation.
 
     Args:
         caption: of the table.
@@ -192,15 +187,12 @@ def grid(
     for label, own in frame.groupby(rows, sort=False):
         row = {"": label}
         for column in frame[columns].unique():
-            row[str(column)] = shown(own, value, digits, **{columns: column})
+            means = by_seed(own, value, **{columns: column})
+            row[str(column)] = ""
+            if len(means):
+                row[str(column)] = Spread.of(means.to_numpy()).text(digits)
         cells.append(row)
     return table_of(caption, cells)
-
-
-def shown(records: Records, value: str, digits: int = 2, **values: Any) -> str:
-    """Return ``mean ± spread`` over seeds, for a table; empty without records."""
-    spread = over_seeds(records, value, **values)
-    return "" if np.isnan(spread.mean) else spread.text(digits=digits)
 
 
 def curves(ax: Axes, records: Records, value: str, x: str, lines: str) -> None:

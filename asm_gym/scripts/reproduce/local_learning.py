@@ -4,10 +4,11 @@
     L_alone: the same along a stream that reads a cue and then runs on its own predictions
     exact: the gradient of each, through all steps of inference and of time      local: Σ_t of the Hebbian changes
 
-Claim: along streams that are read, local changes are the gradient. Their traces hold what was sensed, which no weight
-changes, so that nothing would travel back through time. Along streams that run on alone there is something, and local
-changes leave it out. A memory learns letters by its local rules, and on the way the angles to the three gradients are
-measured, with the weights held still. Then the same network learns from the same letters by backpropagation.
+Claim: along streams that are read, local changes are the gradient. Their traces hold what was sensed. No weight changes
+that, so nothing travels back through time. Along streams that run on alone, traces hold predictions, which depend on
+the weights; local changes leave that dependence out. A memory learns letters by its local rules. On the way the study
+measures the angles to the three gradients, with the weights held still. Then the same network learns the same letters
+by backpropagation.
 """
 
 from __future__ import annotations
@@ -58,9 +59,11 @@ TARGETS = {
     "error": "gradient of the prediction error",
     "alone": f"gradient of the error alone, after a cue of {CUE}",
 }
-# learning rate of a change a row, and of one a batch
+# learning rates
 RATES = {
+    # of the change of a row
     "local": 3e-3,
+    # of the gradient of a batch
     "backpropagation": 1e-2,
 }
 PRIOR_PRECISION = 30.0  # Π_z
@@ -121,27 +124,31 @@ def local(
     error = 0.0
     for t, (x, u) in enumerate(zip(batch.senses, batch.commands, strict=True)):
         runs_on = alone and t >= CUE
-        read = x
-        taken = u
+        senses = x
+        commands = u
         mu = expect(c, weights.W_C)
-        state = sense(mu, weights.W_F)
+        from_state = sense(mu, weights.W_F)
         if runs_on:
-            action = (direct(c, u, weights.W_D) + state)[:, sensory:]
-            taken = np.hstack([action, u[:, -1:]])
-        past = direct(c, taken, weights.W_D)
+            expected = direct(c, u, weights.W_D) + from_state
+            commands = np.hstack([expected[:, sensory:], u[:, -1:]])
+        from_traces = direct(c, commands, weights.W_D)
         if runs_on:
-            read = (past + state)[:, :sensory]
+            expected = from_traces + from_state
+            senses = expected[:, :sensory]
 
-        left = np.hstack([x, u[:, :-1]]) - past
-        z = infer(mu, left, weights.W_F, np.ones_like(left), inference)
-        missed = left - sense(z, weights.W_F)
-        change = hebbian_change(c, taken, mu, z, missed, pi_z)
+        row = np.hstack([x, u[:, :-1]])
+        to_explain = row - from_traces
+        z = infer(mu, to_explain, weights.W_F, np.ones_like(to_explain), inference)
+        unexplained = to_explain - sense(z, weights.W_F)
+        change = hebbian_change(c, commands, mu, z, unexplained, pi_z)
         for name in COMPARED:
             total[name] += getattr(change, name)
         prior = pi_z * np.sum((z - mu) ** 2)
-        energy += 0.5 * float((prior + np.sum(missed**2)) / streams)
-        error += 0.5 * float(np.sum((left - state) ** 2) / streams)
-        c = advance(c, np.hstack([read, taken]), weights.gains)
+        likelihood = np.sum(unexplained**2)
+        squares = np.sum((to_explain - from_state) ** 2)
+        energy += 0.5 * float((prior + likelihood) / streams)
+        error += 0.5 * float(squares / streams)
+        c = advance(c, np.hstack([senses, commands]), weights.gains)
     return Changes(total, energy, error)
 
 
@@ -156,7 +163,9 @@ def exact(
         torch.from_numpy(array.copy()).requires_grad_() for array in weights
     )
     energy, error = losses(tensors, batch, iterations, target, pi_z)
-    loss = energy if target == "energy" else error
+    loss = error
+    if target == "energy":
+        loss = energy
     gradients = torch.autograd.grad(loss, tensors[: len(COMPARED)])
     arrays = [-gradient.numpy().astype(np.float64) for gradient in gradients]
     return Changes(dict(zip(COMPARED, arrays, strict=True)), energy.item(), error.item())
@@ -180,37 +189,45 @@ def losses(
     error = torch.zeros(())
     for t, (x, u) in enumerate(zip(senses, commands, strict=True)):
         runs_on = target == "alone" and t >= CUE
-        read = x
-        taken = u
-        flat = c.flatten(1)
-        mu = flat @ weights.W_C.T
-        state = torch.tanh(mu) @ weights.W_F.T
+        senses = x
+        commands = u
+        traces = c.flatten(1)
+        mu = traces @ weights.W_C.T
+        from_state = torch.tanh(mu) @ weights.W_F.T
         if runs_on:
-            action = (torch.cat([flat, u], dim=1) @ W_D.T + state)[:, S:]
-            taken = torch.cat([action, u[:, -1:]], dim=1)
-        past = torch.cat([flat, taken], dim=1) @ W_D.T
+            expected = torch.cat([traces, u], dim=1) @ W_D.T + from_state
+            commands = torch.cat([expected[:, S:], u[:, -1:]], dim=1)
+        from_traces = torch.cat([traces, commands], dim=1) @ W_D.T
         if runs_on:
-            read = (past + state)[:, :S]
+            expected = from_traces + from_state
+            senses = expected[:, :S]
 
-        left = torch.cat([x, u[:, :-1]], dim=1) - past
-        error = error + 0.5 * torch.sum((left - state) ** 2) / streams
+        row = torch.cat([x, u[:, :-1]], dim=1)
+        to_explain = row - from_traces
+        squares = torch.sum((to_explain - from_state) ** 2)
+        error = error + 0.5 * squares / streams
         if target == "energy":
-            z = settled(mu, left, weights.W_F, iterations, pi_z)
-            missed = torch.sum((left - torch.tanh(z) @ weights.W_F.T) ** 2)
+            z = settled(mu, to_explain, weights.W_F, iterations, pi_z)
+            unexplained = to_explain - torch.tanh(z) @ weights.W_F.T
+            likelihood = torch.sum(unexplained**2)
             prior = pi_z * torch.sum((z - mu) ** 2)
-            energy = energy + 0.5 * (prior + missed) / streams
-        rows = torch.cat([read, taken], dim=1)[:, None]
+            energy = energy + 0.5 * (prior + likelihood) / streams
+        rows = torch.cat([senses, commands], dim=1)[:, None]
         c = decays * c + weights.gains[:, None] * rows
     return energy, error
 
 
-def settled(mu: Tensor, left: Tensor, W_F: Tensor, iterations: int, pi_z: float) -> Tensor:
-    """Return the state (B, H) inferred from the expected one ``mu``, to explain ``left`` (B, S + A)."""
+def settled(mu: Tensor, to_explain: Tensor, W_F: Tensor, iterations: int, pi_z: float) -> Tensor:
+    """Return the inferred state (B, H).
+
+    Inference begins at the expected state ``mu`` (B, H), and explains ``to_explain`` (B, S + A): what the traces
+    have not predicted of the row.
+    """
     curvature = pi_z + float(torch.linalg.matrix_norm(W_F.detach(), 2)) ** 2
     z = mu
     for _ in range(iterations):
         f = torch.tanh(z)
-        feedback = (left - f @ W_F.T) @ W_F
+        feedback = (to_explain - f @ W_F.T) @ W_F
         bend = float(STEEPEST) * feedback.detach().abs().amax(dim=1, keepdim=True)
         gradient = pi_z * (z - mu) - (1 - f * f) * feedback
         z = z - float(STRIDE) / (curvature + bend) * gradient
@@ -242,25 +259,28 @@ def one_seed(seed: int, config: Config) -> list[Record]:
     tests = copybook(letters, 2, rng)
     reader = fit_reader(train)
     taught = trajectories(reader, train)
-    judged = side_by_side(trajectories(reader, tests))
-    probe = side_by_side(taught[:: max(1, len(taught) // PROBED)])
+    held_out = side_by_side(trajectories(reader, tests))
+    every = max(1, len(taught) // PROBED)
+    probe = side_by_side(taught[::every])
+
     weights = initial_weights(config.hidden, reader.size, 2, rng)
     weights.gains[:] = fit_gains([np.hstack([t.senses, t.commands]) for t in taught])
-    start = copy.deepcopy(weights)
-    ways = {
+    same_start = copy.deepcopy(weights)
+    same_order = np.random.default_rng(seed)
+    learners = {
         "local": learn_locally(weights, taught, config.epochs, rng),
-        "backpropagation": backpropagate(start, taught, config.epochs, np.random.default_rng(seed)),
+        "backpropagation": backpropagate(same_start, taught, config.epochs, same_order),
     }
     measured = checkpoints(config.epochs)
     records = []
-    for way, learning in ways.items():
-        for epoch, current in enumerate(learning):
+    for learned_by, learner in learners.items():
+        for epoch, current in enumerate(learner):
             if epoch not in measured:
                 continue
-            if way == "local":
+            if learned_by == "local":
                 records += angles(current, probe, epoch)
-            record = {"epoch": epoch, "learned_by": way, "mse": mean_square(current, judged)}
-            records.append(record)
+            mse = mean_square(current, held_out)
+            records.append({"epoch": epoch, "learned_by": learned_by, "mse": mse})
     return [{"seed": seed, **record} for record in records]
 
 
@@ -279,7 +299,8 @@ def learn_locally(
     )
     practice = Practice(TracesLearner(weights, schedule, rng), STREAMS, rng)
     moments = one_after_another(taught, STREAMS, rng)
-    steps = math.ceil(sum(len(t.senses) for t in taught) / STREAMS)
+    rows = sum(len(t.senses) for t in taught)
+    steps = math.ceil(rows / STREAMS)
     yield weights
     for epoch in range(epochs):
         rate = cosine_decay(schedule.learning_rate, epoch / epochs)
@@ -290,7 +311,7 @@ def learn_locally(
 def backpropagate(
     weights: Weights, taught: Sequence[Trajectory], epochs: int, rng: np.random.Generator
 ) -> Iterator[Weights]:
-    """Train by Adam on the exact gradient of the prediction error; yield as ``learn_locally``."""
+    """Train by Adam on the exact gradient of the prediction error; yield the weights as ``learn_locally`` does."""
     # These tensors share memory with the weights.
     tensors = {name: torch.from_numpy(getattr(weights, name)) for name in COMPARED}
     adam = torch.optim.Adam(tensors.values())
@@ -305,10 +326,10 @@ def backpropagate(
         yield weights
 
 
-def mean_square(weights: Weights, judged: Batch) -> float:
+def mean_square(weights: Weights, held_out: Batch) -> float:
     """Return the mean squared error of a predicted number [variance of the stream]."""
-    numbers = judged.senses[:, 0].size + judged.commands[:, 0, :-1].size
-    return 2 * local(weights, judged, ITERATIONS).error / numbers
+    numbers = held_out.senses[:, 0].size + held_out.commands[:, 0, :-1].size
+    return 2 * local(weights, held_out, ITERATIONS).error / numbers
 
 
 def angles(weights: Weights, probe: Batch, epoch: int) -> list[Record]:
@@ -317,7 +338,8 @@ def angles(weights: Weights, probe: Batch, epoch: int) -> list[Record]:
     for target in TARGETS:
         change = local(weights, probe, ITERATIONS, alone=target == "alone")
         gradient = exact(weights, probe, ITERATIONS, target)
-        degrees = math.degrees(math.acos(min(1.0, cosine(change, gradient))))
+        similarity = min(1.0, cosine(change, gradient))
+        degrees = math.degrees(math.acos(similarity))
         records.append({"epoch": epoch, "target": target, "degrees": degrees})
     return records
 

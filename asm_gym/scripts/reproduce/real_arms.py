@@ -52,7 +52,7 @@ class RealArm(NamedTuple):
     """A recording of an arm that did nothing wrong, and its body model."""
 
     robot: str
-    place: str  # bag below the folder of all recordings
+    bag: str  # below the folder of all recordings
     urdf: str  # file in the folder ``urdf`` of that of all recordings
 
 
@@ -91,15 +91,18 @@ class Piece(NamedTuple):
     def rise(self) -> Floats:
         """Return the share (T - onset,) of its size that a growing fault has reached."""
         rows = np.arange(len(self.episode) - self.onset)
-        return np.minimum(1.0, (1 + rows) * self.episode.spec.dt / RISE_S)
+        since = (1 + rows) * self.episode.spec.dt  # [s]
+        return np.minimum(1.0, since / RISE_S)
 
     def strong_joint(self, rng: np.random.Generator) -> int:
         """Draw one of the joints whose effort ranges far."""
-        return int(rng.choice(np.flatnonzero(self.ranges > 0.1 * self.ranges.max())))
+        strong = np.flatnonzero(self.ranges > 0.1 * self.ranges.max())
+        return int(rng.choice(strong))
 
     def at_joint(self, joint: int, values: Floats | float) -> Floats:
-        """Return what is added (T - onset, J) by values at one joint."""
-        added = np.zeros((len(self.episode) - self.onset, len(self.ranges)))
+        """Return (T - onset, J): ``values`` (T - onset,) at one joint, 0 at the others."""
+        rows = len(self.episode) - self.onset
+        added = np.zeros((rows, len(self.ranges)))
         added[:, joint] = values
         return added
 
@@ -131,10 +134,11 @@ def jacobian(body: BodyModel, q: Floats) -> Floats:
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     depth = np.zeros(model.nbody)
-    for n in range(1, model.nbody):  # parents come first
-        depth[n] = depth[model.body_parentid[n]] + 1
+    for link in range(1, model.nbody):  # parents come first
+        depth[link] = depth[model.body_parentid[link]] + 1
+    outermost = int(depth.argmax())
     by_column = np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, by_column, None, int(depth.argmax()))
+    mujoco.mj_jacBody(model, data, by_column, None, outermost)
     by_joint = np.zeros((3, len(q)))
     by_joint[:, body.columns] = by_column
     return by_joint
@@ -143,7 +147,8 @@ def jacobian(body: BodyModel, q: Floats) -> Floats:
 def push(piece: Piece, rng: np.random.Generator) -> Floats:
     """Push the hand sideways."""
     angle = rng.uniform(0, 2 * np.pi)
-    return piece.torques([NEWTONS * np.cos(angle), NEWTONS * np.sin(angle), 0.0])
+    force = [NEWTONS * np.cos(angle), NEWTONS * np.sin(angle), 0.0]
+    return piece.torques(force)
 
 
 def payload(piece: Piece, rng: np.random.Generator) -> Floats:
@@ -155,7 +160,8 @@ def step(piece: Piece, rng: np.random.Generator) -> Floats:
     """Shift the effort of a joint."""
     joint = piece.strong_joint(rng)
     sign = rng.choice([-1, 1])
-    return piece.at_joint(joint, sign * STEP_SHARE * piece.ranges[joint] * piece.rise())
+    size = sign * STEP_SHARE * piece.ranges[joint]
+    return piece.at_joint(joint, size * piece.rise())
 
 
 def freeze(piece: Piece, rng: np.random.Generator) -> Floats | None:
@@ -166,13 +172,15 @@ def freeze(piece: Piece, rng: np.random.Generator) -> Floats | None:
     if not len(moving):
         return None
     joint = int(rng.choice(moving))
-    return piece.at_joint(joint, angles[piece.onset - 1, joint] - after[:, joint])
+    frozen = angles[piece.onset - 1, joint]
+    return piece.at_joint(joint, frozen - after[:, joint])
 
 
 def slip(piece: Piece, rng: np.random.Generator) -> Floats:
     """Let an encoder slip."""
     angle = rng.choice([-1, 1]) * SLIP
-    return piece.at_joint(int(rng.integers(len(piece.ranges))), angle)
+    joint = int(rng.integers(len(piece.ranges)))
+    return piece.at_joint(joint, angle)
 
 
 def delay(piece: Piece, rng: np.random.Generator) -> Floats:
@@ -192,7 +200,7 @@ class Fault(NamedTuple):
     needs_body: bool = False
 
 
-FAULTS = {
+ADDED_FAULTS = {
     "push": Fault("effort", push, needs_body=True),
     "payload": Fault("effort", payload, needs_body=True),
     "step": Fault("effort", step),
@@ -204,16 +212,18 @@ FAULTS = {
 
 def with_fault(kind: str, piece: Piece, rng: np.random.Generator) -> Episode | None:
     """Return the piece with a fault from the onset on; None where the piece does not allow it."""
-    fault = FAULTS[kind]
+    fault = ADDED_FAULTS[kind]
     if fault.needs_body and piece.body is None:
         return None
     added = fault.added(piece, rng)
     if added is None:
         return None
     spec = piece.episode.spec
+    columns = spec.slices[fault.column]
     stream = piece.episode.stream.copy()
-    stream[piece.onset :, spec.slices[fault.column]] += added.astype(np.float32)
-    return Episode.from_stream(stream, spec, faults=np.arange(len(stream)) >= piece.onset)
+    stream[piece.onset :, columns] += added.astype(np.float32)
+    is_faulty = np.arange(len(stream)) >= piece.onset
+    return Episode.from_stream(stream, spec, faults=is_faulty)
 
 
 # ------------------------------------------------------------------ the study
@@ -259,7 +269,7 @@ def run(config: Config) -> Findings:
     present = []
     missing = []
     for name in config.experiments:
-        path = config.folder / ARMS[name].place
+        path = config.folder / ARMS[name].bag
         if path.exists():
             present.append(name)
         else:
@@ -277,7 +287,7 @@ def run(config: Config) -> Findings:
     return Findings(records, tables)
 
 
-class Folds(NamedTuple):
+class Split(NamedTuple):
     """Pieces of a recording by their use."""
 
     learned: list[Episode]
@@ -285,47 +295,51 @@ class Folds(NamedTuple):
     tested: list[Episode]
 
 
-def split(job: Job, cut: Sequence[Episode]) -> Folds:
-    """Deal the pieces of a recording out for one fold."""
+def split(job: Job, whole: Episode) -> Split:
+    """Cut a recording into pieces, and deal them out for one fold."""
+    cut = [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)]
     order = np.random.default_rng(job.seed).permutation(len(cut))
     is_tested = np.arange(len(cut)) % FOLDS == job.fold
+    tested = np.sort(order[is_tested])
     others = order[~is_tested]
     if len(others) < 4:
         raise ValueError(f"{job.experiment} has {len(cut)} pieces of {PIECE_S:g} s: too few")
-    return Folds(
-        learned=[cut[i] for n, i in enumerate(others) if n % 3],
-        calibration=[cut[i] for i in others[::3]],
-        tested=[cut[i] for i in np.sort(order[is_tested])],
+    is_learned = np.arange(len(others)) % 3 > 0
+    return Split(
+        learned=[cut[i] for i in others[is_learned]],
+        calibration=[cut[i] for i in others[~is_learned]],
+        tested=[cut[i] for i in tested],
     )
 
 
 def examined(job: Job, folder: Path) -> list[Record]:
     """Return a record for each tested piece as it is, and for each fault in it."""
     arm = ARMS[job.experiment]
-    whole = Episode.from_table(read_joint_states(folder / arm.place), success=True)
+    whole = Episode.from_table(read_joint_states(folder / arm.bag), success=True)
     spec = whole.spec
-    folds = split(job, [piece for part in complete_parts(whole) for piece in pieces(part, PIECE_S)])
+    use = split(job, whole)
     urdf = read_body(folder, arm)
-    monitor = fitted(job, folds.learned, urdf)
-    rate = 1.0 / (len(folds.calibration) + 1)
-    threshold = monitor.calibrate(folds.calibration, rate).threshold
+    monitor = fitted(job, use.learned, urdf)
+    rate = 1.0 / (len(use.calibration) + 1)
+    threshold = monitor.calibrate(use.calibration, rate).threshold
 
     effort = whole.stream[:, spec.slices["effort"]].astype(np.float64)
-    ranges = np.quantile(effort, 0.95, axis=0) - np.quantile(effort, 0.05, axis=0)
+    low, high = np.quantile(effort, (0.05, 0.95), axis=0)
     body = BodyModel.of(urdf, spec.labels[spec.slices["position"]])
     rng = np.random.default_rng([job.seed, job.fold])  # the same faults for every monitor
-    kinds = [""] * len(folds.tested)
-    episodes = [*folds.tested]
-    for episode, kind in product(folds.tested, FAULTS):
-        faulty = with_fault(kind, Piece(episode, len(episode) // 2, ranges, body), rng)
+    kinds = [""] * len(use.tested)
+    episodes = [*use.tested]
+    for episode, kind in product(use.tested, ADDED_FAULTS):
+        piece = Piece(episode, onset=len(episode) // 2, ranges=high - low, body=body)
+        faulty = with_fault(kind, piece, rng)
         if faulty is not None:
             kinds.append(kind)
             episodes.append(faulty)
-    scores = monitor.score_episodes(episodes)
-    return [
-        job._asdict() | judged(kind, score.value / threshold, spec.dt)
-        for kind, score in zip(kinds, scores, strict=True)
-    ]
+    records = []
+    for kind, score in zip(kinds, monitor.score_episodes(episodes), strict=True):
+        result = result_of(kind, score.value / threshold, spec.dt)
+        records.append(job._asdict() | result)
+    return records
 
 
 def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
@@ -345,36 +359,36 @@ def fitted(job: Job, episodes: Sequence[Episode], urdf: str) -> Any:
     return monitor.fit(list(episodes))
 
 
-def judged(kind: str, value: Floats, dt: float) -> Record:
-    """Return the record of a piece by its surprise as a multiple of the threshold (T,)."""
-    is_over = value > 1
+def result_of(kind: str, surprise: Floats, dt: float) -> Record:
+    """Return the result of a piece, by its surprise (T,) [thresholds]; a fault begins in its middle."""
+    is_over = surprise > 1
     if not kind:
         return {
             "kind": kind,
-            "alarms": alarms_in(value, 1.0, dt),
+            "alarms": alarms_in(surprise, 1.0, dt),
             "alarm_s": is_over.sum() * dt,
-            "seconds": len(value) * dt,
-            "excess": float(value.max()),
+            "seconds": len(surprise) * dt,
+            "excess": float(surprise.max()),
         }
-    onset = len(value) // 2
-    late = np.flatnonzero(is_over[onset:])
-    found = bool(len(late)) and not is_over[:onset].any()
-    return {
-        "kind": kind,
-        "found": found,
-        "delay": dt * (late[0] + 1) if found else np.nan,
-        "excess": float(value[onset:].max()),
-    }
+    onset = len(surprise) // 2
+    rows_over = np.flatnonzero(is_over[onset:])
+    found = bool(len(rows_over)) and not is_over[:onset].any()
+    delay = np.nan
+    if found:
+        delay = dt * (rows_over[0] + 1)
+    excess = float(surprise[onset:].max())
+    return {"kind": kind, "found": found, "delay": delay, "excess": excess}
 
 
 def table(records: pd.DataFrame, arm: RealArm) -> Table:
     """Return the table of a recording, a row for each monitor."""
     healthy = records[records.kind == ""]
     monitors = records.groupby("monitor", sort=False)
-    fewest = int((healthy.excess > 1).groupby(healthy.monitor).sum().min())
+    pieces_over = (healthy.excess > 1).groupby(healthy.monitor).sum()
+    fewest = int(pieces_over.min())
     seconds = healthy.seconds.sum() / len(monitors)
     caption = (
-        f"{arm.robot} ({arm.place}), {seconds:.0f} s as recorded. "
+        f"{arm.robot} ({arm.bag}), {seconds:.0f} s as recorded. "
         "* added to the recording, found within half a piece. "
         f"At {fewest}: pushes and payloads found by the threshold "
         f"that {fewest} healthy pieces pass."
@@ -383,18 +397,23 @@ def table(records: pd.DataFrame, arm: RealArm) -> Table:
 
 
 def monitor_row(name: str, records: pd.DataFrame, fewest: int) -> dict[str, str]:
-    """Return the row of a monitor; ``fewest`` healthy pieces pass the threshold of pushes and payloads."""
+    """Return the row of a monitor.
+
+    Monitors are compared at thresholds of their own that ``fewest`` healthy pieces pass.
+    """
     row = {"Monitor": name}
-    for kind in FAULTS:
+    for kind in ADDED_FAULTS:
         faulty = records[records.kind == kind]
         if len(faulty):
             row[f"{kind} *"] = f"{faulty.found.astype(int).sum()} of {len(faulty)}"
-    median = records.delay.median()
-    row["delay [s]"] = "" if np.isnan(median) else f"{median:.3g}"
+    row["delay [s]"] = ""
+    if records.delay.notna().any():
+        row["delay [s]"] = f"{records.delay.median():.3g}"
 
     healthy = records[records.kind == ""]
     pushed = records[records.kind.isin(["push", "payload"])]
-    is_found = pushed.excess > healthy.excess.nlargest(fewest + 1).iloc[-1]
+    comparable_threshold = healthy.excess.nlargest(fewest + 1).iloc[-1]
+    is_found = pushed.excess > comparable_threshold
     row[f"at {fewest}"] = f"{is_found.sum()} of {len(pushed)}"
     seconds = healthy.seconds.sum()
     row["false alarms an hour"] = f"{3600 * healthy.alarms.sum() / seconds:.0f}"

@@ -8,6 +8,8 @@ its own errors when it runs on.
 Sources: Cho et al. 2014 (EMNLP); Jaeger 2001 (GMD Report 148) for the noise.
 """
 
+# In shapes: T rows, B episodes, S numbers sensed, A numbers commanded.
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -37,21 +39,19 @@ class Batch(NamedTuple):
 
 def side_by_side(trajectories: Sequence[Trajectory | ScaledRows]) -> Batch:
     """Stack episodes along a new second axis; the shorter ones are NaN after their end."""
-
-    def stacked(arrays: list[Array]) -> Array:
-        return pad_sequence(list(map(torch.from_numpy, arrays)), padding_value=np.nan).numpy()
-
-    return Batch(
-        senses=stacked([t.senses for t in trajectories]),
-        commands=stacked([t.commands for t in trajectories]),
-    )
+    senses = [torch.from_numpy(t.senses) for t in trajectories]
+    commands = [torch.from_numpy(t.commands) for t in trajectories]
+    padded_senses = pad_sequence(senses, padding_value=np.nan)
+    padded_commands = pad_sequence(commands, padding_value=np.nan)
+    return Batch(padded_senses.numpy(), padded_commands.numpy())
 
 
 def batches(trajectories: Sequence[Trajectory], rng: np.random.Generator) -> list[Batch]:
     """Return all episodes in batches of about one length, in random order."""
     shuffled = [trajectories[i] for i in rng.permutation(len(trajectories))]
     shuffled.sort(key=lambda trajectory: len(trajectory.senses))
-    groups = [shuffled[i : i + BATCH] for i in range(0, len(shuffled), BATCH)]
+    starts = range(0, len(shuffled), BATCH)
+    groups = [shuffled[start : start + BATCH] for start in starts]
     return [side_by_side(groups[i]) for i in rng.permutation(len(groups))]
 
 
@@ -72,10 +72,20 @@ class Recurrent(nn.Module):
             commands: (T, B, A) of the row itself.
         """
         h, state = self.cell(rows)
-        return self.sense(torch.cat([h, commands], dim=-1)), self.act(h), state
+        sensed = self.sense(torch.cat([h, commands], dim=-1))
+        return sensed, self.act(h), state
 
     def run_on(self, row: Tensor, state: Any, steps: int) -> tuple[Tensor, Tensor]:
-        """Return x̂ (T, B, S) and â (T, B, A) of ``steps`` rows from memory, after the last row read (B, S + A)."""
+        """Predict rows from memory.
+
+        Args:
+            row: (B, S + A) last row that was read.
+            state: of the cell before that row.
+            steps: T, number of rows to predict.
+
+        Returns:
+            x̂ (T, B, S) and â (T, B, A).
+        """
         senses = []
         commands = []
         for _ in range(steps):
@@ -120,18 +130,27 @@ def train(
     done = 0
     while done < settings.updates:
         for batch in batches(trajectories, rng)[: settings.updates - done]:
-            x = torch.from_numpy(batch.senses)
-            a = torch.from_numpy(batch.commands[:, :, :-1])
-            is_row = a[:, :, 0].isfinite()  # (T, B), false after the end of an episode
-            x = x.nan_to_num()
-            a = a.nan_to_num()
-            rows = shifted(x, a)
-            noise = settings.noise * torch.randn(rows.shape, generator=noise_generator)
-            sensed, acted, _ = network(rows + noise, a)
-            error = ((x - sensed) ** 2).sum(-1) + ((a - acted) ** 2).sum(-1)
+            padded_senses, padded_commands = tensors_of(batch)
+            is_row = padded_commands[:, :, 0].isfinite()  # (T, B), false after an episode
+            senses = padded_senses.nan_to_num()
+            commands = padded_commands.nan_to_num()
+            rows = shifted(senses, commands)
+            noise = torch.randn(rows.shape, generator=noise_generator)
+            noisy_rows = rows + settings.noise * noise
+            sensed, acted, _ = network(noisy_rows, commands)
+            sensory_error = ((senses - sensed) ** 2).sum(-1)
+            motor_error = ((commands - acted) ** 2).sum(-1)
+            error = sensory_error + motor_error  # (T, B)
             descend(error[is_row].mean(), optimiser, schedule)
             done += 1
     return network.eval().requires_grad_(False)
+
+
+def tensors_of(batch: Batch) -> tuple[Tensor, Tensor]:
+    """Return the senses (T, B, S) and the commands (T, B, A) without their constant 1."""
+    senses = torch.from_numpy(batch.senses)
+    commands = torch.from_numpy(batch.commands[:, :, :-1])
+    return senses, commands
 
 
 def shifted(senses: Tensor, commands: Tensor) -> Tensor:
@@ -141,13 +160,14 @@ def shifted(senses: Tensor, commands: Tensor) -> Tensor:
 
 
 def expected(network: Recurrent, batch: Batch, cue: int) -> Batch:
-    """Return the predictions x̂ (T, B, S) and â (T, B, A) of rows of which ``cue`` are read."""
-    x = torch.from_numpy(batch.senses)
-    a = torch.from_numpy(batch.commands[:, :, :-1])
-    sensed, acted, state = network(shifted(x, a)[:cue], a[:cue])
-    if cue < len(x):
-        last = torch.cat([x[cue - 1], a[cue - 1]], dim=-1)
-        senses_alone, commands_alone = network.run_on(last, state, len(x) - cue)
+    """Return the predictions x̂ (T, B, S) and â (T, B, A), where only the first ``cue`` rows are read."""
+    senses, commands = tensors_of(batch)
+    rows = shifted(senses, commands)
+    sensed, acted, state = network(rows[:cue], commands[:cue])
+    steps_alone = len(senses) - cue
+    if steps_alone > 0:
+        last = torch.cat([senses[cue - 1], commands[cue - 1]], dim=-1)
+        senses_alone, commands_alone = network.run_on(last, state, steps_alone)
         sensed = torch.cat([sensed, senses_alone])
         acted = torch.cat([acted, commands_alone])
     return Batch(sensed.numpy(), acted.numpy())

@@ -1,9 +1,8 @@
-"""What one seed of the study of six skills learns, and how well it predicts, names skills, and detects faults."""
+"""One seed of the study of six skills: learn the networks; measure how they predict, name skills, and detect faults."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,8 +56,8 @@ SCHEDULE = Schedule(  # chosen on the seeds 100 to 102
     free_running_probability=0.0,
 )
 TWINS = "twins"  # healthy episodes of the same seeds as the faulty ones
-RATE = 0.05  # healthy episodes over a ceiling, as far as so few can tell
-WARM = 3  # rows that are not judged
+RATE = 0.05  # share of healthy episodes over a ceiling
+WARM = 3  # first rows, which are not judged
 BEFORE_CHANGE = 40  # rows of another skill before the one that is to be named
 UNSEEN = -9.0  # what the forest reads for a sense that is left out
 ALIKE = ("PickPlaceCan", "PickPlaceMilk")
@@ -81,13 +80,13 @@ class Repetition:
         self.records: list[Record] = []
         self.train: list[Episode] = []
         self.tests: list[Episode] = []
-        self.held: list[Episode] = []  # that set the ceilings
+        self.calibration: list[Episode] = []  # they set the ceilings
         for skill in SKILLS:
             solved = [episode for episode in self.load(skill) if episode.success]
             shuffled = [solved[i] for i in self.rng.permutation(len(solved))]
             eighth = max(1, len(solved) // 8)
             self.train += shuffled[: -2 * eighth]
-            self.held += shuffled[-2 * eighth : -eighth]
+            self.calibration += shuffled[-2 * eighth : -eighth]
             self.tests += shuffled[-eighth:]
 
     def learn(self) -> None:
@@ -97,9 +96,10 @@ class Repetition:
         taught = trajectories(self.reader, self.train)
         network: Any = learn_settling(taught, UNITS, schedule, self.rng, lambda: None).network
         self.ours = Settling(self.reader, network, self.train)
-        # (N, G)
-        highest = np.array([self.ours.felt(e.stream).energy[WARM:].max(axis=0) for e in self.held])
-        self.ours.ceilings = np.quantile(highest, 1.0 - RATE / highest.shape[1], axis=0)
+        readings = [self.ours.read_stream(e.stream) for e in self.calibration]
+        highest = np.array([reading.energy[WARM:].max(axis=0) for reading in readings])  # (N, G)
+        groups = highest.shape[1]
+        self.ours.ceilings = np.quantile(highest, 1.0 - RATE / groups, axis=0)
         self.rivals = {}
         for cell, hidden in CELL_UNITS.items():
             training = Training(cell, hidden, self.config.updates)
@@ -126,12 +126,10 @@ class Repetition:
 
 
 def predict(repetition: Repetition) -> None:
-    """Measure the error of the next row, and the distance of the hand from memory.
-
-    Every network expects each row, and the change of what moves slowly.
-    """
-    long_enough = [e for e in repetition.tests if len(e) >= EVENT + SECOND]
-    streams = np.stack([e.stream[: EVENT + SECOND] for e in long_enough], axis=1)  # (T, B, D)
+    """Measure the error of the next row, and how far off the hand is when it is predicted from memory."""
+    rows = EVENT + SECOND
+    long_enough = [e for e in repetition.tests if len(e) >= rows]
+    streams = np.stack([e.stream[:rows] for e in long_enough], axis=1)  # (T, B, D)
     reader = repetition.reader
     network = repetition.ours.network
     online: dict[str, Expresser] = {
@@ -148,7 +146,8 @@ def predict(repetition: Repetition) -> None:
     alone: dict[str, Expresser] = {OURS: ExpressionMemory(reader, network)}
     paths = {}
     for name, model in (alone | repetition.rivals).items():
-        paths[name] = last + np.cumsum(hand_moves(model, batch), axis=0)
+        moves = hand_moves(model, batch)
+        paths[name] = last + np.cumsum(moves, axis=0)
     paths["stands still"] = last
     for name, path in paths.items():
         distance = np.linalg.norm(path - true, axis=2)
@@ -156,35 +155,44 @@ def predict(repetition: Repetition) -> None:
 
 
 def next_row_error(model: Expresser, batch: Batch) -> float:
-    """Return the error of the next row, in that of the last; changes are counted from the last row."""
+    """Return the squared error of the next row, over that of repeating the last row.
+
+    A network predicts all senses, then the changes of the slow ones; a slow sense is the last row's plus its change.
+    """
     reader = model.reader
     S = len(SPEC.sensory)
     last = batch.senses[1:-1, :, :S]
     true = batch.senses[2:, :, :S]
-    expected = model.expect(batch, cue=len(batch.senses)).senses[2:]
+    recalled = model.expect(batch, cue=len(batch.senses))
+    expected = recalled.senses[2:]
+    changes = expected[:, :, S:]
     predicted = expected[:, :, :S].copy()
     slow = np.searchsorted(SPEC.sensory, reader.slow)
     gain = (reader.change / reader.spread)[reader.slow]
-    predicted[:, :, slow] = last[:, :, slow] + gain * expected[:, :, S:]
-    return np.mean((predicted - true) ** 2) / np.mean((true - last) ** 2)
+    predicted[:, :, slow] = last[:, :, slow] + gain * changes
+    error = np.mean((predicted - true) ** 2)
+    error_of_last = np.mean((true - last) ** 2)
+    return error / error_of_last
 
 
 def hand_moves(model: Expresser, batch: Batch) -> Floats:
     """Return the moves of the hand [m] (T, B, 3) that are expected from memory after row ``EVENT``."""
     reader = model.reader
-    hand = np.flatnonzero(np.isin(reader.slow, np.arange(SPEC.size)[HAND]))
-    changes = model.expect(batch, cue=EVENT).senses[EVENT:, :, len(SPEC.sensory) + hand]
+    hand_columns = np.arange(SPEC.size)[HAND]
+    hand = np.flatnonzero(np.isin(reader.slow, hand_columns))
+    recalled = model.expect(batch, cue=EVENT)
+    changes = recalled.senses[EVENT:, :, len(SPEC.sensory) + hand]
     return reader.change[HAND] * changes
 
 
 # ------------------------------------------------------------------ names of skills
 
-Teller = Callable[[Floats], Floats]
+Namer = Callable[[Floats], Floats]
 """Returns how likely each skill is at each row (T, K) of a stream (T, D)."""
 
 
-def hidden(stream: NDArray[Any], until: int | None) -> Floats:
-    """Return a stream (T, D) in which no object is seen before row ``until``; None for never."""
+def without_objects(stream: NDArray[Any], until: int | None) -> Floats:
+    """Return a stream (T, D) whose objects are not seen before row ``until``; None for never."""
     rows = np.array(stream, np.float64)
     rows[:until, GROUP_OF == "object"] = np.nan
     return rows
@@ -196,72 +204,99 @@ def labels_of(episodes: Sequence[Episode]) -> list[int]:
 
 
 def with_changes(stream: Floats) -> Floats:
-    """Return each row and its change over a quarter of a second, as the forest reads it."""
-    before = stream[np.maximum(np.arange(len(stream)) - SECOND // 4, 0)]
-    return np.nan_to_num(np.hstack([stream, stream - before]), nan=UNSEEN)
+    """Return each row and its change over a quarter of a second (T, 2 D), as the forest reads it."""
+    earlier_row = np.maximum(np.arange(len(stream)) - SECOND // 4, 0)
+    changes = stream - stream[earlier_row]
+    return np.nan_to_num(np.hstack([stream, changes]), nan=UNSEEN)
 
 
-def learn_tellers(repetition: Repetition) -> dict[str, Teller]:
-    """Return a readout of the network's state and a random forest, which learned with objects and without."""
+def learn_namers(repetition: Repetition) -> dict[str, Namer]:
+    """Return a readout of the network's state and a random forest, both learned with objects and without."""
     ours = repetition.ours
     train = repetition.train
     rng = repetition.rng
-    streams = [hidden(e.stream, until) for until in (0, None) for e in train]
+    seen = [without_objects(e.stream, until=0) for e in train]
+    blind = [without_objects(e.stream, until=None) for e in train]
+    streams = seen + blind
     lengths = [len(stream) for stream in streams]
-    labels = np.repeat([*labels_of(train), *labels_of(train)], lengths)
-    states = np.concatenate([ours.felt(stream).state for stream in streams]).astype(np.float32)
+    labels = np.repeat(2 * labels_of(train), lengths)
+    readings = [ours.read_stream(stream) for stream in streams]
+    states = np.concatenate([reading.state for reading in readings]).astype(np.float32)
     weights, bias = learn_readout(lambda rows: states[rows], labels, len(SKILLS), rng)
-    forest = RandomForestClassifier(100, min_samples_leaf=3, random_state=int(rng.integers(2**31)))
-    forest.fit(np.concatenate([with_changes(stream) for stream in streams])[::3], labels[::3])
+    forest_seed = int(rng.integers(2**31))
+    forest = RandomForestClassifier(100, min_samples_leaf=3, random_state=forest_seed)
+    forest_rows = np.concatenate([with_changes(stream) for stream in streams])
+    forest.fit(forest_rows[::3], labels[::3])
 
     def by_state(stream: Floats) -> Floats:
-        state = ours.felt(stream).state.astype(np.float32)
+        state = ours.read_stream(stream).state.astype(np.float32)
         return certainty(state, weights, bias).astype(np.float64)
 
-    return {OURS: by_state, FOREST: lambda stream: forest.predict_proba(with_changes(stream))}
+    def by_forest(stream: Floats) -> Floats:
+        return forest.predict_proba(with_changes(stream))
+
+    return {OURS: by_state, FOREST: by_forest}
 
 
 def name_skills(repetition: Repetition) -> None:
     """Measure how soon the right skill is named: with all senses, blind, and after another skill."""
-    note = repetition.note
     tests = repetition.tests
-    tellers = learn_tellers(repetition)
+    namers = learn_namers(repetition)
     labels = np.array(labels_of(tests))
-    others = [
-        tests[repetition.rng.choice(np.flatnonzero(labels != label))].stream for label in labels
-    ]
-    for (model, teller), (episode, other, label) in product(
-        tellers.items(), zip(tests, others, labels, strict=True)
-    ):
-        stream = episode.stream
-        whole = names_over_time(teller, hidden(stream, until=0)) == label
-        blind = names_over_time(teller, hidden(stream, until=None)) == label
-        for row in ROWS:
-            note("named", model, row, whole[row - 1])
-            note("named blind", model, row, blind[row - 1])
+    others = []
+    for label in labels:
+        of_other_skills = np.flatnonzero(labels != label)
+        others.append(tests[repetition.rng.choice(of_other_skills)].stream)
+    for model, namer in namers.items():
+        for episode, other, label in zip(tests, others, labels, strict=True):
+            name_skill(repetition, model, namer, episode.stream, label)
+            name_after_another(repetition, model, namer, episode.stream, label, other)
 
-        joined = hidden(np.concatenate([other[:BEFORE_CHANGE], stream[:60]]), until=0)
-        changed = names_over_time(teller, joined)[BEFORE_CHANGE:] == label
-        context = {
-            "another skill begins: right after a second": changed[SECOND - 1],
-            "rows until right": rows_until(changed),
+
+def name_skill(
+    repetition: Repetition, model: str, namer: Namer, stream: NDArray[Any], label: int
+) -> None:
+    """Measure whether the right skill is named after each of ``ROWS``, with objects and without."""
+    seen = names_over_time(namer, without_objects(stream, until=0))
+    blind = names_over_time(namer, without_objects(stream, until=None))
+    for row in ROWS:
+        repetition.note("named", model, row, seen[row - 1] == label)
+        repetition.note("named blind", model, row, blind[row - 1] == label)
+
+
+def name_after_another(
+    repetition: Repetition,
+    model: str,
+    namer: Namer,
+    stream: NDArray[Any],
+    label: int,
+    other: NDArray[Any],
+) -> None:
+    """Measure how soon the right skill is named after rows of another skill or without objects."""
+    joined = np.concatenate([other[:BEFORE_CHANGE], stream[:60]])
+    names = names_over_time(namer, without_objects(joined, until=0))
+    right = names[BEFORE_CHANGE:] == label
+    context = {
+        "another skill begins: right after a second": right[SECOND - 1],
+        "rows until right": rows_until(right),
+    }
+    if SKILLS[label] in ALIKE:
+        names = names_over_time(namer, without_objects(stream, until=SECOND))
+        name_unseen = names[SECOND - 1]
+        context |= {
+            "objects hidden for a second: one of Can and Milk": SKILLS[name_unseen] in ALIKE,
+            "the right one": name_unseen == label,
+            "rows until right, once seen": rows_until(names[SECOND:] == label),
         }
-        if SKILLS[label] in ALIKE:
-            late = names_over_time(teller, hidden(stream, until=SECOND))
-            unseen = late[SECOND - 1]
-            context |= {
-                "objects hidden for a second: one of Can and Milk": SKILLS[unseen] in ALIKE,
-                "the right one": unseen == label,
-                "rows until right, once seen": rows_until(late[SECOND:] == label),
-            }
-        for at, value in context.items():
-            note("context", model, at, value)
+    for at, value in context.items():
+        repetition.note("context", model, at, value)
 
 
-def names_over_time(teller: Teller, stream: Floats) -> NDArray[np.intp]:
+def names_over_time(namer: Namer, stream: Floats) -> NDArray[np.intp]:
     """Return the index of the skill that is named at each row (T,), by evidence that fades."""
-    evidence = np.log(teller(stream) + 1e-3)
-    return lfilter([1.0], [1.0, -float(KEPT)], evidence, axis=0).argmax(axis=1)
+    evidence = np.log(namer(stream) + 1e-3)
+    faded_sum = lfilter([1.0], [1.0, -float(KEPT)], evidence, axis=0)
+    return faded_sum.argmax(axis=1)
 
 
 def rows_until(right: NDArray[np.bool_]) -> int:
@@ -273,21 +308,22 @@ def rows_until(right: NDArray[np.bool_]) -> int:
 # ------------------------------------------------------------------ surprise
 
 
+def largest_energies(repetition: Repetition, episodes: Sequence[Episode], rows: slice) -> Floats:
+    """Return the largest energy of any group in some rows of each episode (N,) [ceiling]."""
+    readings = [repetition.ours.read_stream(e.stream) for e in episodes]
+    return np.array([reading.energy[rows].max() for reading in readings])
+
+
 def detect(repetition: Repetition) -> None:
     """Measure how well energy tells each kind of fault from its twins, and unknown skills from known ones."""
-
-    def largest(episodes: Sequence[Episode], rows: slice) -> Floats:
-        """Return the largest energy of any group, in its ceiling (N,)."""
-        return np.array([repetition.ours.felt(e.stream).energy[rows].max() for e in episodes])
-
     whole = slice(WARM, None)
     around = slice(EVENT, EVENT + SECOND)
-    healthy = largest(repetition.tests, whole)
-    twins = largest(repetition.load(TWINS), around)
+    healthy = largest_energies(repetition, repetition.tests, whole)
+    twins = largest_energies(repetition, repetition.load(TWINS), around)
     repetition.note(ALARMS, OURS, "healthy", np.mean(healthy > 1.0))
     conditions = [(kind, around, twins) for kind in FAULTS]
     conditions += [(skill, whole, healthy) for skill in UNKNOWN]
     for name, rows, compared in conditions:
-        energies = largest(repetition.load(name), rows)
+        energies = largest_energies(repetition, repetition.load(name), rows)
         repetition.note("AUROC", OURS, name, auroc(energies, compared))
         repetition.note(ALARMS, OURS, name, np.mean(energies > 1.0))

@@ -19,8 +19,13 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode, save_episode
 from asm_gym.faults.suite import possible, suite_fault
 from asm_gym.policies import make_policy
-from asm_gym.policies.scripted.base import Style
-from asm_gym.policies.scripted.geometry import Pose, about_vertical, matrix, yaw
+from asm_gym.policies.scripted.expert import Style
+from asm_gym.policies.scripted.geometry import (
+    Pose,
+    rotation_about_vertical,
+    rotation_from_quaternion,
+    yaw,
+)
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers.faults import FaultInjection
 
@@ -69,7 +74,7 @@ REST = 12  # rows recorded after success
 
 def object_pose(work: Workspace, name: str) -> Pose:
     """Return the pose of an object by the name of its channels."""
-    return Pose(work.read(f"{name}_pos"), matrix(work.read(f"{name}_quat")))
+    return Pose(work.read(f"{name}_pos"), rotation_from_quaternion(work.read(f"{name}_quat")))
 
 
 def handle_pose(work: Workspace, name: str) -> Pose:
@@ -103,7 +108,7 @@ def opened(work: Workspace, thing: Floats) -> Floats:
     """Return the position of the handle when the door is open."""
     simulation = work.inner.simulation
     hinge = simulation.data.xanchor[simulation.model.joint("Door_hinge").id]
-    left_to_turn = about_vertical(0.36 - float(work.read("hinge_qpos")[0]))
+    left_to_turn = rotation_about_vertical(0.36 - float(work.read("hinge_qpos")[0]))
     return np.asarray(hinge + left_to_turn @ (thing - hinge))
 
 
@@ -125,12 +130,12 @@ def square_turn(work: Workspace, pose: Pose) -> Floats:
 def nut_turn(work: Workspace, pose: Pose) -> Floats:
     """Return the turn of the nut from the hand and from its peg (2,) [rad], up to its symmetry."""
     from_hand = up_to_symmetry(turn_from_hand(work, pose), np.pi)
-    return np.array([from_hand, up_to_symmetry(yaw(pose.turned[:, 0]), QUARTER)])
+    return np.array([from_hand, up_to_symmetry(yaw(pose.orientation[:, 0]), QUARTER)])
 
 
 def turn_from_hand(work: Workspace, pose: Pose) -> float:
     """Return the turn of a thing about the vertical, from the fingers' line [rad]."""
-    return yaw(pose.turned[:, 0]) + np.pi / 2 - yaw(work.read("hand_orientation")[3:])
+    return yaw(pose.orientation[:, 0]) + np.pi / 2 - yaw(work.read("hand_orientation")[3:])
 
 
 def up_to_symmetry(turn: float, period: float) -> float:
@@ -180,7 +185,7 @@ class Workspace:
     def reset(self, seed: int) -> tuple[Any, Floats]:
         """Return the observation and the first row (D,)."""
         observation, _ = self.env.reset(seed=seed)
-        self.start = self.pose().at
+        self.start = self.pose().position
         return observation, self.row()
 
     def step(self, action: Any) -> tuple[Any, Floats, bool]:
@@ -201,7 +206,7 @@ class Workspace:
         pose = self.pose()
         hand = self.read("hand_position")
         reach = pose.point(np.array(self.rules.grasp)) - hand
-        way = self.rules.goal(self, pose.at) - pose.at
+        way = self.rules.goal(self, pose.position) - pose.position
         values = (
             self.read("joint_position"),
             hand - self.inner.robosuite_env.robots[0].base_pos,

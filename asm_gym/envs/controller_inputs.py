@@ -13,22 +13,22 @@ from asm_gym.compilation import compiled, inner
 from asm_gym.envs.mujoco_views import Floats, Ints, Views
 
 # Rows of a controller's scaling: bounds of its inputs, and (input - middle) * scale + offset.
-LEAST = 0
-MOST = 1
-MIDDLE = 2
-SCALE = 3
-OFFSET = 4
+LOWEST_INPUT = 0
+HIGHEST_INPUT = 1
+INPUT_MIDDLE = 2
+INPUT_SCALE = 3
+INPUT_OFFSET = 4
 
 
 def scaling_of(controller: Any, size: int) -> Floats:
     """Return the scaling (5, size) of robosuite's controller of ``size`` inputs."""
     controller.scale_action(np.zeros(size))  # which works out the last three
     scaling = np.zeros((5, size))
-    scaling[LEAST] = controller.input_min
-    scaling[MOST] = controller.input_max
-    scaling[MIDDLE] = controller.action_input_transform
-    scaling[SCALE] = controller.action_scale
-    scaling[OFFSET] = controller.action_output_transform
+    scaling[LOWEST_INPUT] = controller.input_min
+    scaling[HIGHEST_INPUT] = controller.input_max
+    scaling[INPUT_MIDDLE] = controller.action_input_transform
+    scaling[INPUT_SCALE] = controller.action_scale
+    scaling[INPUT_OFFSET] = controller.action_output_transform
     return scaling
 
 
@@ -45,14 +45,10 @@ def within(value: float, least: float, most: float) -> float:
 @inner
 def scaled(value: float, scaling: Floats, i: int) -> float:
     """Return input ``i`` of a controller in its own units; scaling is (5, N)."""
-    x = within(value, scaling[LEAST, i], scaling[MOST, i])
-    return (x - scaling[MIDDLE, i]) * scaling[SCALE, i] + scaling[OFFSET, i]
-
-
-@inner
-def product(x: Any, y: Any) -> float:
-    """Return the product of two numbers of single precision, in double."""
-    return np.float64(x * y)
+    lowest = scaling[LOWEST_INPUT, i]
+    highest = scaling[HIGHEST_INPUT, i]
+    from_middle = within(value, lowest, highest) - scaling[INPUT_MIDDLE, i]
+    return from_middle * scaling[INPUT_SCALE, i] + scaling[INPUT_OFFSET, i]
 
 
 @inner
@@ -62,6 +58,7 @@ def rotation(turn: Floats, matrix: Floats) -> None:
     ry = turn[1]
     rz = turn[2]
     angle = np.sqrt(rx * rx + ry * ry + rz * rz)
+    # The quaternion of the turn: w is 1 where there is none.
     w = np.float32(1.0)
     x = np.float32(0.0)
     y = np.float32(0.0)
@@ -73,21 +70,30 @@ def rotation(turn: Floats, matrix: Floats) -> None:
         y = np.float32(ry / angle * sine)
         z = np.float32(rz / angle * sine)
 
-    norm = product(w, w) + product(x, x) + product(y, y) + product(z, z)
+    norm = np.float64(w * w) + np.float64(x * x) + np.float64(y * y) + np.float64(z * z)
     scale = np.sqrt(2.0 / np.float64(np.float32(norm)))
     w = np.float32(w * scale)
     x = np.float32(x * scale)
     y = np.float32(y * scale)
     z = np.float32(z * scale)
-    matrix[0, 0] = 1.0 - product(y, y) - product(z, z)
-    matrix[1, 1] = 1.0 - product(x, x) - product(z, z)
-    matrix[2, 2] = 1.0 - product(x, x) - product(y, y)
-    matrix[0, 1] = x * y - z * w
-    matrix[1, 0] = x * y + z * w
-    matrix[1, 2] = y * z - x * w
-    matrix[2, 1] = y * z + x * w
-    matrix[2, 0] = z * x - y * w
-    matrix[0, 2] = z * x + y * w
+    xx = np.float64(x * x)
+    yy = np.float64(y * y)
+    zz = np.float64(z * z)
+    xy = x * y
+    xz = z * x
+    yz = y * z
+    wx = x * w
+    wy = y * w
+    wz = z * w
+    matrix[0, 0] = 1.0 - yy - zz
+    matrix[1, 1] = 1.0 - xx - zz
+    matrix[2, 2] = 1.0 - xx - yy
+    matrix[0, 1] = xy - wz
+    matrix[1, 0] = xy + wz
+    matrix[1, 2] = yz - wx
+    matrix[2, 1] = yz + wx
+    matrix[2, 0] = xz - wy
+    matrix[0, 2] = xz + wy
 
 
 class Gripper:
@@ -109,8 +115,10 @@ class Gripper:
         self._motors = np.asarray(robot._ref_actuators_indexes_dict[name], np.int64)
         self._ctrl = views.ctrl
         self._scaling = scaling_of(controller, controller.control_dim)
+        middle = 0.5 * (highest + lowest)
+        half = 0.5 * (highest - lowest)
         bounds = views.actuator_ctrlrange[self._motors].T
-        self._ranges = np.array([0.5 * (highest + lowest), 0.5 * (highest - lowest), *bounds])
+        self._ranges = np.array([middle, half, *bounds])
 
     def command(self, action: Floats) -> None:
         """Command the motors as an action asks.
@@ -129,6 +137,10 @@ def move_gripper(
 
     ``ranges`` (4, G) are the middle and half of what it commands, and the motors' own bounds.
     """
+    middle = ranges[0]
+    half = ranges[1]
+    lowest = ranges[2]
+    highest = ranges[3]
     for i in range(len(motors)):
-        value = ranges[0, i] + ranges[1, i] * scaled(fingers[i], scaling, i)
-        ctrl[motors[i]] = within(value, ranges[2, i], ranges[3, i])
+        target = middle[i] + half[i] * scaled(fingers[i], scaling, i)
+        ctrl[motors[i]] = within(target, lowest[i], highest[i])

@@ -13,8 +13,16 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from asm_gym.policies.base import StatefulPolicy
-from asm_gym.policies.scripted.geometry import UP, Pose, Vector, length, matrix, move, rotation
+from asm_gym.policies.policy import StatefulPolicy
+from asm_gym.policies.scripted.geometry import (
+    UP,
+    Pose,
+    Vector,
+    command_towards,
+    length,
+    rotation_from_columns,
+    rotation_from_quaternion,
+)
 from asm_gym.validation import check_number
 
 # Commands of a gripper.
@@ -74,15 +82,15 @@ class ObservationReader:
     def hand(self, observation: Any, prefix: str = "") -> Pose:
         """Return the pose of a hand."""
         return Pose(
-            at=self(observation, f"{prefix}hand_position"),
-            turned=rotation(self(observation, f"{prefix}hand_orientation")),
+            position=self(observation, f"{prefix}hand_position"),
+            orientation=rotation_from_columns(self(observation, f"{prefix}hand_orientation")),
         )
 
     def pose(self, observation: Any, name: str) -> Pose:
         """Return the pose of an object."""
         return Pose(
-            at=self(observation, f"{name}_pos"),
-            turned=matrix(self(observation, f"{name}_quat")),
+            position=self(observation, f"{name}_pos"),
+            orientation=rotation_from_quaternion(self(observation, f"{name}_quat")),
         )
 
 
@@ -120,9 +128,9 @@ class Scene:
         """What was decided at the beginning of the episode."""
         return self.state.plan
 
-    def move(self, target: Vector, turned: Vector, gain: float = 1.0) -> Vector:
+    def move(self, position: Vector, orientation: Vector, gain: float = 1.0) -> Vector:
         """Return the hand's command (6,) towards a position (3,) and an orientation (3, 3)."""
-        return move(self.hand, target, turned, self.state.speed, gain)
+        return command_towards(self.hand, position, orientation, self.state.speed, gain)
 
 
 class Expert(StatefulPolicy):
@@ -196,7 +204,7 @@ class Expert(StatefulPolicy):
 
     def entered(self, scene: Any, phase: int) -> State:
         """Return the state at the beginning of a phase."""
-        return scene.state._replace(phase=phase, since=0, anchor=scene.hand.at)
+        return scene.state._replace(phase=phase, since=0, anchor=scene.hand.position)
 
 
 def has_settled(velocity: Vector, since: int, usual: int) -> bool:

@@ -47,10 +47,10 @@ LISTS = (list, tuple, np.ndarray)  # types of a cell that holds several numbers
 MOST_COLUMNS = 8192  # every number is weighed against every other later on: see ``whitening``
 MOST_BYTES = 512  # of a row of an array of bytes; more are a picture
 MOST_KEYS = 64  # joints of a long table
-MOSTLY = 0.9  # share of its rows in which a long table goes round its joints
+MOSTLY_REGULAR = 0.9  # share of its rows in which a long table goes round its joints
 SPARSE = 0.55  # largest share of filled rows of a column at a lower rate: at most every other row
-HELD = 3.0  # for so many of its own periods a slower column keeps its newest value
-FEWEST = 5  # filled rows that show a rate
+HELD_PERIODS = 3.0  # for so many of its own periods a slower column keeps its newest value
+FEWEST_FILLED_ROWS = 5  # filled rows that show a rate
 
 
 class NamedBy(NamedTuple):
@@ -230,7 +230,7 @@ def _goes_round(values: NDArray[Any]) -> bool:
         return False
     changes = np.mean(codes[1:] != codes[:-1])
     repeats = np.mean(codes[size:] == codes[:-size])
-    return bool(min(changes, repeats) >= MOSTLY)
+    return bool(min(changes, repeats) >= MOSTLY_REGULAR)
 
 
 def _joined(table: Columns) -> Columns:
@@ -251,7 +251,7 @@ def _joined(table: Columns) -> Columns:
         if is_fast or np.array_equal(mask, rows) or not _is_steady(mask):
             continue
         column = pd.Series(table[name])
-        limit = round(HELD / share)
+        limit = round(HELD_PERIODS / share)
         slower[name] = column.ffill(limit=limit)
     if not slower:
         return table
@@ -274,7 +274,7 @@ def _leading_rows(filled: Sequence[Mask]) -> Mask:
         columns.append(mask)
     rows = [columns[0] for columns in publishers.values()]
     is_of_one = np.sum(rows, axis=0) == 1
-    if len(rows) < 2 or is_of_one.mean() <= MOSTLY:
+    if len(rows) < 2 or is_of_one.mean() <= MOSTLY_REGULAR:
         return np.ones_like(is_of_one)
     leader = max(publishers.values(), key=len)
     return leader[0]
@@ -283,11 +283,11 @@ def _leading_rows(filled: Sequence[Mask]) -> Mask:
 def _is_steady(filled: Mask) -> bool:
     """Whether filled cells (T,) come at a steady rate all the time, and not in a stretch of their own."""
     places = np.flatnonzero(filled)
-    if len(places) < FEWEST:
+    if len(places) < FEWEST_FILLED_ROWS:
         return False
     period = len(filled) / len(places)  # [rows]
     stretch = len(filled) - 2 * period
-    if np.ptp(places) < MOSTLY * stretch:
+    if np.ptp(places) < MOSTLY_REGULAR * stretch:
         return False
     steps = np.diff(places)
     usual = max(period, np.median(steps))
