@@ -11,6 +11,8 @@ from asm_gym.memory.settling import learn_settling
 from asm_gym.memory.traces import Weights, direct_synapses, initial_weights
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce import closed_loop, memorise_and_recall, skill_measures, workspace
+from asm_gym.scripts.reproduce.backpropagation import Batch, Training, expected, side_by_side
+from asm_gym.scripts.reproduce.backpropagation import train as train_recurrent
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     ExpressionMemory,
@@ -28,8 +30,6 @@ from asm_gym.scripts.reproduce.handwriting import (
     written,
 )
 from asm_gym.scripts.reproduce.local_learning import COMPARED, cosine, exact, local
-from asm_gym.scripts.reproduce.recurrent import Batch, Training, expected, side_by_side
-from asm_gym.scripts.reproduce.recurrent import train as train_recurrent
 
 
 def test_the_pen_goes_where_its_commands_take_it_at_any_speed():
@@ -174,7 +174,9 @@ def test_a_sense_that_sticks_is_alone_over_its_ceiling_and_counts_no_more_once_l
     rng = np.random.default_rng(0)
     trained = learn_settling(trajectories(reader, train), 64, schedule, rng, lambda: None)
     model = closed_loop.Settling(reader, trained.network, train)
-    assert np.mean([model.read_stream(e.stream)[1] ** 2 for e in train]) == pytest.approx(1.0, abs=0.1)
+    assert np.mean([model.read_stream(e.stream)[1] ** 2 for e in train]) == pytest.approx(
+        1.0, abs=0.1
+    )
     model.ceilings = 1.5 * np.max(
         [model.read_stream(wandering(n).stream)[2][3:].max(axis=0) for n in range(20, 24)], axis=0
     )

@@ -41,9 +41,7 @@ def random_weights(rng: np.random.Generator) -> Weights:
     )
 
 
-def local_total(
-    weights: Weights, rows: np.ndarray, forget: bool = False
-) -> dict[str, np.ndarray]:
+def local_total(weights: Weights, rows: np.ndarray, forget: bool = False) -> dict[str, np.ndarray]:
     """The sum of local changes along rows (T, B, R), with the weights held still."""
     norm = np.linalg.norm(weights.W_F, 2)
     inference = Inference(PRIOR, 1.0, PRIOR + norm**2, 4000)
@@ -69,7 +67,9 @@ def local_total(
 def gradient_through_time(weights: Weights, rows: np.ndarray) -> dict[str, np.ndarray]:
     """-∂/∂w of the mean over streams of Σ_t min_z F_t, by automatic differentiation through every row."""
     torch = pytest.importorskip("torch")
-    w = {n: torch.tensor(a, requires_grad=n in Change._fields) for n, a in weights._asdict().items()}
+    w = {
+        n: torch.tensor(a, requires_grad=n in Change._fields) for n, a in weights._asdict().items()
+    }
     size = torch.exp(-torch.exp(w["decay"]))
     re = size * torch.cos(w["turn"])
     im = size * torch.sin(w["turn"])

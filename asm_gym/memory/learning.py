@@ -50,6 +50,7 @@ class Schedule(NamedTuple):
     prior_precision: float
     sensory_precision: float
     free_running_probability: float
+    noise: float = 0.0  # standard deviation of that on what recurrent units carry on
 
 
 def shuffled(count: int, size: int, rng: np.random.Generator) -> Iterator[NDArray[np.intp]]:

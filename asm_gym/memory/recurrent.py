@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from asm_gym.memory.energy import (
     Array,
     Inference,
-    Scalar,
     activate,
     beside,
     infer,
@@ -66,9 +65,8 @@ class Weights(NamedTuple):
     decay: Array  # (N,) ν
     turn: Array  # (N,) θ [rad a row]
     gain: Array  # (N,) γ; not learned
-    reads: Array  # (R,) 1 where a number of the row is carried on, 0 where it is only predicted; not learned
-    B_re: Array  # noqa: N815 (N, R) real part of B
-    B_im: Array  # noqa: N815 (N, R) imaginary part
+    B_re: Array
+    B_im: Array
     W_C: Array  # (H, I) from what is carried on to the state
     W_F: Array  # (S + A, H) from the state to senses and action
     W_D: Array  # (S + A, I + A + 1) from what is carried on, action and a constant 1 to senses and action
@@ -89,7 +87,6 @@ def weight_shapes(hidden: int, sensory: int, motor: int) -> dict[str, tuple[int,
         "decay": (units,),
         "turn": (units,),
         "gain": (units,),
-        "reads": (row,),
         "B_re": (units, row),
         "B_im": (units, row),
         "W_C": (hidden, carried),
@@ -109,7 +106,6 @@ def multiplier(weights: Weights, i: int) -> tuple[float, float]:
 def advance(m: Array, rows: Array, weights: Weights) -> Array:
     """Return m_t (B, I) from m_{t-1} and the rows r_t (B, R)."""
     N = len(weights.decay)
-    rows = rows * weights.reads
     drive_re = outward(rows, weights.B_re)
     drive_im = outward(rows, weights.B_im)
     out = np.empty_like(m)
@@ -133,8 +129,8 @@ def advance(m: Array, rows: Array, weights: Weights) -> Array:
 class Eligibility(NamedTuple):
     """How the recurrent units of each of B streams follow from their own weights."""
 
-    B_re: Array  # noqa: N815 (B, N, R) Re E
-    B_im: Array  # noqa: N815 (B, N, R) Im E
+    B_re: Array
+    B_im: Array
     decay_re: Array  # (B, N) Re e
     decay_im: Array  # (B, N) Im e
 
@@ -202,8 +198,7 @@ def follow_eligibility(eligible: Eligibility, m: Array, rows: Array, weights: We
             for j in range(R):
                 E_re = eligible.B_re[n, i, j]
                 E_im = eligible.B_im[n, i, j]
-                read = weights.reads[j] * rows[n, j]
-                eligible.B_re[n, i, j] = re * E_re - im * E_im + gain * read
+                eligible.B_re[n, i, j] = re * E_re - im * E_im + gain * rows[n, j]
                 eligible.B_im[n, i, j] = re * E_im + im * E_re
 
 
@@ -292,7 +287,8 @@ class RecurrentNetwork(TemporalNetwork):
         z = infer(mu, np.hstack([x, action]) - past, w.W_F, precision, self.inference)
         inferred = past + sense(z, w.W_F)
         whole = np.where(seen > 0, x, inferred[:, : x.shape[1]])
-        return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w))
+        carried = advance(c, np.hstack([whole, u]), w)
+        return Step(mu, past + sense(mu, w.W_F), z, carried, whole)
 
     def run_on(self, c: Array) -> Step:
         w = self.weights
@@ -304,7 +300,8 @@ class RecurrentNetwork(TemporalNetwork):
         # No synapse leads from an action to itself.
         u[:, :-1] = (direct(c, u, w.W_D) + state)[:, sensory:]
         expected = direct(c, u, w.W_D) + state
-        return Step(mu, expected, mu, advance(c, np.hstack([expected[:, :sensory], u]), w))
+        senses = expected[:, :sensory]
+        return Step(mu, expected, mu, advance(c, np.hstack([senses, u]), w), senses)
 
 
 # ------------------------------------------------------------------ learning
@@ -332,7 +329,6 @@ def initial_weights(hidden: int, sensory: int, motor: int, rng: np.random.Genera
     forgetting = np.geomspace(-np.log(SHORTEST), -np.log(LONGEST), units)
     weights = Weights._make(np.zeros(shape, np.float32) for shape in shapes.values())
     weights.decay[:] = np.log(forgetting)
-    weights.reads[:] = 1.0
     weights.turn[:] = rng.uniform(0.0, FASTEST, units)
     weights.gain[:] = np.sqrt(1 - np.exp(-2 * forgetting))
     for part in (weights.B_re, weights.B_im):
@@ -368,19 +364,15 @@ def local_change(
 
 
 class RecurrentLearner(Learner):
-    """The network of recurrent units as it learns; ``noise`` is the standard deviation of that on r."""
+    """The network of recurrent units as it learns."""
 
     weights: Weights
     learned = Change._fields
     early = False
     scalar = np.float32
 
-    def __init__(
-        self, weights: Weights, schedule: Schedule, rng: np.random.Generator, noise: float
-    ) -> None:
+    def __init__(self, weights: Weights, schedule: Schedule, rng: np.random.Generator) -> None:
         super().__init__(weights, schedule, rng)
-        self.noise = np.float32(noise)
-        self.precision = np.ones(len(weights.W_F), np.float32)
         self.rng = rng
         self.eligible = Eligibility.none(schedule.batch_size, weights)
 
@@ -409,10 +401,9 @@ class RecurrentLearner(Learner):
 
         past = direct(state, taken, w.W_D)
         left = np.hstack([turn.senses, turn.commands[:, :-1]]) - past  # (B, S + A)
-        pi_x = np.broadcast_to(pi_x * self.precision, left.shape).astype(np.float32)
-        z = infer(mu, left, w.W_F, pi_x, inference)
+        z = infer(mu, left, w.W_F, np.full_like(left, pi_x), inference)
         error = left - sense(z, w.W_F)
-        energy = 0.5 * float(pi_z * np.sum((z - mu) ** 2) + np.sum(pi_x * error**2))
+        energy = 0.5 * float(pi_z * np.sum((z - mu) ** 2) + pi_x * np.sum(error**2))
         senses = turn.senses
         if turn.alone.any():
             expected = past + sense(mu, w.W_F)
@@ -421,9 +412,9 @@ class RecurrentLearner(Learner):
         self.learn(local_change(state, taken, z, errors, self.eligible, w), rate)
 
         rows = np.hstack([senses, taken])
-        if self.noise:
-            noise = self.noise * self.rng.standard_normal(rows[:, :-1].shape, np.float32)
-            rows[:, :-1] += noise
+        if self.schedule.noise > 0:
+            noise = self.rng.standard_normal(rows[:, :-1].shape, np.float32)
+            rows[:, :-1] += np.float32(self.schedule.noise) * noise
         follow_eligibility(self.eligible, state, rows, w)
         return advance(state, rows, w), energy
 
@@ -434,17 +425,10 @@ def learn_recurrent(
     schedule: Schedule,
     rng: np.random.Generator,
     tick: Tick,
-    noise: float = 0.0,
-    reads: Array | None = None,
-    precision: Array | None = None,
 ) -> Trained:
-    """Learn the synapses through time; see ``temporal.Learn``. ``noise`` is that on what is carried on."""
+    """Learn the synapses through time; see ``temporal.Learn``."""
     sensory = trajectories[0].senses.shape[1]
     motor = trajectories[0].commands.shape[1] - 1
     weights = initial_weights(hidden, sensory, motor, rng)
-    if reads is not None:
-        weights.reads[:-1] = reads
-    learner = RecurrentLearner(weights, schedule, rng, noise)
-    if precision is not None:
-        learner.precision = precision
+    learner = RecurrentLearner(weights, schedule, rng)
     return learned_network(RecurrentNetwork, learner, trajectories, rng, tick)

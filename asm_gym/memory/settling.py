@@ -99,13 +99,16 @@ class SettlingNetwork(TemporalNetwork):
         mu = carried.state + outward(u, w.W_U)
         precision = self.inference.sensory_precision * seen
         z = infer(mu, x - w.b_F, w.W_F, precision, self.inference)
-        return Step(mu, self._expected(mu, carried), z, z)
+        inferred = outward(activate(z), w.W_F) + w.b_F
+        senses = np.where(seen > 0, x, inferred)
+        return Step(mu, self._expected(mu, carried), z, z, senses)
 
     def run_on(self, c: Array) -> Step:
         carried = carry_over(self.weights, c)
         u = np.hstack([carried.action, np.ones((len(c), 1), c.dtype)])
         mu = carried.state + outward(u, self.weights.W_U)
-        return Step(mu, self._expected(mu, carried), mu, mu)
+        expected = self._expected(mu, carried)
+        return Step(mu, expected, mu, mu, expected[:, : len(self.weights.b_F)])
 
     def _expected(self, mu: Array, carried: Carried) -> Array:
         """Return x̂ and â (B, S + A)."""

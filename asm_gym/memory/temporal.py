@@ -79,6 +79,7 @@ class Step(NamedTuple):
     expected: Array  # (B, S + A) x̂_t and â_t, expected then
     z: Array  # (B, H) the inferred state
     traces: Array  # (B, I) c_t, the new carried state; missing senses in it are completed
+    senses: Array  # (B, S) what was sensed; what was missing is inferred
 
 
 class TemporalNetwork(ABC):

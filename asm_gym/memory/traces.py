@@ -188,7 +188,8 @@ class Network(TemporalNetwork):
         z = infer(mu, np.hstack([x, action]) - past, w.W_F, precision, self.inference)
         inferred = past + sense(z, w.W_F)
         whole = np.where(seen > 0, x, inferred[:, : x.shape[1]])
-        return Step(mu, past + sense(mu, w.W_F), z, advance(c, np.hstack([whole, u]), w.gains))
+        traces = advance(c, np.hstack([whole, u]), w.gains)
+        return Step(mu, past + sense(mu, w.W_F), z, traces, whole)
 
     def run_on(self, c: Array) -> Step:
         w = self.weights
@@ -201,7 +202,7 @@ class Network(TemporalNetwork):
         u[:, :-1] = (direct(c, u, w.W_D) + state)[:, sensory:]
         expected = direct(c, u, w.W_D) + state
         traces = advance(c, np.hstack([expected[:, :sensory], u]), w.gains)
-        return Step(mu, expected, mu, traces)
+        return Step(mu, expected, mu, traces, expected[:, :sensory])
 
 
 class HebbianChange(NamedTuple):

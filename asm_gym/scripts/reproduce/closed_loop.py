@@ -1,8 +1,9 @@
 """Networks that act in closed loop in the tasks of ``workspace``.
 
-The network that settles is surprised where the energy of a group of senses passes its ceiling:
+A network that learned by local rules is surprised where the energy of a group of senses passes its ceiling:
 
-    F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = max(W f(μ_t) + b, least)
+    ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = max(W f(μ_t) + b, least)
+    F_g = (Σ_i (v_i/q_i)^(κ_i p))^(1/p)   v_i: evidence in the errors ε/σ of group g, see ``detection.evidence``
 
 It leaves out a group that alone is over its ceiling, and yields where several are.
 """
@@ -20,8 +21,10 @@ from numpy.typing import NDArray
 from sklearn.linear_model import Ridge
 
 from asm_gym.data.episode import Episode
+from asm_gym.detection.detector import BOUND
+from asm_gym.detection.evidence import Evidence, bounded, pool, strength, whitening, worst_case
 from asm_gym.memory.motor import learn_motor, situation
-from asm_gym.memory.settling import SettlingNetwork
+from asm_gym.memory.temporal import TemporalNetwork
 from asm_gym.monitors.memory_policy import CommandReadout
 from asm_gym.scaling import StreamScaler
 from asm_gym.scripts.reproduce.expression import Backpropagated
@@ -30,7 +33,7 @@ from asm_gym.scripts.reproduce.workspace import EVENT, GROUP_OF, GROUPS, JOINTS,
 LONGEST = 250  # rows of a rollout
 YIELD = 12  # rows for which a pushed arm yields
 ATTENTIVE = EVENT // 2  # row after which the network reacts to its energy
-SMOOTH = 0.5  # gain of energies
+GAINS = np.array([0.8, 0.2, 0.05])  # a, weights of the newest row in the evidence
 SHARPEST = 0.01  # smallest variance of an error, in its mean
 PRIOR = 150.0  # ridge of the regression of variances on the state
 MOTOR_UNITS = 256  # hidden units of the motor association
@@ -44,35 +47,74 @@ class Reading(NamedTuple):
     energy: Floats  # (G,) of ``GROUPS`` [ceiling]
 
 
-class Settling:
-    """The network that settles.
+class GroupEnergy:
+    """The energy of each group of senses: the evidence in its errors, as a share of the worst of healthy episodes.
+
+    Args:
+        episodes: errors (T, N) of healthy episodes [σ].
+        members: (G, N) which errors belong to which group.
+    """
+
+    def __init__(self, episodes: Sequence[Floats], members: NDArray[np.bool_]) -> None:
+        self.members = members
+        self.whitening = whitening(np.concatenate(episodes))
+        self.worst = np.ones((len(GAINS), members.shape[1]))
+        self.tail = np.ones_like(self.worst)
+        strongest = [self.strengths(errors).max(axis=0) for errors in episodes]
+        self.worst, self.tail = worst_case(np.array(strongest))
+
+    def strengths(self, errors: Floats) -> Floats:
+        """Return the evidence in each error (T, gains, N) at each row of an episode (T, N)."""
+        self.begin()
+        return np.array([self._strength(error) for error in errors])
+
+    def begin(self) -> None:
+        """Forget the past."""
+        self.evidence = Evidence.start(1, len(GAINS), self.members.shape[1])
+
+    def _strength(self, error: Floats) -> Floats:
+        before = self.evidence
+        white = bounded(error[None] @ self.whitening, BOUND)
+        vector = before.vector + GAINS[:, None] * (white[:, None] - before.vector)
+        self.evidence = before._replace(vector=vector, steps=before.steps + 1)
+        return strength(self.evidence, GAINS)[0]
+
+    def add(self, error: Floats) -> Floats:
+        """Return the energy of each group (G,) after a row's errors (N,)."""
+        ratios = (self._strength(error) / self.worst) ** self.tail
+        energies = [pool(ratios[:, own].reshape(1, -1))[0][0] for own in self.members]
+        return np.array(energies)
+
+
+class LocalNetwork:
+    """A network that learned by local rules.
 
     Args:
         reader: how it reads a row.
         network: its weights.
-        episodes: healthy ones, of which it learns how far its errors spread in each state: log σ² = W f(μ).
+        episodes: healthy ones, of which it learns how far its errors spread in each state, log σ² = W f(μ), and how
+            much evidence there is in them.
 
     Attributes:
-        ceilings: (G,) energy of each of ``GROUPS`` from which it counts; 1 until the caller sets them.
+        ceiling: energy from which a group counts; 1 until the caller sets it.
     """
 
     def __init__(
-        self, reader: StreamScaler, network: SettlingNetwork, episodes: Sequence[Episode]
+        self, reader: StreamScaler, network: TemporalNetwork, episodes: Sequence[Episode]
     ) -> None:
         self.reader = reader
         self.network = network
         spec = reader.spec
         columns = np.concatenate([spec.sensory, reader.slow, spec.motor])  # (N,) of each error
-        self.members = GROUP_OF[columns] == np.array(GROUPS)[:, None]  # (G, N)
-        self.ceilings = np.ones(len(GROUPS))
+        self.ceiling = 1.0
 
         # With weights of 0, errors are read as they are.
         self.W = np.zeros((len(columns), network.hidden_size))
         self.bias = np.zeros(len(columns))
         self.least = np.zeros(len(columns))
-        readings = [self.read_stream(e.stream) for e in episodes]
-        states = np.concatenate([reading.state for reading in readings])
-        squares = np.concatenate([reading.error for reading in readings]) ** 2
+        steps = [self._steps(e.stream) for e in episodes]
+        states = np.concatenate([state for state, _ in steps])
+        squares = np.concatenate([error for _, error in steps]) ** 2
         self.least = np.log(SHARPEST * squares.mean(axis=0) + 1e-12)
         log_variance = np.log(squares + np.exp(self.least))
         ridge = Ridge(PRIOR).fit(states, log_variance)
@@ -81,14 +123,23 @@ class Settling:
         self.W = ridge.coef_
         self.bias = ridge.intercept_ + np.log(np.mean(ratios, axis=0))
 
-    def begin(self) -> None:
-        """Forget the past."""
+        errors = [self._steps(e.stream)[1] for e in episodes]
+        members = GROUP_OF[columns] == np.array(GROUPS)[:, None]  # (G, N)
+        self.energy = GroupEnergy(errors, members)
+
+    def _steps(self, stream: NDArray[Any]) -> tuple[Floats, Floats]:
+        """Return the states (T, H) and errors (T, N) [σ] of all rows of a stream (T, D)."""
+        self._forget()
+        steps = [self._step(row) for row in np.asarray(stream, np.float64)]
+        states, errors = zip(*steps, strict=True)
+        return np.array(states), np.array(errors)
+
+    def _forget(self) -> None:
         self.c = self.network.at_rest(1)
         self.rows: list[Floats] = []
-        self.energy = np.zeros(len(GROUPS))
 
-    def read(self, row: Floats) -> Reading:
-        """Read a row (D,), NaN where left out; nothing surprises in the first."""
+    def _step(self, row: Floats) -> tuple[Floats, Floats]:
+        """Read a row (D,), NaN where left out; return the state (H,) and the errors (N,) [σ], 0 in the first row."""
         now = row[None]
         is_first = not self.rows
         if is_first:
@@ -104,10 +155,17 @@ class Settling:
         difference[:, : self.reader.size] *= scaled.seen
         log_variance = np.maximum(self.W @ state + self.bias, self.least)
         sigma = np.exp(0.5 * log_variance)
-        error = difference[0] / sigma * (not is_first)
-        energy_of_row = 0.5 * self.members @ error**2
-        self.energy = self.energy + SMOOTH * (energy_of_row - self.energy)
-        return Reading(state, error, self.energy / self.ceilings)
+        return state, difference[0] / sigma * (not is_first)
+
+    def begin(self) -> None:
+        """Forget the past."""
+        self._forget()
+        self.energy.begin()
+
+    def read(self, row: Floats) -> Reading:
+        """Read a row (D,), NaN where left out; nothing surprises in the first."""
+        state, error = self._step(row)
+        return Reading(state, error, self.energy.add(error) / self.ceiling)
 
     def read_stream(self, stream: NDArray[Any]) -> Reading:
         """Return the reading of all rows of a stream (T, D)."""
@@ -121,7 +179,7 @@ class Settling:
         return rescaled(self.reader, expected[0, self.reader.size :])
 
 
-class Recurrent:
+class Cell:
     """A GRU or an LSTM."""
 
     def __init__(self, model: Backpropagated) -> None:
@@ -180,7 +238,7 @@ def rescaled(reader: StreamScaler, action: NDArray[Any]) -> Floats:
     return np.asarray(reader.mean[motor] + reader.spread[motor] * action, np.float64)
 
 
-Actor = Settling | Recurrent | Associated
+Actor = LocalNetwork | Cell | Associated
 
 
 # ------------------------------------------------------------------ closed loop
@@ -243,7 +301,7 @@ class Rollout(NamedTuple):
     """Outcome of a run in closed loop."""
 
     solved: bool
-    energies: Floats  # (T, G) in their ceilings; of the network that settles
+    energies: Floats  # (T, G) [ceiling]; empty for rivals
     left_out: str  # the group that was left out
     yielded: bool
 

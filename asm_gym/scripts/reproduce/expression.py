@@ -20,8 +20,8 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.recall import Recalled, follow, run_on, to_rows
 from asm_gym.memory.traces import learn_traces
 from asm_gym.scaling import StreamScaler
-from asm_gym.scripts.reproduce import recurrent
-from asm_gym.scripts.reproduce.recurrent import Batch, Training, side_by_side
+from asm_gym.scripts.reproduce import backpropagation
+from asm_gym.scripts.reproduce.backpropagation import Batch, Training, side_by_side
 
 Rows = NDArray[np.floating[Any]]
 
@@ -127,10 +127,10 @@ class Backpropagated(Expresser):
     ) -> Backpropagated:
         """Learn from whole episodes without labels."""
         reader = fit_reader(episodes)
-        return cls(reader, recurrent.train(trajectories(reader, episodes), settings, rng))
+        return cls(reader, backpropagation.train(trajectories(reader, episodes), settings, rng))
 
     def expect(self, batch: Batch, cue: int) -> Recalled:
-        senses, commands = recurrent.expected(self.network, batch, cue)
+        senses, commands = backpropagation.expected(self.network, batch, cue)
         return Recalled(senses, commands, traces=commands[-1])
 
 

@@ -47,10 +47,10 @@ from asm_gym.memory.traces import (
 )
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.backpropagation import Batch, batches, side_by_side
 from asm_gym.scripts.reproduce.expression import fit_reader, trajectories
 from asm_gym.scripts.reproduce.handwriting import check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
-from asm_gym.scripts.reproduce.recurrent import Batch, batches, side_by_side
 
 COMPARED = HebbianChange._fields  # the synapses that are learned
 CUE = 10  # rows that are read before a stream runs on alone

@@ -29,6 +29,7 @@ from asm_gym.memory.settling import SettlingLearner, SettlingNetwork, initial_se
 from asm_gym.memory.temporal import unassociated
 from asm_gym.scripts.command import option
 from asm_gym.scripts.reproduce import kit
+from asm_gym.scripts.reproduce.backpropagation import Training, side_by_side
 from asm_gym.scripts.reproduce.expression import (
     Backpropagated,
     Expresser,
@@ -41,7 +42,6 @@ from asm_gym.scripts.reproduce.expression import (
 )
 from asm_gym.scripts.reproduce.handwriting import NAMES, STEPS, check_letters, copybook, repertoire
 from asm_gym.scripts.reproduce.kit import Findings, Record, curves
-from asm_gym.scripts.reproduce.recurrent import Training, side_by_side
 from asm_gym.validation import check_number
 
 MODELS = {

@@ -1,12 +1,10 @@
-"""The network of the papers on the Panda: six skills in one network that settles, learned from unlabelled episodes.
+"""Networks that learn by local rules on the Panda: six skills in one network, learned from unlabelled episodes.
 
-Every task is seen by the same senses: the body, where the thing is from the hand, and its goal from the thing. The
-network is never told the skill. It commands the arm in closed loop, is surprised by its own energy of each row,
-
-    F_t = Σ_i ½ (ε_i/σ_i)²,   ε_t = [x_t, a_t] - [x̂_t, â_t](μ_t),   log σ² = W f(μ_t);   ceilings by group of senses
-
-leaves out a group that alone is over its ceiling, and yields where several are. Beside it, on the same episodes: a GRU
-and an LSTM by backpropagation through time, the motor association that acts today, and a random forest for names.
+Every task is seen by the same senses: the body, torques and the wrist, where the thing is from the hand, and its goal
+from the thing. Two networks of the package, ``recurrent`` and ``settling``, are never told the skill. Each commands the
+arm in closed loop, is surprised by the energy of its own errors (``closed_loop``), leaves out a group of senses that
+alone is over its ceiling, and yields where several are. Beside them, on the same episodes: a GRU and an LSTM by
+backpropagation through time, the motor association that acts today, and a random forest for names.
 """
 
 from __future__ import annotations
@@ -29,15 +27,23 @@ from asm_gym.scripts.reproduce.closed_loop import (
     LONGEST,
     Actor,
     Associated,
+    Cell,
     Conditions,
+    LocalNetwork,
     Reaction,
-    Recurrent,
     Rollout,
-    Settling,
     run_policy,
 )
 from asm_gym.scripts.reproduce.kit import Findings, Record
-from asm_gym.scripts.reproduce.skill_claims import ACTS, OURS, PUSHED, STUCK, claims, drawn, tables
+from asm_gym.scripts.reproduce.skill_claims import (
+    ACTS,
+    PUSHED,
+    RECURRENT,
+    STUCK,
+    claims,
+    drawn,
+    tables,
+)
 from asm_gym.scripts.reproduce.skill_measures import TWINS, Repetition, detect, name_skills, predict
 from asm_gym.scripts.reproduce.workspace import (
     EVENT,
@@ -56,17 +62,17 @@ HELD_OUT = 1000  # seeds of faulty episodes and of their twins begin here
 
 @dataclass(frozen=True)
 class Config(kit.Config):
-    """The papers' network on the Panda: six skills."""
+    """Two local networks on the Panda: six skills."""
 
     seeds: int = option(10, quick=2, least=1)
     """Number of repetitions; they take the seeds that follow."""
-    episodes: int = option(28, quick=4, least=4)
+    episodes: int = option(36, quick=6, least=6)
     """Episodes of each skill that are recorded; a seed learns from most of them."""
     epochs: int = option(40, quick=4, least=1)
-    """Passes of the network over its episodes."""
+    """Passes of the local networks over their episodes."""
     updates: int = option(1200, quick=20, least=1)
     """Batches of the recurrent networks."""
-    faulty: int = option(2, quick=1, least=1)
+    faulty: int = option(5, quick=1, least=1)
     """Episodes of each skill with each kind of fault, and of each unknown skill."""
     trials: int = option(3, quick=1, least=1)
     """Times that each skill is expressed."""
@@ -94,7 +100,7 @@ def run(config: Config) -> Findings:
     records = [record for own, _ in repetitions for record in own]
     frame = pd.DataFrame(records)
     _, energies = repetitions[0]
-    return Findings(records, [claims(frame), *tables(frame)], drawn(frame, energies))
+    return Findings(records, [*claims(frame), *tables(frame)], drawn(frame, energies))
 
 
 def demonstrations(config: Config) -> dict[str, list[Demonstration]]:
@@ -125,12 +131,12 @@ def one_seed(
     predict(repetition)
     name_skills(repetition)
     detect(repetition)
-    actors: dict[str, Actor] = {OURS: repetition.ours}
+    actors: dict[str, Actor] = dict(repetition.networks)
     for cell, model in repetition.rivals.items():
-        actors[cell] = Recurrent(model)
+        actors[cell] = Cell(model)
     actors[ACTS] = Associated(repetition.reader, repetition.train, repetition.rng)
     if config.film and seed == config.seed:
-        film(repetition.ours, config.out / "panda.gif", seed)
+        film(repetition.networks[RECURRENT], config.out / "panda.gif", seed)
     return repetition.records, act(repetition, actors)
 
 
@@ -158,43 +164,47 @@ def act(repetition: Repetition, actors: dict[str, Actor]) -> dict[str, Floats]:
     for skill, trial in product(SKILLS, range(repetition.config.trials)):
         push = push_along(repetition.rng.standard_normal(3))
         conditions = Conditions(scene_of(repetition.seed, trial), steps=repetition.config.steps)
-        rollouts = rollouts_of(skill, actors, push, conditions)
+        env = environment(skill)
+        rollouts = {name: run_policy(actor, env, conditions) for name, actor in actors.items()}
+        for name, network in repetition.networks.items():
+            own = rollouts_of(skill, network, push, conditions)
+            rollouts |= {f"{name}, {condition}": rollout for condition, rollout in own.items()}
+            stuck = own[f"{STUCK}, reacts"]
+            pushed = own[f"{PUSHED}, reacts"]
+            note("reacted rightly", f"{name}, {STUCK}", skill, stuck.left_out == "joint")
+            yielded = pushed.yielded and not pushed.left_out
+            note("reacted rightly", f"{name}, {PUSHED}", skill, yielded)
         for name, rollout in rollouts.items():
             note("solved", name, skill, rollout.solved)
             if len(rollout.energies):
                 energies.setdefault(name, rollout.energies.max(axis=1))
-        stuck = rollouts["settling, encoders stuck, reacts"]
-        pushed = rollouts["settling, pushed, reacts"]
-        note("reacted rightly", STUCK, skill, stuck.left_out == "joint")
-        note("reacted rightly", PUSHED, skill, pushed.yielded and not pushed.left_out)
     return energies
 
 
 def rollouts_of(
-    skill: str, actors: dict[str, Actor], push: Push, conditions: Conditions
+    skill: str, network: LocalNetwork, push: Push, conditions: Conditions
 ) -> dict[str, Rollout]:
-    """Return the rollouts of all actors in one scene, and those of our network in all conditions."""
+    """Return the rollouts of a local network in one scene, by what happens in them."""
     env = environment(skill)
     pushed = FaultInjection(env, [push])
-    ours = actors[OURS]
-    rollouts = {name: run_policy(actor, env, conditions) for name, actor in actors.items()}
     stuck = replace(conditions, encoders_stick=True)
+    rollouts = {}
     for event, around, faulty in ((STUCK, env, stuck), (PUSHED, pushed, conditions)):
-        name = f"{OURS}, {event}"
-        rollouts[name] = run_policy(ours, around, faulty)
-        rollouts[f"{name}, reacts"] = run_policy(ours, around, replace(faulty, reacts=True))
+        reacting = replace(faulty, reacts=True)
+        rollouts[event] = run_policy(network, around, faulty)
+        rollouts[f"{event}, reacts"] = run_policy(network, around, reacting)
     pushed.undo_faults()
-    rollouts["settling, guarded"] = run_policy(ours, NeuralASMSafety(env), conditions)
+    rollouts["guarded"] = run_policy(network, NeuralASMSafety(env), conditions)
 
     skill_before = environment(SKILLS[SKILLS.index(skill) - 1])
-    run_policy(ours, skill_before, Conditions(conditions.seed, steps=40))
+    run_policy(network, skill_before, Conditions(conditions.seed, steps=40))
     continued = replace(conditions, keeps_state=True)
-    rollouts["settling, after another"] = run_policy(ours, env, continued)
+    rollouts["after another"] = run_policy(network, env, continued)
     return rollouts
 
 
-def film(ours: Settling, path: Path, seed: int) -> None:
-    """Film the network: another skill begins without notice, the arm is pushed, and its encoders stick."""
+def film(ours: LocalNetwork, path: Path, seed: int) -> None:
+    """Film a network: another skill begins without notice, the arm is pushed, and its encoders stick."""
     reacting = Conditions(scene_of(seed), reacts=True)
     push = push_along((0.0, 1.0, 0.0))
     film: list[Image.Image] = []
