@@ -205,7 +205,7 @@ class LiveWatch(Adapter):
             self._pass_lost_rows(row.lost)
         self._lost_before = row.lost
 
-        report = self._judge(row.numbers, self._bridge.over(np.isnan(row.numbers)))
+        report = self._judge(row.numbers, self._bridge.goes_over(np.isnan(row.numbers)))
         self._latencies.append(1e3 * (time.perf_counter() - arrival))
         self._check_watchdog()
         self.report_step([report], row)
@@ -235,7 +235,7 @@ class LiveWatch(Adapter):
     def _pass_lost_rows(self, lost: int) -> None:
         """Go on over rows that did not come, as many as the bridge allows."""
         missing = np.full(self._spec.size, np.nan)
-        bridged = [self._bridge.over(np.isnan(missing)) for _ in range(min(lost, MOST_LOST))]
+        bridged = [self._bridge.goes_over(np.isnan(missing)) for _ in range(min(lost, MOST_LOST))]
         is_alarm = not all(bridged)
         if is_alarm:
             del bridged[1:]

@@ -172,7 +172,7 @@ def declared_meaning(
         action_means = attributes.first("action_means")
     if action_means is None:
         return None
-    return ActionMeaning.told(action_means, size, recorded)
+    return ActionMeaning.declared(action_means, size, recorded)
 
 
 def gripper_columns_of(attributes: EnvAttributes, size: int) -> NDArray[np.intp]:
