@@ -91,7 +91,6 @@ ROBOT = np.dtype(
 )
 
 KEPT = "threshold", "policy_rows", "policy_alarms"  # fields that an episode hands on to the next
-FINITE = "threshold", "pressed_impulse", "leaning_time"  # fields that are always finite numbers
 
 
 class RobotTable:
@@ -147,15 +146,6 @@ class RobotTable:
                 f"{i:5}  {STATES[robot['state']]:6}  {surprise}  {contact}  {bool(robot['alarm'])}"
             )
         return "\n".join(lines)
-
-
-def damaged(records: NDArray[Any]) -> dict[int, str]:
-    """Return which field of a record is no finite number though it must be, by robot."""
-    failures: dict[int, str] = {}
-    for name in FINITE:
-        for robot in np.flatnonzero(~np.isfinite(records[name])).tolist():
-            failures[robot] = f"guard: {name} is {records[name][robot]}"
-    return failures
 
 
 def copied(records: NDArray[Any]) -> NDArray[Any]:
