@@ -14,9 +14,9 @@ from asm_gym.policies.scripted.expert import Style, has_settled
 from asm_gym.policies.scripted.geometry import UP, flattest_side, pointing_down, rotation_about
 from asm_gym.policies.scripted.pick_place import (
     ASKEW,
+    ENOUGH_ROOM,
     PALM_ACROSS,
     PALM_ALONG,
-    ENOUGH_ROOM,
     beside_walls,
 )
 from tests.rates import attempt, failures, room_to_the_stops, too_few
