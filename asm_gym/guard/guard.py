@@ -42,6 +42,7 @@ from asm_gym.guard.robot_table import (
     RobotTable,
     cleared,
     copied,
+    damaged,
 )
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator
@@ -334,10 +335,10 @@ class Guard:
         """Decide about the robots that are marked."""
         records = self.table.records
         row.eventful = True
-        failures = invalid_surprises(self._row_judge.surprises)
-        row.fail(failures)
-        for robot, failure in failures.items():
-            self._warn(robot, failure, "which counts as an alarm")
+        for failures in (invalid_surprises(self._row_judge.surprises), damaged(records)):
+            row.fail(failures)
+            for robot, failure in failures.items():
+                self._warn(robot, failure, "which counts as an alarm")
         row.terms = self.terms.masks(self.table)
         for robot in np.flatnonzero(records["must_decide"]).tolist():
             row.outcomes[robot] = self._decide_about(robot, row)

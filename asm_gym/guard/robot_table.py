@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice
 
+FINITE = "threshold", "pressed_impulse", "leaning_time"  # fields that are always finite numbers
+
 Mask = NDArray[np.bool_]
 Floats32 = NDArray[np.float32]
 
@@ -146,6 +148,15 @@ class RobotTable:
                 f"{i:5}  {STATES[robot['state']]:6}  {surprise}  {contact}  {bool(robot['alarm'])}"
             )
         return "\n".join(lines)
+
+
+def damaged(records: NDArray[Any]) -> dict[int, str]:
+    """Return which field of a record is no finite number though it must be, by robot."""
+    failures: dict[int, str] = {}
+    for name in FINITE:
+        for robot in np.flatnonzero(~np.isfinite(records[name])).tolist():
+            failures[robot] = f"guard: {name} is {records[name][robot]}"
+    return failures
 
 
 def copied(records: NDArray[Any]) -> NDArray[Any]:
