@@ -111,7 +111,7 @@ def register_task(
     check_number("horizon", horizon, low=1, whole=True)
     entry: Any = make
     if _is_of_robosuite(make):
-        entry = "asm_gym.envs.user_environment:OwnRobosuite"
+        entry = "asm_gym.envs.user_environment:UserEnvironment"
         arguments = {"make": make} | arguments
     spec = EnvSpec(
         f"asm_gym/{name}-v0", entry_point=entry, max_episode_steps=horizon, kwargs=arguments

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from asm_gym.control_period import control_period
 from asm_gym.guard.reflexes import FeltMotion
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import RobotTable
@@ -161,4 +162,4 @@ class Repaired:
 def reflexes_of(env, name):
     """The reflexes of one robot."""
     spec = env.get_wrapper_attr("stream_spec")
-    return FeltMotion.of(robots_of(env, spec)[0], spec, name)
+    return FeltMotion.of(robots_of(env, spec, control_period(env))[0], spec, name)

@@ -131,7 +131,7 @@ def test_an_observation_that_a_wrapper_has_changed_is_refused():
     shorter = gym.wrappers.TransformObservation(
         env, lambda o: o[:5], spaces.Box(-100, 100, (5,), np.float32)
     )
-    robots, places = robots_of(shorter, env.unwrapped.stream_spec)
+    robots, places = robots_of(shorter, env.unwrapped.stream_spec, dt=0.05)
     assert places is None
     assert "has changed the observation" in robots.refused["complete"]
     env.close()
@@ -143,7 +143,7 @@ def test_the_numbers_of_an_observation_are_found_in_the_stream(observation):
     spec = env.unwrapped.stream_spec
     seen, info = env.reset(seed=0)
     everything = np.ones(spec.size, bool)
-    _, places = robots_of(env, spec)
+    _, places = robots_of(env, spec, spec.dt)
     same = places.repaired(seen, info["stream"], everything)
     other = places.repaired(seen, info["stream"] + 1, everything)
     if observation == "flat":

@@ -11,7 +11,7 @@ from asm_gym.data.episode import EpisodeLabel
 from asm_gym.detection.contact_limits import ContactLimits, healthy_forces
 from asm_gym.detection.hand_speed_map import MOMENTUM, HandSpeedMap
 from asm_gym.envs.robots import ROBOTS, robot_named
-from asm_gym.envs.speed_limit import BESIDE
+from asm_gym.envs.speed_limit import BESIDE_BASE
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.monitors import NeuralASM, make_monitor
@@ -123,7 +123,7 @@ def test_limits_of_another_arm_are_refused_at_construction(lift):
 
 def test_who_has_pressed_too_hard_may_press_half_as_hard_and_go_a_third_as_fast_for_a_second(lift):
     spec, yes, no = lift.unwrapped.stream_spec, np.ones(1, bool), np.zeros(1, bool)
-    limits = EpisodeLimits(robots_of(lift, spec)[0], ContactLimits(), True)
+    limits = EpisodeLimits(robots_of(lift, spec, spec.dt)[0], ContactLimits(), True)
     limits.begin(yes)
     limits.follow(yes, yes)
     told = []
@@ -240,8 +240,8 @@ def test_a_hand_beside_its_own_mount_goes_half_as_fast_and_meets_it_gently():
         env.step(np.float32([-1, 0, -0.3, 0, 0, 0, 0]))  # towards itself
     env.close()
     distance, speed, force = np.array(found).T
-    assert speed[distance > BESIDE + 0.05].max() > 0.12
-    assert speed[distance < BESIDE - 0.05].max() < 0.1
+    assert speed[distance > BESIDE_BASE + 0.05].max() > 0.12
+    assert speed[distance < BESIDE_BASE - 0.05].max() < 0.1
     assert 20.0 < force.max() < 280.0
 
 

@@ -14,9 +14,9 @@ from asm_gym.policies.scripted.expert import Style, has_settled
 from asm_gym.policies.scripted.geometry import UP, flattest_side, pointing_down, rotation_about
 from asm_gym.policies.scripted.pick_place import (
     ASKEW,
+    ENOUGH_ROOM,
     PALM_ACROSS,
     PALM_ALONG,
-    SPARE,
     beside_walls,
 )
 from tests.rates import attempt, failures, room_to_the_stops, too_few
@@ -127,7 +127,7 @@ def test_a_palm_in_a_bin_has_the_room_it_is_said_to_have_and_is_askew_only_for_i
     assert -(np.abs(corners - BIN_AT) - BIN / 2).max() == pytest.approx(room, abs=1e-9)
     askew = abs(np.arctan2(closing[1], closing[0])) % (np.pi / 2)
     assert min(askew, np.pi / 2 - askew) <= max(ASKEW) + 1e-9
-    assert room >= SPARE or np.abs(closing).max() > 1 - 1e-9
+    assert room >= ENOUGH_ROOM or np.abs(closing).max() > 1 - 1e-9
 
 
 @pytest.mark.parametrize(
@@ -140,5 +140,5 @@ def test_a_palm_in_a_bin_has_the_room_it_is_said_to_have_and_is_askew_only_for_i
 )
 def test_in_the_middle_by_a_wall_and_in_a_corner(x, y, heading, room, square):
     closing, free, _ = chosen(x, y, heading)
-    assert (free >= SPARE) == room
+    assert (free >= ENOUGH_ROOM) == room
     assert (np.abs(closing).max() > 1 - 1e-9) == square

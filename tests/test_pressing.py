@@ -185,7 +185,7 @@ def test_the_policy_goes_on_in_alarm_only_while_it_presses_no_harder_than_free_m
 ):
     monitor = Judge({10}, "object")
     diagnosis, spec = monitor.diagnosis_, monitor.spec
-    diagnostician = Diagnostician(spec, diagnosis, DEFAULT, asked=True)
+    diagnostician = Diagnostician(spec, diagnosis, DEFAULT, responds=True)
     no, shares = np.zeros(spec.size, bool), np.full(spec.size, 1.0 / spec.size)
     rows = np.zeros((3, spec.size), np.float32)
     robot = RobotTable(1, spec, 1.0).robot(0)

@@ -25,7 +25,7 @@ def shelf(tmp_path, monkeypatch):
     )
     memory.about = {"name": "sines", "controller": "SWING"}
     memory.save(tmp_path / "sines.asm")
-    monkeypatch.setattr("asm_gym.monitors.shipped.SHIPPED", tmp_path)
+    monkeypatch.setattr("asm_gym.monitors.shipped.SHIPPED_FOLDER", tmp_path)
     return memory
 
 

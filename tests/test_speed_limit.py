@@ -7,7 +7,7 @@ import pytest
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed import cell_near
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.envs.speed_limit import BESIDE
+from asm_gym.envs.speed_limit import BESIDE_BASE
 from asm_gym.monitors import NeuralASM
 from tests.hand_motion import hand_momentum, hand_speed, joint_twist, present_twist
 
@@ -56,7 +56,7 @@ def slowed(env, action, limits):
         place = simulation.data.site_xpos[simulation.arms.site[arm]]
         base = simulation.data.xpos[simulation.arms.root[arm]]
         own = limits
-        if np.linalg.norm((place - base)[:2]) < BESIDE:
+        if np.linalg.norm((place - base)[:2]) < BESIDE_BASE:
             own = ContactLimits(hand_speed=limits.hand_speed / 2)
         brakes.append(own.hand_speed)
         if controller.name == "IK_POSE":

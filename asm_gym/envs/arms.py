@@ -14,8 +14,6 @@ from asm_gym.envs.mujoco_views import (
     HAND_POSE,
     JOINT_ANGLES,
     JOINT_POSITION,
-    JOINTS,
-    MOST_BODIES,
     OSC_POSE,
     Arm,
     Floats,
@@ -54,11 +52,7 @@ def unit_change(controller: Any) -> Floats:
 
 def is_compilable(part: Part) -> bool:
     """Whether the compiled loop implements the arm's controller, which has robosuite's own settings."""
-    robot = part[0]
-    controller = controller_of(part)
-    if controller.name not in CHANGES or controller.joint_dim > JOINTS:
-        return False
-    return len(robot.arms) == 1 and not robot.is_mobile
+    return controller_of(part).name in CHANGES
 
 
 def describe(parts: list[Part], model: mujoco.MjModel) -> Any:
@@ -76,15 +70,12 @@ def describe_inputs(arm: Arm, model: mujoco.MjModel, controller: Any, part: slic
 
     They are ``part`` of an action.
     """
-    size = part.stop - part.start
-    if controller.name not in SLOWED or size > JOINTS:
+    if controller.name not in SLOWED:
         return
+    size = part.stop - part.start
     arm.first_input = part.start
     arm.input_count = size
     arm.scaling[:, :size] = scaling_of(controller, size)
-    if controller.input_type != "delta":
-        return
-
     # A controller asked for a change again and again reaches a velocity of Kp/Kd times the change.
     gains = controller.kp / controller.kd
     arm.input_speeds[:size] = gains[:size] * unit_change(controller)
@@ -115,15 +106,11 @@ def _fill_places(arm: Arm, model: mujoco.MjModel, part: Part) -> None:
     _fill(arm.tree_dofs, _carried_dofs(model, robot))
 
     sensors = robot.gripper[name].important_sensors
-    arm.wrench = model.sensor(sensors["force_ee"]).adr[0]
-    if model.sensor(sensors["torque_ee"]).adr[0] != arm.wrench + 3:
-        raise RuntimeError("the wrist's force and torque sensors are expected side by side")
+    arm.wrench = model.sensor(sensors["force_ee"]).adr[0]  # the torque sensor follows
 
 
 def _fill(row: Ints, values: Ints) -> None:
     """Write values into a row, and -1 after them."""
-    if len(values) >= MOST_BODIES:
-        raise RuntimeError(f"a robot may have {MOST_BODIES - 1} bodies, this one has {len(values)}")
     row[:] = -1
     row[: len(values)] = values
 
@@ -137,19 +124,12 @@ def _fill_settings(arm: Arm, model: mujoco.MjModel, controller: Any) -> None:
         arm.controller = OSC_POSE
         arm.rest_angles[: arm.joint_count] = controller.initial_joint
         arm.frame = _base_site(model, controller)
-        return
-
-    arm.controller = JOINT_POSITION
-    arm.compensates_dynamics = controller.use_torque_compensation
-    arm.set_point_limits[:] = [-np.inf, np.inf]
-    if controller.position_limits is not None:
-        arm.set_point_limits[: arm.joint_count] = np.transpose(controller.position_limits)
+    else:
+        arm.controller = JOINT_POSITION
 
 
 def _base_site(model: mujoco.MjModel, controller: Any) -> int:
-    """Return the site that actions of operational space control are relative to; -1 for the world."""
-    if controller.input_ref_frame != "base":
-        return -1
+    """Return the site that actions of operational space control are relative to, at the arm's base."""
     return int(model.site(f"{controller.naming_prefix}{controller.part_name}_center").id)
 
 
@@ -176,7 +156,7 @@ def _carried_dofs(model: mujoco.MjModel, robot: Any) -> Ints:
 
 
 def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[Chain, ...]:
-    """Return the kinematic chain of each arm, with sensors of ``noise``; an arm on a moving base has none."""
+    """Return the kinematic chain of each arm, with sensors of ``noise``."""
     data = mujoco.MjData(model)
     for robot, _ in parts:
         data.qpos[robot._ref_joint_pos_indexes] = 0.0
@@ -186,8 +166,6 @@ def chains_of(parts: list[Part], model: mujoco.MjModel, noise: float) -> tuple[C
     for i, (robot, arm) in enumerate(parts):
         joints = np.asarray(robot._ref_joint_indexes)
         hand = model.body(robot.robot_model.eef_name[arm]).id
-        if not _is_chain(model, joints, hand):
-            continue
         fingers = data.site_xpos[robot.eef_site_id[arm]]
         turn = data.xmat[hand].reshape(3, 3)
         chain = Chain(
@@ -208,10 +186,3 @@ def prefix_of(number: int, robots: int) -> str:
     if robots > 1:
         return f"robot{number}_"
     return ""
-
-
-def _is_chain(model: mujoco.MjModel, joints: Ints, hand: int) -> bool:
-    """Whether the joints all turn, and nothing else moves between the world and the hand."""
-    between = np.flatnonzero(np.isin(model.jnt_bodyid, _links(model, hand)))
-    turns = model.jnt_type[joints] == int(mujoco.mjtJoint.mjJNT_HINGE)
-    return set(between.tolist()) == set(joints.tolist()) and bool(turns.all())

@@ -21,7 +21,7 @@ from asm_gym.envs.robots import ROBOTS, robot_named
 from asm_gym.extras import require
 from asm_gym.spec import Channel
 from asm_gym.tasks import TaskSpec
-from asm_gym.validation import check_choice, check_text
+from asm_gym.validation import check_choice, check_number, check_text
 
 CONTROLLERS = ("OSC_POSE", "OSC_POSITION", "JOINT_POSITION", "JOINT_TORQUE", "IK_POSE")
 """Robosuite's controllers of an arm, less JOINT_VELOCITY, which fails inside robosuite 1.5."""
@@ -82,11 +82,14 @@ def _compile_less() -> None:
     robot.T = SimpleNamespace(**{**vars(transform_utils), "mat2quat": mat2quat})
 
 
-def row_substeps(rate: int, control_freq: int) -> int:
-    """Return the physics substeps between two rows at ``rate`` [Hz].
+def row_substeps(rate: int | None, control_freq: int) -> int:
+    """Return the physics substeps between two rows at ``rate``, by default that of control [Hz].
 
     Raises ValueError, listing the rates that fit.
     """
+    if rate is None:
+        rate = control_freq
+    check_number("stream_freq", rate, low=1, whole=True)
     rates = range(control_freq, PHYSICS_FREQ + 1, control_freq)
     possible = [f for f in rates if PHYSICS_FREQ % f == 0]
     if rate not in possible:
@@ -239,8 +242,8 @@ def _find_pads(gripper: Any) -> tuple[tuple[str, ...], ...]:
     return tuple(geoms["left_fingerpad"]), tuple(geoms["right_fingerpad"])
 
 
-class _Asked(dict[str, Any]):
-    """A dict that notes the names whose values it was asked for."""
+class _NotedDict(dict[str, Any]):
+    """A dict that notes the names whose values were read."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -261,7 +264,9 @@ class ObjectSensors:
         observables = env._observables
         # Others compute from these: poses of hands, and of the world in a hand's frame.
         hidden = [name for name in observables if name.startswith("world_pose_in")]
-        hands = [f"robot{i}_eef_{what}" for i in range(len(env.robots)) for what in ("pos", "quat")]
+        hands: list[str] = []
+        for i in range(len(env.robots)):
+            hands += [f"robot{i}_eef_pos", f"robot{i}_eef_quat"]
         self._observables = _poses_shown(observables, task)
 
         channels: list[Channel] = []
@@ -274,7 +279,7 @@ class ObjectSensors:
 
         # Relative poses are computed from absolute ones, which robosuite lists after them.
         self._in_order = sorted(self._observables, key=_is_relative)
-        values = _Asked()
+        values = _NotedDict()
         known = [observables[name] for name in (*hands, *hidden) if name in observables]
         for observable in (*known, *self._in_order):
             values[observable.name] = observable._sensor(values)

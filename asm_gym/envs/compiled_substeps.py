@@ -84,14 +84,15 @@ def _evaluate_nominal(views: Views, nominal: NominalViews) -> None:
 def sample(views: Views, nominal: NominalViews, arms: Arms, k: int, samples: Floats) -> None:
     """Write the sensor values of every arm after substep ``k`` into samples (A, K, SAMPLE)."""
     for a in range(len(arms)):
+        arm = arms[a]
         row = samples[a, k]
         for i in range(SAMPLE):
             row[i] = 0.0
-        read_torques(views, nominal, arms[a], row)
+        read_torques(views, nominal, arm, row)
         for i in range(6):
-            row[_WRENCH + i] = views.sensordata[arms[a].wrench + i]
-        read_contact(views, arms[a], row)
-        read_hand_velocity(views, arms[a], row)
+            row[_WRENCH + i] = views.sensordata[arm.wrench + i]
+        read_contact(views, arm, row)
+        read_hand_velocity(views, arm, row)
 
 
 @partial(inner, inlined=True)
@@ -103,23 +104,27 @@ def read_torques(views: Views, nominal: NominalViews, arm: Arm, row: Floats) -> 
         t += 1
     for i in range(arm.joint_count):
         dof = arm.dofs[i]
+        motor_torque = views.qfrc_actuator[dof]
         unknown_damping = views.dof_damping[dof] - nominal.damping[dof]
-        damped = views.qfrc_passive[dof] + unknown_damping * views.qvel[dof]
-        row[i] += nominal.bias[dof] - damped - views.qfrc_actuator[dof]
-        row[_MOTOR + i] = views.qfrc_actuator[dof]
+        passive = views.qfrc_passive[dof] + unknown_damping * views.qvel[dof]
+        row[i] += nominal.bias[dof] - passive - motor_torque
+        row[_MOTOR + i] = motor_torque
 
 
 @partial(inner, inlined=True)
 def add_inertia(views: Views, nominal: NominalViews, arm: Arm, i: int, row: Floats) -> None:
     """Add what row ``i`` of the mass matrix, and the column that mirrors it, give the torques M q̈."""
     first = views.M_rowadr[i]
-    for at in range(first + views.M_rownnz[i] - 1, first - 1, -1):
+    last = first + views.M_rownnz[i] - 1
+    for at in range(last, first - 1, -1):
         j = views.M_colind[at]
+        mass = nominal.mass[at]
         for r in range(arm.joint_count):
-            if arm.dofs[r] == i:
-                row[r] += nominal.mass[at] * views.qacc[j]
-            elif arm.dofs[r] == j:
-                row[r] += nominal.mass[at] * views.qacc[i]
+            dof = arm.dofs[r]
+            if dof == i:
+                row[r] += mass * views.qacc[j]
+            elif dof == j:
+                row[r] += mass * views.qacc[i]
 
 
 @partial(inner, inlined=True)
@@ -128,8 +133,10 @@ def read_contact(views: Views, arm: Arm, row: Floats) -> None:
     t = 0
     while arm.bodies[t] >= 0:
         body = arm.bodies[t]
+        wrench = views.cfrc_ext[body]
+        applied = views.xfrc_applied[body]
         for i in range(3):
-            row[_CONTACT + i] += views.cfrc_ext[body, 3 + i] - views.xfrc_applied[body, i]
+            row[_CONTACT + i] += wrench[3 + i] - applied[i]
         t += 1
 
 
@@ -150,17 +157,18 @@ def read_hand_velocity(views: Views, arm: Arm, row: Floats) -> None:
 
 
 @inner
-def largest_load(most: Floats, k: int, samples: Floats, largest: float) -> float:
+def largest_share(limits: Floats, k: int, samples: Floats, largest: float) -> float:
     """Return the greater of ``largest`` and the largest |load| / limit in substep ``k``.
 
-    ``most`` (A, FELT) are the limits. A load that is NaN makes it infinite.
+    The limits are (A, FELT). A load that is NaN makes it infinite.
     """
-    for a in range(len(most)):
+    for a in range(len(limits)):
+        loads = samples[a, k]
         for i in range(FELT):
-            load = abs(samples[a, k, i]) / most[a, i]
-            if np.isnan(load):
+            share = abs(loads[i]) / limits[a, i]
+            if np.isnan(share):
                 return np.inf
-            largest = max(largest, load)
+            largest = max(largest, share)
     return largest
 
 
@@ -174,7 +182,8 @@ def feel(goals: Goals, limits: SubstepLimits, k: int, samples: Floats) -> None:
     status = limits.status[0]
     status.substeps += 1
     if status.armed:
-        limits.load_share[0] = largest_load(limits.load_limits, k, samples, limits.load_share[0])
+        before = limits.load_share[0]
+        limits.load_share[0] = largest_share(limits.load_limits, k, samples, before)
     if status.passed_after > 0 or limits.load_share[0] <= 1.0:
         return
     status.passed_after = status.substeps
@@ -236,34 +245,37 @@ def run(bound: Bound, fresh: bool, first: int, count: int) -> None:
 
 @compiled
 def sense(
-    sources: tuple[Floats, ...], where: Ints, beside: Floats, noise: Floats, row: Floats
+    sources: tuple[Floats, ...], places: Ints, other_values: Floats, noise: Floats, row: Floats
 ) -> None:
     """Turn standard normal draws into readings.
 
     Args:
         sources: arrays that the arms' sensors read.
-        where: (P, 2) source of each of their numbers, and its index there.
-        beside: (M - P,) true values of the other numbers.
+        places: (P, 2) source of each number that they read, and its index there.
+        other_values: (M - P,) true values of the other numbers.
         noise: (M,) standard deviations.
         row: (M,) draws on entry, readings on return.
     """
-    own = len(where)
-    for n in range(own):
-        row[n] = sources[where[n, 0]][where[n, 1]] + noise[n] * row[n]
-    for n in range(own, len(row)):
-        row[n] = beside[n - own] + noise[n] * row[n]
+    count = len(places)
+    for n in range(count):
+        source = sources[places[n, 0]]
+        value = source[places[n, 1]]
+        row[n] = value + noise[n] * row[n]
+    for n in range(count, len(row)):
+        value = other_values[n - count]
+        row[n] = value + noise[n] * row[n]
 
 
 @compiled
 def finish(
     row: Floats,
-    steps: Floats,
+    resolution: Floats,
     carried: Ints,
     stream: NDArray[np.float32],
     observed: Ints,
     observation: NDArray[np.float32],
 ) -> tuple[bool, bool]:
-    """Round a row (M,) in place to resolutions ``steps`` (M,), 0 for none, and share its numbers out.
+    """Round a row (M,) in place to the sensors' resolution (M,), 0 for none, and share its numbers out.
 
     Args:
         carried, observed: which numbers go into the stream (D,), and which into the observation (S,), where they are
@@ -274,8 +286,9 @@ def finish(
     """
     row_finite = True
     for n in range(len(row)):
-        if steps[n] > 0.0:
-            row[n] = np.rint(row[n] / steps[n]) * steps[n]
+        step = resolution[n]
+        if step > 0.0:
+            row[n] = np.rint(row[n] / step) * step
         row_finite = row_finite and np.isfinite(np.float32(row[n]))
 
     stream_finite = True
@@ -307,14 +320,19 @@ def summarise(samples: Floats, count: int, mean: Floats, peak: Floats, last: Flo
             for k in range(count):
                 value = samples[a, k, i]
                 mean[a, i] += value / count
-                # NaN compares false: it is taken when it comes, and stays.
-                if not abs(value) <= abs(peak[a, i]) and peak[a, i] == peak[a, i]:
-                    peak[a, i] = value
+                peak[a, i] = larger(peak[a, i], value)
         for k in range(count):
             force = length(samples[a, k, _CONTACT:_VELOCITY])
-            if not force <= largest and largest == largest:
-                largest = force
+            largest = larger(largest, force)
     return largest
+
+
+@inner
+def larger(number: float, other: float) -> float:
+    """Return the number of larger magnitude; NaN where one is NaN."""
+    if np.isnan(number) or abs(other) <= abs(number):
+        return number
+    return other
 
 
 @compiled
@@ -322,7 +340,9 @@ def touching(pairs: Ints, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> b
     """Whether, among pairs (N, 2) of geoms in contact, one of the first group (G,) touches one of the other (G,)."""
     for n in range(len(pairs)):
         a, b = pairs[n]
-        if (one[a] and other[b]) or (one[b] and other[a]):
+        if one[a] and other[b]:
+            return True
+        if one[b] and other[a]:
             return True
     return False
 
@@ -331,8 +351,10 @@ def touching(pairs: Ints, one: NDArray[np.bool_], other: NDArray[np.bool_]) -> b
 def edited(live: tuple[Floats, ...], frozen: tuple[Floats, ...], rows: Ints) -> bool:
     """Whether arrays (N, M) differ from others in any of ``rows``."""
     for k in range(len(live)):
+        values = live[k]
+        expected = frozen[k]
         for r in rows:
-            for c in range(live[k].shape[1]):
-                if live[k][r, c] != frozen[k][r, c]:
+            for c in range(values.shape[1]):
+                if values[r, c] != expected[r, c]:
                     return True
     return False

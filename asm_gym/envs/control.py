@@ -134,16 +134,6 @@ def rotate(R: Floats, frame: Floats, product: Floats) -> None:
             product[i, j] = entry
 
 
-@inner
-def read_frame(orientations: Floats, site: int, frame: Floats) -> None:
-    """Write the orientation (3, 3) of a site, the world's for -1, into frame."""
-    for i in range(3):
-        for j in range(3):
-            frame[i, j] = 1.0 * (i == j)
-            if site >= 0:
-                frame[i, j] = orientations[site, 3 * i + j]
-
-
 @partial(inner, inlined=True)
 def set_goal(views: Views, arm: Arm, goal: Goal, action: Floats, work: Work) -> None:
     """Move the set-point of an arm as the action asks, from where the arm is now."""
@@ -153,10 +143,7 @@ def set_goal(views: Views, arm: Arm, goal: Goal, action: Floats, work: Work) -> 
         change[i] = scaled(action[number], arm.scaling, i)
     if arm.controller == JOINT_POSITION:
         for i in range(arm.joint_count):
-            angle = views.qpos[arm.qpos[i]] + change[i]
-            lowest = arm.set_point_limits[i, 0]
-            highest = arm.set_point_limits[i, 1]
-            goal.joints[i] = within(angle, lowest, highest)
+            goal.joints[i] = views.qpos[arm.qpos[i]] + change[i]
     else:
         set_pose(views, arm, goal, work)
 
@@ -165,13 +152,11 @@ def set_goal(views: Views, arm: Arm, goal: Goal, action: Floats, work: Work) -> 
 def set_pose(views: Views, arm: Arm, goal: Goal, work: Work) -> None:
     """Move the hand's set-point by ``work.displacement``, the position's and the turn's, in the frame of actions."""
     change = work.displacement
-    base = work.rotations[0]
-    hand = work.rotations[1]
-    turn = work.rotations[2]
-    hand_in_base = work.rotations[3]
-    turned_in_base = work.rotations[1]  # once the hand's own is not needed any more
-    read_frame(views.site_xmat, arm.frame, base)
-    read_frame(views.site_xmat, arm.site, hand)
+    base = views.site_xmat[arm.frame].reshape((3, 3))
+    hand = views.site_xmat[arm.site].reshape((3, 3))
+    turn = work.rotations[0]
+    hand_in_base = work.rotations[1]
+    turned_in_base = work.rotations[2]
     rotation(change[3:], turn)
     position = views.site_xpos[arm.site]
     for i in range(3):
@@ -348,11 +333,9 @@ def track_joints(arm: Arm, goal: Goal, work: Work) -> None:
     n = arm.joint_count
     for i in range(n):
         error = goal.joints[i] - work.angles[i]
-        wanted = arm.kp[i] * error - arm.kd[i] * work.velocities[i]
-        work.acceleration[i] = wanted
-        work.torques[i] = wanted
-    if arm.compensates_dynamics:
-        accelerate(work, n)
+        damping = arm.kd[i] * work.velocities[i]
+        work.acceleration[i] = arm.kp[i] * error - damping
+    accelerate(work, n)
 
 
 @partial(inner, inlined=True)

@@ -85,7 +85,7 @@ ARM = np.dtype(
         ("site", np.int64),  # between the fingers
         ("site_body", np.int64),  # that the site belongs to
         ("root", np.int64),  # the robot's outermost body
-        ("frame", np.int64),  # the site that actions are relative to, -1 for the world
+        ("frame", np.int64),  # the site that actions are relative to
         ("wrench", np.int64),  # where the wrist's force and torque begin in sensordata
         ("bodies", np.int64, MOST_BODIES),  # whose contacts count; then -1
         ("links", np.int64, MOST_BODIES),  # bodies from the hand to the base; then -1
@@ -93,9 +93,7 @@ ARM = np.dtype(
         ("controller", np.int64),  # OSC_POSE or JOINT_POSITION
         ("kp", np.float64, JOINTS),
         ("kd", np.float64, JOINTS),
-        ("compensates_dynamics", np.int64),  # 1 for joint control that knows the arm's dynamics
         ("rest_angles", np.float64, JOINTS),  # the posture that spare joints tend to [rad]
-        ("set_point_limits", np.float64, (JOINTS, 2)),  # least and most of each joint [rad]
         ("first_input", np.int64),  # where the arm's part of the action begins
         ("input_count", np.int64),  # how many numbers it has
         ("scaling", np.float64, (5, JOINTS)),  # of the inputs; see ``controller_inputs``
@@ -143,7 +141,7 @@ class Work(NamedTuple):
     factor: Floats  # (JOINTS, JOINTS) L, a Cholesky factor
     weighted: Floats  # (JOINTS, JOINTS) J L⁻ᵀ, and below it p L⁻ᵀ
     products: Floats  # (JOINTS, JOINTS) J M⁻¹ Jᵀ, and below it J M⁻¹ p
-    rotations: Floats  # (4, 3, 3) frames on the way to a set-point
+    rotations: Floats  # (3, 3, 3) frames on the way to a set-point
 
     @classmethod
     def empty(cls) -> Work:
@@ -163,7 +161,7 @@ class Work(NamedTuple):
             factor=np.zeros(square),
             weighted=np.zeros(square),
             products=np.zeros(square),
-            rotations=np.zeros((4, 3, 3)),
+            rotations=np.zeros((3, 3, 3)),
         )
 
 

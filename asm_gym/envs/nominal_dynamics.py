@@ -27,7 +27,8 @@ class NominalDynamics:
     def __init__(self, model: mujoco.MjModel, views: Views, robots: Ints) -> None:
         self._model = model
         self._robots = robots
-        self._live = tuple(getattr(model, name).reshape(model.nbody, -1) for name in self._INERTIA)
+        inertia = [getattr(model, name) for name in self._INERTIA]
+        self._live = tuple(array.reshape(model.nbody, -1) for array in inertia)
         self._frozen = tuple(live.copy() for live in self._live)
         self.unedited = NominalViews(
             model=0,

@@ -50,6 +50,16 @@ def _substeps_at(control_freq: int) -> int:
     return PHYSICS_FREQ // control_freq
 
 
+def _refuse_unknown(task: str, arguments: dict[str, Any]) -> None:
+    """Raise TypeError where there are arguments that no environment takes."""
+    if not arguments:
+        return
+    hint = ""
+    if "robots" in arguments:
+        hint = "; the arm is named by robot="
+    raise TypeError(f"asm_gym/{task}-v0 takes no {', '.join(arguments)}{hint}")
+
+
 def _check_picture(size: tuple[int, int]) -> None:
     pixels = check_numbers("render_size", size, 2, low=1, high=LARGEST_PICTURE)
     if (pixels % 1).any():
@@ -109,18 +119,13 @@ class RobosuiteEnv(SteppedEnv):
         render_size: tuple[int, int] = (480, 480),
         **unknown: Any,
     ) -> None:
-        if unknown:
-            hint = "; the arm is named by robot=" if "robots" in unknown else ""
-            raise TypeError(f"asm_gym/{task}-v0 takes no {', '.join(unknown)}{hint}")
+        _refuse_unknown(task, unknown)
         self.task = task_spec(task)
         self.robots = robots_for(self.task, robot)
         check_choice("render_mode", render_mode, (None, "rgb_array"))
         check_choice("observation", observation, ("flat", "dict"))
         _check_groups(stream)
         super().__init__(_substeps_at(control_freq))
-        if stream_freq is None:
-            stream_freq = control_freq
-        check_number("stream_freq", stream_freq, low=1, whole=True)
         self._row_substeps = backend.row_substeps(stream_freq, control_freq)
         if horizon is None:
             horizon = self.task.horizon
@@ -138,18 +143,23 @@ class RobosuiteEnv(SteppedEnv):
         self._steps_taken = 0
 
         self.controller = controller  # name of the arms' controller
+        check_flag("reward_shaping", reward_shaping)
         self.robosuite_env: Any = backend.make(
-            self.task,
-            self.robots,
-            controller,
-            control_freq,
-            check_flag("reward_shaping", reward_shaping),
+            self.task, self.robots, controller, control_freq, reward_shaping
         )
         """The simulator underneath."""
+        self._make_renderer(camera, render_size)
+        self._bind()
+        self._build_actions()
+        self._build_spaces()
+
+    def _make_renderer(self, camera: str, render_size: tuple[int, int]) -> None:
         cameras = self.robosuite_env.sim.model.camera_names
         check_choice("camera", check_text("camera", camera), cameras)
-        self._renderer = OffscreenRenderer(camera, render_size[1], render_size[0])
-        self._bind()
+        height, width = render_size
+        self._renderer = OffscreenRenderer(camera, width, height)
+
+    def _build_actions(self) -> None:
         parts = self.simulation.parts
         self.hand_chains = chains_of(parts, self.simulation.model, self.sensor_noise)
         """Kinematic chains of the arms, as they were made."""
@@ -157,7 +167,6 @@ class RobosuiteEnv(SteppedEnv):
         self._actions.begin_episode(self.simulation)
         self.action_space = self._actions.space
         self.gripper_actions = self._actions.grippers  # indices of the action that command grippers
-        self._build_spaces()
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         """Refuse to be copied or pickled: a simulator has no bytes of its own."""

@@ -38,7 +38,7 @@ class _Sensor(NamedTuple):
     group: str
     unit: str  # of fingers that slide; see ``_TURNING``
     source: str  # an array of ``Proprioception.__init__``
-    part: slice | str  # of a sample, or a key of ``_places``
+    part: slice | str  # of a sample, or a key of ``_indices_by_part``
     noise: float = 0.0  # standard deviation [unit]
     # step between readings [unit]; 0 for what is computed from several sensors
     resolution: float = 0.0
@@ -105,48 +105,51 @@ class Proprioception:
         self.sources = tuple(sources.values())  # arrays that the sensors read
         names = list(sources)
         channels: list[Channel] = []
-        where: list[tuple[int, int]] = []
+        places: list[tuple[int, int]] = []
         for a, part in enumerate(parts):
-            places = _places(part)
+            prefix = prefix_of(a, len(parts))
+            indices_of = _indices_by_part(part)
             for sensor in _SENSORS:
-                indices = _indices(sensor, a, places)
-                if len(indices) > 0:
-                    prefix = prefix_of(a, len(parts))
-                    channels.append(_channel(sensor, prefix, len(indices), part))
-                    where += [(names.index(sensor.source), int(i)) for i in indices]
+                indices = _indices(sensor, a, indices_of)
+                if len(indices) == 0:
+                    continue
+                channels.append(_channel(sensor, prefix, len(indices), part))
+                source = names.index(sensor.source)
+                places += [(source, int(i)) for i in indices]
         self.channels = tuple(channels)
         # (P, 2) of each number its source and its index there
-        self.where = np.array(where, np.int64)
+        self.places = np.array(places, np.int64)
 
 
-def _places(part: Part) -> dict[str, Any]:
+def _indices_by_part(part: Part) -> dict[str, Any]:
     """Return where in their sources an arm's sensors read, by ``_Sensor.part``."""
     robot, arm = part
-    model = robot.sim.model._model
-    places = {
+    hand = robot.sim.model._model.body(robot.robot_model.eef_name[arm]).id
+    indices = {
         "joints": robot._ref_joint_pos_indexes,
         "dofs": robot._ref_joint_vel_indexes,
         "motors": robot._ref_actuators_indexes_dict[arm],
         "hand": 3 * robot.eef_site_id[arm] + np.arange(3),
         # The first two columns of the rotation: six numbers that turn smoothly; a quaternion flips
         # its sign.
-        "turn": 9 * model.body(robot.robot_model.eef_name[arm]).id + np.array([0, 3, 6, 1, 4, 7]),
+        "turn": 9 * hand + np.array([0, 3, 6, 1, 4, 7]),
         "fingers": (),
         "finger_dofs": (),
     }
     if robot.gripper[arm].joints:
-        places["fingers"] = robot._ref_gripper_joint_pos_indexes[arm]
-        places["finger_dofs"] = robot._ref_gripper_joint_vel_indexes[arm]
-    return places
+        indices["fingers"] = robot._ref_gripper_joint_pos_indexes[arm]
+        indices["finger_dofs"] = robot._ref_gripper_joint_vel_indexes[arm]
+    return indices
 
 
-def _indices(sensor: _Sensor, a: int, places: dict[str, Any]) -> Any:
+def _indices(sensor: _Sensor, a: int, indices_of: dict[str, Any]) -> Any:
     """Return the indices in its source that a sensor of arm ``a`` reads; none where the arm has no such part."""
     if isinstance(sensor.part, str):
-        return places[sensor.part]
-    indices = np.arange(sensor.part.start, sensor.part.stop) + a * kernels.SAMPLE
+        return indices_of[sensor.part]
+    in_sample = np.arange(sensor.part.start, sensor.part.stop)
+    indices = a * kernels.SAMPLE + in_sample
     if sensor.group == "torque":
-        return indices[: len(places["joints"])]
+        return indices[: len(indices_of["joints"])]
     return indices
 
 
@@ -229,9 +232,9 @@ class Senses:
             self.stream_spec = replace(spec, channels=chosen)
         self._carried = _columns(spec, [c.name for c in chosen])
         self._noise = spec.noise * noise
-        self._steps = spec.resolution
+        self._resolution = spec.resolution
         if noise == 0:
-            self._steps = np.zeros(spec.size)
+            self._resolution = np.zeros(spec.size)
         self._needs_objects = "object" in groups
 
         names = [c.name for c in spec.channels if c.name.endswith(_OBSERVED) or c.group == "object"]
@@ -262,8 +265,8 @@ class Senses:
         """
         if faults or self._needs_objects or not within_step:
             self._object_poses = objects.read()
-        beside = np.concatenate([*self._object_poses, action], dtype=np.float64)
-        row = sense(beside, self._noise, rng)
+        other_values = np.concatenate([*self._object_poses, action], dtype=np.float64)
+        row = sense(other_values, self._noise, rng)
         if faults:
             was_finite = bool(np.isfinite(row).all())
             for corrupt in faults:
@@ -272,7 +275,7 @@ class Senses:
         stream = np.empty(len(self._carried), np.float32)
         observed = np.empty(len(self._observed), np.float32)
         row_finite, stream_finite = kernels.finish(
-            row, self._steps, self._carried, stream, self._observed, observed
+            row, self._resolution, self._carried, stream, self._observed, observed
         )
         if faults:  # a fault that reads NaN is no fault of the simulation
             row_finite = was_finite

@@ -48,9 +48,10 @@ class Simulation:
         self.warnings: Any = self.data.warning.number  # a view
         self.parts = [(robot, arm) for robot in env.robots for arm in robot.arms]
         self.views = Views.of(self.model, self.data)
-        robots = np.unique(np.concatenate([bodies(self.model, robot) for robot, _ in self.parts]))
+        robots = [bodies(self.model, robot) for robot, _ in self.parts]
+        own_bodies = np.unique(np.concatenate(robots))
         # the robots' own model of their dynamics
-        self.nominal = NominalDynamics(self.model, self.views, robots)
+        self.nominal = NominalDynamics(self.model, self.views, own_bodies)
         n = len(self.parts)
         self._samples = np.zeros((n, substeps, kernels.SAMPLE))
         self.speed_limits = np.full(n, np.inf)
@@ -91,7 +92,7 @@ class Simulation:
             )
             self._run(0)
         kernels.sample(self.views, self.nominal.now(), self.arms, 0, self._samples)
-        self._add_up(1)
+        self._summarise(1)
 
     def _take_up_controllers(self) -> None:
         # whether control runs compiled
@@ -169,7 +170,8 @@ class Simulation:
         if not self.compiled:
             self._run_robosuites(count)
         elif self.keeps_history and self._done == 0:
-            wrenches = [self.data.sensordata[at : at + 6].copy() for at in self.arms.wrench]
+            sensed = self.data.sensordata
+            wrenches = [sensed[at : at + 6].copy() for at in self.arms.wrench]
             self._run(count)
             self._remember(wrenches)
         else:
@@ -234,7 +236,8 @@ class Simulation:
     @property
     def braked(self) -> float:
         """The share of the control step's substeps in which an arm was slowed down beneath its controller."""
-        return float(self._limits.status[0]["braked"]) / max(1, self._done * len(self.parts))
+        braked = float(self._limits.status[0]["braked"])
+        return braked / max(1, self._done * len(self.parts))
 
     @property
     def felt(self) -> Floats:
@@ -254,16 +257,19 @@ class Simulation:
         forces = self._samples[:, : self._done - self._row_began, kernels.CONTACT]
         return np.linalg.norm(forces, axis=2).max(axis=0)
 
-    def sense(self, beside: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
-        """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began; see
-        ``compiled_substeps.sense``."""
+    def sense(self, other_values: Floats, noise: Floats, rng: np.random.Generator) -> Floats:
+        """Return noisy readings (M,) of all sensors, summarised over the substeps since the row began.
+
+        The arguments are those of ``compiled_substeps.sense``.
+        """
         if self._done > self._row_began:
-            self._add_up(self._done - self._row_began)
+            self._summarise(self._done - self._row_began)
+        own = self.proprioception
         row = rng.standard_normal(len(noise))
-        kernels.sense(self.proprioception.sources, self.proprioception.where, beside, noise, row)
+        kernels.sense(own.sources, own.places, other_values, noise, row)
         return row
 
-    def _add_up(self, count: int) -> None:
+    def _summarise(self, count: int) -> None:
         """Summarise ``count`` substeps, and take the force of the row into that of the control step; NaN stays."""
         own = self.proprioception
         self.contact_force = kernels.summarise(self._samples, count, own.mean, own.peak, own.last)
@@ -284,10 +290,10 @@ class Simulation:
         """Return the change (6,) of the pose of arm ``a``'s hand, in the frame of actions, by turns (n,) of joints."""
         arm = self.arms[a]
         jacobian = np.zeros((6, self.model.nv))
-        mujoco.mj_jacSite(self.model, self.data, jacobian[:3], jacobian[3:], arm.site)
+        linear = jacobian[:3]
+        angular = jacobian[3:]
+        mujoco.mj_jacSite(self.model, self.data, linear, angular, arm.site)
         change = jacobian[:, arm.dofs[: len(turns)]] @ turns
-        if arm.frame < 0:
-            return change
         frame = self.data.site_xmat[arm.frame].reshape(3, 3)
         return np.concatenate([frame.T @ change[:3], frame.T @ change[3:]])
 

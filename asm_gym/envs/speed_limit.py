@@ -31,8 +31,8 @@ from asm_gym.envs.control import REACHES, length
 from asm_gym.envs.mujoco_views import JOINT_ANGLES, UNKNOWN_CHANGE, Arm, Arms, Floats, Views
 
 # Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].
-BESIDE = 0.3
-LIGHT = 1e-12  # no inverse mass is taken to be less [1/kg]
+BESIDE_BASE = 0.3
+LEAST_INVERSE_MASS = 1e-12  # [1/kg]
 
 # Rows of ``Motions``.
 ASKED = 0  # what the action asks for
@@ -113,9 +113,7 @@ def add_direction(views: Views, base: int, number: int, speed: float, twist: Flo
     column = number % 3
     first = number - column  # 0 for linear, 3 for angular velocity
     for axis in range(3):
-        cosine = 1.0 * (axis == column)
-        if base >= 0:
-            cosine = views.site_xmat[base, 3 * axis + column]
+        cosine = views.site_xmat[base, 3 * axis + column]
         twist[first + axis] += cosine * speed
 
 
@@ -133,7 +131,8 @@ def read_asked(
         twist[axis] = 0.0
     for i in range(arm.input_count):
         number = arm.first_input + i
-        speed = arm.input_speeds[i] * (action[number] - rest[number])
+        asked = action[number] - rest[number]
+        speed = arm.input_speeds[i] * asked
         if arm.changes == JOINT_ANGLES:
             add_joint(motions.jacobian, arm.dofs[i], speed, twist)
         else:
@@ -160,19 +159,20 @@ def hand_speed(twist: Floats) -> float:
 @partial(inner, inlined=True)
 def momentum(views: Views, motions: Motions, row: int) -> float:
     """Return m |v|, the momentum of an arm along its hand's motion [N s]."""
+    jacobian = motions.jacobian
     velocity = motions.twists[row, :3]
     force = motions.forces[row]
     solved = motions.solved[row]
     for dof in range(len(force)):
         force[dof] = 0.0
         for axis in range(3):
-            force[dof] += motions.jacobian[axis, dof] * velocity[axis]
+            force[dof] += jacobian[axis, dof] * velocity[axis]
     _solve_mass(views.model, views.data, solved.ctypes.data, force.ctypes.data, 1)
 
     inverse = 0.0  # |v|²/m
     for dof in range(len(force)):
         inverse += force[dof] * solved[dof]
-    return length(velocity) ** 3 / max(inverse, LIGHT)
+    return length(velocity) ** 3 / max(inverse, LEAST_INVERSE_MASS)
 
 
 @partial(inner, inlined=True)
@@ -185,7 +185,8 @@ def share_of(
     along = 0.0
     if limit.grid.size > 0:
         along = momentum(views, motions, row)
-    return allowed_share(limit, a, place, twist, hand_speed(twist), along)
+    speed = hand_speed(twist)
+    return allowed_share(limit, a, place, twist, speed, along)
 
 
 @partial(inner, inlined=True)
@@ -195,14 +196,15 @@ def is_beside_base(views: Views, arm: Arm) -> bool:
     base = views.xpos[arm.root]
     x = hand[0] - base[0]
     y = hand[1] - base[1]
-    return np.hypot(x, y) < BESIDE
+    return np.hypot(x, y) < BESIDE_BASE
 
 
 @partial(inner, inlined=True)
 def scale_part(arm: Arm, share: np.float32, rest: Action, action: Action) -> None:
     """Leave a share of an arm's part of an action, in place."""
     first = arm.first_input
-    for number in range(first, first + arm.input_count):
+    end = first + arm.input_count
+    for number in range(first, end):
         asked = action[number] - rest[number]
         action[number] = rest[number] + share * asked
 
@@ -234,7 +236,8 @@ def slow(bound: Bound, action: Action, slowed: Action) -> None:
 
         fastest = share * hand_speed(motions.twists[ASKED])
         if present_share < 1.0:
-            fastest = min(fastest, present_share * hand_speed(motions.twists[PRESENT]))
+            present = hand_speed(motions.twists[PRESENT])
+            fastest = min(fastest, present_share * present)
         if fastest > limit.hand_speed:
             brake_speeds[a] = fastest
         if share < 1.0:

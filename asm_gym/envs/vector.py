@@ -100,12 +100,14 @@ class ThreadedVectorEnv(SyncVectorEnv[Any, Any]):
             seeds = [seed + i for i in range(n)]
         else:
             seeds = list(seed)
-        if len(seeds) != n or begun.dtype != bool or begun.shape != (n,):
+        is_mask = begun.dtype == bool and begun.shape == (n,)
+        if len(seeds) != n or not is_mask:
             raise ValueError(
                 f"seed and reset_mask must have {n} entries (one an environment), "
                 f"got {seed} and {begun}"
             )
-        if any(seen is None and not now for seen, now in zip(self._env_obs, begun, strict=True)):
+        never_reset = [observation is None for observation in self._env_obs]
+        if np.any(never_reset & ~begun):
             raise gym.error.ResetNeeded("the first reset() must reset all environments")
 
         def start(i: int) -> tuple[int, Any, dict[str, Any]]:
@@ -233,11 +235,13 @@ def cores() -> int:
 
 def _are_alike(values: list[Any]) -> bool:
     """Whether values of several members are numbers of one type, or arrays of one shape and type."""
+    types = set(map(type, values))
     first = values[0]
+    if len(types) > 1:
+        return False
     if isinstance(first, np.ndarray):
-        form = (first.shape, first.dtype)
-        return all(isinstance(v, np.ndarray) and (v.shape, v.dtype) == form for v in values)
-    return isinstance(first, int | float | np.number) and len(set(map(type, values))) == 1
+        return all((v.shape, v.dtype) == (first.shape, first.dtype) for v in values)
+    return isinstance(first, int | float | np.number)
 
 
 def make(num_envs: int = 1, task: str = "Lift", **settings: Any) -> ThreadedVectorEnv:
@@ -247,4 +251,5 @@ def make(num_envs: int = 1, task: str = "Lift", **settings: Any) -> ThreadedVect
         settings: ``threads`` and ``autoreset_mode`` of ``ThreadedVectorEnv``; the rest is of each environment.
     """
     ours = {key: settings.pop(key) for key in ("threads", "autoreset_mode") if key in settings}
-    return ThreadedVectorEnv([partial(gym.make, TASKS[task].id, **settings)] * num_envs, **ours)
+    member = partial(gym.make, TASKS[task].id, **settings)
+    return ThreadedVectorEnv([member] * num_envs, **ours)

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.faults.fault import LONGEST, Clock, HookedFault, Interface, delayed, within
+from asm_gym.faults.fault import LONGEST_DELAY, Clock, HookedFault, Interface, delayed, within
 from asm_gym.validation import check_number
 
 Action = NDArray[np.float32]
@@ -61,7 +61,7 @@ class ActionDelay(ActionFault):
 
     grippers_too = True
 
-    steps: int = within(4, low=1, high=LONGEST)
+    steps: int = within(4, low=1, high=LONGEST_DELAY)
 
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
         return delayed(commanded, self.steps, memory)
@@ -103,7 +103,7 @@ class ActionRepeat(ActionFault):
 
     grippers_too = True
 
-    steps: int = within(5, low=1, high=LONGEST)
+    steps: int = within(5, low=1, high=LONGEST_DELAY)
 
     def deliver(self, commanded: Action, k: int, memory: list[Action]) -> Action:
         if k % self.steps == 0 or not memory:

@@ -54,7 +54,8 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         if self._source.own:
             sensed = np.asarray(info["stream"])[self._source.spec.sensory]
-            if not np.allclose(sensed, flat(self.observation_space, observation), equal_nan=True):
+            observed = flat(self.observation_space, observation)
+            if not np.allclose(sensed, observed, equal_nan=True):
                 raise ValueError(
                     "this environment's stream does not hold its observation: "
                     "a fault cannot be in both"
@@ -65,7 +66,8 @@ class FaultyInterface(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         box: Any = self.action_space
         delivered = action
         for deliver in self.deliveries:
-            changed = deliver(np.ravel(as_float32(delivered))).reshape(box.shape)
+            commanded = np.ravel(as_float32(delivered))
+            changed = deliver(commanded).reshape(box.shape)
             delivered = np.clip(changed, box.low, box.high)
         observation, reward, terminated, truncated, info = self.env.step(delivered)
         if self._source.own and self.deliveries:
@@ -168,7 +170,8 @@ def _drawn(
     env: Interface, sigma: NDArray[np.float64], number: int, rng: np.random.Generator
 ) -> Target:
     """Return the target that holds one number of the measured row; its axis of the action is drawn."""
-    halves = np.ravel(0.5 * (env.action_space.high - env.action_space.low))  # (A,)
+    ranges = env.action_space.high - env.action_space.low
+    halves = np.ravel(0.5 * ranges)  # (A,)
     axis = int(rng.integers(len(halves)))
     slices = env.measured_spec.slices
     channel = next(name for name, span in slices.items() if number < span.stop)

@@ -118,7 +118,8 @@ class Collision(ForceField):
             depth = float(at @ into) - wall
             size = 0.0
             if depth > 0:
-                size = self.stiffness * depth + self.damping * max(0.0, float(v @ into))
+                speed_inwards = max(0.0, float(v @ into))
+                size = self.stiffness * depth + self.damping * speed_inwards
             return -min(size, self.newtons) * into
 
         return push
@@ -136,7 +137,8 @@ class CablePull(ForceField):
         def pull(at: Floats, _: Floats) -> Floats:
             away = at - position
             length = float(np.linalg.norm(away))
-            size = min(self.stiffness * max(0.0, length - self.slack), self.newtons)
+            stretch = max(0.0, length - self.slack)
+            size = min(self.stiffness * stretch, self.newtons)
             return -size * away / max(length, 1e-9)
 
         return pull
@@ -160,7 +162,8 @@ class HeldByPerson(ForceField):
         direction /= np.linalg.norm(direction)
 
         def hold(at: Floats, v: Floats) -> Floats:
-            hand = position + self.sway * np.sin(np.pi * (data.time - start)) * direction
+            angle = np.pi * (data.time - start)
+            hand = position + self.sway * np.sin(angle) * direction
             pull: Floats = self.stiffness * (hand - at) - self.damping * v
             size = max(float(np.linalg.norm(pull)), 1e-9)
             return min(1.0, self.newtons / size) * pull

@@ -17,8 +17,8 @@ from asm_gym.validation import check_choice, check_number, check_numbers, check_
 
 Vector3 = tuple[float, float, float]  # in the world's axes
 Floats = NDArray[np.float64]
-MOST = 1e9  # no parameter is larger, so that nothing overflows
-LONGEST = 10_000  # the longest delay [control steps]
+LARGEST_PARAMETER = 1e9  # so that nothing overflows
+LONGEST_DELAY = 10_000  # [control steps]
 
 Interface = Any
 """What faults of sensors and actions act on: ``RobosuiteEnv``, or the ``FaultyInterface`` of any other environment."""
@@ -32,7 +32,11 @@ class Clock:
 
 
 def within(
-    default: Any, *, low: float | None = -MOST, high: float = MOST, above: float | None = None
+    default: Any,
+    *,
+    low: float | None = -LARGEST_PARAMETER,
+    high: float = LARGEST_PARAMETER,
+    above: float | None = None,
 ) -> Any:
     """Declare a parameter of a fault, and its bounds."""
     if above is not None:
@@ -78,7 +82,9 @@ class Fault(ABC):
 
     def active(self, step: int) -> bool:
         """Whether the fault acts in a control step."""
-        return self.onset <= step and (self.duration is None or step < self.onset + self.duration)
+        if self.duration is None:
+            return self.onset <= step
+        return self.onset <= step < self.onset + self.duration
 
     def rng(self, purpose: int = 1) -> np.random.Generator:
         """Return a generator of the fault's own."""
@@ -180,7 +186,11 @@ def _check(parameter: Field[Any], value: Any) -> None:
     """Raise ValueError unless a parameter is of its type and within its bounds."""
     name = parameter.name
     kind = parameter.type
-    bounds = parameter.metadata or {"low": -MOST, "high": MOST, "above": None}
+    bounds = parameter.metadata or {
+        "low": -LARGEST_PARAMETER,
+        "high": LARGEST_PARAMETER,
+        "above": None,
+    }
     if kind == "float":
         check_number(name, value, **bounds)
     elif kind == "int" or (kind == "int | None" and value is not None):
@@ -189,18 +199,14 @@ def _check(parameter: Field[Any], value: Any) -> None:
         check_numbers(name, value, 3, low=bounds["low"], high=bounds["high"])
         if name == "direction" and not np.linalg.norm(value) > 0:
             raise ValueError(f"direction must not be all zero, got {value}")
-    elif kind == "str" and not _is_empty(value):
+    elif kind == "str" and value != "":
         check_text(name, value)
-
-
-def _is_empty(value: Any) -> bool:
-    return isinstance(value, str) and not value
 
 
 def steady_force(env: RobosuiteEnv, body: int, newtons: float, direction: Vector3) -> Edit:
     """Return the edit that pushes a body along a direction in the world's axes."""
-    way = np.asarray(direction, np.float64)
-    force = newtons * (way / float(np.linalg.norm(way)))
+    along = np.asarray(direction, np.float64)
+    force = newtons * (along / float(np.linalg.norm(along)))
     forces = env.simulation.data.xfrc_applied
     return forces, [(body, slice(0, 3))], lambda others: others + force
 

@@ -27,8 +27,12 @@ _AWAY = np.array([8.0, 8.0, 0.5])  # where a missing object lies [m]
 def movable(env: RobosuiteEnv) -> dict[str, int]:
     """Return the joints of the objects that can be moved about, by name: each body with a free joint."""
     model = env.simulation.model
-    free = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
-    return {model.body(int(model.jnt_bodyid[j])).name.removesuffix("_main"): j for j in free}
+    joints: dict[str, int] = {}
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            body = model.body(int(model.jnt_bodyid[joint]))
+            joints[body.name.removesuffix("_main")] = joint
+    return joints
 
 
 class ObjectFault(Fault):
@@ -82,9 +86,10 @@ class Slip(ObjectFault, EditingFault):
 
     def edits(self, env: RobosuiteEnv) -> list[Edit]:
         model = env.simulation.model
-        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.body_of(env)]
-        touching = (model.geom_contype | model.geom_conaffinity) != 0
-        geoms = np.flatnonzero(own & touching).tolist()
+        root = model.body_rootid[self.body_of(env)]
+        is_own = model.body_rootid[model.geom_bodyid] == root
+        can_touch = (model.geom_contype | model.geom_conaffinity) != 0
+        geoms = np.flatnonzero(is_own & can_touch).tolist()
         sliding = [(geom, slice(0, 1)) for geom in geoms]
         return [
             (model.geom_friction, sliding, lambda mu: mu * (self.friction / mu)),
@@ -110,7 +115,8 @@ class Teleport(ObjectFault):
 
     @contextmanager
     def applied(self, env: RobosuiteEnv, clock: Clock) -> Iterator[None]:
-        self.move(env, _position(env, self.joint_of(env)) + np.asarray(self.offset))
+        position = _position(env, self.joint_of(env))
+        self.move(env, position + np.asarray(self.offset))
         yield
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults.fault import (
-    LONGEST,
+    LONGEST_DELAY,
     Clock,
     Floats,
     HookedFault,
@@ -116,8 +116,9 @@ class Spikes(SensorFault):
 
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
         rng = self.rng(2 + k)
-        hit = rng.random(len(true)) < self.probability
-        return true + self.amount * hit * rng.choice([-1.0, 1.0], len(true))
+        is_hit = rng.random(len(true)) < self.probability
+        signs = rng.choice([-1.0, 1.0], len(true))
+        return true + self.amount * is_hit * signs
 
 
 class Dropout(SensorFault):
@@ -141,7 +142,7 @@ class Freeze(SensorFault):
 class Delay(SensorFault):
     """Deliver readings ``steps`` control steps late."""
 
-    steps: int = within(3, low=1, high=LONGEST)
+    steps: int = within(3, low=1, high=LONGEST_DELAY)
 
     def read(self, true: Floats, k: int, memory: list[Floats]) -> Floats:
         return delayed(true, self.steps, memory)

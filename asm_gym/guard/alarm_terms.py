@@ -131,21 +131,21 @@ class AlarmTerms:
         self.terms = dict(sorted(ALARM_TERMS.items(), key=lambda item: item[1].priority))
         self.held_rows = dict.fromkeys(self.terms, 0)
         self.of_user = tuple(name for name in self.terms if name not in ALARM_TERMS.own)
-        self._of_row: dict[str, Mask] = {}  # of the user's own terms
+        self._user_masks: dict[str, Mask] = {}  # (n,) at the newest row, by the user's own terms
 
     def ask_users(self, robots: RobotTable) -> str:
         """Evaluate the user's own terms at a row, whose masks are kept; return what failed, as an alarm must not."""
-        self._of_row = {}
+        self._user_masks = {}
         for name in self.of_user:
             try:
-                self._of_row[name] = self._checked(name, robots)
+                self._user_masks[name] = self._checked(name, robots)
             except Exception as error:
                 return f"alarm term {name}: {error!r}"
         return ""
 
     def any_of_user(self) -> Mask | bool:
         """Return (n,) where any of the user's own terms holds at the row."""
-        return np.logical_or.reduce(list(self._of_row.values()), initial=False)
+        return np.logical_or.reduce(list(self._user_masks.values()), initial=False)
 
     def masks(self, robots: RobotTable) -> dict[str, Mask]:
         """Return where each term holds (n,), by name, in the order of priority."""
@@ -153,7 +153,7 @@ class AlarmTerms:
         built_in = {
             name: term.holds(robots) for name, term in self.terms.items() if name in ALARM_TERMS.own
         }
-        masks = built_in | self._of_row
+        masks = built_in | self._user_masks
         return {name: masks[name] & active for name in self.terms if name in masks}
 
     def count(self, names: tuple[str, ...]) -> None:

@@ -132,6 +132,9 @@ class Decision(NamedTuple):
     """The surprise has had its consequence: its evidence is not to be counted again."""
 
 
+NO_DECISION = Decision()
+
+
 class Arbiter:
     """Decides who acts.
 
@@ -196,7 +199,7 @@ class Arbiter:
         if not robot.overridden:
             robot.largest_surprise = max(robot.largest_surprise, robot.surprise)
         if not self._acts:
-            return Decision()
+            return NO_DECISION
 
         self._count_row(evidence, response)
         transition = following(int(robot.state), self._situation(evidence, response))

@@ -188,8 +188,10 @@ class Commander:
             action = stay.action.copy()
         if motion.keeps_grip:
             grip = self.holding.executed[robot, facts.grip]
-            action[facts.grip] = np.where(np.isfinite(grip), grip, action[facts.grip])
-        return motion._replace(action=np.clip(action, facts.low, facts.high)), failure
+            is_known = np.isfinite(grip)
+            action[facts.grip[is_known]] = grip[is_known]
+        within = np.clip(action, facts.low, facts.high)
+        return motion._replace(action=within), failure
 
     def _reflex_motion(self, robot: int, reflex: str, observe: Observe) -> Motion:
         """Return what the reflex of a name, or the user's own policy, does."""
@@ -252,11 +254,13 @@ def clip_action(robot: Any, proposed: Any, before: Any, limits: Any, executed: A
     finite = True
     absurd = False
     for i in range(len(proposed)):
-        executed[i] = min(max(proposed[i], limits[LOW, i]), limits[HIGH, i])
+        action = min(max(proposed[i], limits[LOW, i]), limits[HIGH, i])
+        step = np.abs(action - before[i])
         finite = finite and np.isfinite(proposed[i])
-        absurd = absurd or executed[i] < limits[LEAST_EXECUTED, i]
-        absurd = absurd or executed[i] > limits[MOST_EXECUTED, i]
-        absurd = absurd or np.abs(executed[i] - before[i]) > limits[GREATEST_STEP, i]
+        absurd = absurd or action < limits[LEAST_EXECUTED, i]
+        absurd = absurd or action > limits[MOST_EXECUTED, i]
+        absurd = absurd or step > limits[GREATEST_STEP, i]
+        executed[i] = action
     policy_acts = robot.state != REFLEX
     robot.out_of_range = policy_acts and finite and absurd
     robot.refused = policy_acts and (absurd or not finite)

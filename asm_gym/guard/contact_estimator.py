@@ -52,8 +52,9 @@ class ContactEstimator:
 
     def presses(self, rows: Rows) -> bool:
         """Return whether something presses in the last of the rows (T, D)."""
-        last = self.deviations(rows[-2:])
-        return bool((np.abs(last) >= PRESSED).any())
+        newest = self.deviations(rows[-2:])
+        pressed = np.abs(newest) >= PRESSED
+        return bool(pressed.any())
 
     def blocked(self, rows: Rows, joint: str = "") -> bool:
         """Return whether ``joint``, such as ``joint[3]``, has been pressed in most of the rows (T, D), without turning.

@@ -173,18 +173,18 @@ def wrist_force(numbers: Any, wrists: Any, weighed: Any, steps: float) -> float:
         return np.nan
     largest = 0.0
     for w in range(len(wrists)):
-        columns = wrists[w]
         hand = weighed[w]
         weight = hand.force
-        x = float(numbers[columns[0]])
-        y = float(numbers[columns[1]])
-        z = float(numbers[columns[2]])
+        x = float(numbers[wrists[w, 0]])
+        y = float(numbers[wrists[w, 1]])
+        z = float(numbers[wrists[w, 2]])
         if x * x + y * y + z * z < HEAVIEST * HEAVIEST:
             hand.steps = min(hand.steps + 1.0, steps)
             weight[0] += (x - weight[0]) / hand.steps
             weight[1] += (y - weight[1]) / hand.steps
             weight[2] += (z - weight[2]) / hand.steps
-        largest = np.maximum(largest, norm(x - weight[0], y - weight[1], z - weight[2]))
+        pressing = norm(x - weight[0], y - weight[1], z - weight[2])
+        largest = np.maximum(largest, pressing)
     return largest
 
 
@@ -206,11 +206,10 @@ def fastest_hand(row: Any, hands: Any) -> float:
         return np.nan
     largest = 0.0
     for h in range(len(hands)):
-        columns = hands[h]
-        x = float(row[columns[0]])
-        y = float(row[columns[1]])
-        z = float(row[columns[2]])
-        largest = np.maximum(largest, norm(x, y, z))
+        vx = float(row[hands[h, 0]])
+        vy = float(row[hands[h, 1]])
+        vz = float(row[hands[h, 2]])
+        largest = np.maximum(largest, norm(vx, vy, vz))
     return largest
 
 

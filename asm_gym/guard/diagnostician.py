@@ -17,7 +17,14 @@ from asm_gym.guard.responses import GOING_ON, LASTING, NO_RESPONSE, PRESSING, Re
 from asm_gym.guard.robot_facts import NO_COLUMNS, columns_ending
 from asm_gym.guard.robot_table import POLICY, Floats32, Mask
 from asm_gym.guard.row_evidence import RowEvidence
-from asm_gym.monitors.diagnosis import FAMILIES, WINDOW, Cause, Diagnosis, as_info, averaged
+from asm_gym.monitors.diagnosis import (
+    DIAGNOSED_ROWS,
+    FAMILIES,
+    Cause,
+    Diagnosis,
+    as_info,
+    updated_belief,
+)
 from asm_gym.spec import StreamSpec
 
 CALM_S = 1.0  # after so long without an alarm, what comes next has a cause of its own [s]
@@ -49,7 +56,7 @@ class Incident:
         """Return the cause by all diagnoses, the newest of which counts a tenth at least."""
         self.diagnoses += 1
         probabilities = np.array([cause.probabilities[name] for name in FAMILIES])
-        self.belief = averaged(self.belief, probabilities, self.diagnoses)
+        self.belief = updated_belief(self.belief, probabilities, self.diagnoses)
         self.newest[cause.family] = cause
         family = FAMILIES[int(self.belief.argmax())]
         return self.newest.get(family, cause)._replace(
@@ -72,8 +79,8 @@ class Diagnostician:
     Args:
         spec: of their streams.
         diagnosis: of the monitor; without one every cause is unknown.
-        table: what is done about which cause, as ``responses_from`` gives it.
-        asked: the table is followed; else causes are only named.
+        responses: what is done about which cause, as ``responses_from`` gives it.
+        responds: the responses are followed; else causes are only named.
 
     Attributes:
         incidents: of the robots that have not been calm for long enough.
@@ -84,20 +91,20 @@ class Diagnostician:
         self,
         spec: StreamSpec,
         diagnosis: Diagnosis | None,
-        table: Mapping[str, str],
-        asked: bool,
+        responses: Mapping[str, str],
+        responds: bool,
     ) -> None:
         self._dt = spec.dt
         self._diagnosis = diagnosis
-        self._table = table
-        self._asked = asked
+        self._responses = responses
+        self._responds = responds
         # By which a joint is found blocked.
         self._blocked_rows = 1 + round(LASTING["actuator"] / spec.dt)
         self._contact = None
         if diagnosis is not None and columns_ending(spec.channels, "external_torque").size:
             self._contact = ContactEstimator(diagnosis.completion)
         self.incidents: dict[int, Incident] = {}
-        self.rows = WINDOW + self._blocked_rows
+        self.rows = DIAGNOSED_ROWS + self._blocked_rows
 
     def begin(self, which: Mask) -> None:
         """Begin new episodes of the robots of ``which`` (n,)."""
@@ -141,12 +148,12 @@ class Diagnostician:
         incident.touched = presses or cause.family == "contact"
         incident.first_row.setdefault(PRESSING if presses else family, incident.rows)
 
-        case, name = self._look_up(incident, family, cause, evidence)
+        case, name = self._case_and_response(incident, family, cause, evidence)
         description = as_info(cause)
         if family != cause.family:
             description |= {"family": family, "part": ""}
         response = Response(name, description, touched, case)
-        if not self._asked:
+        if not self._responds:
             response = response._replace(name="", case="")
         if name != "complete":
             return Prescription(response)
@@ -154,37 +161,39 @@ class Diagnostician:
 
     def instead_of_completing(self, response: Response) -> Response:
         """Return what is done where the sensors at fault cannot be completed."""
-        return response._replace(name=self._table["unknown"])
+        return response._replace(name=self._responses["unknown"])
 
     def _brake(self, incident: Incident, evidence: RowEvidence) -> Response:
         """Return the response to a knock that presses no more: the arm is braked until the contact has gone."""
         incident.touched = True
         incident.calm_rows = 0
-        name = "hold" if self._asked else ""
         return Response(
-            name, _certain("contact"), self._touched(incident, evidence.rows), "contact"
+            name="hold" if self._responds else "",
+            cause=_certain("contact"),
+            touched=self._touched(incident, evidence.rows),
+            case="contact",
         )
 
-    def _look_up(
+    def _case_and_response(
         self,
         incident: Incident,
         family: str,
         cause: Cause,
         evidence: RowEvidence,
     ) -> tuple[str, str]:
-        """Return the row of the table that holds, and the response."""
+        """Return the row of the table of responses that holds, and the response."""
         case = PRESSING if evidence.robot.presses else family
         if case in (PRESSING, "contact") and self._lasts(incident, case):
             case = f"lasting {case}"
-        name = self._table[case]
+        name = self._responses[case]
         if name == "go on" and self._blocked(family, cause, evidence.rows):
             # Whatever the policy goes on with, it does not move the arm, and presses.
             case = "lasting actuator" if family == "actuator" else "lasting contact"
-            name = self._table[case]
+            name = self._responses[case]
         if name in GOING_ON and not _may_go_on(name, cause, evidence):
             name = "hold"
-            if case != "unknown" and self._table["unknown"] not in GOING_ON:
-                name = self._table["unknown"]
+            if case != "unknown" and self._responses["unknown"] not in GOING_ON:
+                name = self._responses["unknown"]
         return case, name
 
     def _find_cause(self, incident: Incident, evidence: RowEvidence) -> Cause:
@@ -198,7 +207,7 @@ class Diagnostician:
                 probabilities=dict.fromkeys(FAMILIES, 0.0) | {"sensor": 1.0},
                 columns=evidence.contradiction.columns,
             )
-        rows = evidence.rows[-1 - WINDOW :]
+        rows = evidence.rows[-1 - DIAGNOSED_ROWS :]
         if failed or self._diagnosis is None or not np.isfinite(rows).all():
             return NO_CAUSE
         try:
@@ -211,7 +220,7 @@ class Diagnostician:
 
     def _touched(self, incident: Incident, rows: Floats32) -> bool | None:
         """Return whether what touched the body still does; None where nobody knows."""
-        if not self._asked or not incident.touched or self._contact is None or len(rows) < 2:
+        if not self._responds or not incident.touched or self._contact is None or len(rows) < 2:
             return None
         if not self._contact.presses(rows):
             return False

@@ -43,7 +43,7 @@ class EpisodeLimits:
                 limits = replace(limits, stays=False, hand_speed=np.inf)
             careful = limits.stricter(CAREFUL_FORCES, CAREFUL_SPEED * limits.hand_speed)
 
-        self._choices = limits, careful
+        self._usual_and_careful = limits, careful
         self._careful_steps = max(1, round(CAREFUL_S / facts.dt))
         # (n,) of the policy, under the careful limits
         self._steps_left = np.zeros(facts.count, np.int64)
@@ -62,9 +62,9 @@ class EpisodeLimits:
         self._choose()
 
     def _choose(self) -> None:
-        careful = self._steps_left > 0
-        self.steady = not careful.any()
-        self.now = tuple(self._choices[int(chosen)] for chosen in careful)
+        is_careful = self._steps_left > 0
+        self.steady = not is_careful.any()
+        self.now = tuple(self._usual_and_careful[int(careful)] for careful in is_careful)
 
 
 def limits_of(

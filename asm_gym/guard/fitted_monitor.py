@@ -30,29 +30,34 @@ class FittedMonitor:
 
     monitor: Monitor
     threshold: float
-    parts: tuple[Any, Any, Any]  # the monitor, and what ``fit`` replaces, compared by identity
+    learned: tuple[Any, Any]
+    """What ``fit`` replaces, compared by identity."""
 
     @classmethod
     def of(cls, monitor: Monitor, spec: StreamSpec) -> Self:
         """Return a monitor that can watch such a stream. Raises what ``check_monitor`` does."""
-        return cls(monitor, check_monitor(monitor, spec), _parts(monitor))
+        return cls(monitor, check_monitor(monitor, spec), _learned(monitor))
 
     @property
     def stale(self) -> bool:
         """Whether it was fitted since."""
-        parts = _parts(self.monitor)
-        return parts[1] is not self.parts[1] or parts[2] is not self.parts[2]
+        return not _identical(self.learned, _learned(self.monitor))
 
     def differs(self, other: FittedMonitor) -> bool:
         """Return whether it is another monitor, or was fitted or calibrated in between."""
-        same = all(a is b for a, b in zip(self.parts, other.parts, strict=True))
+        same = self.monitor is other.monitor and _identical(self.learned, other.learned)
         return self.threshold != other.threshold or not same
 
 
-def _parts(monitor: Monitor) -> tuple[Any, Any, Any]:
+def _learned(monitor: Monitor) -> tuple[Any, Any]:
+    """Return what ``fit`` replaces in a monitor."""
     if isinstance(monitor, NeuralASM):
-        return monitor, monitor.model.completion_, monitor.model.senses_
-    return monitor, getattr(monitor, "diagnosis_", None), None
+        return monitor.model.completion_, monitor.model.senses_
+    return getattr(monitor, "diagnosis_", None), None
+
+
+def _identical(one: tuple[Any, Any], other: tuple[Any, Any]) -> bool:
+    return one[0] is other[0] and one[1] is other[1]
 
 
 def check_monitor(monitor: Monitor, watched: StreamSpec, controller: str = "") -> float:

@@ -28,7 +28,7 @@ from asm_gym.guard.diagnostician import Diagnostician
 from asm_gym.guard.episode_limits import EpisodeLimits, limits_of
 from asm_gym.guard.fitted_monitor import STALE, FittedMonitor, diagnosis_of
 from asm_gym.guard.judged_rows import JudgedRow, RowJudge
-from asm_gym.guard.observer import Observer, merged, unjudged
+from asm_gym.guard.observer import Observer, invalid_surprises, merged_failures
 from asm_gym.guard.options import GuardOptions
 from asm_gym.guard.preview import Preview, preview_chunk
 from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, MotionArrays
@@ -91,7 +91,6 @@ class Guard:
         self._graded = self._on_alarm == GRADED
         self._facts = facts
         self._spec = spec
-        self.options = options
         self.ends_on_alarm = self._on_alarm == "terminate"
         self.fitted = FittedMonitor.of(monitor, spec)
         self.terms = AlarmTerms()
@@ -267,20 +266,20 @@ class Guard:
             ends_step: the rows end a control step.
             active: (n,) whose rows count; all by default.
         """
-        row = self._take_up(sensed, executed, ends_step, active)
+        row = self._begin_row(sensed, executed, ends_step, active)
         to_decide = self._row_judge.judge(row)
         for robot, failure in row.failures.items():
             self._warn(robot, failure, "which counts as an alarm")
         if to_decide:
             self._decide(row)
-        self._follow(row)
+        self._prepare_next_step(row)
         report = self._report(row)
         if row.eventful:
             for name in ROW_MARKS:
                 self.table.records[name] = False
         return report
 
-    def _take_up(
+    def _begin_row(
         self, sensed: SensedRows, executed: Floats32, ends_step: bool, active: Mask | None
     ) -> JudgedRow:
         """Write into the table what is known before the rows are judged."""
@@ -326,7 +325,7 @@ class Guard:
             robot: failure for robot, failure in choosing.items() if not refused[robot]
         }
         row.eventful = True
-        row.fail(merged(policy, sensing))
+        row.fail(merged_failures(policy, sensing))
         if self.fitted.stale:
             row.fail(dict.fromkeys(range(self._facts.count), STALE))
 
@@ -336,7 +335,7 @@ class Guard:
         """Decide about the robots that are marked."""
         records = self.table.records
         row.eventful = True
-        for failures in (unjudged(self._row_judge.surprises), damaged(records)):
+        for failures in (invalid_surprises(self._row_judge.surprises), damaged(records)):
             row.fail(failures)
             for robot, failure in failures.items():
                 self._warn(robot, failure, "which counts as an alarm")
@@ -366,7 +365,7 @@ class Guard:
         robot.event = FAULT_EVENT
         if set(evidence.terms) <= {CONTACT, SURPRISE} and not robot.over:
             robot.event = KNOCK_EVENT  # which keeps the surprise under its threshold
-        return Outcome(evidence.terms, int(robot.event), response, decision)
+        return Outcome(evidence.terms, response, decision)
 
     def _evidence(self, index: int, row: JudgedRow) -> RowEvidence:
         """Return what is known of the row of one robot."""
@@ -413,11 +412,11 @@ class Guard:
         failure = self._observer.forget(acted_on)
         if failure:
             forgetting = dict.fromkeys(np.flatnonzero(acted_on).tolist(), failure)
-            row.failures = merged(row.failures, forgetting)
+            row.failures = merged_failures(row.failures, forgetting)
 
     # ------------------------------------------------------------------ report
 
-    def _follow(self, row: JudgedRow) -> None:
+    def _prepare_next_step(self, row: JudgedRow) -> None:
         """Let what acts next take account of the row: holding actions, expected actions, contact limits."""
         if row.ends_step:
             self._commander.holding.sense(row.rows)
@@ -442,7 +441,7 @@ class Guard:
             robots=robots,
             attribution=row.attribution,
             outcomes=row.outcomes,
-            failures=merged(row.harmless_failures, row.failures),
+            failures=merged_failures(row.harmless_failures, row.failures),
             repairs={robot: repair.names for robot, repair in self._validator.repairs.items()},
             lost=row.lost,
         )

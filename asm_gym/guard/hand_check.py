@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.hand_speed import Floats
-from asm_gym.detection.kinematics import HAND, Chain
+from asm_gym.detection.kinematics import HAND_SIZE, Chain
 from asm_gym.guard.hand_comparison import (
     HAND_GEOMETRY,
     HAND_STATE,
@@ -92,7 +92,8 @@ class HandChecks:
 
     def contradiction(self, robot: int, missing: Mask) -> Contradiction | None:
         """Return what is wrong with the last row of a robot beside what is ``missing`` (D,): the first arm's."""
-        named = [arm.contradiction(robot, missing) for arm in self.arms if arm.contradicts(robot)]
+        contradicting = [arm for arm in self.arms if arm.contradicts(robot)]
+        named = [arm.contradiction(robot, missing) for arm in contradicting]
         return next(filter(None, named), None)
 
 
@@ -113,14 +114,15 @@ class HandCheck:
 
     def __post_init__(self) -> None:
         joints = int(self.geometry["joints"][0])
-        columns = self.geometry["columns"][0, : 2 * joints + HAND]
+        columns = self.geometry["columns"][0, : 2 * joints + HAND_SIZE]
         self._joints = joints
         self._columns = columns
         # What may be at fault: J angles, then the numbers of the hand.
         self._suspects = np.delete(columns, np.s_[joints : 2 * joints])
         self._gain = float(self.geometry["gain"][0])
         # Compiled or loaded here, so that the first contradiction does not wait for it.
-        self._fit(0, self.state["rows"][0, 0], np.ones(len(self._suspects), bool))
+        all_wrong = np.ones(len(self._suspects), bool)
+        self._fit(0, self.state["rows"][0, 0], all_wrong)
 
     def begin(self, which: Mask) -> None:
         """Forget what was named of the robots of ``which`` (n,): new episodes begin."""
@@ -149,8 +151,9 @@ class HandCheck:
             case.unexplained += self._gain * (bounded - case.unexplained)
             if case.unexplained <= EXPLAINED:
                 # What was named still explains it; if nothing completes that sensor, name it again.
-                is_completed = not (case.accused & ~missing).any()
-                return None if is_completed else case.named
+                if (case.accused & ~missing).any():
+                    return case.named
+                return None
         named = self._name_sensor(robot, case, wrong)
         if named is not None:
             case.named = named
@@ -168,16 +171,18 @@ class HandCheck:
         before, newest = joints.reshape(2, 2, self._joints)  # each (angles or speeds, J)
         turned, sped_up = newest - before
         mean_speed = (newest[1] + before[1]) / 2
-        agrees = np.abs(turned / self.spec.dt - mean_speed) < SAME_SPEED
+        off_by = np.abs(turned / self.spec.dt - mean_speed)
+        agrees = off_by < SAME_SPEED
         changes = (turned != 0.0) | (sped_up != 0.0)
-        consistent[self._columns[:-HAND]] = np.tile(agrees & changes, 2)
-        consistent[self._columns[-HAND:]] = True
+        consistent[self._columns[:-HAND_SIZE]] = np.tile(agrees & changes, 2)
+        consistent[self._columns[-HAND_SIZE:]] = True
         return consistent
 
     def accused(self, robot: int) -> Mask:
         """Return (D,) what is not to be believed again while the contradiction lasts."""
-        case = self._cases.get(robot)
-        return np.zeros(self.spec.size, bool) if case is None else case.accused
+        if robot not in self._cases:
+            return np.zeros(self.spec.size, bool)
+        return self._cases[robot].accused
 
     def refine(self, robot: int, row: Floats, missing: Mask, error: Floats) -> Floats:
         """Return a completed row (D,), of errors (D,), with ``missing`` angles (D,) as the hand says."""
@@ -226,7 +231,8 @@ class HandCheck:
         joints = self._joints
         geometry = self.geometry[robot]
         free = wrong[:joints]
-        turned_since = np.where(free, 0.0, geometry["late_s"] * row[joints : 2 * joints])
+        speeds = row[joints : 2 * joints]
+        turned_since = np.where(free, 0.0, geometry["late_s"] * speeds)
         believed = self.state["angles"][robot, :joints]
         fitted, unexplained = fit_angles(
             geometry,

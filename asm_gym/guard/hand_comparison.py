@@ -13,7 +13,7 @@ import numpy as np
 
 from asm_gym.compilation import compiled, inner
 from asm_gym.detection.hand_speed import Floats
-from asm_gym.detection.kinematics import HAND, Chain, hand_at
+from asm_gym.detection.kinematics import HAND_SIZE, Chain, hand_at
 from asm_gym.guard.robot_table import Mask
 from asm_gym.spec import StreamSpec
 
@@ -33,12 +33,12 @@ HAND_GEOMETRY = np.dtype(
     [
         ("joints", np.int64),  # J
         # of the stream: J angles, J speeds, the hand
-        ("columns", np.int64, 2 * MOST_JOINTS + HAND),
+        ("columns", np.int64, 2 * MOST_JOINTS + HAND_SIZE),
         ("axes", np.float64, (MOST_JOINTS, 3)),  # as in ``Chain``
         ("anchors", np.float64, (MOST_JOINTS, 3)),
         ("pose", np.float64, (3, 3)),
         ("late_s", np.float64),  # the angles are sensed by so much later than the hand [s]
-        ("weights", np.float64, HAND),  # 1/σ
+        ("weights", np.float64, HAND_SIZE),  # 1/σ
         ("gain", np.float64),  # g
     ],
     align=True,
@@ -47,11 +47,11 @@ HAND_GEOMETRY = np.dtype(
 
 HAND_STATE = np.dtype(
     [
-        ("mean", np.float64, HAND),  # m
+        ("mean", np.float64, HAND_SIZE),  # m
         ("distance", np.float64),  # |m|; -1 where a number is missing
         ("whole_rows", np.int64),  # since a number was missing
         # the last that were whole, the newest last; 0 before the first
-        ("rows", np.float64, (WINDOW, 2 * MOST_JOINTS + HAND)),
+        ("rows", np.float64, (WINDOW, 2 * MOST_JOINTS + HAND_SIZE)),
         ("angles", np.float64, MOST_JOINTS),  # that were believed last [rad]
     ],
     align=True,
@@ -63,14 +63,16 @@ def describe_arm(geometry: Any, chain: Chain, spec: StreamSpec) -> None:
     """Write what is known of an arm into a record of ``HAND_GEOMETRY``."""
     joints = len(chain.axes)
     numbers = np.arange(spec.size)
-    columns = np.concatenate([numbers[spec.slices[chain.prefix + name]] for name in NEEDS])
+    channels = [spec.slices[chain.prefix + name] for name in NEEDS]
+    columns = np.concatenate([numbers[channel] for channel in channels])
     geometry["joints"] = joints
     geometry["columns"][: len(columns)] = columns
     geometry["axes"][:joints] = chain.axes
     geometry["anchors"][:joints] = chain.anchors
     geometry["pose"] = chain.hand
     geometry["late_s"] = chain.late_s
-    geometry["weights"] = 1.0 / (chain.noise * spec.noise[columns[-HAND:]])
+    noise = spec.noise[columns[-HAND_SIZE:]]
+    geometry["weights"] = 1.0 / (chain.noise * noise)
     geometry["gain"] = min(1.0, spec.dt / AVERAGED_S)
 
 
@@ -100,7 +102,7 @@ def compare_hands_of(row: Any, geometry: Any, state: Any) -> bool:
 @inner
 def shift_in(row: Any, hand: Any, seen: Any) -> bool:
     """Keep the numbers of an arm as the newest of its last rows, if all are finite; return whether they are."""
-    size = 2 * hand.joints + HAND
+    size = 2 * hand.joints + HAND_SIZE
     for i in range(size):
         if not np.isfinite(row[hand.columns[i]]):
             return False
@@ -117,11 +119,13 @@ def update_mean(hand: Any, seen: Any) -> None:
     """Take the newest row into m."""
     joints = hand.joints
     newest = seen.rows[-1]
-    angles = newest[:joints] - hand.late_s * newest[joints : 2 * joints]
+    speeds = newest[joints : 2 * joints]
+    angles = newest[:joints] - hand.late_s * speeds
     z = residual(angles, newest, hand.weights, hand)
+    distance = np.sqrt(squared(z))
     longest = ONE_ROW * LIMIT / hand.gain
-    share = longest / max(np.sqrt(squared(z)), longest)
-    for k in range(HAND):
+    share = longest / max(distance, longest)
+    for k in range(HAND_SIZE):
         seen.mean[k] += hand.gain * (share * z[k] - seen.mean[k])
     seen.distance = np.sqrt(squared(seen.mean))
 
@@ -130,9 +134,9 @@ def update_mean(hand: Any, seen: Any) -> None:
 def residual(angles: Any, row: Any, weights: Any, hand: Any) -> Any:
     """Return z (9,): what angles (J,) leave of the hand that a row says, under weights (9,)."""
     joints = hand.joints
-    z = np.empty(HAND)
+    z = np.empty(HAND_SIZE)
     hand_at(angles, hand.axes[:joints], hand.anchors[:joints], hand.pose, z)
-    for k in range(HAND):
+    for k in range(HAND_SIZE):
         z[k] = (row[2 * joints + k] - z[k]) * weights[k]
     return z
 
@@ -161,7 +165,7 @@ def fit_angles(
     """
     which = np.flatnonzero(free)
     trust = 1.0 / error[which] ** 2
-    slopes = np.empty((len(which), HAND))
+    slopes = np.empty((len(which), HAND_SIZE))
     z = residual(angles, row, weights, hand)
     for _ in range(ITERATIONS):
         for i, joint in enumerate(which):

@@ -25,7 +25,7 @@ from asm_gym.guard.alarm_terms import AlarmTerms
 from asm_gym.guard.arbiter import MOSTLY_AFTER
 from asm_gym.guard.contact_state import ContactColumns, contact_columns, measure_contacts
 from asm_gym.guard.hand_check import Contradiction
-from asm_gym.guard.observer import Observer, merged
+from asm_gym.guard.observer import Observer, merged_failures
 from asm_gym.guard.recent_rows import RowArrays
 from asm_gym.guard.reflexes import MotionArrays, record_motion
 from asm_gym.guard.report import Outcome
@@ -72,7 +72,7 @@ class JudgedRow:
         active = self.robots["active"]
         failures = {robot: failure for robot, failure in failures.items() if active[robot]}
         if failures:
-            self.failures = merged(self.failures, failures)
+            self.failures = merged_failures(self.failures, failures)
             self.robots["failed"][list(failures)] = True
             self.eventful = True
 

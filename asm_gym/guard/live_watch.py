@@ -151,8 +151,8 @@ class LiveWatch(Adapter):
         self._bridge = Bridge(self._settings.bridge_s, self._spec.dt, self._spec.size)
         self._lost_before = 0  # rows lost before the newest one
         self._cause = ""  # why surprise is over its threshold; empty where it is not
-        self._event = NO_EVENT  # of the newest row
-        self._newest = dict[str, int]()  # the last row over the threshold, by cause
+        self._last_event = NO_EVENT  # of the newest row
+        self._last_rows = dict[str, int]()  # the last row over the threshold, by cause
 
     def rows_of(self, lines: Iterable[str] | None) -> Iterator[tuple[Row, float]]:
         """Yield each row and its arrival [s], of a source and of the same opened anew."""
@@ -205,7 +205,7 @@ class LiveWatch(Adapter):
             self._pass_lost_rows(row.lost)
         self._lost_before = row.lost
 
-        report = self._judge(row.numbers, self._bridge.over(np.isnan(row.numbers)))
+        report = self._judge(row.numbers, self._bridge.goes_over(np.isnan(row.numbers)))
         self._latencies.append(1e3 * (time.perf_counter() - arrival))
         self._check_watchdog()
         self.report_step([report], row)
@@ -235,7 +235,7 @@ class LiveWatch(Adapter):
     def _pass_lost_rows(self, lost: int) -> None:
         """Go on over rows that did not come, as many as the bridge allows."""
         missing = np.full(self._spec.size, np.nan)
-        bridged = [self._bridge.over(np.isnan(missing)) for _ in range(min(lost, MOST_LOST))]
+        bridged = [self._bridge.goes_over(np.isnan(missing)) for _ in range(min(lost, MOST_LOST))]
         is_alarm = not all(bridged)
         if is_alarm:
             del bridged[1:]
@@ -280,10 +280,11 @@ class LiveWatch(Adapter):
 
         excess = float(robot["surprise"] / robot["threshold"])
         cause = self._cause or reason(numbers)
-        if (self.rows - self._newest.get(cause, -math.inf)) * self._spec.dt > TOGETHER_S:
+        rows_since = self.rows - self._last_rows.get(cause, -math.inf)
+        if rows_since * self._spec.dt > TOGETHER_S:
             self._alarm_surprise(cause, excess, blamed(numbers, report.attribution[0]))
         self._cause = cause
-        self._newest[cause] = self.rows
+        self._last_rows[cause] = self.rows
 
     def _alarm_surprise(self, cause: str, excess: float, column: int | None) -> None:
         """Raise the alarm of a surprise of ``excess`` thresholds in a column of the row."""
@@ -299,9 +300,9 @@ class LiveWatch(Adapter):
 
     def _report_event(self, event: str) -> None:
         """Note a knock or a stop when it begins."""
-        if event in (KNOCK, STOP) and event != self._event:
+        if event in (KNOCK, STOP) and event != self._last_event:
             self._note(f"{event}: no alarm")
-        self._event = event
+        self._last_event = event
 
     def _alarm(self, text: str, reason: str, **details: Any) -> None:
         """Count and say an alarm."""

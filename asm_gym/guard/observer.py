@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,15 @@ from asm_gym.compilation import Bound
 from asm_gym.guard.robot_table import Floats32, Mask
 from asm_gym.monitors import ExpectsActions, ForgetsEvidence, Monitor, NeuralASM, Surprise
 from asm_gym.monitors.row_kernel import RowKernel, unwritten
+
+
+class _CompiledStep(NamedTuple):
+    """A compiled row from one state of the monitor to the next."""
+
+    kernel: RowKernel
+    state: Any
+    next_state: Any  # written
+    bound: Bound
 
 
 class Observer:
@@ -75,23 +84,25 @@ class Observer:
             return None
         spare = self._spare()
         for step in self._steps:
-            if step.kernel is kernel and step.state is self._state and step.new is spare:
+            is_same = step.kernel is kernel and step.state is self._state
+            if is_same and step.next_state is spare:
                 return step.bound
         if spare is None:
             spare = unwritten(self._state)
-        step = _CompiledStep(kernel, self._state, spare)
+        bound = kernel.bound(self._state, spare)
+        step = _CompiledStep(kernel, self._state, spare, bound)
         self._steps = [*self._steps[-1:], step]
-        return step.bound
+        return bound
 
     def stepped(self, bound: Bound, seconds: float) -> None:
         """Take up the state that compiled code has written, in so many seconds."""
         step = next(step for step in self._steps if step.bound is bound)
         self._state_before = self._state
-        self._state = step.new
+        self._state = step.next_state
         self.latency = seconds
 
     def _spare(self) -> Any:
-        """Return a state that may be written to; None where there is none."""
+        """Return the state before the present one, which may be written to; None where it is still needed."""
         if self._state_before is self._initial or self._state_before is self._state:
             return None
         return self._state_before
@@ -125,7 +136,7 @@ class Observer:
             return dict.fromkeys(range(self._count), f"monitor: {error!r}")
         self._state = state
         self.latency = time.perf_counter() - start
-        return unjudged(judged)
+        return invalid_surprises(judged)
 
     def amend(self, rows: Floats32) -> None:
         """Observe other rows (n, D) in the place of the last ones: something else was commanded than it seemed."""
@@ -169,17 +180,7 @@ class Observer:
         attribution[:] = shares
 
 
-class _CompiledStep:
-    """A row from one state to another."""
-
-    def __init__(self, kernel: RowKernel, state: Any, new: Any) -> None:
-        self.kernel = kernel
-        self.state = state
-        self.new = new
-        self.bound = kernel.bound(state, new)
-
-
-def unjudged(judged: Any) -> dict[int, str]:
+def invalid_surprises(judged: Any) -> dict[int, str]:
     """Return what failed by robot, where a surprise is no number that a threshold can be compared with."""
     values = judged["surprise"]
     wrong = np.flatnonzero(~(values > -np.inf))  # NaN too
@@ -191,7 +192,7 @@ def joined(*failures: str) -> str:
     return "; ".join(dict.fromkeys(filter(None, failures)))
 
 
-def merged(*reports: Mapping[int, str]) -> dict[int, str]:
+def merged_failures(*reports: Mapping[int, str]) -> dict[int, str]:
     """Return what failed by robot, from several reports of that."""
     failures: dict[int, str] = {}
     for report in reports:

@@ -37,18 +37,20 @@ class ReleaseRule:
     Counted in rows; infinite for never.
     """
 
-    release_after: int = 10  # calm rows after which control is handed back
-    # rows of a reflex, those before a hand-back after which the alarm was soon back too
+    release_after: int = 10
+    """Calm rows after which control is handed back."""
     max_override: float = math.inf
-    try_after: float = math.inf  # rows until a trial; after each trial that fails, twice as many
-    # rows without contact after which it is over; after each that was too early, twice as many
+    """Rows of a reflex, those before a hand-back after which the alarm was soon back too."""
+    try_after: float = math.inf
+    """Rows until a trial; after each trial that fails, twice as many."""
     free_after: int = 5
-    # how often the policy may pass a contact limit before the episode ends
+    """Rows without contact after which it is over; after each that was too early, twice as many."""
     strikes: float = math.inf
-    # how much the arm may press in an episode, beyond healthy motion [N s]
+    """How often the policy may pass a contact limit before the episode ends."""
     impulse: float = math.inf
-    # rows in alarm for which the policy may go on in an episode; at later alarms it is held
+    """How much the arm may press in an episode, beyond healthy motion [N s]."""
     go_on: float = math.inf
+    """Rows in alarm for which the policy may go on in an episode; at later alarms it is held."""
 
 
 @dataclass(frozen=True)
@@ -110,19 +112,20 @@ class GuardOptions:
     def rule(self, graded: bool, dt: float, rows_per_step: int) -> ReleaseRule:
         """Return when control is handed back, for a control period of ``dt`` [s]; ``graded`` sets more limits."""
 
-        def rows(steps: int | None, seconds: float) -> float:
-            if steps is not None:
-                return rows_per_step * steps
-            if graded:
-                return rows_per_step * max(1, round(seconds / dt))
-            return math.inf
+        def rows_of(steps: int | None, seconds: float) -> float:
+            """Return how many rows steps have; without them, those in so many seconds, or infinite."""
+            if steps is None and not graded:
+                return math.inf
+            if steps is None:
+                steps = max(1, round(seconds / dt))
+            return rows_per_step * steps
 
         rule = ReleaseRule(
             release_after=rows_per_step * self.release_after,
-            max_override=rows(self.max_override, GIVE_UP_AFTER_S),
-            try_after=rows(self.try_after, TRY_AFTER_S),
+            max_override=rows_of(self.max_override, GIVE_UP_AFTER_S),
+            try_after=rows_of(self.try_after, TRY_AFTER_S),
             free_after=rows_per_step * ReleaseRule.free_after,
-            go_on=rows(None, GO_ON_S),
+            go_on=rows_of(None, GO_ON_S),
         )
         if graded:
             return replace(rule, strikes=STRIKES, impulse=IMPULSE)

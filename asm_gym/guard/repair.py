@@ -95,8 +95,8 @@ class Repair:
         return self._unchecked <= self._rows_in(TRUST_S) and oldest <= self._rows_in(LONGEST_S)
 
     @property
-    def over(self) -> bool:
-        """There is nothing left to repair."""
+    def finished(self) -> bool:
+        """Whether there is nothing left to repair."""
         busy = self._sensors or self._returned.any() or self.settling
         return self.trusted and not busy
 

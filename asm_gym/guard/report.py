@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK_EVENT
-from asm_gym.guard.alarm_terms import ALARM_TERMS, CONTACT
-from asm_gym.guard.arbiter import Decision
+from asm_gym.guard.alarm_terms import ALARM_TERMS
+from asm_gym.guard.arbiter import NO_DECISION, Decision
 from asm_gym.guard.contact_state import severity_info
 from asm_gym.guard.observer import joined
 from asm_gym.guard.responses import NO_RESPONSE, Response
@@ -24,26 +24,12 @@ from asm_gym.spec import StreamSpec
 class Outcome:
     """What became of the row of one robot about which there was something to decide."""
 
-    # alarm terms that hold, in the order of priority; empty for no alarm
     terms: tuple[str, ...] = ()
-    event: int = 0  # an index in ``EVENTS``; 0 where there is no alarm
-    response: Response = NO_RESPONSE  # what is done about it
-    decision: Decision = field(default_factory=Decision)  # what it has led to
-
-    @property
-    def transition(self) -> str:
-        """What has led to the state; empty for no change."""
-        return self.decision.transition
-
-    @property
-    def reason(self) -> str:
-        """The alarm term that gives the reason; empty where there is no alarm."""
-        return self.terms[0] if self.terms else ""
-
-    @property
-    def ends(self) -> bool:
-        """Whether it ends the episode, where alarms do: a knock that passes no contact limit does not."""
-        return bool(self.terms) and (self.event != KNOCK_EVENT or self.reason == CONTACT)
+    """Alarm terms that hold, in the order of priority; empty for no alarm."""
+    response: Response = NO_RESPONSE
+    """What is done about it."""
+    decision: Decision = NO_DECISION
+    """What it has led to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +59,9 @@ class RowReport:
 
     @property
     def ends(self) -> Mask:
-        """(n,) an alarm that ends the episode, where alarms do."""
-        ending = np.zeros(len(self.robots), bool)
-        for robot, outcome in self.outcomes.items():
-            ending[robot] = outcome.ends
-        return ending
+        """(n,) an alarm that ends the episode, where alarms do: a knock that passes no contact limit does not."""
+        is_knock = self.robots["event"] == KNOCK_EVENT
+        return np.asarray(self.robots["alarm"] & (self.robots["presses"] | ~is_knock))
 
 
 NO_OUTCOME = Outcome()
@@ -132,6 +116,7 @@ def asm_info(
     outcomes = [row.outcomes.get(robot, NO_OUTCOME) for row in rows]
     responses = [outcome.response for outcome in outcomes if outcome.response.why]
     response = _last(responses, NO_RESPONSE)
+    transitions = [outcome.decision.transition for outcome in outcomes]
     terms = in_order_of_priority([name for outcome in outcomes for name in outcome.terms])
     info: AsmInfo = {
         "surprise": float(surprises.max()),
@@ -143,7 +128,7 @@ def asm_info(
         "state": STATES[now["state"]],
         "intervened": _any(rows, "overridden", robot),
         "gave_up": bool(now["state"] == ENDED),
-        "transition": _last([outcome.transition for outcome in outcomes if outcome.transition], ""),
+        "transition": _last([name for name in transitions if name], ""),
         "failure": joined(*(row.failures.get(robot, "") for row in rows)),
         "cause": deepcopy(response.cause),
         "response": response.name,
@@ -191,13 +176,13 @@ def side_by_side(row: RowReport, spec: StreamSpec, **step: Any) -> dict[str, Any
         spec: of their streams.
         step: further fields, arrays whose first axis is n.
     """
-    each = [asm_info([row], robot, spec) for robot in range(len(row.robots))]
-    numbers = [severity_info(record) for record in row.robots]
-    info: dict[str, Any] = {}
-    for name in each[0]:
-        info[name] = _stacked([said[name] for said in each])  # type: ignore[literal-required]
+    infos: list[Any] = [asm_info([row], robot, spec) for robot in range(len(row.robots))]
+    severities = [severity_info(robot) for robot in row.robots]
+    info: dict[str, Any] = {
+        name: _stacked([of_robot[name] for of_robot in infos]) for name in infos[0]
+    }
     info["severity"] = {
-        name: np.array([severity[name] for severity in numbers]) for name in numbers[0]
+        name: np.array([severity[name] for severity in severities]) for name in severities[0]
     }
     info["attribution"] = {
         label: row.attribution[:, column] for column, label in enumerate(spec.labels)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_choice
 
+FINITE = "threshold", "pressed_impulse", "leaning_time"  # fields that are always finite numbers
+
 Mask = NDArray[np.bool_]
 Floats32 = NDArray[np.float32]
 
@@ -91,7 +93,6 @@ ROBOT = np.dtype(
 )
 
 KEPT = "threshold", "policy_rows", "policy_alarms"  # fields that an episode hands on to the next
-FINITE = "threshold", "pressed_impulse", "leaning_time"  # fields that are always finite numbers
 
 
 class RobotTable:

@@ -155,7 +155,9 @@ class RowValidator:
 
     def drop_repairs(self) -> None:
         """Forget the repairs that are over."""
-        self.repairs = {robot: repair for robot, repair in self.repairs.items() if not repair.over}
+        self.repairs = {
+            robot: repair for robot, repair in self.repairs.items() if not repair.finished
+        }
 
     def _missing(self, robot: int) -> Mask:
         """Return (D,) what is completed of a robot."""

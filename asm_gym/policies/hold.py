@@ -236,7 +236,8 @@ def _rest_by_attribute(env: gym.Env[Any, Any]) -> NDArray[np.float32]:
 
 def nearest_to_zero(space: spaces.Box) -> NDArray[np.float32]:
     """Return the action (A,) of a space that is nearest to zero."""
-    return np.clip(np.zeros(space.shape), space.low, space.high).astype(np.float32)
+    zero = np.zeros(space.shape)
+    return np.clip(zero, space.low, space.high).astype(np.float32)
 
 
 def resting_action(env: gym.Env[Any, Any]) -> NDArray[np.float32]:

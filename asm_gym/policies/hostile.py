@@ -37,7 +37,7 @@ class Hostile(StatefulPolicy):
         self._speed = speed
         self.seed = seed
         self.size = int(np.prod(space.shape))
-        self.held = np.zeros(self.size)  # what a rule goes on with
+        self.present = np.zeros(self.size)  # an action that a rule goes on with
 
     def begin(self, observation: Any) -> tuple[int, np.random.Generator]:
         return 0, np.random.default_rng(self.seed)
@@ -49,22 +49,23 @@ class Hostile(StatefulPolicy):
         rule = self._rule
         if callable(rule):
             rule = rule(self, step, rng)
-        first = self._speed * np.asarray(rule, np.float64)
-        action = np.pad(first, (0, self.size - len(first)))
+        action = np.zeros(self.size)
+        action[: len(rule)] = self._speed * np.asarray(rule, np.float64)
         action = np.clip(action, self._space.low, self._space.high)
         return action.astype(np.float32), (step + 1, rng)
 
 
 # The first numbers of the action, (x, y, z), turns about them and grip: of every control step, or
 # as a function of the policy, the number of the step and a generator. The others are 0.
-Rule = tuple[float, ...] | Callable[[Hostile, int, np.random.Generator], Any]
+RuleFunction = Callable[[Hostile, int, np.random.Generator], Any]
+Rule = tuple[float, ...] | RuleFunction
 
 
 def _bang_bang(policy: Hostile, step: int, rng: np.random.Generator) -> Floats:
     """Return full scale in every number, in another direction every ``BANG_STEPS``."""
     if step % BANG_STEPS == 0:
-        policy.held = rng.choice([-1.0, 1.0], policy.size)
-    return policy.held
+        policy.present = rng.choice([-1.0, 1.0], policy.size)
+    return policy.present
 
 
 class SpoiltState(NamedTuple):
@@ -110,12 +111,28 @@ class _Spoilt(StatefulPolicy):
         return action, SpoiltState(state.step + 1, inner, actions)
 
 
+def _first_then(
+    first: tuple[float, ...], steps: int, then: tuple[float, ...], period: int | None = None
+) -> RuleFunction:
+    """Return the rule of one action for some control steps, of each period where there is one, and then another."""
+
+    def rule(policy: Hostile, step: int, rng: np.random.Generator) -> tuple[float, ...]:
+        if period is not None:
+            step = step % period
+        if step < steps:
+            return first
+        return then
+
+    return rule
+
+
 # Actions of rules: (x, y, z), turns about them, grip.
 REST = (0.0,)
+RISE = (0.0, 0.0, 1.0)
 DOWN = (0.0, 0.0, -1.0)
 JERK = (1.0, 0.0, -1.0, 0.0, 1.0, 0.0)
 SQUEEZE_DOWN = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
-CLOSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+GRIP = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 SWING = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 RULES: dict[str, Rule] = {
@@ -125,17 +142,17 @@ RULES: dict[str, Rule] = {
     "bang-bang": _bang_bang,
     "uniform": lambda policy, step, rng: rng.uniform(-1.0, 1.0, policy.size),
     "ramp": lambda policy, step, rng: (0.0, 0.0, -min(1.0, step / 100)),
-    "hammering": lambda policy, step, rng: (0.0, 0.0, -1.0 if step % 20 < 12 else 1.0),
+    "hammering": _first_then(DOWN, 12, RISE, period=20),
     "grinding": lambda policy, step, rng: (np.cos(step / 5), np.sin(step / 5), -0.5),
-    "squeezing": lambda policy, step, rng: SQUEEZE_DOWN if step < 60 else CLOSE,
+    "squeezing": _first_then(SQUEEZE_DOWN, 60, GRIP),
     "flinging": lambda policy, step, rng: (-1.0) ** (step // 6) * SWING,
     "to joint limits": (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
     "into itself": (-1.0, 0.0, -0.3),
     "turning": (0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
     "rolling": (0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
     # a trial comes after 10 quiet steps
-    "waits for the hand-back": lambda policy, step, rng: DOWN if step % 36 < 24 else REST,
-    "first rows": lambda policy, step, rng: JERK if step < 12 else REST,
+    "waits for the hand-back": _first_then(DOWN, 24, REST, period=36),
+    "first rows": _first_then(JERK, 12, REST),
 }
 
 # Hostile policies by name: made for an environment, with a seed and a share of the full speed.

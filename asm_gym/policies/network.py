@@ -47,17 +47,21 @@ class NetworkPolicy(StatefulPolicy):
         scale: ArrayLike | None = None,
         trained_in: dict[str, Any] | None = None,
     ) -> None:
-        self.layers = [(np.asarray(W, np.float32), np.asarray(b, np.float32)) for W, b in layers]
+        self.layers: list[tuple[Array, Array]] = []
+        for W, b in layers:
+            self.layers.append((np.asarray(W, np.float32), np.asarray(b, np.float32)))
         self._check_layers()
         first, _ = self.layers[0]
         last, _ = self.layers[-1]
         self.observation_size = first.shape[1]
         self.action_size = last.shape[0]
         size = self.observation_size
-        mean = check_numbers("mean", np.zeros(size) if mean is None else mean, size)
-        scale = check_numbers("scale", np.ones(size) if scale is None else scale, size, above=0.0)
-        self.mean = mean.astype(np.float32)
-        self.scale = scale.astype(np.float32)
+        if mean is None:
+            mean = np.zeros(size)
+        if scale is None:
+            scale = np.ones(size)
+        self.mean = check_numbers("mean", mean, size).astype(np.float32)
+        self.scale = check_numbers("scale", scale, size, above=0.0).astype(np.float32)
         self.trained_in = dict(trained_in or {})
         self._high: NDArray[Any] = np.ones(self.action_size, np.float32)
         self._low: NDArray[Any] = -self._high
@@ -68,7 +72,8 @@ class NetworkPolicy(StatefulPolicy):
             raise ValueError("a network needs at least one layer, got none")
         size = self.layers[0][0].shape[-1]
         for number, (W, b) in enumerate(self.layers):
-            if W.ndim != 2 or W.shape[1] != size or b.shape != W.shape[:1]:
+            is_matrix = W.ndim == 2 and W.shape[1] == size
+            if not is_matrix or b.shape != W.shape[:1]:
                 raise ValueError(
                     f"layer {number} takes {size} numbers, with weights in two dimensions, "
                     f"got {W.shape} and biases {b.shape}"
@@ -100,15 +105,19 @@ class NetworkPolicy(StatefulPolicy):
         for W, b in self.layers[:-1]:
             x = np.maximum(x @ W.T + b, np.float32(0.0))
         W, b = self.layers[-1]
-        out = self._low + 0.5 * (np.tanh(x @ W.T + b) + 1.0) * (self._high - self._low)
-        return np.clip(out, self._low, self._high).astype(np.float32), state
+        squashed = np.tanh(x @ W.T + b)
+        span = self._high - self._low
+        action = self._low + 0.5 * (squashed + 1.0) * span
+        return np.clip(action, self._low, self._high).astype(np.float32), state
 
     def save(self, path: str | Path, **about: Any) -> None:
         """Write the agent, with what is said ``about`` it in JSON."""
         arrays = {"mean": self.mean, "scale": self.scale}
         for number, (W, b) in enumerate(self.layers):
-            arrays |= {f"W{number}": W, f"b{number}": b}
-        write_checkpoint(path, KIND, {"trained_in": self.trained_in, "about": about} | RULE, arrays)
+            arrays[f"W{number}"] = W
+            arrays[f"b{number}"] = b
+        header = {"trained_in": self.trained_in, "about": about} | RULE
+        write_checkpoint(path, KIND, header, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> NetworkPolicy:

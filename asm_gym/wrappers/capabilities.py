@@ -1,4 +1,4 @@
-"""What a guard asks of an environment that it does not know: one function for each capability.
+"""What a guard asks of an environment that it does not know, all of it in ``robots_of``.
 
 Each attribute belongs to the environment, or to a wrapper inside the guard. The members of a
 vector environment are of one kind; they have a capability if all of them have its attribute.
@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.control_period import control_period
 from asm_gym.data.action_meaning import ActionMeaning, ActionMeans
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.kinematics import Chain
@@ -27,6 +26,7 @@ DELTAS = ("OSC_POSE", "JOINT_POSITION")
 def robots_of(
     env: AnyEnv,
     spec: StreamSpec,
+    dt: float,
     recorded: ActionMeaning | None = None,
     action_means: ActionMeans | None = None,
 ) -> tuple[RobotFacts, ObservationMap | None]:
@@ -35,6 +35,7 @@ def robots_of(
     Args:
         env: an environment, or a vector environment.
         spec: of the streams.
+        dt: control period [s].
         recorded: what recorded episodes show of the meaning of their actions.
         action_means: what the user says of it.
 
@@ -46,7 +47,6 @@ def robots_of(
     space = attributes.action_space
     if not isinstance(space, gym.spaces.Box):
         none = np.zeros(0, np.float32)
-        dt = control_period_of(attributes)
         return RobotFacts(count=1, low=none, high=none, rest=none, dt=dt), None
 
     resting = resting_of(attributes, space, recorded, action_means)
@@ -66,13 +66,13 @@ def robots_of(
         high=np.float32(space.high).ravel(),
         rest=resting.action.ravel(),
         meaning=resting.meaning,
-        brakes=brakes(attributes),
-        grip=gripper_columns_of(attributes, size),
-        dt=control_period_of(attributes),
-        task=task_name(attributes),
+        brakes=can_brake(attributes),
+        grip=gripper_columns(attributes.first("gripper_actions", ()), size),
+        dt=dt,
+        task=getattr(attributes.first("task"), "name", ""),
         chains=hand_chains(attributes),
         felt_channels=felt_channels(attributes),
-        contact_limits=usual_contact_limits(attributes),
+        contact_limits=attributes.first("usual_contact_limits") or ContactLimits(),
         limits_contact=limits_contact(attributes),
         observed=observed,
         turning_action=turning_action(attributes),
@@ -80,17 +80,6 @@ def robots_of(
         refused=refused,
     )
     return robots, observation_map
-
-
-def control_period_of(attributes: EnvAttributes) -> float:
-    """Return the control period [s].
-
-    It is ``dt`` of the members of a vector environment; else ``asm_gym.spec.control_period``
-    tells where it comes from.
-    """
-    if attributes.is_vector and (dt := attributes.first("dt")):
-        return float(dt)
-    return control_period(attributes.env)
 
 
 def controller_of(attributes: EnvAttributes) -> str:
@@ -106,12 +95,7 @@ def has_stream(attributes: EnvAttributes) -> bool:
     return attributes.has("stream_spec")
 
 
-def task_name(attributes: EnvAttributes) -> str:
-    """Return the name of the task: ``task.name``; empty without it."""
-    return getattr(attributes.first("task"), "name", "")
-
-
-def brakes(attributes: EnvAttributes) -> bool:
+def can_brake(attributes: EnvAttributes) -> bool:
     """Return whether robots can be braked beneath their controllers: ``HoldsItself``.
 
     They stay in all steps that a wrapper makes of one. Without ``holding`` and
@@ -172,15 +156,7 @@ def declared_meaning(
         action_means = attributes.first("action_means")
     if action_means is None:
         return None
-    return ActionMeaning.told(action_means, size, recorded)
-
-
-def gripper_columns_of(attributes: EnvAttributes, size: int) -> NDArray[np.intp]:
-    """Return (G,) the numbers of an action of this size that command grippers: ``gripper_actions``.
-
-    There are none without it.
-    """
-    return gripper_columns(attributes.first("gripper_actions", ()), size)
+    return ActionMeaning.declared(action_means, size, recorded)
 
 
 def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
@@ -191,11 +167,6 @@ def hand_chains(attributes: EnvAttributes) -> tuple[tuple[Chain, ...], ...]:
 def felt_channels(attributes: EnvAttributes) -> tuple[Channel, ...]:
     """Return what the arms feel in physics substeps: ``felt_channels``; nothing without it."""
     return attributes.first("felt_channels", ())
-
-
-def usual_contact_limits(attributes: EnvAttributes) -> ContactLimits:
-    """Return the contact limits of the arms: ``usual_contact_limits``; the defaults without it."""
-    return attributes.first("usual_contact_limits") or ContactLimits()
 
 
 def limits_contact(attributes: EnvAttributes) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, Literal
@@ -26,7 +26,9 @@ from asm_gym.guard.fitted_monitor import (
 )
 from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarm
+from asm_gym.guard.report import LazyInfo, RowReport
 from asm_gym.guard.robot_facts import RobotFacts
+from asm_gym.guard.robot_table import Mask
 from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.hold import Hold
 from asm_gym.policies.policy import Policy
@@ -50,6 +52,7 @@ class Guarding:
     _spec: StreamSpec  # of the streams that are watched
     _period: float  # control period [s]
     _rows_per_step = 1
+    _alarms: NDArray[np.int64]  # (n,) steps in alarm so far in the running episodes
 
     def __init__(
         self,
@@ -85,7 +88,7 @@ class Guarding:
         raise NotImplementedError
 
     @cached_property
-    def _name(self) -> str:
+    def _guard_name(self) -> str:
         """Its name among all guards around one environment."""
         return uuid4().hex
 
@@ -101,10 +104,9 @@ class Guarding:
         recorded = getattr(monitor, "about", {}).get(ACTIONS)
         if recorded is not None:
             recorded = ActionMeaning.from_json(recorded)
-        facts, self._observation_map = robots_of(
-            self.env, monitor.spec, recorded, options.action_means
+        self._facts, self._observation_map = robots_of(
+            self.env, monitor.spec, self._period, recorded, options.action_means
         )
-        self._facts = replace(facts, dt=self._period)
 
         policies: list[Policy] = []
         reaction = options.reaction(diagnosis_of(monitor) is not None)
@@ -129,7 +131,7 @@ class Guarding:
         """Set the environments' contact limits if they changed, or ``anew`` for new episodes."""
         limits = self.guard.limits
         if self._facts.limits_contact and (anew or limits is not self._limits):
-            named_limits = [(self._name, own) for own in limits]
+            named_limits = [(self._guard_name, own) for own in limits]
             if isinstance(self.env, VectorEnv):
                 askable(self.env).set_attr("limits_of_guard", named_limits)
             else:
@@ -144,7 +146,39 @@ class Guarding:
             )
             self._watch_with(self._next_monitor)
 
-    def _following(self) -> dict[str, float]:
+    def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
+        """Write what became of a step to its ``info``, which may tell of a guard inside."""
+        surprise = np.max([report.robots["surprise"] for report in reports], axis=0)
+        alarm = np.any([report.robots["alarm"] for report in reports], axis=0)
+        intervened = np.any([report.robots["overridden"] for report in reports], axis=0)
+        alarm |= np.asarray(target.get("asm_alarm", False), bool)
+        intervened |= np.asarray(target.get("asm_intervened", False), bool)
+        self._alarms += alarm
+        numbers = {
+            "asm_surprise": surprise,
+            "asm_alarm": alarm,
+            "asm_intervened": intervened,
+            "cost": alarm.astype(np.float64),
+            "cost_sum": self._alarms.astype(np.float64),
+        }
+        self._write(target, LazyInfo(self._describe(reports)), numbers)
+
+    def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
+        """Write ``info["asm"]``, and numbers (n,) by name, to the ``info`` of a step."""
+        raise NotImplementedError
+
+    def _describe(self, reports: Sequence[RowReport]) -> Callable[[], Any]:
+        """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
+        raise NotImplementedError
+
+    def _stopped(self, reports: Sequence[RowReport]) -> Mask:
+        """Return (n,) whose episode the guard ends."""
+        stopped = reports[-1].gave_up
+        if self.guard.ends_on_alarm:
+            return np.any([stopped, *(report.ends for report in reports)], axis=0)
+        return stopped
+
+    def _running_threshold(self) -> dict[str, float]:
         """Return what ``info["asm"]`` says of a threshold that follows the policy; nothing where none does."""
         running = self.guard.running
         if running is None:
@@ -234,9 +268,10 @@ def refuse_counts(env: AnyEnv, guard: str, on_alarm: object) -> None:
     """
     ends = not (isinstance(on_alarm, str) and on_alarm == "monitor")
     for layer in layers(env):
-        reported = vars(layer).get("info_keywords", ())  # of Stable-Baselines3's Monitor
+        attributes = vars(layer)
+        reported = attributes.get("info_keywords", ())  # of Stable-Baselines3's Monitor
         reports_guard = any(key.startswith(("asm", "cost")) for key in reported)
-        if COUNTS in vars(layer) and (ends or reports_guard):
+        if COUNTS in attributes and (ends or reports_guard):
             name = type(layer).__name__
             raise ValueError(
                 f"{name} inside the guard would miss the episodes that the guard ends, "

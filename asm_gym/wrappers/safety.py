@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -140,7 +140,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         self._observation = observation
         self._first_info = info
         self._row: Floats32 | None = None  # (D,) sensed last in this episode
-        self._alarms = 0
+        self._alarms = np.zeros(1, np.int64)
         self._solved = False
         self._preview = Preview(None)
         self._previewed = 0  # actions left of the chunk that was previewed
@@ -192,7 +192,7 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
         info["overridden"] = overridden or bool(info.get("overridden"))
         self.report_step(self._reports, info)
 
-        if self._gave_up():
+        if self._stopped(self._reports)[0]:
             terminated = terminated or not self._options.truncate
             truncated = truncated or self._options.truncate
         self._ended = bool(terminated or truncated)
@@ -218,21 +218,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             self._inner.holding = True
         return bool(command.overridden[0])
 
-    def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
-        """Write the report of a step to its ``info``."""
-        robots = [report.robots[0] for report in reports]
-        # of a guard inside
-        alarm = any([bool(robot["alarm"]) for robot in robots]) or bool(target.get("asm_alarm"))
-        intervened = any([bool(robot["overridden"]) for robot in robots]) or bool(
-            target.get("asm_intervened")
-        )
-        self._alarms += alarm
-        target["asm"] = LazyInfo(self._describe(reports))
-        target["asm_surprise"] = np.float64(max([robot["surprise"] for robot in robots]))
-        target["asm_alarm"] = np.bool_(alarm)
-        target["asm_intervened"] = np.bool_(intervened)
-        target["cost"] = np.float64(alarm)
-        target["cost_sum"] = np.float64(self._alarms)
+    def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
+        target["asm"] = asm
+        for name, values in numbers.items():
+            target[name] = values[0]
 
     # ------------------------------------------------------------------ parts of a step
 
@@ -303,21 +292,18 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
             return observation
         return self._observation_map.repaired(observation, row, missing)
 
-    def _gave_up(self) -> bool:
-        """Return whether the guard ends the episode."""
-        if self._reports[-1].gave_up[0]:
-            return True
-        return self.guard.ends_on_alarm and any(report.ends[0] for report in self._reports)
-
-    def _describe(self, reports: Sequence[RowReport]) -> Any:
-        """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
+    def _describe(self, reports: Sequence[RowReport]) -> Callable[[], AsmInfo]:
         facts = self._facts
         spec = self._spec
         commanded: Any = None  # nothing was done before the first step
         if self._row is not None:
             commanded = self._executed
         rows = self.guard.table.rows
-        step = {"alarms": self._alarms, "preview": self._count_down(), **self._following()}
+        step = {
+            "alarms": int(self._alarms[0]),
+            "preview": self._count_down(),
+            **self._running_threshold(),
+        }
 
         def describe() -> AsmInfo:
             executed = commanded

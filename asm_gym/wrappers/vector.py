@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -129,15 +129,17 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        begun = np.array((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        begun = np.ones(self.num_envs, bool)
+        if options is not None and "reset_mask" in options:
+            begun = np.array(options["reset_mask"])
         ended = self._ended
+        if ended is None:
+            ended = np.zeros(self.num_envs, bool)
+            if not begun.all():
+                raise gym.error.ResetNeeded("the first reset() must reset all environments")
         self._ended = None  # until it has worked
         # A copy: vector environments take the mask out of the options they are given.
         self._observations, infos = self.env.reset(seed=seed, options=copy(options))
-        if ended is None and not begun.all():
-            raise gym.error.ResetNeeded("the first reset() must reset all environments")
-        if ended is None:
-            ended = np.zeros(self.num_envs, bool)
         self._ended = ended
         if begun.all():
             self._watch_with_next()
@@ -159,31 +161,21 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
                 f"actions have the shape {self.env.action_space.shape}, got {proposed.shape}"
             )
         # their members begin an episode in this step, and take no action
-        begun = self._ended.copy()
+        begun = np.array(self._ended)
         running = ~begun
         self._ended = None  # where anything raises, nobody knows what was done
 
         self._limit_contact()
         command = self.guard.act(proposed.reshape(self._flat_shape), self._observed_by, idle=begun)
-        self._first_step.begin()
-        observations, rewards, terminated, truncated, infos = self.send_command(command)
-        self._first_step.end(bool(begun[0] or terminated[0] or truncated[0]))
-        self._check_period(self._first_step.period)
-        infos = dict(infos)
-        infos["overridden"] = command.overridden | infos.get("overridden", False)
-        infos["_overridden"] = np.ones_like(begun)
-        if self._forced.any():
-            observations, infos = self._reset_forced(infos)
-            rewards, terminated, truncated = (
-                np.where(self._forced, 0, x) for x in (rewards, terminated, truncated)
-            )
-
+        observations, rewards, terminated, truncated, infos = self._step_members(command, begun)
         sensed = self.sense_rows((observations, infos))
         report = self.guard.judge(sensed, self._commanded, active=running)
-        stopped = (report.gave_up | (report.ends & self.guard.ends_on_alarm)) & running
-        self._forced = stopped & ~np.asarray(terminated | truncated, bool)
-        terminated = np.asarray(terminated, bool) | (stopped & (not self._options.truncate))
-        truncated = np.asarray(truncated, bool) | (stopped & self._options.truncate)
+        stopped = self._stopped([report]) & running
+        self._forced = stopped & ~(terminated | truncated)
+        if self._options.truncate:
+            truncated = truncated | stopped
+        else:
+            terminated = terminated | stopped
 
         self._observations = self._repaired(observations, infos, running)
         self._commanded[begun] = np.nan
@@ -200,25 +192,30 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
     def sense_rows(self, given: tuple[Any, dict[str, Any]]) -> SensedRows:
         """Return what was sensed in a step, by the observations and infos of the members."""
         observations, infos = given
+        size = self._spec.size
         load = load_felt(self._facts, infos, infos.get("_contact_load"))
         stream: Any = infos.get("stream")
-        present = np.asarray(infos.get("_stream", np.ones(self.num_envs, bool)))
-        shape = (self.num_envs, self._spec.size)
+        everyone = np.ones(self.num_envs, bool)
+        present = np.asarray(infos.get("_stream", everyone))
+        shape = self.num_envs, size
         if self._has_stream and present.all() and np.shape(stream) == shape:
             return SensedRows(np.asarray(as_float32(stream)), load, infos=infos)
 
         def read(member: int) -> Floats32:
             if not self._has_stream:
-                return np.concatenate([np.ravel(observations[member]), self._commanded[member]])
+                sensed = np.ravel(observations[member])
+                return np.concatenate([sensed, self._commanded[member]])
             if stream is None or not present[member]:
                 raise KeyError('info has no "stream"')
             return stream[member]
 
-        rows, failures = zip(
-            *(sensed_row(partial(read, i), self._spec.size) for i in range(shape[0])), strict=True
-        )
-        failed = {member: failure for member, failure in enumerate(failures) if failure}
-        return SensedRows(np.stack(rows), load, failed, infos)
+        rows = np.empty((self.num_envs, size), np.float32)
+        failures: dict[int, str] = {}
+        for member in range(self.num_envs):
+            rows[member], failure = sensed_row(partial(read, member), size)
+            if failure:
+                failures[member] = failure
+        return SensedRows(rows, load, failures, infos)
 
     def send_command(self, command: Command) -> tuple[Any, ...]:
         """Step the members as the guard decided; return what that gives."""
@@ -228,27 +225,15 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._holding = brakes
         self._commanded = command.actions
         actions = command.actions.copy().reshape(self.env.action_space.shape or ())
-        return self.env.step(as_action(self.env.single_action_space, actions))
+        actions = as_action(self.env.single_action_space, actions)
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        ends = np.asarray(terminated, bool), np.asarray(truncated, bool)
+        return observations, rewards, *ends, infos
 
-    def report_step(self, reports: Sequence[RowReport], target: dict[str, Any]) -> None:
-        """Write the report of a step to its infos, with Gymnasium's masks of the members that are present."""
-        report = reports[-1]
-        robots = report.robots
-        # of guards inside
-        alarm = robots["alarm"] | np.asarray(target.get("asm_alarm", False), bool)
-        self._alarms += alarm
-        fields: dict[str, Any] = {
-            "asm_surprise": robots["surprise"].copy(),
-            "asm_alarm": alarm,
-            "asm_intervened": robots["overridden"]
-            | np.asarray(target.get("asm_intervened", False), bool),
-            "cost": alarm.astype(np.float64),
-            "cost_sum": self._alarms.astype(np.float64),
-            "asm": LazyInfo(self._describe(report)),
-        }
-        for name, value in fields.items():
-            target[name] = value
-            target[f"_{name}"] = self._present
+    def _write(self, target: dict[str, Any], asm: LazyInfo, numbers: dict[str, Any]) -> None:
+        for name, values in {"asm": asm, **numbers}.items():
+            target[name] = values
+            target[f"_{name}"] = self._present  # Gymnasium's mask of the members that it tells of
 
     # ------------------------------------------------------------------ parts of a step
 
@@ -261,10 +246,23 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         """Return the last observation of a member."""
         return list(iterate(self.observation_space, self._observations))[member]
 
-    def _reset_forced(self, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Reset the members whose episodes this wrapper has ended; return observations and infos of all."""
-        observations, fresh = self.env.reset(options={"reset_mask": self._forced.copy()})
-        return observations, _replaced(infos, fresh, self._forced)
+    def _step_members(self, command: Command, begun: Mask) -> tuple[Any, ...]:
+        """Step the members, and reset those whose episodes this wrapper has ended; return what that gives."""
+        self._first_step.begin()
+        observations, rewards, terminated, truncated, infos = self.send_command(command)
+        self._first_step.end(bool(begun[0] or terminated[0] or truncated[0]))
+        self._check_period(self._first_step.period)
+        infos = dict(infos)
+        infos["overridden"] = command.overridden | infos.get("overridden", False)
+        infos["_overridden"] = np.ones_like(begun)
+        forced = self._forced
+        if forced.any():
+            observations, fresh = self.env.reset(options={"reset_mask": forced.copy()})
+            infos = _replaced(infos, fresh, forced)
+            rewards = np.where(forced, 0, rewards)
+            terminated = terminated & ~forced
+            truncated = truncated & ~forced
+        return observations, rewards, terminated, truncated, infos
 
     def _repaired(self, observations: Any, infos: dict[str, Any], running: Mask) -> Any:
         """Return the observations, and set the streams, with what is completed of the ``running`` members."""
@@ -290,22 +288,21 @@ class VectorNeuralASMSafety(Guarding, VectorWrapper):
         self._limit_contact(anew=True)
         return nothing
 
-    def _describe(self, report: RowReport) -> Any:
-        """Return a function that makes ``info["asm"]`` of this step, whenever it is called."""
+    def _describe(self, reports: Sequence[RowReport]) -> Callable[[], dict[str, Any]]:
         facts = self._facts
         spec = self._spec
         commanded = self._commanded.copy()
         executed = self._executed.copy()
-        step: dict[str, Any] = {"alarms": self._alarms.copy()}
-        for name, value in self._following().items():
+        step: dict[str, Any] = {
+            "alarms": self._alarms.copy(),
+            "executed_action": executed.reshape(self.env.action_space.shape or ()),
+        }
+        for name, value in self._running_threshold().items():
             step[name] = np.full(self.num_envs, value)
 
         def describe() -> dict[str, Any]:
             slowed = [facts.slowed(*pair) for pair in zip(commanded, executed, strict=True)]
-            actions = executed.reshape(self.env.action_space.shape or ())
-            return side_by_side(
-                report, spec, executed_action=actions, slowed=np.array(slowed), **step
-            )
+            return side_by_side(reports[-1], spec, slowed=np.array(slowed), **step)
 
         return describe
 
@@ -332,7 +329,8 @@ def _replaced(infos: dict[str, Any], by: dict[str, Any], mask: Mask) -> dict[str
             old = _blank(new)
         if new is None:
             new = _blank(old)
-        merged[name] = np.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        along_the_first_axis = mask.reshape(-1, *[1] * (old.ndim - 1))
+        merged[name] = np.where(along_the_first_axis, new, old)
     return merged
 
 

@@ -32,7 +32,8 @@ from asm_gym.policies.scripted.geometry import (
     yaw,
 )
 
-REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT, IDLE = range(9)
+REACH, DESCEND, GRASP, RAISE, CARRY, LOWER, RELEASE, RETREAT = range(8)
+RETREATED = 14  # steps after which a hand has gone up from what it put down
 TURN_AT_ONCE = 1.0  # how far to turn the hand at once [rad]
 ROOM = 0.9  # how far from its stops the last joint is to stay [rad]
 EXACT = 0.005  # what has to fit as exactly as this is not lowered beside its place [m]
@@ -58,9 +59,9 @@ class CarryTask(NamedTuple):
 
 @dataclass(frozen=True)
 class CarryScene(Scene):
-    """What is observed; its plan is the present task."""
+    """What is observed; its plan is the present task, None where nothing is left to carry."""
 
-    thing: Any  # pose of the object; None where nothing is left to carry
+    thing: Any  # pose of the object; None without a task
     fingers: Vector  # velocities of the gripper's joints
     wrist: float  # angle of the arm's last joint [rad]
     is_careful: bool  # the arm is not a Panda, whose pace the plans are made for
@@ -105,17 +106,20 @@ class CarryScene(Scene):
         return float(min(turns, key=abs, default=0.0))
 
     def reach(self) -> Vector:
-        above = self.plan.clearance * UP + 0.3 * self.state.spread
+        above = self.plan.clearance * UP + 0.3 * self.state.waypoint_offset
         target = self.grip + above
         # From afar, first high: the way may lead over a wall or another object.
         if length(self.offset[:2]) > 0.1:
-            target[2] = max(target[2], min(self.hand.position[2], target[2] + 0.1))
+            height = min(self.hand.position[2], target[2] + 0.1)
+            target[2] = max(target[2], height)
         return self.move(target, self._turning(self.grasping), self.gain)
 
     def is_above(self) -> bool:
-        aside = length(self.offset[:2] - self.state.spread[:2] * 0.3)
-        is_above = aside < 0.02 and abs(self.offset[2] - self.plan.clearance) < 0.03
-        return is_above and angle_between(self.hand.orientation, self.grasping) < 0.15
+        waypoint = self.state.waypoint_offset[:2] * 0.3
+        aside = length(self.offset[:2] - waypoint)
+        too_high = self.offset[2] - self.plan.clearance
+        askew = angle_between(self.hand.orientation, self.grasping)
+        return aside < 0.02 and abs(too_high) < 0.03 and askew < 0.15
 
     def descend(self) -> Vector:
         target = self.grip
@@ -126,20 +130,21 @@ class CarryScene(Scene):
 
     def is_around(self) -> bool:
         distance = length(self.offset)
-        return distance < 0.011 or (self.state.since > 30 and distance < 0.02)
+        return distance < 0.011 or (self.state.steps_in_phase > 30 and distance < 0.02)
 
     def is_astray(self) -> bool:
-        return self.state.since > 60 or length(self.offset[:2]) > 0.06
+        return self.state.steps_in_phase > 60 or length(self.offset[:2]) > 0.06
 
     def grasp(self) -> Vector:
-        gain = self.gain if self.is_careful else 1.0
-        return self.move(self.state.anchor, self.down, gain)
+        if self.is_careful:
+            return self.move(self.state.anchor, self.down, self.gain)
+        return self.move(self.state.anchor, self.down)
 
     def has_gripped(self) -> bool:
-        return has_settled(self.fingers, self.state.since, usual=7)
+        return has_settled(self.fingers, self.state.steps_in_phase, usual=7)
 
     def lift(self) -> Vector:
-        height = self.over[2] + 0.3 * self.state.spread[2]
+        height = self.over[2] + 0.3 * self.state.waypoint_offset[2]
         target = np.array([*self.thing.position[:2], height])
         return command_towards(self._held, target, self.down, self.state.speed)
 
@@ -148,48 +153,49 @@ class CarryScene(Scene):
         return length(self.offset) > LOST
 
     def is_lifted(self) -> bool:
-        return self.thing.position[2] > self.over[2] - 0.03 or self.state.since > 60
+        height = self.thing.position[2]
+        return height > self.over[2] - 0.03 or self.state.steps_in_phase > 60
 
     def carry(self) -> Vector:
         return self._move_held(self.over, self.state.speed)
 
     def is_over_place(self) -> bool:
-        # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
-        patience = self.state.since / 60 if self.is_careful else 0.0
-        return (
-            self.aside < self.plan.fit * (1 + patience)
-            and abs(self.turn_to_fit) < self.plan.heading_fit
-        )
+        tolerance = self.plan.fit
+        if self.is_careful:
+            # An arm that cannot get nearer, at the end of its reach, makes do with less in time.
+            tolerance = self.plan.fit * (1 + self.state.steps_in_phase / 60)
+        return self.aside < tolerance and abs(self.turn_to_fit) < self.plan.heading_fit
 
     def lower(self) -> Vector:
         target = self.plan.place
         if self.is_careful or self.plan.fit <= EXACT:
             # The further aside of its place an object is, the less it goes down.
-            down = 0.025 * np.clip(1.5 - 0.5 * self.aside / self.plan.fit, 0.0, 1.0)
+            share = 1.5 - 0.5 * self.aside / self.plan.fit
+            down = 0.025 * np.clip(share, 0.0, 1.0)
             height = max(target[2], self.thing.position[2] - down)
             target = np.array([*target[:2], height])
         return self._move_held(target, 0.6 * self.state.speed)
 
     def has_slipped_aside(self) -> bool:
-        share = 2.5 if self.is_careful else 1.0
-        return self.aside > self.plan.fit * share + 0.02
+        tolerance = self.plan.fit
+        if self.is_careful:
+            tolerance = self.plan.fit * 2.5
+        return self.aside > tolerance + 0.02
 
     def is_down(self) -> bool:
         height = self.thing.position[2]
         bottom = self.plan.place[2]
-        return height < bottom + 0.006 or (self.state.since > 50 and height < bottom + 0.03)
+        is_late = self.state.steps_in_phase > 50
+        return height < bottom + 0.006 or (is_late and height < bottom + 0.03)
 
     def release(self) -> Vector:
         return self.move(self.state.anchor, self.down)
 
     def has_let_go(self) -> bool:
-        return has_settled(self.fingers, self.state.since, usual=6)
+        return has_settled(self.fingers, self.state.steps_in_phase, usual=6)
 
     def retreat(self) -> Vector:
         return self.move(self.state.anchor + 0.12 * UP, self.down)
-
-    def idle(self) -> Vector:
-        return np.zeros(6)
 
     @property
     def _held(self) -> Pose:
@@ -203,13 +209,13 @@ class CarryScene(Scene):
 
     def _turning(self, target: Vector) -> Vector:
         """Return how (3, 3) to turn the hand first on its way to ``target``: not through the last joint's stops."""
-        left = wrapped(yaw(target[:, 1]) - yaw(self.down[:, 1]))
+        now = self.down
+        left = wrapped(yaw(target[:, 1]) - yaw(now[:, 1]))
         if abs(left) <= TURN_AT_ONCE:
             return target
         left = self.wrist - wrapped(self.wrist - left)
-        return (
-            rotation_about_vertical(float(np.clip(left, -TURN_AT_ONCE, TURN_AT_ONCE))) @ self.down
-        )
+        at_once = float(np.clip(left, -TURN_AT_ONCE, TURN_AT_ONCE))
+        return rotation_about_vertical(at_once) @ now
 
     phases: ClassVar = {
         REACH: Phase(reach, OPEN, {DESCEND: is_above}),
@@ -222,7 +228,6 @@ class CarryScene(Scene):
         ),
         RELEASE: Phase(release, OPEN, {RETREAT: has_let_go}),
         RETREAT: Phase(retreat, OPEN),  # ``advance`` goes on with the next task
-        IDLE: Phase(idle, OPEN),
     }
 
 
@@ -237,13 +242,14 @@ class CarryExpert(Expert):
 
     def begin(self, observation: Any) -> State:
         speed = self.draw_speed()
-        spread = self.draw_offset()
+        waypoint_offset = self.draw_offset()
         task = self.next_task(observation)
         if task is None:
-            return State(speed, task, phase=IDLE)
-        return State(speed, task, spread=spread)
+            anchor = self.read(observation, "hand_position")
+            return State(speed, task, waypoint_offset, anchor=anchor, phase=RETREAT)
+        return State(speed, task, waypoint_offset)
 
-    def look(self, observation: Any, state: State) -> CarryScene:
+    def observe(self, observation: Any, state: State) -> CarryScene:
         thing = None
         if state.plan is not None:
             thing = self.read.pose(observation, state.plan.name)
@@ -262,7 +268,7 @@ class CarryExpert(Expert):
         state = scene.state
         if state.phase != RETREAT:
             return super().advance(scene, observation)
-        if state.since < 14:
+        if state.steps_in_phase < RETREATED:
             return state
         task = self.next_task(observation)
         if task is None:
@@ -274,30 +280,37 @@ class CarryExpert(Expert):
         return float(self.read(observation, "joint_position")[-1])
 
     def at_ease(self, task: CarryTask, observation: Any) -> CarryTask:
-        """Return the task with one of its two grasps and headings: those with room for the last joint, which turns back
-        with a hand that points down and onwards with the arm's bearing; of several, those that turn it least."""
+        """Return the task with one of its two grasps and headings: those with room for the arm's last joint.
+
+        That joint turns back with a hand that points down, and onwards with the arm's bearing. Of several choices with
+        room, the one that turns it least counts.
+        """
         thing = self.read.pose(observation, task.name)
         hand = self.read.hand(observation)
         robot = self.robosuite.robots[0]
         base = robot.base_pos
-        stops = self.inner.simulation.model.jnt_range[robot._ref_joint_indexes[-1]]
+        last_joint = robot._ref_joint_indexes[-1]
+        stops = self.inner.simulation.model.jnt_range[last_joint]
         most = stops[1] - ROOM
         now = self._wrist(observation)
-        along = now + yaw(hand.orientation[:, 1]) - yaw(hand.position - base)
+        bearing = yaw(hand.position - base)
+        along = now + yaw(hand.orientation[:, 1]) - bearing
         heading = yaw(thing.orientation[:, 0])
 
         def strain(choice: tuple[Vector, float]) -> tuple[float, float]:
             """How far the last joint comes beyond where it has room, and how far it turns in all [rad]."""
             closing, wanted = choice
             fitting = rotation_about_vertical(wanted - heading) @ thing.orientation
-            picked_at = thing.point(task.grip)
-            placed_at = task.place + fitting @ task.grip
-            grasp = wrapped(along - yaw(thing.orientation @ closing) + yaw(picked_at - base))
-            place = wrapped(along - yaw(fitting @ closing) + yaw(placed_at - base))
+            picked_at = yaw(thing.point(task.grip) - base)
+            placed_at = yaw(task.place + fitting @ task.grip - base)
+            grasp = wrapped(along - yaw(thing.orientation @ closing) + picked_at)
+            place = wrapped(along - yaw(fitting @ closing) + placed_at)
             beyond = max(abs(grasp) - most, abs(place) - most, 0.0)
             return beyond, abs(grasp - now) + abs(place - grasp)
 
         choices = product((task.closing, -task.closing), task.headings or (heading,))
         closing, wanted = min(choices, key=strain)
-        headings = (wanted,) if task.headings else ()
-        return task._replace(closing=closing, turns=2 * np.pi, headings=headings)
+        eased = task._replace(closing=closing, turns=2 * np.pi)
+        if task.headings:
+            return eased._replace(headings=(wanted,))
+        return eased

@@ -11,13 +11,13 @@ from asm_gym.policies.scripted.expert import CLOSE, OPEN, Expert, Phase, Scene, 
 from asm_gym.policies.scripted.geometry import UP, Vector, angle_between, length, rotation_about
 
 REACH, APPROACH, GRASP, TURN, PULL, REST = range(6)
-TURNED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
-PRESSED = 1.55  # how far to ask for; its spring and the hand's give take some of it [rad]
-BEFORE = 0.09  # how far in front of the handle to come from [m]
+UNLATCHED = 1.4  # how far the handle is pressed before the latch is out of its hole for sure [rad]
+ASKED_PRESS = 1.55  # how far to ask for; its spring and the hand's give take some of it [rad]
+DISTANCE_IN_FRONT = 0.09  # how far in front of the handle to come from [m]
 ROLL_AT_ONCE = 0.8  # how far to roll the hand at once [rad]
 OPENED = 0.36  # how far to open the door; the task asks for 0.3 [rad]
 GAIN = 2.0  # of the hand's commands
-SLIPPED = 0.07  # so far from the handle a hand does not hold it [m]
+SLIPPED_OFF = 0.07  # so far from the handle a hand does not hold it [m]
 
 
 class Hardware(NamedTuple):
@@ -30,29 +30,32 @@ class Hardware(NamedTuple):
     normal: Vector  # (3,) out of the door, towards the robot
     sign: float  # of the latch's joint, where the handle goes down
 
-    def grip_at(self, turned: float, opened: float) -> Vector:
+    def grip_at(self, pressed: float, opened: float) -> Vector:
         """Return where (3,) to hold the handle, when it is pressed and the door is open by these angles [rad]."""
-        held = self.pivot + rotation_about(self.axis, turned) @ (self.grip - self.pivot)
-        return self.hinge + rotation_about(UP, opened) @ (held - self.hinge)
+        press = rotation_about(self.axis, pressed)
+        held = self.pivot + press @ (self.grip - self.pivot)
+        swing = rotation_about(UP, opened)
+        return self.hinge + swing @ (held - self.hinge)
 
-    def held(self, turned: float) -> Vector:
+    def held(self, pressed: float) -> Vector:
         """Return the hand (3, 3) on the handle of the closed door, its y axis down: else a joint meets its stop."""
         y = np.array([0.0, 0.0, -1.0])
         z = -self.normal
-        return rotation_about(self.axis, turned) @ np.column_stack([np.cross(y, z), y, z])
+        before_door = np.column_stack([np.cross(y, z), y, z])
+        return rotation_about(self.axis, pressed) @ before_door
 
 
 @dataclass(frozen=True)
 class DoorScene(Scene):
     """What is observed; its plan is the door's hardware."""
 
-    turned: float  # how far the handle is pressed [rad]
+    pressed: float  # how far the handle is pressed [rad]
     opened: float  # how far the door is open [rad]
 
     @property
     def grip(self) -> Vector:
         """Where (3,) to hold the handle as it stands now [m]."""
-        return self.plan.grip_at(self.turned, self.opened)
+        return self.plan.grip_at(self.pressed, self.opened)
 
     @property
     def offset(self) -> Vector:
@@ -64,47 +67,49 @@ class DoorScene(Scene):
         """Of the hand from where to hold the handle [m]."""
         return length(self.offset)
 
-    def facing(self, turned: float = 0.0) -> Vector:
-        """Return the hand (3, 3) before the door, fingers above and below a handle ``turned`` so far [rad]."""
-        return rotation_about(UP, self.opened) @ self.plan.held(turned)
+    def facing(self, pressed: float = 0.0) -> Vector:
+        """Return the hand (3, 3) before the door, fingers above and below a handle ``pressed`` so far [rad]."""
+        return rotation_about(UP, self.opened) @ self.plan.held(pressed)
 
     def reach(self) -> Vector:
         facing = _rolling(self.plan, self.hand.orientation, self.facing())
-        return self.move(self.grip + BEFORE * self.plan.normal, facing, GAIN)
+        in_front = self.grip + DISTANCE_IN_FRONT * self.plan.normal
+        return self.move(in_front, facing, GAIN)
 
     def is_before_handle(self) -> bool:
-        off = length(self.offset - BEFORE * self.plan.normal)
-        return off < 0.02 and angle_between(self.hand.orientation, self.facing()) < 0.15
+        distance = length(self.offset - DISTANCE_IN_FRONT * self.plan.normal)
+        askew = angle_between(self.hand.orientation, self.facing())
+        return distance < 0.02 and askew < 0.15
 
     def approach(self) -> Vector:
         return self.move(self.grip, self.facing(), GAIN)
 
     def is_around(self) -> bool:
-        distance = self.distance
-        return distance < 0.012 or (self.state.since > 25 and distance < 0.025)
+        is_late = self.state.steps_in_phase > 25
+        return self.distance < 0.012 or (is_late and self.distance < 0.025)
 
     def is_late(self) -> bool:
-        return self.state.since > 60
+        return self.state.steps_in_phase > 60
 
     def grasp(self) -> Vector:
         return self.move(self.state.anchor, self.facing(), GAIN)
 
     def has_gripped(self) -> bool:
-        return self.state.since >= 7
+        return self.state.steps_in_phase >= 7
 
     def turn(self) -> Vector:
-        ahead = min(self.turned + 0.4, PRESSED)
+        ahead = min(self.pressed + 0.4, ASKED_PRESS)
         return self._hold(self.plan.grip_at(ahead, self.opened))
 
     def has_slipped_off(self) -> bool:
-        return self.distance > SLIPPED
+        return self.distance > SLIPPED_OFF
 
     def is_unlatched(self) -> bool:
-        return self.turned > TURNED - 0.1
+        return self.pressed > UNLATCHED - 0.1
 
     def pull(self) -> Vector:
         ahead = min(self.opened + 0.12, OPENED + 0.04)
-        return self._hold(self.plan.grip_at(PRESSED, ahead))
+        return self._hold(self.plan.grip_at(ASKED_PRESS, ahead))
 
     def is_open(self) -> bool:
         return self.opened > OPENED - 0.02
@@ -114,7 +119,7 @@ class DoorScene(Scene):
 
     def _hold(self, target: Vector) -> Vector:
         """Return the command (6,) of a hand that turns with the handle that it holds."""
-        return self.move(target, self.facing(self.turned), GAIN)
+        return self.move(target, self.facing(self.pressed), GAIN)
 
     phases: ClassVar = {
         REACH: Phase(reach, OPEN, {APPROACH: is_before_handle}),
@@ -160,28 +165,32 @@ class DoorExpert(Expert):
             sign=sign,
         )
 
-    def look(self, observation: Any, state: State) -> DoorScene:
+    def observe(self, observation: Any, state: State) -> DoorScene:
         return DoorScene(
             state,
             hand=self.read.hand(observation),
-            turned=state.plan.sign * float(self.read(observation, "handle_qpos")[0]),
+            pressed=state.plan.sign * float(self.read(observation, "handle_qpos")[0]),
             opened=float(self.read(observation, "hinge_qpos")[0]),
         )
 
 
 def _rolling(hardware: Hardware, hand: Vector, facing: Vector) -> Vector:
-    """Return where (3, 3) to turn first on the way to ``facing``, whose shortest way may lead any way round."""
-    pressed = hardware.held(TURNED)
-    left = _roll(hand, pressed) + _roll(pressed, facing)
-    return facing @ rotation_about(UP, left - np.clip(left, -ROLL_AT_ONCE, ROLL_AT_ONCE))
+    """Return how (3, 3) to turn the hand first on its way to ``facing``: by way of its pose on the pressed handle."""
+    on_handle = hardware.held(UNLATCHED)
+    left = _roll(hand, on_handle) + _roll(on_handle, facing)
+    at_once = np.clip(left, -ROLL_AT_ONCE, ROLL_AT_ONCE)
+    return facing @ rotation_about(UP, left - at_once)
 
 
-def _roll(hand: Vector, to: Vector) -> float:
+def _roll(hand: Vector, other: Vector) -> float:
     """Return the hand's roll from another orientation about its z axis, once that points the same way [rad]."""
-    axis = np.cross(hand[:, 2], to[:, 2])
+    ahead = hand[:, 2]
+    other_ahead = other[:, 2]
+    axis = np.cross(ahead, other_ahead)
     sine = length(axis)
     tilt = np.eye(3)
     if sine > 1e-9:
-        tilt = rotation_about(axis / sine, float(np.arctan2(sine, hand[:, 2] @ to[:, 2])))
-    across = to.T @ tilt @ hand[:, 1]
+        angle = float(np.arctan2(sine, ahead @ other_ahead))
+        tilt = rotation_about(axis / sine, angle)
+    across = other.T @ tilt @ hand[:, 1]
     return float(np.arctan2(-across[0], across[1]))

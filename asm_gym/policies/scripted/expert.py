@@ -52,15 +52,15 @@ class Style:
             check_number(name, getattr(self, name), low=0)
         check_number("speed", self.speed, above=0)
 
-    def pace(self, usual: float, rng: np.random.Generator) -> float:
+    def draw_speed(self, usual: float, rng: np.random.Generator) -> float:
         """Return the speed of one episode, where ``usual`` is the expert's own."""
         drawn = 1 + self.speed_spread * rng.standard_normal()
         return usual * self.speed * float(np.clip(drawn, 0.5, 1.5))
 
-    def drifted(self, drift: Vector, size: int, rng: np.random.Generator) -> Vector:
-        """Return the next action noise (size,) after ``drift``: an AR(1) process that forgets in about 4 steps."""
-        fresh = self.noise * np.sqrt(1 - FORGETTING**2) * rng.standard_normal(size)
-        return FORGETTING * drift + fresh
+    def draw_noise(self, last: Vector, size: int, rng: np.random.Generator) -> Vector:
+        """Return the action noise (size,) after the ``last`` one: an AR(1) process that forgets in about 4 steps."""
+        std = self.noise * np.sqrt(1 - FORGETTING**2)
+        return FORGETTING * last + std * rng.standard_normal(size)
 
 
 class ObservationReader:
@@ -76,8 +76,9 @@ class ObservationReader:
 
     def __call__(self, observation: Any, name: str) -> Vector:
         """Return the numbers of a channel."""
-        key = self._columns[name] if self._is_flat else name
-        return np.asarray(observation[key], np.float64)
+        if self._is_flat:
+            return np.asarray(observation[self._columns[name]], np.float64)
+        return np.asarray(observation[name], np.float64)
 
     def hand(self, observation: Any, prefix: str = "") -> Pose:
         """Return the pose of a hand."""
@@ -99,11 +100,11 @@ class State(NamedTuple):
 
     speed: float  # of the hand in this episode [action units]
     plan: Any  # what else was decided at the beginning
-    drift: Any = 0.0  # (A,) correlated action noise
-    spread: Any = 0.0  # (3,) how this episode's way-points differ from the plan [m]
+    waypoint_offset: Any = 0.0  # (3,) how this episode's way-points differ from the plan [m]
+    noise: Any = 0.0  # (A,) of the last action
     anchor: Any = None  # (3,) where the hand was when the phase began [m]
     phase: int = 0  # of the plan
-    since: int = 0  # steps spent in the phase
+    steps_in_phase: int = 0
 
 
 class Phase(NamedTuple):
@@ -155,15 +156,14 @@ class Expert(StatefulPolicy):
         self.read = ObservationReader(env)
         self.size = int(np.prod(env.action_space.shape or ()))
         # indices of the action that move arms
-        self.moves = np.setdiff1d(np.arange(self.size), inner.gripper_actions)
-        # Plans have the Panda's pace; other arms drift further from their course.
-        # Plans are made for the pace and reach of a Panda.
+        self.arm_columns = np.setdiff1d(np.arange(self.size), inner.gripper_actions)
+        # Plans are made for the pace and reach of a Panda; other arms drift further from their course.
         self.is_careful = set(inner.robots) != {"Panda"}
         self.gain = 3.0 if self.is_careful else 2.0
 
     def draw_speed(self) -> float:
         """Return the speed of the hand in one episode [action units]."""
-        return self.style.pace(self.pace, self.np_random)
+        return self.style.draw_speed(self.pace, self.np_random)
 
     def draw_offset(self) -> Vector:
         """Return how far (3,) a way-point of one episode is from the plan's [m]."""
@@ -174,25 +174,26 @@ class Expert(StatefulPolicy):
         """Draw the style of an episode, and return its first state."""
 
     @abstractmethod
-    def look(self, observation: Any, state: State) -> Any:
+    def observe(self, observation: Any, state: State) -> Any:
         """Return the ``Scene``."""
 
     def act(
         self, observation: Any, state: State, deterministic: bool
     ) -> tuple[NDArray[np.float32], State]:
         """Return the action (A,) and the next state; ``deterministic`` leaves the action noise out, not the style."""
-        drift = self.style.drifted(state.drift, self.size, self.np_random)
-        scene = self.look(observation, state._replace(since=state.since + 1, drift=drift))
+        noise = self.style.draw_noise(state.noise, self.size, self.np_random)
+        steps = state.steps_in_phase + 1
+        scene = self.observe(observation, state._replace(steps_in_phase=steps, noise=noise))
         state = self.advance(scene, observation)
         if state is not scene.state:
-            scene = self.look(observation, state)
+            scene = self.observe(observation, state)
 
         phase = scene.phases[state.phase]
         command = phase.command(scene)
         if phase.gripper is not None:
             command = np.append(command, phase.gripper)
         if not deterministic:
-            command[self.moves] += drift[self.moves]
+            command[self.arm_columns] += noise[self.arm_columns]
         return np.clip(command, -1.0, 1.0).astype(np.float32), state
 
     def advance(self, scene: Any, observation: Any) -> State:
@@ -204,10 +205,10 @@ class Expert(StatefulPolicy):
 
     def entered(self, scene: Any, phase: int) -> State:
         """Return the state at the beginning of a phase."""
-        return scene.state._replace(phase=phase, since=0, anchor=scene.hand.position)
+        return scene.state._replace(phase=phase, steps_in_phase=0, anchor=scene.hand.position)
 
 
-def has_settled(velocity: Vector, since: int, usual: int) -> bool:
+def has_settled(velocity: Vector, steps: int, usual: int) -> bool:
     """Return whether fingers have closed or opened.
 
     Those that slide take the usual number of steps. Those that turn, in linkages, take several
@@ -215,16 +216,20 @@ def has_settled(velocity: Vector, since: int, usual: int) -> bool:
 
     Args:
         velocity: (J,) of the gripper's joints.
-        since: steps since they were told to.
+        steps: since the gripper was commanded.
         usual: steps that sliding fingers take.
     """
     if velocity.size <= SLIDING_JOINTS:
-        return since >= usual
+        return steps >= usual
     is_still = np.abs(velocity).max() < STILL
-    return (since >= 2 * usual and is_still) or since >= 5 * usual
+    return (steps >= 2 * usual and is_still) or steps >= 5 * usual
 
 
 def over_first(position: Vector, target: Vector) -> Vector:
-    """Return how much higher (3,) than its target [m] a careful hand goes beside it, lest a finger comes down on it."""
+    """Return how much higher (3,) than its target a careful hand goes while it is aside of it [m].
+
+    A finger would come down on the object otherwise.
+    """
     aside = length((position - target)[:2])
-    return np.clip(4 * (aside - STRAIGHT_DOWN), 0.0, HIGHEST_DETOUR) * UP
+    higher = np.clip(4 * (aside - STRAIGHT_DOWN), 0.0, HIGHEST_DETOUR)
+    return higher * UP

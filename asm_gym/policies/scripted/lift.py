@@ -71,7 +71,7 @@ class LiftScene(Scene):
         return self.move(self.state.anchor, pointing_down(self.hand.orientation))
 
     def has_gripped(self) -> bool:
-        return has_settled(self.fingers, self.state.since, usual=6)
+        return has_settled(self.fingers, self.state.steps_in_phase, usual=6)
 
     def lift(self) -> Vector:
         return self.move(self.state.anchor + self.plan.goal, pointing_down(self.hand.orientation))
@@ -107,7 +107,7 @@ class LiftExpert(Expert):
         plan = LiftPlan(hover, goal, depth=float(np.clip(depth, 0.0, 2 * deep)))
         return State(speed, plan)
 
-    def look(self, observation: Any, state: State) -> LiftScene:
+    def observe(self, observation: Any, state: State) -> LiftScene:
         return LiftScene(
             state,
             hand=self.read.hand(observation),

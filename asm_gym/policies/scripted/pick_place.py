@@ -17,15 +17,14 @@ from asm_gym.policies.scripted.geometry import (
     rotation_from_quaternion,
 )
 
-LOWEST_FINGERTIPS = (
-    0.09  # above the bins' floor, so high the fingertips keep the palm off the walls' tops [m]
-)
+# Above the bins' floor, so high the fingertips keep the palm off the walls' tops [m].
+LOWEST_FINGERTIPS = 0.09
 REACH_OF_PANDA = 0.8  # further from its base a hand comes down with its elbow at its stop [m]
 PALM_ALONG = 0.103  # half of a Panda's palm, along which its fingers close [m]
 PALM_ACROSS = 0.035  # and across [m]
 PALM_HEIGHT = 0.03  # of a Panda's palm above the fingertips [m]
 WALL_HEIGHT = 0.1  # of the walls above the bins' origin [m]
-SPARE = 0.01  # so much room beside a wall is enough [m]
+ENOUGH_ROOM = 0.01  # so much room beside a wall is enough [m]
 ASKEW = (0.0, 0.2, -0.2, 0.4, -0.4)  # how far from square to an object fingers may close [rad]
 SLOWLY = 0.3  # with which share of its speed a palm comes down that will meet a wall
 NARROW = 0.035  # half of what fits between the fingers [m]
@@ -60,6 +59,9 @@ class PickPlaceExpert(CarryExpert):
         grip = max(0.0, half[2] - 0.02)
         closing = self._closing(name, thing, half, grip)
         place = self._place(number, half, grip)
+        haste = 1.0
+        if closing.room < ENOUGH_ROOM:
+            haste = SLOWLY
         task = CarryTask(
             name=name,
             grip=grip * UP,
@@ -71,7 +73,7 @@ class PickPlaceExpert(CarryExpert):
             headings=self._headings(place, closing.along),
             heading_fit=0.3,
             fit=0.03,
-            haste=1.0 if closing.room >= SPARE else SLOWLY,
+            haste=haste,
         )
         return self.at_ease(task, observation)
 
@@ -91,7 +93,8 @@ class PickPlaceExpert(CarryExpert):
     def _closing(self, name: str, thing: Pose, half: Vector, grip: float) -> Closing:
         """Return how to close on an object, of half this size (3,), that is held ``grip`` above its middle [m]."""
         env = self.robosuite
-        to_walls = env.bin_size[:2] / 2 - np.abs(thing.position[:2] - env.bin1_pos[:2])
+        from_middle = thing.position[:2] - env.bin1_pos[:2]
+        to_walls = env.bin_size[:2] / 2 - np.abs(from_middle)
         palm = thing.position[2] + grip + PALM_HEIGHT
         if not self.is_careful and palm < env.bin1_pos[2] + WALL_HEIGHT:
             return beside_walls(half, thing.orientation, to_walls)
@@ -101,7 +104,7 @@ class PickPlaceExpert(CarryExpert):
         if self.is_careful and name == "Can":
             axes += DIAGONALS
         along = max(axes, key=lambda axis: _way_to_wall(thing.orientation @ axis, to_walls))
-        return Closing(along, room=SPARE)
+        return Closing(along, room=ENOUGH_ROOM)
 
     def _headings(self, place: Vector, closing: Vector) -> tuple[float, ...]:
         """Return headings for which, over its bin, wide fingers open across the arm's reach [rad]."""
@@ -174,7 +177,7 @@ def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> Closing:
     for angle, axis in product(ASKEW, axes):
         along = rotation_about_vertical(angle) @ axis
         room = _room(turned @ along, to_walls)
-        if room >= SPARE:
+        if room >= ENOUGH_ROOM:
             return Closing(along, room)
     widest = max(axes, key=lambda axis: _room(turned @ axis, to_walls))
     return Closing(widest, _room(turned @ widest, to_walls))
@@ -183,12 +186,14 @@ def beside_walls(half: Vector, turned: Vector, to_walls: Vector) -> Closing:
 def _room(along: Vector, to_walls: Vector) -> float:
     """Return the palm's room beside the walls when the fingers close ``along`` (3,) [m]."""
     share = np.abs(along[:2])
-    return float(np.min(to_walls - PALM_ALONG * share - PALM_ACROSS * share[::-1]))
+    room = to_walls - PALM_ALONG * share - PALM_ACROSS * share[::-1]
+    return float(np.min(room))
 
 
 def _way_to_wall(along: Vector, to_walls: Vector) -> float:
     """Return how far it is ``along`` (3,) to the nearest wall [m]."""
-    return float(np.min(to_walls / np.maximum(np.abs(along[:2]), 1e-6)))
+    share = np.maximum(np.abs(along[:2]), 1e-6)
+    return float(np.min(to_walls / share))
 
 
 def _narrow(half: Vector) -> list[Vector]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -28,12 +28,15 @@ class Swaying(StatefulPolicy):
 
     def __init__(self, env: gym.Env[Any, Any], seed: int | None = None) -> None:
         space = env.action_space
-        if not isinstance(space, gym.spaces.Box) or not np.isfinite([space.low, space.high]).all():
+        if not _is_finite_box(space):
             raise ValueError(f"the policy 'sway' needs actions in a finite Box, got {space}")
-        self.space = space
+        self.low: NDArray[Any] = space.low
+        self.high: NDArray[Any] = space.high
         self.dt = control_period(env)
-        self.middle = np.ravel(0.5 * (space.high + space.low)).astype(np.float64)
-        self.half = np.ravel(0.5 * (space.high - space.low)).astype(np.float64)
+        middle = 0.5 * (self.high + self.low)
+        half = 0.5 * (self.high - self.low)
+        self.middle = np.ravel(middle).astype(np.float64)
+        self.half = np.ravel(half).astype(np.float64)
         self.size = self.half.size
         self.set_random_seed(seed or 0)
 
@@ -50,10 +53,14 @@ class Swaying(StatefulPolicy):
         self.width = self.WIDTH * self.rng.uniform(0.8, 1.2, self.size)
         self.frequency = 0.5 + 0.3 * np.linspace(0.0, 1.0, self.size)  # [Hz]
 
+    def sines(self, t: float, phase: Floats | float = 0.0) -> Floats:
+        """Return the sine (A,) of each number of the action at a time [s]."""
+        angle = 2 * np.pi * self.frequency * t + phase
+        return np.sin(angle)
+
     def intended(self, observation: Any) -> Floats:
         """Return the action (A,) before noise."""
-        sines = np.sin(2 * np.pi * self.frequency * self.t + self.phase)  # (A,)
-        return self.middle + self.half * self.width * sines
+        return self.middle + self.half * self.width * self.sines(self.t, self.phase)
 
     def act(
         self, observation: Any, state: Any, deterministic: bool
@@ -61,9 +68,17 @@ class Swaying(StatefulPolicy):
         """Return the action and the state as it was."""
         fresh = self.NOISE * self.half * self.rng.standard_normal(self.size)
         self.noise = self.COLOUR * self.noise + fresh
-        chosen = (self.intended(observation) + self.noise).reshape(self.space.shape)
+        action = self.intended(observation) + self.noise
         self.t += self.dt
-        return np.clip(chosen, self.space.low, self.space.high).astype(np.float32), state
+        within = np.clip(action.reshape(self.low.shape), self.low, self.high)
+        return within.astype(np.float32), state
+
+
+def _is_finite_box(space: gym.Space[Any]) -> TypeGuard[gym.spaces.Box]:
+    """Return whether a space is a Box without infinite bounds."""
+    if not isinstance(space, gym.spaces.Box):
+        return False
+    return bool(np.isfinite(space.low).all() and np.isfinite(space.high).all())
 
 
 class Arm(Swaying):
@@ -74,7 +89,8 @@ class Arm(Swaying):
 
     def draw(self) -> None:
         turns = self.rng.uniform(-0.6, 0.6, (4, self.size))
-        self.poses = 0.7 * np.cumsum(np.vstack([np.zeros(self.size), turns]), axis=0)  # [rad]
+        start = np.zeros(self.size)
+        self.poses = 0.7 * np.cumsum(np.vstack([start, turns]), axis=0)  # (5, 7) [rad]
         self.width = self.rng.uniform(0.02, 0.08, self.size)  # [rad]
         self.frequency = np.linspace(0.5, 1.5, self.size)  # [Hz]
 
@@ -90,5 +106,5 @@ class Arm(Swaying):
         s = min(t - move, 1.0)
         share = 10 * s**3 - 15 * s**4 + 6 * s**5
         start = self.poses[move]
-        sway = self.width * np.sin(2 * np.pi * self.frequency * t)
-        return start + share * (self.poses[move + 1] - start) + sway
+        way = self.poses[move + 1] - start
+        return start + share * way + self.width * self.sines(t)

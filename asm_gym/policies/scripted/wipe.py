@@ -12,11 +12,11 @@ from asm_gym.policies.scripted.expert import Expert, Phase, Scene, State
 from asm_gym.policies.scripted.geometry import UP, Vector, length, pointing_down
 
 REACH, LOWER, WIPE, REST = range(4)
-ACROSS = np.array([0.0, 1.0, 0.0])  # how the tool is held
-OVER = 0.06 * UP  # how high above the table the tool comes to the dirt [m]
-ABOVE = 0.1 * UP  # how high it rests above where the last mark was [m]
+TOOL_ACROSS = np.array([0.0, 1.0, 0.0])  # how the tool is held
+ABOVE_DIRT = 0.06 * UP  # how high above the table the tool comes to the dirt [m]
+ABOVE_TABLE = 0.1 * UP  # how high it rests above where the last mark was [m]
 # The tool's face stands on the table's own plane and wipes under about 23 N [action units].
-PRESS = 0.2
+USUAL_PRESS = 0.2
 FAR_OFF = 0.15  # so far from a mark the tool goes through the air, not over the table [m]
 
 
@@ -32,28 +32,29 @@ class WipePlan(NamedTuple):
 class WipeScene(Scene):
     """What is observed."""
 
-    left: Vector  # (M, 3) the marks still on the table, in the order of the trace [m]
+    dirt_left: Vector  # (M, 3) the marks still on the table, in the order of the trace [m]
 
     @property
     def level(self) -> Vector:
         """Orientation (3, 3) in which the tool lies flat on the table."""
-        return pointing_down(self.hand.orientation, ACROSS)
+        return pointing_down(self.hand.orientation, TOOL_ACROSS)
 
     @property
     def aside(self) -> float:
         """Horizontal distance of the tool from the first mark that is left [m]."""
-        return length((self.left[0] - self.hand.position)[:2])
+        return length((self.dirt_left[0] - self.hand.position)[:2])
 
     @property
     def height(self) -> float:
         """Height of the tool above the first mark that is left [m]."""
-        return float(self.hand.position[2] - self.left[0][2])
+        return float(self.hand.position[2] - self.dirt_left[0][2])
 
     def is_clean(self) -> bool:
-        return not len(self.left)
+        return not len(self.dirt_left)
 
     def reach(self) -> Vector:
-        return self.move(self.left[0] + OVER + 0.3 * self.state.spread, self.level)
+        target = self.dirt_left[0] + ABOVE_DIRT + 0.3 * self.state.waypoint_offset
+        return self.move(target, self.level)
 
     def is_over_dirt(self) -> bool:
         return self.aside < 0.03
@@ -71,20 +72,23 @@ class WipeScene(Scene):
     def wipe(self) -> Vector:
         # Gently at first: a tool that comes down with all of it hits the table three times as hard
         # as it presses.
-        return self._follow(-self.plan.press * min(1.0, 0.3 + self.state.since / 15))
+        share = min(1.0, 0.3 + self.state.steps_in_phase / 15)
+        return self._follow(-self.plan.press * share)
 
     def is_lifted_off(self) -> bool:
         return self.height > 0.02
 
     def rest(self) -> Vector:
-        return self.move(self.state.anchor + ABOVE + self.state.spread, self.level)
+        target = self.state.anchor + ABOVE_TABLE + self.state.waypoint_offset
+        return self.move(target, self.level)
 
     def _follow(self, down: float) -> Vector:
         """Return the command (6,) towards the first mark that is left, which leads the tool along the trace.
 
         ``down`` replaces the vertical part [action units].
         """
-        target = np.array([*self.left[0][:2], self.hand.position[2]])
+        x, y, _ = self.dirt_left[0]
+        target = np.array([x, y, self.hand.position[2]])
         command = self.move(target, self.level, gain=2.0)
         command[2] = down
         return command
@@ -104,8 +108,8 @@ class WipeExpert(Expert):
 
     def begin(self, observation: Any) -> State:
         speed = 0.5 * self.draw_speed()
-        stronger = 1 + self.style.speed_spread * self.np_random.standard_normal()
-        press = PRESS * float(np.clip(stronger, 0.8, 1.2))
+        strength = 1 + self.style.speed_spread * self.np_random.standard_normal()
+        press = USUAL_PRESS * float(np.clip(strength, 0.8, 1.2))
 
         hand = self.read(observation, "hand_position")
         env = self.robosuite
@@ -116,14 +120,14 @@ class WipeExpert(Expert):
         if length(dirt[-1] - hand) < length(dirt[0] - hand):
             order = order[::-1]
         plan = WipePlan(press, dirt[order], order)
-        return State(speed, plan, spread=self.draw_offset(), anchor=hand)
+        return State(speed, plan, waypoint_offset=self.draw_offset(), anchor=hand)
 
-    def look(self, observation: Any, state: State) -> WipeScene:
+    def observe(self, observation: Any, state: State) -> WipeScene:
         marks = self.robosuite.model.mujoco_arena.markers
         wiped = set(self.robosuite.wiped_markers)
         is_dirty = np.array([mark not in wiped for mark in marks])
         return WipeScene(
             state,
             hand=self.read.hand(observation),
-            left=state.plan.dirt[is_dirty[state.plan.order]],
+            dirt_left=state.plan.dirt[is_dirty[state.plan.order]],
         )
