@@ -154,7 +154,7 @@ class Repetition:
             rank = math.ceil((1.0 - RATE) * (len(highest) + 1))
             local.ceiling = np.sort(highest)[min(rank, len(highest)) - 1]
             self.networks[name] = local
-        self.rivals = {}
+        self.rivals: dict[str, Backpropagated] = {}
         for cell, hidden in CELL_UNITS.items():
             training = Training(cell, hidden, self.config.updates)
             start = time.process_time()
@@ -197,8 +197,8 @@ def predict(repetition: Repetition) -> None:
             repetition.note("next row", f"{name}, {steps}", "error", error)
             missing = completion_error(network, batch, repetition.seed)
             repetition.note("missing senses", f"{name}, {steps}", "error", missing)
-    for name, model in repetition.rivals.items():
-        repetition.note("next row", name, "error", next_row_error(model, batch))
+    for name, rival in repetition.rivals.items():
+        repetition.note("next row", name, "error", next_row_error(rival, batch))
 
     true = streams[EVENT:, :, HAND]
     last = streams[EVENT - 1, :, HAND].astype(np.float64)
