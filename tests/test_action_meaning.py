@@ -228,7 +228,10 @@ def test_a_hold_is_refused_where_nothing_tells_what_actions_mean_and_the_option_
         guarded(CASES["torques"])
     with pytest.warns(UserWarning, match="contradicts the recorded episodes: number 0"):
         NeuralASMSafety(
-            env, Surprised(spec, 5, identify_meaning(recorded(env))), "hold", action_means="velocity"
+            env,
+            Surprised(spec, 5, identify_meaning(recorded(env))),
+            "hold",
+            action_means="velocity",
         )
 
 
