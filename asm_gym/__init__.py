@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from asm_gym.monitors import register_monitor as register_monitor
     from asm_gym.policies import make_policy as make_policy
     from asm_gym.policies.registry import register_policy as register_policy
-    from asm_gym.rollouts.pretraining.healthy import harmless as harmless
+    from asm_gym.rollouts.pretraining.body_memory import harmless as harmless
     from asm_gym.rollouts.run_trials import collect as collect
     from asm_gym.spec import Channel as Channel
     from asm_gym.spec import StreamSpec as StreamSpec
@@ -56,7 +56,7 @@ _NAMES: dict[str, Iterable[str]] = {
     "policies": ("make_policy",),
     "policies.registry": ("register_policy",),
     "rollouts.run_trials": ("collect",),
-    "rollouts.pretraining.healthy": ("harmless",),
+    "rollouts.pretraining.body_memory": ("harmless",),
     "spec": ("Channel", "StreamSpec"),
     "tasks": ("register_task",),
     "wrappers": ("FaultInjection", "NeuralASMSafety", "StreamRecorder", "VectorNeuralASMSafety"),

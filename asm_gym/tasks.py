@@ -26,7 +26,7 @@ class TaskSpec:
     horizon: int  # control steps before an episode is truncated, at the default 20 Hz
     success: str  # meaning of ``info["success"]``
     arms: int = 1  # number of robots
-    # of its objects, when robosuite loads the model; see ``asm_gym.envs.shapes``
+    # of its objects, when robosuite loads the model; see ``asm_gym.envs.lift_cube``
     draws_shapes: bool = False
 
     @property

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from asm_gym.envs.control import REACHES
+from asm_gym.envs.controllers import REACHES
 
 
 def hand_jacobian(simulation, arm):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.data.arrays import read_hdf5, read_mat
+from asm_gym.data.array_files import read_hdf5, read_mat
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema_inference import SchemaHints

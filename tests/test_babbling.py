@@ -22,7 +22,7 @@ from asm_gym.rollouts.pretraining.body_evaluation import (
     summary,
     usual_force,
 )
-from asm_gym.rollouts.pretraining.healthy import KNOWN, healthy, held_out
+from asm_gym.rollouts.pretraining.body_memory import KNOWN, healthy, held_out
 from asm_gym.rollouts.pretraining.training_motions import (
     AROUND,
     DISTURBED,

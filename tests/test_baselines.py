@@ -24,7 +24,7 @@ SPEC = StreamSpec(
 )
 
 
-TORCH = "asm_gym.monitors.baselines.networks"
+TORCH = "asm_gym.monitors.baselines.torch_baselines"
 
 
 def episodes(count, seed=0):
@@ -148,7 +148,7 @@ def test_unknown_names_and_hyperparameters_list_the_known():
 
 def test_training_slows_down_at_plateaus_ends_where_nothing_is_gained_and_keeps_the_best():
     torch = needs("torch")
-    from asm_gym.monitors.baselines.networks import PATIENCE, train_on_episodes
+    from asm_gym.monitors.baselines.torch_baselines import PATIENCE, train_on_episodes
 
     module, fresh = torch.nn.Linear(1, 1, bias=False), iter([5.0, 3.0, *[4.0] * 200])
     weights = []

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
-from asm_gym.data.selection import pieces
+from asm_gym.data.training_selection import pieces
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.torque.body_model import BodyModel, JointMotion
 from asm_gym.monitors.torque.urdf import read_urdf

@@ -17,11 +17,11 @@ from asm_gym.data.column_behaviour import (
 )
 from asm_gym.data.column_match import ColumnMatch
 from asm_gym.data.episode import Episode
+from asm_gym.data.live_rows import RowReader
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import LogWarning, noted
-from asm_gym.data.rows import RowReader
 from asm_gym.data.schema import LogSchema
-from asm_gym.evaluation.alarms import alarms_of, sensed_peak
+from asm_gym.evaluation.recorded_alarms import alarms_of, sensed_peak
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.scripts.cli import main
 from asm_gym.spec import StreamSpec

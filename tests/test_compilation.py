@@ -123,7 +123,7 @@ def ensured(self):
 for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
     locator.ensure_cache_path = ensured
 from asm_gym.compilation import kept_in
-from asm_gym.envs.backend import import_robosuite
+from asm_gym.envs.robosuite_backend import import_robosuite
 print(kept_in(import_robosuite().utils.transform_utils.quat2mat))
 """
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from asm_gym.data.episode import Episode
-from asm_gym.data.live import SourceDied, lines_from
-from asm_gym.data.rows import RowReader
+from asm_gym.data.live_rows import RowReader
+from asm_gym.data.live_sources import SourceDied, lines_from
 from asm_gym.data.schema import LogSchema
 from asm_gym.monitors import make_monitor
 from asm_gym.scripts.cli import main

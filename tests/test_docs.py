@@ -22,8 +22,8 @@ import pytest
 
 import asm_gym
 from asm_gym.faults.suite import KINDS
-from asm_gym.guard.report import RowReport, asm_info
 from asm_gym.guard.robot_table import RobotTable
+from asm_gym.guard.step_info import RowReport, asm_info
 from asm_gym.monitors import MONITORS
 from asm_gym.policies.registry import POLICIES
 from asm_gym.scripts import command as command_of

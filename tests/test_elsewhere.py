@@ -21,7 +21,7 @@ from asm_gym.faults import (
     Push,
     Scale,
 )
-from asm_gym.faults.anywhere import KINDS, FaultyInterface, faults_anywhere, sigmas
+from asm_gym.faults.foreign_faults import KINDS, FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import SEVERITIES
 from asm_gym.policies import make_policy
 from asm_gym.scripts.cli import main

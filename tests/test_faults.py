@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asm_gym import faults, register_fault
-from asm_gym.envs.edits import SimulatorEdits
+from asm_gym.envs.undoable_edits import SimulatorEdits
 from asm_gym.faults import Bias, FrozenEncoder, Push, WeakJoint
 from asm_gym.faults.suite import (
     GROUPS,

@@ -16,14 +16,14 @@ from asm_gym.data.episode import Episode
 from asm_gym.data.inspection import Inspection, inspect_log
 from asm_gym.data.logs import Log
 from asm_gym.data.schema import LogSchema
-from asm_gym.data.selection import (
+from asm_gym.data.text_files import read_text
+from asm_gym.data.training_selection import (
     normal_episodes,
     pieces,
     split_at_random,
     split_in_time,
 )
-from asm_gym.data.text import read_text
-from asm_gym.evaluation.alarms import alarms_of, traces_of
+from asm_gym.evaluation.recorded_alarms import alarms_of, traces_of
 from asm_gym.guard.live_watch import follow
 from asm_gym.monitors import load_monitor
 from asm_gym.scripts.cli import main

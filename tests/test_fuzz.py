@@ -149,7 +149,9 @@ def test_an_environment_is_made_or_refused(data):
 
     def checked(**arguments):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("asm_gym.envs.backend.import_robosuite", lambda: pytest.fail("made"))
+            patch.setattr(
+                "asm_gym.envs.robosuite_backend.import_robosuite", lambda: pytest.fail("made")
+            )
             try:
                 return RobosuiteEnv(**arguments)
             except pytest.fail.Exception:

@@ -7,8 +7,8 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import asm_gym  # noqa: F401
 from asm_gym.detection.contact_limits import ContactLimits
-from asm_gym.envs.backend import CONTROLLERS
-from asm_gym.envs.control import YIELDS_AT
+from asm_gym.envs.controllers import YIELDS_AT
+from asm_gym.envs.robosuite_backend import CONTROLLERS
 from asm_gym.envs.robots import robot_named
 from asm_gym.faults import Push
 from asm_gym.tasks import ROBOTS

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from asm_gym.envs import compiled_substeps as kernels
-from asm_gym.envs import control
-from asm_gym.envs.backend import import_robosuite
+from asm_gym.envs import controllers
 from asm_gym.envs.mujoco_views import Work
+from asm_gym.envs.robosuite_backend import import_robosuite
 from tests.problems import called
 
 
@@ -27,17 +27,19 @@ def test_a_solution_solves_and_where_a_matrix_is_singular_numbers_that_depend_on
     M, L = A @ A.T, np.empty((6, 6))
     b = rng.standard_normal((2, 6))
     x = b.copy()
-    called(control.solve)(M, 6, L, x[1])
+    called(controllers.solve)(M, 6, L, x[1])
     np.testing.assert_allclose(M @ x[1], b[1], atol=1e-10)
     np.testing.assert_array_equal(x[0], b[0])
     x = np.array([[4.0, 3.0, 2.0]])
-    called(control.solve)(np.diag([2.0, 0.0, 1.0]), 3, L, x[0])
+    called(controllers.solve)(np.diag([2.0, 0.0, 1.0]), 3, L, x[0])
     np.testing.assert_allclose(x, [[2.0, 0.0, 2.0]], atol=1e-12)
     x = np.array([[2.0, 2.0, 5.0]])
-    called(control.solve)(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 3, L, x[0])
+    called(controllers.solve)(
+        np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 3, L, x[0]
+    )
     np.testing.assert_allclose(x, [[2.0, 0.0, 5.0]], atol=1e-12)
     x = np.ones((1, 3))
-    called(control.solve)(np.full((3, 3), np.nan), 3, L, x[0])
+    called(controllers.solve)(np.full((3, 3), np.nan), 3, L, x[0])
     np.testing.assert_array_equal(x, 0.0)
 
 
@@ -50,7 +52,7 @@ def test_an_arms_mass_matrix_and_jacobian_and_its_hands_velocity_are_mujocos(som
     linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     mujoco.mj_jacSite(model, data, linear, angular, arms.site[0])
     nominal, samples = somewhere.nominal.unedited, np.zeros((1, 1, kernels.SAMPLE))
-    called(control.read_arm)(somewhere.views, nominal, arms[0], work)
+    called(controllers.read_arm)(somewhere.views, nominal, arms[0], work)
     kernels.sample(somewhere.views, nominal, arms, 0, samples)
     np.testing.assert_array_equal(work.mass, whole[np.ix_(dofs, dofs)])
     np.testing.assert_array_equal(
@@ -75,7 +77,7 @@ def test_operational_space_torques_are_robosuites(n):
     expected = J.T @ decoupled + bias + nullspace_torques(M, nullspace, rest, q, v)
     work.mass[:n, :n], work.jacobian[:, :n], work.bias[:n], work.force[:] = M, J, bias, wrench
     work.torques[:n] = M @ (10 * (rest - q) - 2 * np.sqrt(10) * v)
-    called(control.osc_torques)(work, n)
+    called(controllers.osc_torques)(work, n)
     np.testing.assert_allclose(work.torques[:n], expected, atol=1e-9)
 
 

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asm_gym.data import live
+from asm_gym.data import live_sources
 from asm_gym.data.alarm_reasons import blamed, reason
 from asm_gym.data.bridging import Bridge, bridged, filled
-from asm_gym.data.live import SourceDied, live_source, record
 from asm_gym.data.live_clock import NEWEST, Pace
+from asm_gym.data.live_rows import RowReader
+from asm_gym.data.live_sources import SourceDied, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.publishers import Publishers
-from asm_gym.data.rows import RowReader
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.spec import MOTOR, Channel, StreamSpec
@@ -29,7 +29,7 @@ from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 def lines_from(*source):
     """Lines of a source without the empty ones, which say that time goes on."""
-    return filter(str.strip, live.lines_from(*source))
+    return filter(str.strip, live_sources.lines_from(*source))
 
 
 SPEC = StreamSpec(

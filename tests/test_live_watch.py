@@ -20,10 +20,10 @@ import pytest
 
 from asm_gym.data.bridging import bridge_of
 from asm_gym.data.episode import Episode
+from asm_gym.data.live_rows import SourceDied
 from asm_gym.data.logs import Log
-from asm_gym.data.rows import SourceDied
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK
-from asm_gym.evaluation.alarms import alarms_of, excused_in, traces_of
+from asm_gym.evaluation.recorded_alarms import alarms_of, excused_in, traces_of
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.guard.alarm_outlets import AlarmOutlets, LineWriter
 from asm_gym.guard.live_events import LiveEvent

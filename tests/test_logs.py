@@ -13,14 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from asm_gym.data.clock_inference import clocks_among
+from asm_gym.data.column_names import is_command
 from asm_gym.data.episode import Episode, EpisodeLabel, save_episode
 from asm_gym.data.logs import FILES, read_logs
-from asm_gym.data.names import is_command
 from asm_gym.data.reader_notes import LogWarning, noted
 from asm_gym.data.schema_inference import SchemaHints
-from asm_gym.data.selection import normal_episodes
-from asm_gym.data.text import read_text
+from asm_gym.data.text_files import read_text
 from asm_gym.data.timing import evenly, period
+from asm_gym.data.training_selection import normal_episodes
 from asm_gym.readings import noise_of, resolution
 from asm_gym.spec import MOTOR
 from tests.needs import needs

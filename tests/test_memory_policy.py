@@ -21,7 +21,7 @@ from asm_gym.monitors.memory_policy import (
     CommandReadout,
     NeuralASMPolicy,
 )
-from asm_gym.monitors.skills import learn_to_act, next_commands
+from asm_gym.monitors.memory_skills import learn_to_act, next_commands
 from asm_gym.policies import make_policy, rollout
 from asm_gym.scaling import StreamScaler
 from asm_gym.spec import Channel, StreamSpec

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.skills import name_skills
+from asm_gym.monitors.memory_skills import name_skills
 from tests.memories import SMALL, sine_memory
 from tests.streams import sine_episodes, sine_spec
 

@@ -16,7 +16,7 @@ from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import LogWarning
 from asm_gym.data.schema_inference import SchemaHints
 from asm_gym.data.table_layout import MOST_BYTES, table_of
-from asm_gym.data.text import read_text
+from asm_gym.data.text_files import read_text
 
 ROWS = 120
 NAMES = ["q1", "q2", "M1", "M2"]

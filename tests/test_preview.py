@@ -9,7 +9,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection.commands import healthy_commands, learned_motion
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.guard.preview import preview_chunk
+from asm_gym.guard.chunk_preview import preview_chunk
 from asm_gym.monitors import NeuralASM, load_monitor, make_monitor
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 from asm_gym.wrappers import NeuralASMSafety

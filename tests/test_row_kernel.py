@@ -26,8 +26,8 @@ from asm_gym.memory.recall import continued
 from asm_gym.memory.temporal import UNSURE, MemoryState
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.memory_model import MemoryModel
+from asm_gym.monitors.memory_skills import name_skills, recall
 from asm_gym.monitors.monitor_state import MonitorState
-from asm_gym.monitors.skills import name_skills, recall
 from tests.streams import sine_episodes, sine_spec
 
 

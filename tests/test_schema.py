@@ -12,10 +12,10 @@ import pandas as pd
 import pytest
 
 from asm_gym.data.episode import Episode
+from asm_gym.data.live_rows import RowReader
 from asm_gym.data.log_comparison import FACTOR
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.rows import RowReader
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_file import read_schema, write_schema
 from asm_gym.monitors import load_monitor

@@ -20,7 +20,7 @@ from asm_gym.memory.settling import (
 )
 from asm_gym.memory.temporal import unassociated
 from asm_gym.monitors import MemoryConfig, NeuralASM, load_monitor
-from asm_gym.monitors.skills import name_skills, recall
+from asm_gym.monitors.memory_skills import name_skills, recall
 from tests.problems import some_rows
 from tests.streams import frozen, sine_episodes, sine_spec
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
-from asm_gym.envs import shapes
+from asm_gym.envs import lift_cube
 
 
 def numbers(model):
@@ -48,7 +48,7 @@ def test_what_is_drawn_into_a_model_is_what_loading_draws(seeds, monkeypatch):
     sizes = set()
     for seed in range(seeds):
         with monkeypatch.context() as patch:
-            patch.setattr(shapes, "draw", lambda env: False)
+            patch.setattr(lift_cube, "draw", lambda env: False)
             expected = episode(loaded, seed)
         before = drawn.unwrapped.simulation.model
         assert episode(drawn, seed) == expected

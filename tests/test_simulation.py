@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import asm_gym  # noqa: F401
-from asm_gym.envs import backend
+from asm_gym.envs import robosuite_backend
 from asm_gym.tasks import task
 
 
@@ -17,7 +17,7 @@ def pair(name, controller="OSC_POSE"):
     ours = gym.make(
         f"asm_gym/{name}-v0", controller=controller, sensor_noise=0.0, horizon=10_000
     ).unwrapped
-    theirs = backend.make(task(name), ours.robots, controller, 20, reward_shaping=True)
+    theirs = robosuite_backend.make(task(name), ours.robots, controller, 20, reward_shaping=True)
     ours.reset(seed=4)
     for env in (theirs, ours.robosuite_env):
         env.rng.bit_generator.state = np.random.default_rng(9).bit_generator.state

@@ -38,7 +38,7 @@ from asm_gym.memory.traces import (
     learn_traces,
 )
 from asm_gym.monitors import MemoryConfig, NeuralASM
-from asm_gym.monitors.skills import recall
+from asm_gym.monitors.memory_skills import recall
 from tests.problems import called, energy, problem, schedule, some_rows, trajectory
 from tests.streams import sine_episodes, sine_spec
 

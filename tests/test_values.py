@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asm_gym.data.episode import Episode
-from asm_gym.data.selection import pieces
+from asm_gym.data.training_selection import pieces
 from asm_gym.detection.scores import Largest
 from asm_gym.monitors import CalibratedMonitor, NeuralASM, load_monitor, make_monitor
 from asm_gym.monitors.baselines.friction_rule import FrictionRule
+from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.stream_model import model_outputs
-from asm_gym.monitors.surprise import Surprise
 from asm_gym.monitors.torque.arm_features import judged_by_values, motion_columns, torque_columns
 from asm_gym.monitors.torque.value_association import ValueAssociation, running_mean
 from asm_gym.monitors.torque.value_judge import ValueJudge

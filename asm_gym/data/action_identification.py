@@ -28,8 +28,8 @@ from asm_gym.data.action_meaning import (
     VELOCITY,
     ActionMeaning,
 )
+from asm_gym.data.column_names import SPEED_NAME
 from asm_gym.data.episode import Episode
-from asm_gym.data.names import SPEED_NAME
 from asm_gym.spec import StreamSpec
 
 LATEST_LAG = 3  # most rows after which a command may act

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import LONGER
+from asm_gym.data.column_names import LONGER
 from asm_gym.data.table_layout import is_numeric
 
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.clock import DATE, DAY_S, NUMBER, LogClock, kind_of, numbers_of, unit_by_size
 from asm_gym.data.column_behaviour import are_whole, finite
-from asm_gym.data.names import CLOCK_NAME, COUNTERS, LONGER, SECONDS, is_clock, split_unit
+from asm_gym.data.column_names import CLOCK_NAME, COUNTERS, LONGER, SECONDS, is_clock, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import is_numeric
 

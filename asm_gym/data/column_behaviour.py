@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import TAU, TURN
+from asm_gym.data.column_names import TAU, TURN
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.data.column_names import TAU, factor, label_of, split_unit
 from asm_gym.data.log_column import LogColumn
-from asm_gym.data.names import TAU, factor, label_of, split_unit
 from asm_gym.data.table_layout import Columns, is_numeric
 
 if TYPE_CHECKING:

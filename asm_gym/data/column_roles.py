@@ -38,6 +38,14 @@ from asm_gym.data.column_behaviour import (
     missing_value_sentinel,
     wrap_period,
 )
+from asm_gym.data.column_names import (
+    BASE_UNITS,
+    COUNTERS,
+    SENSE_NAME,
+    element_of,
+    is_command,
+    split_unit,
+)
 from asm_gym.data.log_column import (
     CLOCK,
     COMMAND,
@@ -50,17 +58,9 @@ from asm_gym.data.log_column import (
     UNCLEAR,
     LogColumn,
 )
-from asm_gym.data.names import (
-    BASE_UNITS,
-    COUNTERS,
-    SENSE_NAME,
-    element_of,
-    is_command,
-    split_unit,
-)
 from asm_gym.data.schema import is_called_label
 from asm_gym.data.table_layout import Columns, is_numeric
-from asm_gym.data.text import DOUBLED, numbers_in
+from asm_gym.data.text_files import DOUBLED, numbers_in
 
 Floats = NDArray[np.float64]
 

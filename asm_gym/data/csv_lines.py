@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import Any
 
 from asm_gym.data.table_layout import is_key, named_columns, named_row
-from asm_gym.data.text import DOUBLED, Dialect, check_cells, header_of
+from asm_gym.data.text_files import DOUBLED, Dialect, check_cells, header_of
 
 
 class CsvLines:

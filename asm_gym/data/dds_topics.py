@@ -18,8 +18,8 @@ from functools import cache
 from typing import Any
 
 from asm_gym.data.bags import MESSAGES, numbers_of, stamp_of
+from asm_gym.data.live_rows import SourceDied
 from asm_gym.data.publishers import Publishers
-from asm_gym.data.rows import SourceDied
 from asm_gym.extras import require
 
 CONNECT_S = 5.0  # how long a topic may take to be found [s]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.data.bridging import BRIDGED_ROWS
+from asm_gym.data.column_names import split_unit
 from asm_gym.data.log_column import COMMAND, IGNORED, SENSE, LogColumn
-from asm_gym.data.names import split_unit
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.table_layout import Columns, is_numeric
 from asm_gym.data.timing import FAR, Timing, evenly, timing_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from asm_gym.data.column_names import element_name, is_clock, split_unit
 from asm_gym.data.live_clock import LiveClock
-from asm_gym.data.names import element_name, is_clock, split_unit
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.table_layout import is_key
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from asm_gym.data.arrays import read_parquet
+from asm_gym.data.array_files import read_parquet
 from asm_gym.data.table_layout import Columns, as_array
 
 INFO = Path("meta") / "info.json"

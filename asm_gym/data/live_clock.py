@@ -17,7 +17,7 @@ import numpy as np
 
 from asm_gym.data.clock import NUMBER, SINCE_1970, LogClock
 from asm_gym.data.clock_inference import UNNAMED_UNITS, clock_called, clocks_among, resolve
-from asm_gym.data.names import LONGER
+from asm_gym.data.column_names import LONGER
 from asm_gym.data.schema import LogSchema, can_resample
 
 NEWEST = 32  # rows that tell the rate, and after which it is told again

@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from asm_gym.checkpoint import read_arrays
-from asm_gym.data.arrays import read_array, read_hdf5, read_mat, read_parquet
+from asm_gym.data.array_files import read_array, read_hdf5, read_mat, read_parquet
 from asm_gym.data.bags import read_bag
+from asm_gym.data.column_names import is_label, split_unit
 from asm_gym.data.episode import Episode, load_episode
 from asm_gym.data.lerobot_datasets import INFO, read_lerobot
 from asm_gym.data.minari_datasets import METADATA_FILE, read_dataset
-from asm_gym.data.names import is_label, split_unit
 from asm_gym.data.reader_notes import UNREAD, note
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.schema_inference import SchemaHints, infer_schema, note_columns, recordings_in
 from asm_gym.data.table_layout import Columns, laid_out
-from asm_gym.data.text import read_json_lines, read_text
+from asm_gym.data.text_files import read_json_lines, read_text
 from asm_gym.files import regular_file
 from asm_gym.validation import typed
 

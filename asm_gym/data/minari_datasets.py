@@ -24,7 +24,7 @@ from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 
 from asm_gym.control_period import control_period
-from asm_gym.data.arrays import check_hdf5
+from asm_gym.data.array_files import check_hdf5
 from asm_gym.data.episode import Episode, check_recorded
 from asm_gym.exceptions import DamagedFile
 from asm_gym.extras import require

@@ -22,8 +22,8 @@ from asm_gym.data.clock import LogClock
 from asm_gym.data.clock_inference import infer_clock
 from asm_gym.data.column_behaviour import are_whole, finite
 from asm_gym.data.column_match import ColumnMatch
+from asm_gym.data.column_names import TAU, TURN, TURNED_ELEMENTS, is_label, split_unit
 from asm_gym.data.log_column import COMMAND, COUNTER, LABEL, SENSE, UNCLEAR, LogColumn
-from asm_gym.data.names import TAU, TURN, TURNED_ELEMENTS, is_label, split_unit
 from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import Columns, is_numeric, laid_out
 from asm_gym.data.timing import Timing, evenly, timing_of

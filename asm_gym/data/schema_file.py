@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from asm_gym.data.clock import CLOCK_KINDS, NUMBER, LogClock
+from asm_gym.data.column_names import LONGER
 from asm_gym.data.log_column import COLUMN_ROLES, LogColumn
-from asm_gym.data.names import LONGER
 from asm_gym.data.schema import LogSchema
 from asm_gym.files import write_text
 from asm_gym.validation import check_choice, check_number

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import element_name, is_clock
+from asm_gym.data.column_names import element_name, is_clock
 from asm_gym.data.reader_notes import note
 from asm_gym.validation import short_repr
 

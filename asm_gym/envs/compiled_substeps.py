@@ -20,8 +20,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from asm_gym.compilation import Bound, compiled, inner
-from asm_gym.envs.control import HELD, control, length, read_arm, set_goal, slow_down
 from asm_gym.envs.controller_inputs import within
+from asm_gym.envs.controllers import HELD, control, length, read_arm, set_goal, slow_down
 from asm_gym.envs.mujoco_views import (
     FELT,
     JOINTS,

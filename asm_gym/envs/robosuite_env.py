@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asm_gym.detection.contact_limits import LIMITED, ContactLimits
-from asm_gym.envs import backend, shapes
+from asm_gym.envs import lift_cube, robosuite_backend
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.arms import PHYSICS_FREQ, chains_of
 from asm_gym.envs.rendering import OffscreenRenderer
@@ -85,7 +85,7 @@ class RobosuiteEnv(SteppedEnv):
         render_mode: ``None`` or ``"rgb_array"``.
         observation: ``"flat"`` for one Box, ``"dict"`` for named arrays.
         control_freq: actions a second [Hz]; must divide 500.
-        controller: one of ``asm_gym.envs.backend.CONTROLLERS``.
+        controller: one of ``asm_gym.envs.robosuite_backend.CONTROLLERS``.
         horizon: control steps before truncation; the task's own where None.
         reward_shaping: dense reward where True, for success alone where False.
         terminate_on_success: end the episode (``terminated``) when the task is solved.
@@ -126,7 +126,7 @@ class RobosuiteEnv(SteppedEnv):
         check_choice("observation", observation, ("flat", "dict"))
         _check_groups(stream)
         super().__init__(_substeps_at(control_freq))
-        self._row_substeps = backend.row_substeps(stream_freq, control_freq)
+        self._row_substeps = robosuite_backend.row_substeps(stream_freq, control_freq)
         if horizon is None:
             horizon = self.task.horizon
         self.horizon = check_number("horizon", horizon, low=1, whole=True)
@@ -144,7 +144,7 @@ class RobosuiteEnv(SteppedEnv):
 
         self.controller = controller  # name of the arms' controller
         check_flag("reward_shaping", reward_shaping)
-        self.robosuite_env: Any = backend.make(
+        self.robosuite_env: Any = robosuite_backend.make(
             self.task, self.robots, controller, control_freq, reward_shaping
         )
         """The simulator underneath."""
@@ -176,8 +176,8 @@ class RobosuiteEnv(SteppedEnv):
         """Take up the present model, which a hard reset replaces."""
         mend_robots(self.robosuite_env)
         self.simulation = Simulation(self.robosuite_env, self.substeps)
-        self._objects = backend.ObjectSensors(self.robosuite_env, self.task)
-        backend.speed_up_contacts(self.robosuite_env)
+        self._objects = robosuite_backend.ObjectSensors(self.robosuite_env, self.task)
+        robosuite_backend.speed_up_contacts(self.robosuite_env)
         self.simulation.keeps_history = self.task.name == "Wipe"  # whose reward reads it
 
     def _build_spaces(self) -> None:
@@ -228,14 +228,14 @@ class RobosuiteEnv(SteppedEnv):
         super().reset(seed=seed)
         env = self.robosuite_env
         if seed is not None or not self._seeded:
-            backend.reseed(env, self.np_random)
+            robosuite_backend.reseed(env, self.np_random)
             self._seeded = True
-        backend.choose_object(env, self.task)
+        robosuite_backend.choose_object(env, self.task)
         draws = seed is not None and self.task.draws_shapes
         # What others edit would be mixed up with what is drawn.
         nominal = self.simulation.nominal
         edited = len(self.edits) > 0 or nominal.now() is not nominal.unedited
-        env.hard_reset = draws and (edited or not shapes.draw(env))
+        env.hard_reset = draws and (edited or not lift_cube.draw(env))
         env.reset()
         if draws:
             self._bind()

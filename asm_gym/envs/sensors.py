@@ -22,7 +22,7 @@ from asm_gym.envs.mujoco_views import Floats, Ints, Views
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 if TYPE_CHECKING:
-    from asm_gym.envs.backend import ObjectSensors
+    from asm_gym.envs.robosuite_backend import ObjectSensors
 
 Corruption = Callable[[NDArray[np.float64]], None]  # a sensor fault: edits a measured row in place
 GROUPS = ("joint", "torque", "hand", "wrench", "gripper", MOTOR)

@@ -14,8 +14,8 @@ from asm_gym.compilation import Bound, bind, must_compile
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs import compiled_substeps as kernels
 from asm_gym.envs.arms import bodies, controller_of, describe, describe_inputs, is_compilable
-from asm_gym.envs.control import HELD
 from asm_gym.envs.controller_inputs import Gripper
+from asm_gym.envs.controllers import HELD
 from asm_gym.envs.mujoco_views import (
     FELT,
     GOAL,

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from asm_gym.compilation import Bound, bind, compiled, inner
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.detection.hand_speed import SpeedLimit, allowed_share
-from asm_gym.envs.control import REACHES, length
+from asm_gym.envs.controllers import REACHES, length
 from asm_gym.envs.mujoco_views import JOINT_ANGLES, UNKNOWN_CHANGE, Arm, Arms, Floats, Views
 
 # Nearer to the axis of its own base a hand goes half as fast, for its mount is hard [m].

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from asm_gym.detection.contact_limits import ContactLimits
 from asm_gym.envs.actions import Actions
 from asm_gym.envs.arms import PHYSICS_FREQ
-from asm_gym.envs.backend import ObjectSensors
-from asm_gym.envs.edits import SimulatorEdits
+from asm_gym.envs.robosuite_backend import ObjectSensors
 from asm_gym.envs.sensors import Corruption, Reading, Senses
 from asm_gym.envs.simulation import Simulation
+from asm_gym.envs.undoable_edits import SimulatorEdits
 from asm_gym.spec import Channel
 
 _UNSTABLE = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.envs.backend import import_robosuite, reseed
+from asm_gym.envs.robosuite_backend import import_robosuite, reseed
 from asm_gym.spec import MOTOR, Channel, StreamSpec
 
 UNIT_OF = {

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.guard.report import RowReport
 from asm_gym.guard.robot_facts import NOTHING
+from asm_gym.guard.step_info import RowReport
 
 
 class SensedRows(NamedTuple):

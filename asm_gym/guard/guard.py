@@ -22,6 +22,7 @@ from asm_gym.detection.alarm_rule import FAULT_EVENT, KNOCK_EVENT
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.alarm_terms import BY_CAUSE, CONTACT, SURPRISE, AlarmTerms
 from asm_gym.guard.arbiter import Arbiter
+from asm_gym.guard.chunk_preview import Preview, preview_chunk
 from asm_gym.guard.commander import Command, Commander, Observe
 from asm_gym.guard.contact_state import no_load
 from asm_gym.guard.diagnostician import Diagnostician
@@ -30,9 +31,7 @@ from asm_gym.guard.fitted_monitor import STALE, FittedMonitor, diagnosis_of
 from asm_gym.guard.judged_rows import JudgedRow, RowJudge
 from asm_gym.guard.observer import Observer, invalid_surprises, merged_failures
 from asm_gym.guard.options import GuardOptions
-from asm_gym.guard.preview import Preview, preview_chunk
 from asm_gym.guard.reflexes import GRADED, REFLEXES, FeltMotion, MotionArrays
-from asm_gym.guard.report import Outcome, RowReport
 from asm_gym.guard.responses import Response, responses_from, unexplained
 from asm_gym.guard.robot_facts import NOTHING, RobotFacts
 from asm_gym.guard.robot_table import (
@@ -46,6 +45,7 @@ from asm_gym.guard.robot_table import (
 )
 from asm_gym.guard.row_evidence import RowEvidence
 from asm_gym.guard.row_validation import RowValidator
+from asm_gym.guard.step_info import Outcome, RowReport
 from asm_gym.monitors import Monitor
 from asm_gym.policies.policy import Policy
 

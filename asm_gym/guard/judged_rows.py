@@ -28,10 +28,10 @@ from asm_gym.guard.hand_check import Contradiction
 from asm_gym.guard.observer import Observer, merged_failures
 from asm_gym.guard.recent_rows import RowArrays
 from asm_gym.guard.reflexes import MotionArrays, record_motion
-from asm_gym.guard.report import Outcome
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import POLICY, REFLEX, Floats32, Mask, RobotTable
 from asm_gym.guard.row_validation import RowValidator, ValidatedRows, validate_rows
+from asm_gym.guard.step_info import Outcome
 from asm_gym.monitors import Surprise
 from asm_gym.monitors.row_kernel import observe_rows
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.alarm_reasons import LATE, SURPRISING, TOGETHER_S, blamed, reason
 from asm_gym.data.bridging import Bridge
-from asm_gym.data.rows import Row, RowReader, SourceDied
+from asm_gym.data.live_rows import Row, RowReader, SourceDied
 from asm_gym.data.schema import LogSchema
 from asm_gym.detection.alarm_rule import EVENTS, KNOCK, NO_EVENT, STOP
 from asm_gym.guard.adapter import Adapter, SensedRows
@@ -40,8 +40,8 @@ from asm_gym.guard.live_events import (
     LiveEvent,
 )
 from asm_gym.guard.options import GuardOptions
-from asm_gym.guard.report import RowReport
 from asm_gym.guard.robot_facts import RobotFacts
+from asm_gym.guard.step_info import RowReport
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import as_float32
 
@@ -80,7 +80,7 @@ def follow(
     """Watch a live source until it ends; say each alarm at once, those of one cause as one.
 
     Args:
-        lines: rows as text, as ``asm_gym.data.live.lines_from`` yields them.
+        lines: rows as text, as ``asm_gym.data.live_sources.lines_from`` yields them.
         monitor: a calibrated monitor.
         say: called with every event.
         settings: how the source is watched.

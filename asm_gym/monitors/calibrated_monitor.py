@@ -28,6 +28,7 @@ from asm_gym.monitors.calibration import (
     with_ceilings,
 )
 from asm_gym.monitors.monitor_files import read_monitor, threshold_below, write_monitor
+from asm_gym.monitors.monitor_protocol import Progress, Surprise
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows, surprise_of_stream
 from asm_gym.monitors.stream_model import (
     StreamModel,
@@ -37,7 +38,6 @@ from asm_gym.monitors.stream_model import (
     require_arrays,
     side_by_side,
 )
-from asm_gym.monitors.surprise import Progress, Surprise
 from asm_gym.monitors.training_data import (
     Hashes,
     about_episodes,

@@ -21,9 +21,9 @@ from asm_gym.memory.learning import Schedule, Trajectory
 from asm_gym.memory.linear_association import check_inputs, specialise
 from asm_gym.memory.motor import Motor, situation
 from asm_gym.memory.temporal import UNSURE, MemoryState, TemporalNetwork
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.row_kernel import RowWeights, expected_errors, row_weights, unwritten
 from asm_gym.monitors.stream_model import ScaledModel, require_arrays
-from asm_gym.monitors.surprise import Progress
 from asm_gym.scaling import StreamScaler, rows_apart
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_shapes

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from asm_gym.control_period import control_period
 from asm_gym.monitors import NeuralASM
-from asm_gym.monitors.surprise import State
+from asm_gym.monitors.monitor_protocol import State
 from asm_gym.policies.policy import StatefulPolicy
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import typed

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asm_gym.monitors.monitor_protocol import State, Surprise
 from asm_gym.monitors.stream_model import batch_of
-from asm_gym.monitors.surprise import State, Surprise
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import short_repr
 

@@ -26,11 +26,11 @@ from asm_gym.monitors.diagnosis import Diagnosis, Readout
 from asm_gym.monitors.memory_config import OF_EVIDENCE, MemoryConfig
 from asm_gym.monitors.memory_model import MemoryModel
 from asm_gym.monitors.monitor_files import restored
+from asm_gym.monitors.monitor_protocol import Progress, Surprise
 from asm_gym.monitors.monitor_state import MonitorState, checked_rows
 from asm_gym.monitors.row_kernel import RowKernel
 from asm_gym.monitors.shipped import pretrained_file
 from asm_gym.monitors.stream_model import made, parameter_names
-from asm_gym.monitors.surprise import Progress, Surprise
 from asm_gym.monitors.torque.arm_features import ArmFeatures, judged_by_values
 from asm_gym.monitors.torque.value_judge import ValueJudge, without_values
 from asm_gym.monitors.weight_packing import rounded

@@ -37,8 +37,8 @@ from asm_gym.memory.readout import add_up
 from asm_gym.memory.settling import SettlingWeights, settle, settling_shapes
 from asm_gym.memory.temporal import UNSURE, MemoryState, RowHistory, TemporalNetwork
 from asm_gym.memory.traces import Weights, carry, weight_shapes
+from asm_gym.monitors.monitor_protocol import Surprise
 from asm_gym.monitors.monitor_state import MonitorState
-from asm_gym.monitors.surprise import Surprise
 from asm_gym.scaling import RowScale, ScaledRows, StreamScaler, read_rows
 
 

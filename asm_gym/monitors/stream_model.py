@@ -16,7 +16,7 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.temporal import RowHistory
-from asm_gym.monitors.surprise import Progress, State
+from asm_gym.monitors.monitor_protocol import Progress, State
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 

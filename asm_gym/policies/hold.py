@@ -6,7 +6,7 @@
     action is a target x*            x* = x where its override began, by ``ActionMeaning.staying``
     action is a torque, or unknown   nothing makes it stay: hold is refused
 
-The brake beneath the controllers of this package's environments is in ``asm_gym.envs.control``.
+The brake beneath the controllers of this package's environments is in ``asm_gym.envs.controllers``.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from asm_gym.evaluation.scored_episode import (
     ScoredEpisode,
 )
 from asm_gym.faults import Fault, Push
-from asm_gym.faults.anywhere import FaultyInterface, faults_anywhere, sigmas
+from asm_gym.faults.foreign_faults import FaultyInterface, faults_anywhere, sigmas
 from asm_gym.faults.suite import draw, suite_fault
 from asm_gym.guard.options import OnAlarmName
 from asm_gym.monitors import NeuralASM

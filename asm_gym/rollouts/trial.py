@@ -15,8 +15,8 @@ from asm_gym.control_period import control_period
 from asm_gym.data.episode import EpisodeLabel
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.evaluation.scored_episode import NOMINAL, POLICY_ALONE
-from asm_gym.faults import Fault, anywhere
-from asm_gym.faults.anywhere import FaultyInterface
+from asm_gym.faults import Fault, foreign_faults
+from asm_gym.faults.foreign_faults import FaultyInterface
 from asm_gym.faults.suite import KINDS, kinds_of, possible
 from asm_gym.policies import Policy, make_policy
 from asm_gym.rollouts.seeds import draw_onset, role_seeds
@@ -134,7 +134,7 @@ def kinds_in(env: gym.Env[Any, Any], faults: Sequence[str]) -> list[str]:
     inner = env.unwrapped
     if not isinstance(inner, RobosuiteEnv):
         FaultyInterface(env)  # refuses spaces that no fault can act on
-        return list(faults or anywhere.KINDS)
+        return list(faults or foreign_faults.KINDS)
     return [k for k in kinds_of(faults or tuple(KINDS)) if possible(k, inner)]
 
 

@@ -35,7 +35,7 @@ from asm_gym.rollouts.pretraining.body_evaluation import (
     summary,
     usual_force,
 )
-from asm_gym.rollouts.pretraining.healthy import calibrate_body, healthy, held_out, learn_body
+from asm_gym.rollouts.pretraining.body_memory import calibrate_body, healthy, held_out, learn_body
 from asm_gym.rollouts.pretraining.training_motions import curriculum, record_motion
 from asm_gym.rollouts.progress import stage
 from asm_gym.rollouts.run_folder import claimed, make_missing, versions

@@ -26,7 +26,7 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 from asm_gym.data.episode import Episode
-from asm_gym.envs.backend import import_robosuite
+from asm_gym.envs.robosuite_backend import import_robosuite
 from asm_gym.envs.vector import ThreadedVectorEnv, cores
 from asm_gym.evaluation.statistics import Spread
 from asm_gym.evaluation.tables import Table, markdown

@@ -21,7 +21,7 @@ from asm_gym.evaluation.defaults import FALSE_ALARM_RATE, REPORTED_RATE, WINDOW_
 from asm_gym.evaluation.detection_tables import brief_monitors_table, kept_table, kinds_table
 from asm_gym.evaluation.report_page import publish
 from asm_gym.evaluation.scoring import benchmark
-from asm_gym.faults import anywhere
+from asm_gym.faults import foreign_faults
 from asm_gym.faults.suite import SEVERITIES, kinds_of
 from asm_gym.monitors import MONITORS, make_monitor
 from asm_gym.monitors.monitor_registry import check_monitor_name
@@ -99,7 +99,7 @@ class Args(Options):
                     f"got {', '.join(self.tasks)}"
                 )
             for name in self.faults:
-                check_choice("kind of fault", name, anywhere.KINDS)
+                check_choice("kind of fault", name, foreign_faults.KINDS)
         else:
             if self.steps is not None:
                 raise ValueError("robosuite's tasks have lengths of their own: leave --steps out")

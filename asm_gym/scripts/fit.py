@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from asm_gym.data import selection
+from asm_gym.data import training_selection
 from asm_gym.data.bridging import bridge_of, filled
 from asm_gym.data.episode import Episode
-from asm_gym.data.live import lines_from, live_source, record
+from asm_gym.data.live_sources import lines_from, live_source, record
 from asm_gym.data.logs import read_logs
 from asm_gym.data.reader_notes import noted
-from asm_gym.data.selection import SHORTEST_PART_S, normal_episodes, pieces
+from asm_gym.data.training_selection import SHORTEST_PART_S, normal_episodes, pieces
 from asm_gym.detection import conformal_episodes
 from asm_gym.detection.conformal import EPISODE
 from asm_gym.evaluation.defaults import FALSE_ALARM_RATE
@@ -141,7 +141,7 @@ def divide(
     """
     by_hour = args.promise.per != EPISODE
     if is_live or (by_hour and args.split is not None):
-        fitting, calibration = selection.split_in_time(stretches, CALIBRATION_SHARE)
+        fitting, calibration = training_selection.split_in_time(stretches, CALIBRATION_SHARE)
         if len(calibration) < args.needed:
             raise ValueError(
                 f"a false-alarm rate of {args.false_alarm_rate:g} needs {args.needed} pieces to "
@@ -150,7 +150,7 @@ def divide(
             )
     else:
         needed = args.needed or conformal_episodes(ANY_EPISODE)
-        fitting, calibration = selection.split_at_random(
+        fitting, calibration = training_selection.split_at_random(
             flat(stretches), needed, CALIBRATION_SHARE, args.seed
         )
     args.promise.check_hours(hours_of(calibration))
@@ -170,9 +170,9 @@ def parts_between_gaps(args: Args, episodes: list[Episode]) -> tuple[list[Episod
     dt = episodes[0].spec.dt
     seconds = bridge_of(args.bridge, dt)
     bridged = [replace(e, stream=filled(e.stream, dt, seconds)) for e in episodes]
-    parts = [selection.complete_parts(e) for e in bridged]  # of each episode
+    parts = [training_selection.complete_parts(e) for e in bridged]  # of each episode
     if args.split is None and len(flat(parts)) < args.needed / CALIBRATION_SHARE:
-        parts_without_bridge = [selection.complete_parts(e) for e in episodes]
+        parts_without_bridge = [training_selection.complete_parts(e) for e in episodes]
         if len(flat(parts_without_bridge)) > len(flat(parts)):
             bridged = episodes
             parts = parts_without_bridge
@@ -324,7 +324,7 @@ def fit(args: Args, console: Console) -> int:
     stretches = [[part] for part in parts]
     if args.split is not None:
         stretches = [pieces(part, args.split) for part in parts]
-    stretches, repeats = selection.without_repeats(stretches)
+    stretches, repeats = training_selection.without_repeats(stretches)
     if repeats:
         notes_on_parts.append(f"Left out: {repeats} parts whose rows are those of another one.")
     fitting, calibration = divide(args, stretches, is_live)

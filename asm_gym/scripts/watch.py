@@ -30,12 +30,12 @@ from asm_gym.data.alarm_reasons import SURPRISING
 from asm_gym.data.bridging import bridge_of, bridged
 from asm_gym.data.clock import date_of
 from asm_gym.data.dds_topics import publisher
-from asm_gym.data.live import lines_from, live_source
+from asm_gym.data.live_sources import lines_from, live_source
 from asm_gym.data.logs import Log, read_logs
 from asm_gym.data.reader_notes import noted
 from asm_gym.data.schema import LOG_ORIGIN, LogSchema
-from asm_gym.evaluation import alarms as recorded
-from asm_gym.evaluation.alarms import HEADINGS, Alarm
+from asm_gym.evaluation import recorded_alarms
+from asm_gym.evaluation.recorded_alarms import HEADINGS, Alarm
 from asm_gym.evaluation.scored_episode import ScoredEpisode
 from asm_gym.evaluation.tables import Table
 from asm_gym.extras import needed_for
@@ -112,13 +112,13 @@ class Review:
 
     def add(self, logs: Sequence[Log], monitor: Any, bridge: float) -> None:
         """Score some recordings; gaps of at most ``bridge`` [s] are not judged."""
-        for log, trace in zip(logs, recorded.traces_of(logs, monitor, bridge), strict=True):
+        for log, trace in zip(logs, recorded_alarms.traces_of(logs, monitor, bridge), strict=True):
             rows = bridged(log.episode.stream, monitor.spec.dt, bridge)
             self.bridged_rows += int(rows.sum())
-            self.alarms += recorded.alarms_of(trace, log.episode.info.get(LOG_ORIGIN))
-            self.excused.update(recorded.excused_in(trace))
+            self.alarms += recorded_alarms.alarms_of(trace, log.episode.info.get(LOG_ORIGIN))
+            self.excused.update(recorded_alarms.excused_in(trace))
             self.worst.append(trace)
-        self.worst.sort(key=lambda trace: -recorded.sensed_peak(trace))
+        self.worst.sort(key=lambda trace: -recorded_alarms.sensed_peak(trace))
         del self.worst[DRAWN_EPISODES:]
         self.episodes += len(logs)
 
@@ -145,7 +145,7 @@ def review(args: Args, monitor: Any, console: Console) -> int:
             progress(reviewed.episodes, reviewed.episodes)
 
     table = io.StringIO(newline="")
-    rows = [map(recorded.plain_cell, alarm.cells()) for alarm in reviewed.alarms]
+    rows = [map(recorded_alarms.plain_cell, alarm.cells()) for alarm in reviewed.alarms]
     csv.writer(table).writerows([HEADINGS, *rows])
     write_text(args.out / "alarms.csv", table.getvalue())
     written = publish(args, reviewed)

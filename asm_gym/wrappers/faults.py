@@ -10,7 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from asm_gym.envs.robosuite_env import RobosuiteEnv
 from asm_gym.faults import Fault
-from asm_gym.faults.anywhere import FaultyInterface
+from asm_gym.faults.foreign_faults import FaultyInterface
 from asm_gym.stream_source import stepped
 from asm_gym.validation import short_repr, typed
 

@@ -26,9 +26,9 @@ from asm_gym.guard.fitted_monitor import (
 )
 from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarm
-from asm_gym.guard.report import LazyInfo, RowReport
 from asm_gym.guard.robot_facts import RobotFacts
 from asm_gym.guard.robot_table import Mask
+from asm_gym.guard.step_info import LazyInfo, RowReport
 from asm_gym.monitors import Monitor, NeuralASM, pretrained_for
 from asm_gym.policies.hold import Hold
 from asm_gym.policies.policy import Policy

@@ -28,12 +28,12 @@ from asm_gym.data.live_clock import ClockWentBack, Pace
 from asm_gym.detection.commands import command_limits
 from asm_gym.guard.adapter import Adapter, SensedRows
 from asm_gym.guard.alarm_terms import FAILURE, OUT_OF_RANGE
+from asm_gym.guard.chunk_preview import Preview
 from asm_gym.guard.fitted_monitor import check_monitor
 from asm_gym.guard.guard import Guard
 from asm_gym.guard.options import GuardOptions, OnAlarmName
-from asm_gym.guard.preview import Preview
-from asm_gym.guard.report import RowReport
 from asm_gym.guard.robot_table import Floats32
+from asm_gym.guard.step_info import RowReport
 from asm_gym.guard.watchdog import Watchdog
 from asm_gym.monitors import Monitor, load_monitor
 from asm_gym.validation import check_choice, check_number
@@ -47,7 +47,7 @@ from asm_gym.wrappers.lerobot_arm import (
     row_of,
     servo_of,
 )
-from asm_gym.wrappers.servo_faults import ServoHistory
+from asm_gym.wrappers.servo_diagnosis import ServoHistory
 
 _log = logging.getLogger("asm_gym.lerobot")
 

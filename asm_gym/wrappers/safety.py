@@ -11,10 +11,10 @@ from gymnasium.utils import RecordConstructorArgs
 
 from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.adapter import SensedRows
+from asm_gym.guard.chunk_preview import Preview, checked_chunk
 from asm_gym.guard.commander import Command
-from asm_gym.guard.preview import Preview, checked_chunk
-from asm_gym.guard.report import AsmInfo, LazyInfo, RowReport, asm_info
 from asm_gym.guard.robot_table import Floats32
+from asm_gym.guard.step_info import AsmInfo, LazyInfo, RowReport, asm_info
 from asm_gym.monitors import Monitor
 from asm_gym.policies.hold import HoldsItself, why_changed
 from asm_gym.stream_source import StepResult, StreamSource
@@ -33,9 +33,10 @@ class NeuralASMSafety(Guarding, gym.Wrapper[Any, Any, Any, Any], RecordConstruct
     alarm whatever the surprise. Under ``"graded"``, severity and cause choose the response, and an estimate replaces a
     faulty sensor in observation and stream.
 
-    ``info["asm"]`` describes the step; ``asm_gym.guard.report.AsmInfo`` lists its fields. Flat NumPy scalars are beside
-    it: ``asm_surprise``, ``asm_alarm``, ``asm_intervened``, ``cost`` (1.0 in every step in alarm), ``cost_sum`` (of the
-    episode), and ``overridden`` (the policy's action was not executed: a recurrent policy keeps its previous state).
+    ``info["asm"]`` describes the step; ``asm_gym.guard.step_info.AsmInfo`` lists its fields. Beside it are flat NumPy
+    scalars: ``asm_surprise``, ``asm_alarm``, ``asm_intervened``, ``cost`` (1.0 in every step in alarm), ``cost_sum``
+    (of the episode), and ``overridden`` (the policy's action was not executed: a recurrent policy keeps its previous
+    state).
 
     Guards may be nested: the strictest contact limits and speeds apply, and cost and alarm combine all guards, while
     ``info["asm"]`` describes the outermost.

@@ -18,8 +18,8 @@ from asm_gym.control_period import PeriodCheck, control_period
 from asm_gym.exceptions import UnsupportedEnvironment
 from asm_gym.guard.adapter import SensedRows
 from asm_gym.guard.commander import Command
-from asm_gym.guard.report import LazyInfo, RowReport, side_by_side
 from asm_gym.guard.robot_table import Floats32, Mask
+from asm_gym.guard.step_info import LazyInfo, RowReport, side_by_side
 from asm_gym.monitors import Monitor
 from asm_gym.spec import StreamSpec
 from asm_gym.stream_source import refuse_running_statistics

@@ -20,8 +20,8 @@ from asm_gym.detection import ModelOutput
 from asm_gym.memory.association import ChangeLayout
 from asm_gym.memory.linear_association import check_inputs, learn_linear
 from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
-from asm_gym.monitors.surprise import Progress
 from asm_gym.monitors.torque.crossfitting import LEAST_REMAINDER
 from asm_gym.scaling import rows_apart
 from asm_gym.spec import StreamSpec

@@ -21,8 +21,8 @@ from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.detection.channel_columns import columns_where
 from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context, zero_unless_finite
-from asm_gym.monitors.surprise import Progress
 from asm_gym.spec import StreamSpec
 
 LEAST_CHANNEL_SPREAD = 1e-6  # of a channel [its unit]

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from asm_gym.data.episode import Episode
 from asm_gym.detection import ModelOutput
 from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.stream_model import StreamModel, no_context
-from asm_gym.monitors.surprise import Progress
 from asm_gym.monitors.torque.arm_features import WIDTHS, ArmFeatures, torque_columns
 from asm_gym.monitors.torque.body_model import JointMotion, explained_torque, joint_weights
 from asm_gym.scaling import rows_apart

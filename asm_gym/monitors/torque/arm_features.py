@@ -18,7 +18,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import POSITION_NAME, SPEED_NAME, ratio
+from asm_gym.data.column_names import POSITION_NAME, SPEED_NAME, ratio
 from asm_gym.detection.channel_columns import columns_where
 from asm_gym.monitors.torque.body_model import BodyModel, JointMotion
 from asm_gym.spec import StreamSpec

@@ -28,8 +28,8 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.linear_association import check_inputs
 from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next, require_arrays
-from asm_gym.monitors.surprise import Progress
 from asm_gym.monitors.torque.arm_features import (
     WIDTHS,
     ArmFeatures,

@@ -24,8 +24,8 @@ from asm_gym.detection.base import Arrays
 from asm_gym.detection.evidence import TINY
 from asm_gym.detection.scores import Largest
 from asm_gym.monitors.calibrated_monitor import CalibratedMonitor
+from asm_gym.monitors.monitor_protocol import State, Surprise
 from asm_gym.monitors.stream_model import read_next, require_arrays
-from asm_gym.monitors.surprise import State, Surprise
 from asm_gym.monitors.torque.crossfitting import quadratic_form, regular_inverse
 from asm_gym.monitors.torque.value_association import (
     ALIKE_S,

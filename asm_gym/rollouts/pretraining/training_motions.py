@@ -33,7 +33,7 @@ from asm_gym.policies import Policy, make_policy
 from asm_gym.policies.policy import StatefulPolicy
 from asm_gym.policies.scripted.expert import CLOSE, OPEN, ObservationReader, Style
 from asm_gym.policies.scripted.geometry import Vector, command_towards
-from asm_gym.rollouts.pretraining.healthy import HELD_OUT, MOTION_KEY, held_out
+from asm_gym.rollouts.pretraining.body_memory import HELD_OUT, MOTION_KEY, held_out
 from asm_gym.rollouts.run_trials import environment, record_stream
 from asm_gym.rollouts.seeds import role_seeds
 from asm_gym.rollouts.trial import RolloutConfig, Trial

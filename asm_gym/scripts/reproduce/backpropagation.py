@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from asm_gym.memory.learning import Trajectory
-from asm_gym.monitors.baselines.networks import adam, descend
+from asm_gym.monitors.baselines.torch_baselines import adam, descend
 from asm_gym.scaling import ScaledRows
 
 Array = NDArray[np.float32]

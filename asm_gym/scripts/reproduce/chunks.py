@@ -14,7 +14,7 @@ import pandas as pd
 
 from asm_gym.detection.commands import learned_motion
 from asm_gym.detection.hand_speed_map import HandSpeedMap
-from asm_gym.guard.preview import preview_chunk
+from asm_gym.guard.chunk_preview import preview_chunk
 from asm_gym.policies import rollout
 from asm_gym.rollouts.run_trials import collect, environment, staged
 from asm_gym.scripts.command import option

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from asm_gym.data.bags import read_bag
 from asm_gym.data.episode import Episode
-from asm_gym.data.selection import complete_parts, pieces
+from asm_gym.data.training_selection import complete_parts, pieces
 from asm_gym.detection import alarms_in
 from asm_gym.detection.scores import Largest
 from asm_gym.evaluation.tables import Table

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asm_gym.data.names import element_name
+from asm_gym.data.column_names import element_name
 from asm_gym.data.reader_notes import note
 from asm_gym.data.table_layout import MOST_COLUMNS, Columns, check_width
 from asm_gym.data.text_exports import check_export, on_first_clock, scope_head, with_unit

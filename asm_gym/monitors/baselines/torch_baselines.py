@@ -32,8 +32,8 @@ from asm_gym.detection import ModelOutput
 from asm_gym.detection.base import Arrays
 from asm_gym.memory.learning import shuffled
 from asm_gym.memory.temporal import RowHistory
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.monitors.stream_model import ScaledModel, no_context, read_next
-from asm_gym.monitors.surprise import Progress
 from asm_gym.scaling import ScaledRows, StreamScaler
 from asm_gym.spec import StreamSpec
 from asm_gym.validation import check_number, typed

@@ -15,7 +15,7 @@ from asm_gym.detection.contact_limits import healthy_forces
 from asm_gym.detection.hand_speed_map import HandSpeedMap
 from asm_gym.monitors import NeuralASM
 from asm_gym.monitors.calibration import AlarmRate
-from asm_gym.monitors.surprise import Progress
+from asm_gym.monitors.monitor_protocol import Progress
 from asm_gym.spec import StreamSpec
 
 MOTION_KEY = "lesson"  # under which a recording's ``info`` has its training motion

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import NamedTuple, TextIO
 
 from asm_gym.data.dds_topics import follow_topics
-from asm_gym.data.rows import SourceDied
-from asm_gym.data.text import decoded
+from asm_gym.data.live_rows import SourceDied
+from asm_gym.data.text_files import decoded
 from asm_gym.files import naming, no_links, regular_file
 from asm_gym.validation import check_number
 

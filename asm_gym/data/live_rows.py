@@ -26,7 +26,7 @@ from asm_gym.data.live_clock import LONGEST_STEP_S, ClockWentBack, LiveClock, Pa
 from asm_gym.data.publishers import Publishers
 from asm_gym.data.schema import LogSchema
 from asm_gym.data.table_layout import MOST_COLUMNS
-from asm_gym.data.text import flat_row
+from asm_gym.data.text_files import flat_row
 
 
 class SourceDied(Exception):  # noqa: N818 (it is no error of ours)
